@@ -48,8 +48,7 @@ def require_writable(path: Path) -> None:
 def set_aside(path: Path) -> None:
     """Rename the file that an earlier run has left at `path`: `policy.pt` becomes `policy.earlier.pt`.
 
-    A run that ends before its time must leave nothing where its result is looked for. A file that has the other name is
-    replaced.
+    A run that is cut off must leave nothing where its result is looked for. A file that has the other name is replaced.
 
     Raises
     ------

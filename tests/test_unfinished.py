@@ -1,4 +1,4 @@
-"""The file of a search: what was saved is what is gone on with, and anything else is refused in one sentence."""
+"""The file of a search: exactly the saved search is resumed, and anything else is refused in one sentence."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_what_is_loaded_is_what_was_saved(boxes: int, target: float, violated: b
 def test_so_it_is_of_any_tree_and_keys(
     kept: tuple[Unfinished, bytes], nodes: list[int], keys: list[float], boxes: int, share: float, tmp_path: Path
 ) -> None:
-    """Whether they fit is found out where the search is gone on with, and there it is refused if they do not."""
+    """A search that does not fit is refused where it is resumed."""
     trial = kept[0].trial
     state = SearchState(share, 5.0, boxes, boxes // 2, VIOLATION, bytes(nodes), np.array(keys))
     path = tmp_path / "search.json"
@@ -120,7 +120,7 @@ def test_so_it_is_of_any_tree_and_keys(
     try:
         attempt.restore(found.state)
     except InputError as error:
-        assert "cannot be gone on with" in str(error)
+        assert "cannot be resumed" in str(error)
     else:
         assert nodes.count(254) == len(keys)
 
@@ -237,7 +237,7 @@ def test_what_is_no_search_is_refused(raw: bytes, tmp_path: Path) -> None:
 
 
 def test_what_is_not_there_or_no_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no search to go on with"):
+    with pytest.raises(InputError, match="no search to resume"):
         load(tmp_path / "search.json", LOOP, 0.0)
     with pytest.raises(InputError, match="cannot be read"):
         load(tmp_path, LOOP, 0.0)
@@ -275,7 +275,7 @@ def test_a_search_of_something_else_is_refused(what: str, kept: tuple[Unfinished
         load(tmp_path / "search.json", *OTHERS[what]())
 
 
-# ------------------------------------------------------------------------------------------------------- gone on with
+# ------------------------------------------------------------------------------------------------------------ resumed
 
 
 def begun(kept_: Unfinished) -> Any:
@@ -283,7 +283,7 @@ def begun(kept_: Unfinished) -> Any:
 
 
 def test_a_search_in_pieces_is_the_search_in_one(tmp_path: Path) -> None:
-    """Kept and gone on with, again and again, no level moving: the tree is the same."""
+    """The tree is the same if the search is kept and resumed again and again, as long as no level moves."""
     whole = begun(searched(10))
     whole.advance(Budget(batch=8))
     expected = whole.proof()
@@ -350,7 +350,7 @@ def test_a_run_out_of_boxes_is_gone_on_with_twice(tmp_path: Path, monkeypatch: p
     for one in found:
         assert one.verdict is Verdict.PROVED
     assert found[2].certificate is not None and run_checker(found[2].certificate)["result"] == "ACCEPTED"
-    with pytest.raises(InputError, match="no search to go on with"):
+    with pytest.raises(InputError, match="no search to resume"):
         result_of(tmp_path, resume=True)
 
 

@@ -21,7 +21,7 @@ from certify.errors import BackendError, InputError, SoundnessError
 from certify.provers.ball.contraction import contraction
 from certify.provers.boxes.mend import below_leaf, split_again
 
-_SPLITS, _LOWERINGS = 3, 9  # of what the checker refuses
+_SPLITS, _LOWERINGS = 3, 9  # the most splits and lowerings for leaves that the checker refuses
 _BELOW_LEAVES, _LEVELS = 2, 5  # weaker certificates: below a refused leaf so long, and with a lower level at all
 _HIGHER = 1.5  # the next floor, after one that is refused
 
@@ -43,7 +43,7 @@ class Clerk:
 
     Parameters
     ----------
-    left : seconds that may still be spent on a leaf that was refused; after that only the level is lowered.
+    left : operations that may still be spent on a leaf that was refused; after that only the level is lowered.
     stage : times the stages `write` and `check`.
     tell : called before each check.
     show : called with the bytes of a certificate that the run ends with if they are accepted, before they are checked.
@@ -145,9 +145,9 @@ def _what_is_lower(first: Certificate, certificate: Certificate) -> str:
         said.append("it is left out with its tube")
     floor, lower = certificate.claim.floor, first.claim.floor
     if floor is not None and lower is not None and floor > lower:
-        said.append(f"the floor is {floor:.6g} in the place of {lower:.6g}")
+        said.append(f"the floor is {floor:.6g} instead of {lower:.6g}")
     if certificate.roa < first.roa:
-        said.append(f"the level is {certificate.roa:.6g} in the place of {first.roa:.6g}")
+        said.append(f"the level is {certificate.roa:.6g} instead of {first.roa:.6g}")
     return ", ".join(said)
 
 
@@ -219,7 +219,7 @@ def _with_higher_floor(refused: _Refused) -> Certificate | None:
 
 
 def _without_tube(refused: _Refused) -> Certificate | None:
-    """Without its tube, what is refused may not be asked any more."""
+    """The claim without its tube, for which the refused condition may not be needed."""
     return refused.with_claim(refused.claim.without_tube(), tube=())
 
 
@@ -251,7 +251,7 @@ _CONCESSIONS = (
     _without_equilibrium,
     _local_only,
 )
-"""What can be given up for the rest to be accepted, in this order."""
+"""The parts that can be given up for the rest to be accepted, in this order."""
 
 
 def _lowered(certificate: Certificate, answer: Mapping[str, Any], problem: Problem, tries: int) -> Certificate | None:

@@ -1,8 +1,8 @@
-"""`certify.certify_roa`: the pipeline for whoever works in Python, with names and files in the place of objects.
+"""`certify.certify_roa`: the pipeline for Python, which takes names and files instead of objects.
 
-The command and this function obey the same rules (`certify.analysis.inputs`): which plant a policy belongs to, what is
-asked for that a file does not say, where a domain is cut. What the command prints on standard error a result keeps as
-`notices`. Nothing here decides anything: the pipeline is `certify.analysis.run`.
+The command and this function obey the same rules (`certify.analysis.inputs`): the plant that a policy belongs to, the
+facts that a file does not give and that are asked for, the cut of a domain. A result keeps as `notices` the lines that
+the command prints on standard error. Nothing here decides anything: the pipeline is `certify.analysis.run`.
 """
 
 from __future__ import annotations
@@ -110,14 +110,14 @@ def certify_roa(
         Linear and Tanh layers and constant scalings; or a state_dict of such layers.
     out : folder for `certificate.json`, made if it is not there. None is a temporary folder that lives as long as the
         result does: copy the certificate, or keep the result. No report is drawn until `result.report()` asks for it.
-    options : all options of the run in one `RoaOptions`, in the place of the keywords below.
-    importing : what a policy that is not this program's own does not say: an `ImportOptions`, or a mapping with its
-        names, such as `{"states": ["theta", "theta_dot"], "normaliser": "none", "action_scale": 6}`. What is missing
-        is asked for by name; nothing is guessed.
+    options : all options of the run in one `RoaOptions`, instead of the keywords below.
+    importing : facts that a policy of another program does not give: an `ImportOptions`, or a mapping with its names,
+        such as `{"states": ["theta", "theta_dot"], "normaliser": "none", "action_scale": 6}`. A missing one is asked
+        for by name; nothing is guessed.
     <options>
     load_seconds : time already spent on reading, for the report.
     provenance : entries for the certificate that the checkers ignore; by default the policy's name and versions.
-    progress : called with a stage ("candidate", "ring", "check") and where the search stands, or None.
+    progress : called with a stage ("candidate", "ring", "check") and the search's `Progress`, or None.
 
     Returns
     -------
@@ -180,7 +180,7 @@ def certify_roa(
 
 
 def _keywords() -> dict[str, Option]:
-    """What is declared, by keyword."""
+    """The declared options, by keyword."""
     options = [*declared(RoaOptions).values(), *declared(PlantChanges).values()]
     return {option.keyword: option for option in options if option.keyword}
 

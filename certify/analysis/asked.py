@@ -1,4 +1,4 @@
-"""What is asked of a plant, in its own terms: boxes and states by the states' names, and what is refused.
+"""Requests in a plant's own terms: boxes and states by the states' names, and the reasons to refuse them.
 
 A run asks here before it begins; nothing here is part of a proof.
 """
@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 
 
 def require_one_that_knows(system: System, options: RoaOptions) -> None:
-    """Refuse what is about exact equations and Vdot alone, a solver of formulas and a tube, where something has a range
-    or time goes in steps.
+    """Refuse a solver of formulas and a tube, which need exact equations and Vdot, if something has a range or time has
+    steps.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def ellipsoid_in(system: System, box: Mapping[str, float] | None = None) -> Arra
 
 
 def state_in(system: System, values: Mapping[str, Fraction | float]) -> tuple[Fraction, ...]:
-    """A state by the states' values as a deviation from the operating point, at which those are that are not named.
+    """A state by the states' values, as a deviation from the operating point, at which states without a value are.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a run says of a set beyond the ellipsoid: its size, what limits it, why a level that was asked for is missed."""
+"""Facts on an outer set: its size, what limits it, why a level that was asked for is missed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from certify.provers.outer import OuterProof
 
 
 def outer_facts(problem: Problem, claim: Claim, outer: Outer, found: OuterProof) -> OuterFacts:
-    """What is said of a proved outer set; its volume, with that of the ellipsoid, is estimated from samples."""
+    """The facts on a proved outer set; its volume, with that of the ellipsoid, is estimated from samples."""
     held = sampled_volume(
         lambda x: (outer.function(x) <= outer.level) | (problem.V(x) <= claim.roa), problem.loop.system.domain
     )
@@ -30,7 +30,7 @@ def outer_facts(problem: Problem, claim: Claim, outer: Outer, found: OuterProof)
 
 
 def short_of(problem: Problem, claim: Claim, options: RoaOptions, found: OuterProof | None) -> str:
-    """Why the level of the function that was asked for is not proved."""
+    """The reason why the level of the function that was asked for is not proved."""
     reached = "nothing beyond V <= " + f"{claim.roa:.6g} is proved"
     if claim.outer is not None:
         reached = f"proved only up to N <= {claim.outer.level:.12g}, not {options.lyapunov_level:g}"
@@ -41,7 +41,7 @@ def short_of(problem: Problem, claim: Claim, options: RoaOptions, found: OuterPr
 
 
 def _rises(problem: Problem, claim: Claim, found: OuterProof) -> bool:
-    """Whether N certainly does not fall at the witness, where the certificate has no range to choose a value from."""
+    """True if N certainly does not fall at the witness, and the certificate has no range to choose a value from."""
     witness = found.witness
     if witness is None or witness.kind != "rise" or problem.loop.system.ranges:
         return False

@@ -1,4 +1,4 @@
-"""What a person changes of a plant, as one value, and the one place where it is put into the plant."""
+"""A person's changes of a plant, as one value, and the one place where they are put into the plant."""
 
 from __future__ import annotations
 

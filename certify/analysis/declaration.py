@@ -27,7 +27,7 @@ Kind = Literal[
     "bounds",
     "period",
 ]
-"""How a value is given: `certify.analysis.arguments` reads it as text, `certify.analysis.values` as Python's."""
+"""The form of a value: `certify.analysis.arguments` reads it as text, `certify.analysis.values` as Python's."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,7 +71,7 @@ class Option:
         return self.typed.removeprefix("--").replace("-", "_")
 
     def require(self, value: Any, error: type[Exception]) -> None:
-        """Refuse a value that is not what it must be, with this kind of error."""
+        """Refuse a value that breaks the option's rule, with this kind of error."""
         if value is not None and self.must is not None and not self.must[1](value):
             raise error(f"`{self.name}` must {self.must[0]}; found {_shown(value)}.")
 

@@ -1,9 +1,9 @@
-"""What limits a result, in the plant's own names, and what to try next: computed from the run, in floats, for people.
+"""The limit of a result, in the plant's own names, and the next step to try: computed from the run, in floats.
 
-Of a plant with ranges the modes and the input that leaves its bounds are those at the nominal values.
+For a plant with ranges, the modes and the input that leaves its bounds are those at the nominal values.
 
-Nothing here is part of a proof. The next step is worked out: a longer limit from how the proof grew, a wider domain
-from what sampling finds beyond it, another candidate only if others were left untried.
+Nothing here is part of a proof. The next step is worked out: more effort from how the proof grew, a wider domain from
+samples beyond it, another candidate only if others were left untried.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from certify.report.timing import TimingInWords
 from certify.report.words import number, quantity, symbol
 
 Array = NDArray[np.float64]
-_WIDER = Fraction(3, 2)  # of the side of the domain that binds
+_WIDER = Fraction(3, 2)  # factor of the side of the domain that binds
 _WORTH = 1.1  # growth of the volume that makes a wider domain worth a word
 _MOST = 1000.0  # an effort that may be suggested
-_LONGER, _LOOK = 1.1, 2 * UNIT  # of a tube's start, relative to the proved set; operations for looking
+_LONGER, _LOOK = 1.1, 2 * UNIT  # a tube's start relative to the proved set; operations for looking
 _LITTLE = 25.0  # per cent of the volume that sampling allows, below which the bounds are to blame
 _BENT = 1.0  # bends of the hidden units, as a share of the linear part, that are worth flattening
 _TELLING = 1000  # boxes: a limit below it is what ended the search, and says nothing of the policy
@@ -52,8 +52,10 @@ def diagnose(
     asked: tuple[System, TanhNetwork] | None = None,
     effort: Effort = UNLIMITED,
 ) -> Diagnosis:
-    """What limits `result`, `proof` being what its engine found, and `asked` the plant and the policy as they were
-    given, if the result is about them as seen from where they rest. The next step is looked for with this effort."""
+    """Find what limits `result`, whose engine found `proof`; the next step is looked for with this effort.
+
+    `asked` are the plant and the policy as they were given, if the result is about them as seen from where they rest.
+    """
     system = result.system
     loop = ClosedLoop(system, result.network)
     fastest, slowest = _modes(loop)
@@ -309,7 +311,7 @@ def _longer(result: RoaResult, options: RoaOptions, proof: Proof | None, effort:
         return Step((("--max-boxes", f"{10 * options.max_boxes}"),), "the limit on boxes ended the search")
     if result.stop is Stop.TIME and options.time_limit is not None:
         needed = "" if left is None else f": the ring needs about {_round(effort.seconds_for(left))} s more"
-        return Step((("--time-limit", _round(10 * options.time_limit)),), f"the time ended the search{needed}")
+        return Step((("--time-limit", _round(10 * options.time_limit)),), f"the time limit ended the search{needed}")
     if left is not None and options.effort + 2 * left / WHOLE < _MOST:
         more = options.effort + 2 * left / WHOLE  # the check grows with the tree
         seconds = _round(effort.seconds_for(left))

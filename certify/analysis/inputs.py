@@ -1,9 +1,9 @@
-"""A plant and a policy, from what somebody names them by: the same rules for the command line and for Python.
+"""A plant and a policy from names and files: the same rules for the command line and for Python.
 
-A policy file says which plant it was trained for, and by which numbers; whoever uses it may say otherwise, and what
-he says counts. What has to be known of that goes to `tell`, a line each: the command prints it on standard error, a
-result of Python keeps it. Where a policy's network is what it was made from only on a part of the states, the domain
-is cut to that part here, and nowhere is it left to the caller to remember.
+A policy file says which plant it was trained for, and by which numbers; the user may say otherwise, and the user's word
+counts. Notices of that go to `tell`, in lines: the command prints them on standard error, a result of Python keeps
+them. If a policy's network agrees with its origin on a part of the states only, the domain is cut to that part here,
+and no caller has to remember it.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def policy_in(
 
 
 def plant_for(whose: str, system: System | str | None, changes: PlantChanges) -> System:
-    """The plant, with the changes, of a policy that does not say what it controls.
+    """The plant, with the changes, of a policy that does not name its plant.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def tell_of_other(stored: Policy, plant: System, tell: Tell) -> None:
 
 
 def function_in(path: Path, plant: System, tell: Tell) -> StoredLyapunov:
-    """What is in a Lyapunov file, for this plant; says so if the file names another.
+    """The content of a Lyapunov file, for this plant; a notice says so if the file names another.
 
     Raises
     ------
@@ -158,7 +158,7 @@ def function_in(path: Path, plant: System, tell: Tell) -> StoredLyapunov:
     stored = load_lyapunov(path)
     if stored.function.n != plant.n:
         raise InputError(
-            f"Lyapunov file {path} must be of {plant.n} states, those of {plant.name}; it is of {stored.function.n}."
+            f"Lyapunov file {path} must have the {plant.n} states of {plant.name}; it has {stored.function.n}."
         )
     if stored.system != plant.name:
         tell(f"Lyapunov file {path} is of {stored.system}; it is proved for {plant.name}")
@@ -182,7 +182,7 @@ def ellipsoid_beside(stored: StoredLyapunov, plant: System) -> Array | None:
 
 
 def where_valid(stored: Policy, plant: System, tell: Tell) -> System:
-    """The plant on the part of its domain where the policy's network is what it was made from; says what was cut.
+    """The plant on the part of its domain where the policy's network agrees with its origin; a notice says the cut.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def where_valid(stored: Policy, plant: System, tell: Tell) -> System:
 
 
 def is_own(path: Path, importing: ImportOptions) -> bool:
-    """Whether a file is to be read as this program's own: also one that nobody can read, whose reader says why.
+    """True if a file is to be read as this program's own: also one that nobody can read, whose reader says why.
 
     Raises
     ------
@@ -226,7 +226,7 @@ def is_own(path: Path, importing: ImportOptions) -> bool:
 
 
 def lines(imported: Imported) -> list[str]:
-    """What an import found, for people."""
+    """The findings of an import, for people."""
     found, policy = imported, imported.policy
     origin, target = _row(found.at_origin), _row(found.u_eq)
     said = [

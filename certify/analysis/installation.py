@@ -1,7 +1,7 @@
-"""What this installation is: versions, the source of the checkers, and which `certify` an import finds here.
+"""This installation: versions, the source of the checkers, and which `certify` an import finds here.
 
-Whoever trusts a verdict trusts the two checkers, the Python that runs them, and two packages. So they are named, and
-the checkers' source by a hash that anybody can compute: `cd certify/checker; LC_ALL=C; sha256sum *.py | sha256sum`.
+A verdict rests on the two checkers, the Python that runs them, and two packages. So they are named, and the checkers'
+source by a hash that anybody can compute: `cd certify/checker; LC_ALL=C; sha256sum *.py | sha256sum`.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def source_sha256(program: Program) -> str:
 
 
 def found_by_import(folder: Path) -> str | None:
-    """Where `import certify` is found by a script or notebook that starts in `folder`; None if it is this package.
+    """The place at which a script or notebook in `folder` finds `import certify`; None if it is this package.
 
     A folder named `certify`, or a file `certify.py`, beside a script comes before everything that is installed: Python
     looks there first. A folder without `__init__.py` comes behind a package that lies on the path. Nothing is run.

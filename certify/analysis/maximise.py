@@ -1,9 +1,9 @@
 """The longest period, or the largest rate, for which the set that is proved without it can still be proved.
 
-The set is that of a first run: its P stays, and its level but for a few hundredths. What sampling allows for it is
-found by bisection; then shares of that are tried, the largest first, each as a run of its own for exactly this set, and
-middles between the first that is proved and the last that is not. What is returned is the largest that the checker
-accepted, under the usual name.
+The set is that of a first run: its P stays, and its level but for a few hundredths. The largest value that sampling
+allows for it is found by bisection; then shares of that are tried, the largest first, each as a run of its own for
+exactly this set, and middles between the first that is proved and the last that is not. The result is the largest that
+the checker accepted, under the usual name.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from certify.lyapunov.function import Quadratic
 from certify.provers.falsify import is_violated
 
 Quantity = Literal["period", "rate"]
-_FOR_THE_SET = 0.25  # of the effort, for the run without it
-_SHARES = (0.97, 0.87, 0.66, 0.4, 0.2, 0.1, 0.03)  # of what sampling allows
-_EACH = 0.25  # of the effort that is left, for one of them
-_BISECTIONS, _HALVINGS = 12, 4  # of what sampling allows, and between what is proved and what is not
-_SET = 0.95  # of the level that is proved without it: at the edge of what can be proved there is room for neither
-_LEAST = 2.0**-16  # of the slowest time constant, or of the fastest rate, that is looked at
+_FOR_THE_SET = 0.25  # share of the effort for the run without it
+_SHARES = (0.97, 0.87, 0.66, 0.4, 0.2, 0.1, 0.03)  # shares of what sampling allows
+_EACH = 0.25  # share of the effort that is left for one of them
+_BISECTIONS, _HALVINGS = 12, 4  # steps to find what sampling allows, and between the proved and the unproved value
+_SET = 0.95  # share of the level that is proved without it: at the edge of what can be proved there is room for neither
+_LEAST = 2.0**-16  # share of the slowest time constant, or of the fastest rate, that is looked at
 _DIGITS = 3
 
 

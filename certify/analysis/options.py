@@ -1,4 +1,4 @@
-"""What a run is asked for: each option is declared here, once."""
+"""The options of a run: each is declared here, once."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 EngineName = Literal["bounds", "dreal", "both"]
 Asked = Literal["auto", "asymptotic", "practical", "nearby"]
 Around = Literal["auto", "origin", "rest"]
-_MOST_JOBS = 256  # of the checker
+_MOST_JOBS = 256  # processes of the checker
 
 
 _POSITIVE = ("be a positive number", lambda value: math.isfinite(value) and value > 0)
@@ -34,7 +34,7 @@ _NUMBERS = ("be a state of finite numbers", lambda value: all(map(math.isfinite,
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoaOptions:
-    """How to certify; `certify.certify_roa` takes these options one by one as well."""
+    """The options of a run; `certify.certify_roa` takes them one by one as well."""
 
     # fmt: off
     claim: Asked = option("auto", "claim", "word", first=True, help=(
@@ -124,7 +124,7 @@ class RoaOptions:
 
     @property
     def learned(self) -> Beyond | None:
-        """What is learned for an outer set, if anything is."""
+        """The kind of function that is learned for an outer set, if any is."""
         from certify.lyapunov import BEYOND
 
         return next((name for name in BEYOND if name == self.candidate), None)
@@ -195,4 +195,4 @@ _RULES: tuple[_Rule, ...] = (
         "`candidate` {0.learned} learns a function; leave `lyapunov` out, or name another candidate.",
     ),
 )
-"""What options need of each other: the rule is broken, and the sentence that says so."""
+"""The rules between options: a test that is true if the rule is broken, and the sentence that says so."""

@@ -1,7 +1,6 @@
-"""What a run may say: a result with a candidate, its levels, a witness; and whether something is refuted, exactly.
+"""Results of a run: a candidate, its levels, a witness; and an exact test of whether the claim is refuted.
 
-Results are put together from what the engines found; PROVED is not said here, but by the run once the checker has
-spoken.
+Results are put together from the engines' proofs; PROVED is not said here, but by the run once the checker has spoken.
 """
 
 from __future__ import annotations
@@ -75,7 +74,7 @@ def refuted_at_once(result: RoaResult, trial: Trial) -> RoaResult | None:
 
 
 def is_refuted(task: Task, witness: Witness | None) -> bool:
-    """Whether a witness refutes the claim for the level that the task asks for, exactly."""
+    """True if a witness refutes the claim for the level that the task asks for, exactly."""
     return witness is not None and task.kind == "asymptotic" and refutes(task.problem, witness, task.target)
 
 
@@ -108,7 +107,7 @@ def lowest_witness(*witnesses: Witness | None) -> Witness | None:
 
 
 def limit_of(stop: Stop, task: Task, witness: Witness | None) -> Stop:
-    """What limits a level, from what stopped its proof."""
+    """The limit of a level, from what stopped its proof."""
     if stop is not Stop.REQUESTED or task.exactly:
         return stop
     return Stop.DOMAIN if witness is None else (Stop.INPUTS if witness.kind == "input" else Stop.WITNESS)

@@ -19,7 +19,7 @@ from certify.errors import BackendError
 from certify.provers.execution import Jobs, Runner
 
 _JOB = struct.Struct("<QQ")  # K, N
-_LEAVES = 5_000  # of a part, so that its checker's start is not the most of it
+_LEAVES = 5_000  # leaves of a part, so that its checker's start is not the most of it
 _EACH = 2  # parts a place
 _POLL = 0.5  # seconds
 _STATUS = {"PART": 4, "REJECTED": 1}
@@ -65,7 +65,7 @@ def check_in_parts(path: Path, runner: Runner, patient: bool = False) -> tuple[i
 
 
 def _gathered(jobs: Jobs, work: Part, wanted: list[bytes]) -> list[dict[str, Any]]:
-    """What is said of each part, in their order; one that nobody could check is checked here."""
+    """The answers about the parts, in their order; one that nobody could check is checked here."""
     given = {jobs.give(job): k for k, job in enumerate(wanted)}
     found: dict[int, dict[str, Any]] = {}
     while len(found) < len(wanted):

@@ -1,6 +1,6 @@
 """What a run found, as a typed value, and what one asks of it in Python.
 
-Whatever a result says of the certified set comes from the numbers that the checker accepted: membership is decided in
+All that a result says of the proved set comes from the numbers that the checker accepted: membership is decided in
 rationals, sizes are rounded down, and pictures are drawn from the very bytes that were checked.
 """
 
@@ -42,19 +42,19 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, repr=False)
 class RoaResult:
-    """What was proved. `stop` and `detail` say what limits the level, or why nothing was proved.
+    """The result of a run. `stop` and `detail` say what limits the level, or why nothing was proved.
 
-    Where `system` has ranges, all that is proved holds for every function of time with values in them; `eigenvalues`,
-    `rest` and the modes of `diagnosis` are those at the nominal values, as `system.parameters` has them.
+    If `system` has ranges, the proof holds for every function of time with values in them; `eigenvalues`, `rest` and
+    the modes of `diagnosis` are those at the nominal values, as `system.parameters` has them.
 
-    `rest` is where the loop rests, if not at the origin. `candidate` is where P came from, `tried` all that were tried,
-    `notice` what is not as it was asked for. `reach_from` is the state that was asked about, by the states' values;
-    where the verdict on it is UNKNOWN by `Stop.PATH`, `certificate` and `levels` are of a proved set without it. Where
-    the verdict is UNKNOWN by `Stop.BEYOND` they, and `outer`, are of a smaller set than was asked for.
-    `checker` is what the checker said, None if it was not reached, about `raw`, the certificate's bytes; `solver` has
-    dReal's version and every query with its answer, None if it was not asked. `notices` is what had to be known about
-    plant and policy before the run, such as a domain that was cut; `folder` keeps a temporary folder of the certificate
-    alive. `search` is a file with the search, if more time could go on with it (`resume`).
+    `rest` is the loop's equilibrium, if not the origin. `candidate` is the source of P, `tried` all that were tried,
+    `notice` says what is not as it was asked for. `reach_from` is the state that was asked about, by the states'
+    values; if the verdict on it is UNKNOWN by `Stop.PATH`, `certificate` and `levels` are of a proved set without it.
+    If the verdict is UNKNOWN by `Stop.BEYOND` they, and `outer`, are of a smaller set than was asked for.
+    `checker` is the checker's answer, None if it was not reached, about `raw`, the certificate's bytes; `solver` has
+    dReal's version and every query with its answer, None if it was not asked. `notices` are facts about plant and
+    policy known before the run, such as a domain that was cut; `folder` keeps a temporary folder of the certificate
+    alive. `search` is a file with the search, if more effort could continue it (`resume`).
 
     In Python: `contains`, `volume`, `plot`, `report`, `certificate` (the file's path), `to_dict`.
     """
@@ -96,12 +96,12 @@ class RoaResult:
 
     @property
     def reason(self) -> str:
-        """What limits the level, or why nothing was proved, in words."""
+        """The limit of the level, or the reason why nothing was proved, in words."""
         return self.stop.explain(self.detail)
 
     @property
     def timing(self) -> Timing:
-        """How time passes in the loop, and the rate that was asked for."""
+        """The loop's timing, with the rate that was asked for."""
         return Timing.of(self.system, 0.0 if self.problem is None else self.problem.rate)
 
     @property
@@ -135,7 +135,7 @@ class RoaResult:
 
     @property
     def _region(self) -> Region | None:
-        """What the levels, the tube and the outer set say together; None if there is no level c2."""
+        """The union of the sets of the levels, the tube and the outer set; None if there is no level c2."""
         if self.P is None or self.levels.roa is None:
             return None
         tube, outer = self.tube, self.outer
@@ -144,7 +144,7 @@ class RoaResult:
         return Region((sublevel_set(self.P, self.levels.roa), *starts), beyond)
 
     def contains(self, x: ArrayLike, *, deviations: bool = False) -> bool | NDArray[np.bool_]:
-        """Whether states lie in the proved set, decided in rationals: no state is let in by rounding.
+        """True for states that lie in the proved set, decided in rationals: no state is let in by rounding.
 
         The set is {V <= c2}, and with a tube the union of that and the tube's start. With an outer set it is the union
         of that and {N <= n2} within the domain, decided in balls of growing precision: a state at which N is exactly n2
@@ -152,10 +152,10 @@ class RoaResult:
 
         Parameters
         ----------
-        x : one state, (n,), or several, (N, n), in the states' units. A float means its binary value; whoever wants
-            0.1 to be a tenth gives Fraction(1, 10).
-        deviations : whether x are deviations from the operating point x_eq, in which the certificate speaks, and not
-            the states' values. Where x_eq is 0 the two are the same.
+        x : one state, (n,), or several, (N, n), in the states' units. A float means its binary value; for exactly a
+            tenth give Fraction(1, 10).
+        deviations : True if x are deviations from the operating point x_eq, as in the certificate, and not the states'
+            values. If x_eq is 0 the two are the same.
 
         Returns
         -------

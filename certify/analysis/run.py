@@ -96,7 +96,7 @@ def certify_roa(
 
 
 def effort_of(options: RoaOptions, load_seconds: float = 0.0) -> Effort:
-    """The counted work that the options allow, and what reading has left of their limit on the clock."""
+    """The counted work that the options allow, and the part of their time limit that reading has left."""
     limit = options.time_limit
     return Effort(options.effort * WHOLE, None if limit is None else max(0.0, limit - load_seconds))
 

@@ -1,9 +1,9 @@
 """Searches that can be resumed: a file beside the certificate, with the candidate and the tree as far as it is.
 
 A run that is stopped early has no candidate yet, or no tree, or has not decided among candidates. The file says so, and
-the run that resumes it does the rest. Nothing here is trusted. What a search that was resumed proves, the checker sees
-leaf by leaf like any other. A hash tells a damaged file. Numbers and violations are looked at all the same: whoever
-wrote the file may have been somebody else."""
+the run that resumes it does the rest. Nothing here is trusted. The checker sees the proof of a resumed search leaf by
+leaf like any other. A hash tells a damaged file. Numbers and violations are looked at all the same: somebody else may
+have written the file."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ class Unfinished:
     Parameters
     ----------
     trial : the candidate.
-    state : of its search; one without a tree has not bounded any box yet.
-    decided : whether this candidate was chosen for the rest of the time; if not, others may be better.
+    state : its search; one without a tree has not bounded any box yet.
+    decided : True if this candidate was chosen for the rest of the effort; if not, others may be better.
     """
 
     trial: Trial
@@ -185,7 +185,7 @@ def load(path: Path, loop: ClosedLoop, rate: float) -> Unfinished:
             raise ValueError(f"it is larger than {_LARGEST} bytes")
         data = json.loads(path.read_bytes())
     except FileNotFoundError as error:
-        raise InputError(f"there is no search to go on with in {path.parent}; run without --resume.") from error
+        raise InputError(f"there is no search to resume in {path.parent}; run without --resume.") from error
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"the search in {path} cannot be read: {error}. Run without --resume.") from error
     try:
@@ -210,7 +210,7 @@ def load(path: Path, loop: ClosedLoop, rate: float) -> Unfinished:
 
 
 class _Unfit(Exception):
-    """A file that is in order, and not what is asked for."""
+    """A file that is in order, but does not fit this run."""
 
 
 def _read(data: Mapping[str, Any], loop: ClosedLoop, rate: float) -> Unfinished:

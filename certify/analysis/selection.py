@@ -14,10 +14,10 @@ from certify.effort import Effort
 from certify.lyapunov import volume
 from certify.provers.base import Attempt, Budget, Once, Progress
 
-_FIRST_LOOK = 0.25  # of a heat, after which it may end
+_FIRST_LOOK = 0.25  # share of a heat after which it may end
 _HOPELESS = 1e9  # boxes that a first gain may need, at a hundred thousand a second some hours
 _RING = 0.5  # share of a set's level, up to which the local rule proves little of it
-_WORTH = 1.02  # of the best proved volume: what a candidate's reach must exceed to be given effort
+_WORTH = 1.02  # factor of the best proved volume that a candidate's reach must exceed to be given effort
 _LEAST = 1.0  # operation of an advance, so that an attempt that has begun is always asked once
 
 
@@ -74,7 +74,7 @@ class Race:
 
     @property
     def open(self) -> list[Contender]:
-        """Those that more effort could make the best, the largest proved volume first."""
+        """The contenders that more effort could make the best, the largest proved volume first."""
         most = self.best.proved
         can = [c for c in self.contenders if c is self.best or c.trial.volume > _WORTH * most]
         return sorted((c for c in can if not c.attempt.done), key=lambda c: -c.proved)

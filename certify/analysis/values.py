@@ -47,7 +47,7 @@ def changes_in(given: Mapping[str, Any]) -> PlantChanges:
 
 
 def import_options_in(given: ImportOptions | Mapping[str, Any] | None) -> ImportOptions:
-    """What is known of a policy of another program, with numbers where the fields take tuples of rationals."""
+    """The facts on a policy of another program, with numbers where the fields take tuples of rationals."""
     if given is None or isinstance(given, ImportOptions):
         return given if given is not None else ImportOptions()
     if not isinstance(given, Mapping):
@@ -185,7 +185,7 @@ def _state(value: Any, name: str) -> dict[str, Fraction]:
 
 
 def _ranges(value: Any, name: str) -> dict[str, Any]:
-    if name == "ranges":  # of parameters, which have values of their own
+    if name == "ranges":  # ranges of parameters, which have values of their own
         return _named(value, name, "pairs", _pair)
     return _named(value, name, "half-widths or pairs", _value_or_pair)
 

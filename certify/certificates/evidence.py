@@ -44,12 +44,12 @@ class Contraction:
 
 @dataclass(frozen=True, slots=True)
 class Waypoint:
-    """Where a slab of a tube around a path ends, and what its inequality takes beyond the multipliers.
+    """The end of a slab of a tube around a path, and the numbers of its inequality beyond the multipliers.
 
     Parameters
     ----------
-    centre : of the slab's ellipsoids at its end, (n,); between its ends it moves on a line.
-    share : of the slab's ball, that its middle's motion takes; between 0 and 1.
+    centre : the centre of the slab's ellipsoids at its end, (n,); between its ends it moves on a line.
+    share : the share of the slab's ball that its middle's motion takes, between 0 and 1.
     edge, motion, joint : multipliers of the tube's edge and of the motion, and the motion's entry of the third row.
     """
 
@@ -89,7 +89,7 @@ class OuterTree:
     Parameters
     ----------
     T, root : (n, n) and (n,), half-widths of the root box in z, x = T z.
-    tree : the partition in preorder, one byte a node.
+    tree : the partition in preorder, one byte for each node.
     faces : the same for the lower and the upper end of each state, in the order of the states, 2 n in all.
     """
 
@@ -106,7 +106,7 @@ class PartitionTree:
     Parameters
     ----------
     T, root : (n, n) and (n,), half-widths of the root box in z, x = T z.
-    tree : the partition in preorder, one byte a node.
+    tree : the partition in preorder, one byte for each node.
     local : of the local proof; None where the claim has none.
     cells : into how many parts the range of each uncertain quantity is cut for it, in their order.
     tube : the slabs, in their order, of a claim that is enlarged by a tube.

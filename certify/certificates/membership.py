@@ -85,7 +85,7 @@ class Located:
 
 
 NOTHING_PROVED = Located(Containment.UNDECIDED)
-"""Where any box lies if there is no proved set."""
+"""The place of any box if there is no proved set."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
-"""How time passes in a closed loop, and how soon a claim with a rate holds.
+"""Time in a closed loop, and the time after which a claim with a rate holds.
 
-A claim says the same of every loop; *when* it holds is another matter. A loop in continuous time is spoken of at all
-times, one whose input is held over a period at its sampling instants, one in discrete time at its steps.
+A claim says the same of every loop, but at other times: at all times of a loop in continuous time, at the sampling
+instants if its input is held over a period, and at the steps of a loop in discrete time.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ PERCENT = 100  # of V: the share of it after which a rate is told as a time
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Whether a plant is in `discrete` time, the least and the largest period over which its input is held (`sample`;
-    None if it follows the state at once), and the `rate` lambda at which V is claimed to fall (0: no rate)."""
+    """`discrete` time or not, the least and the largest period over which the input is held (`sample`; None if it
+    follows the state at once), and the `rate` lambda at which V is claimed to fall (0: no rate)."""
 
     discrete: bool = False
     sample: Interval | None = None
@@ -29,28 +29,28 @@ class Timing:
 
     @classmethod
     def of(cls, system: System, rate: float = 0.0) -> Self:
-        """Of a plant, with what is claimed of it."""
+        """The timing of a plant, with the rate that is claimed."""
         return cls(system.time == "discrete", system.sample, rate)
 
     @property
     def is_plain(self) -> bool:
-        """Whether the input follows at once in continuous time."""
+        """True if the input follows at once in continuous time."""
         return not self.discrete and self.sample is None
 
     @property
     def from_zero(self) -> bool:
-        """Whether the claim holds within each period as well, because each part of a period is one that is allowed."""
+        """True if the claim holds within each period as well, because each part of a period is an allowed period."""
         return self.sample is not None and self.sample[0] == 0
 
     @property
     def simulated(self) -> Self:
-        """The longest of several periods, which is what is simulated."""
+        """The timing that is simulated, with the longest of several periods."""
         return self if self.sample is None else replace(self, sample=(self.sample[1], self.sample[1]))
 
     def time_to_fall(self, factor: Fraction | int) -> float:
-        """How long it takes V at most to be divided by a factor of at least 1, rounded up; infinite without a rate.
+        """The longest time until V is divided by a factor of at least 1, rounded up; infinite without a rate.
 
-        With a sample it is by when a sampling instant has come at which that is so, less the longest period.
+        If the input is held, a sampling instant at which that is so comes within the longest period after it.
         """
         if not self.rate:
             return math.inf
@@ -60,8 +60,8 @@ class Timing:
         return float(math.ceil(time)) if self.discrete and math.isfinite(time) else time
 
     def reach_time(self, factor: Fraction | int) -> float | None:
-        """By when V is certainly divided by the factor: in units of time, at a step, or at a sampling instant that has
-        come by then. None without a rate, or where no number is as large."""
+        """The time after which V is certainly divided by the factor: in units of time, at a step, or at a sampling
+        instant that has come by then. None without a rate, or if no number is as large."""
         time = self.time_to_fall(factor)
         if self.sample is not None:  # the next instant comes within a period
             time = math.nextafter(time + math.nextafter(float(self.sample[1]), math.inf), math.inf)
@@ -69,8 +69,8 @@ class Timing:
 
 
 def reach_time(timing: Timing, floor: float | None, roa: float | None) -> float | None:
-    """By when a trajectory from {V <= c2} is in {V <= c0}, `floor`; without a floor, by when V is a hundredth of what
-    it was. None where nothing is claimed."""
+    """The time after which a trajectory from {V <= c2} is in {V <= c0}, `floor`; without a floor, after which V is at
+    most a hundredth of its first value. None if nothing is claimed."""
     if roa is None:
         return None
     return timing.reach_time(PERCENT if floor is None else Fraction(roa) / Fraction(floor))

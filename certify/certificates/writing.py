@@ -49,7 +49,7 @@ def write_beside(path: Path, data: bytes, suffix: str) -> Path:
 
 SEARCH = "search.json"
 _OURS = {"certificate.json": b"certify-certificate/", "report.html": b"-m certify.checker", SEARCH: b"certify-search/"}
-"""What a run writes, by names, each with what its text holds."""
+"""The files that a run writes, by names, each with words that its text holds."""
 
 
 def set_aside(folder: Path, *, keep: bool = False) -> None:

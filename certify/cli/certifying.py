@@ -1,4 +1,4 @@
-"""What the commands that certify share: what is said before a run, the run, and what is written and printed of it."""
+"""The run that `certify roa` and `certify reach` share: the notices before it, its files, its summary."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def certified(
     out : folder for the results.
     start : when the command began, by `time.perf_counter`.
     drawing : draws the report.
-    asked : a state or a box, as people write it, of which it is to be said whether the proved set contains it.
-    largest : what is to be as large as can be proved for the set.
+    asked : a state or a box, as people write it; the result says if the proved set contains it.
+    largest : the quantity that is to be as large as can be proved for the set.
     """
     from certify.report import summary
 
@@ -80,8 +80,8 @@ def certified(
         if largest is not None or not search.exists():
             raise
         raise Interrupted(
-            f"interrupted; what was done is kept in {search}, and the same command with --resume{_without(context)} "
-            "goes on from there."
+            f"interrupted; the search is kept in {search}, and the same command with --resume{_without(context)} "
+            "continues it."
         ) from None
     finally:
         if progress is not None:
@@ -134,7 +134,7 @@ def _with_next_command(data: dict[str, Any], context: typer.Context, policy: Pat
 
 
 def _where(result: RoaResult, asked: str) -> tuple[dict[str, Any], str]:
-    """Whether the proved set contains a box, for JSON and in words, from the very bytes that were checked.
+    """The answer if the proved set contains a box, for JSON and in words, from the very bytes that were checked.
 
     The box is read as of the result's plant, in whose deviations the set is: those of the plant that was asked about
     may be others.
@@ -155,7 +155,7 @@ def _without(context: typer.Context) -> str:
 
 
 def _known(context: typer.Context) -> list[str]:
-    """The options that were given and that a resumed search has of its own; what is learned is no part of it."""
+    """The options that were given and that a resumed search has of its own; a learned function is no part of it."""
     from certify.lyapunov import BEYOND
 
     found = {f"--{key}": context.params.get(key) for key in _OF_SEARCH}
@@ -163,15 +163,16 @@ def _known(context: typer.Context) -> list[str]:
 
 
 def _command(context: typer.Context, changed: Mapping[str, str]) -> str:
-    """The command that was given, with these options instead of those it had; a search that is resumed has its own."""
+    """The command that was given, with these options instead of its own; a resumed search has some already."""
     known = _known(context) if "--resume" in changed else []
     added = (part for pair in changed.items() for part in pair if part)
     return shlex.join(["certify", str(context.info_name), *given_words(context, changed, without=known), *added])
 
 
 def _flattened(context: typer.Context, policy: Path) -> str:
-    """The commands that fine-tune the policy for proof, after its import if it is another program's, and then the one
-    that was given about what comes of it; each policy lies beside the one that it was made from."""
+    """The commands that import the policy if it is another program's, fine-tune it for proof, and certify the result.
+
+    Each policy lies beside the one that it was made from."""
     from certify.analysis.inputs import is_own
     from certify.loop.policies.importers import ImportOptions
 
@@ -202,7 +203,7 @@ def _plant_line(stored: Policy, plant: System, overridden: bool) -> str:
 
 
 def _within(plant: System, name: str) -> str:
-    """The range of what is uncertain, as it is proved for."""
+    """The range of an uncertain quantity, as it is proved for."""
     if name not in plant.ranges:
         return ""
     from certify.report.words import inside

@@ -49,7 +49,7 @@ def export_smt2(
         raise InputError(
             f"export-smt2 must have a plant in continuous time; found {plant.name}, whose time is discrete."
         )
-    options = options_of(typed | {"claim": "asymptotic"}, plant, tell)  # what is written are its conditions
+    options = options_of(typed | {"claim": "asymptotic"}, plant, tell)  # its conditions are written
     result = certify_roa(plant, stored.network, out, options)
     inner, outer = result.levels.local, result.levels.roa
     if result.verdict is not Verdict.PROVED or result.problem is None or inner is None or outer is None:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-_FOR_ELLIPSOID = 0.4  # of the effort, at most
+_FOR_ELLIPSOID = 0.4  # the largest share of the effort
 _TIMES = 2.4  # the effort of a proof: that of ellipsoid and learning
 
 
@@ -153,6 +153,6 @@ def _text(learned: Learned, area: float, out: Path, command: str) -> str:
 
 
 def _next(context: typer.Context, policy: Path, out: Path) -> str:
-    """The command that proves what was learned."""
+    """The command that proves the learned function."""
     given = given_words(context, only={"system", "parameters", "domain"})
     return shlex.join(["certify", "roa", "--policy", str(policy), *given, "--lyapunov", str(out)])

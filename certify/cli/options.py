@@ -1,4 +1,4 @@
-"""Options that are declared elsewhere as parameters of a command, which receives them as one value."""
+"""Parameters of a command made of options that are declared elsewhere; the command receives them as one value."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def parameter(name: str, typed: str, help_: str, of: Any = str, required: bool =
 
 
 def takes(**bundles: Bundle) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the parameters of each bundle in the place of its parameter of that name."""
+    """Give a command the parameters of each bundle instead of its parameter of that name."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         own, parameters = inspect.signature(command), list[Parameter]()

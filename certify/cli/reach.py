@@ -19,7 +19,7 @@ from certify.report.drawing import Drawing
 if TYPE_CHECKING:
     from certify.loop.policies.importers import ImportOptions
 
-_KIND = "--kind"  # of a policy file of another program: --from is the state
+_KIND = "--kind"  # the kind of another program's policy file: --from is the state
 
 
 @takes(

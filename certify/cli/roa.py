@@ -64,14 +64,14 @@ def roa(
     plant = plant_of(stored, system, changes, note)
     options = options_of(typed | {"engine": _engine(context, typed.get("engine", "bounds"))}, plant, note)
     if contains is not None:
-        region(contains, plant, CONTAINS)  # what cannot be read is said before the run
+        region(contains, plant, CONTAINS)  # an error in it is reported before the run
     certified(context, path, stored, plant, options, out, start, drawing, quiet, as_json, contains, largest)
 
 
 def _largest(period: str | None, rate: str | None, resume: bool) -> Quantity | None:
-    """What is to be as large as can be proved, if anything is."""
+    """The quantity that is to be as large as can be proved, if any."""
     if resume and _MOST in (period, rate):
-        raise InputError("--resume goes on with one search; ask for a period or a rate in the place of max.")
+        raise InputError("--resume continues one search; ask for a period or a rate instead of max.")
     if period == _MOST and rate not in (None, "0"):
         raise InputError("--sample-time max must stand without --rate; found both. Ask for one of them at a time.")
     return "period" if period == _MOST else "rate" if rate == _MOST else None
@@ -86,6 +86,6 @@ def _engine(context: typer.Context, name: str) -> str:
         try:
             find_backend()
         except BackendError as error:
-            tell(f"engine bounds in the place of {name}: {error}")
+            tell(f"engine bounds instead of {name}: {error}")
             return "bounds"
     return name

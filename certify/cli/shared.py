@@ -60,7 +60,7 @@ def the_policy(context: typer.Context, file: Path | None, policy: Path | None) -
 
 
 def noting(quiet: bool) -> Tell:
-    """What notices go to."""
+    """The function that receives notices."""
     return (lambda _: None) if quiet else tell
 
 

@@ -22,7 +22,7 @@ Candidate = Literal["auto", "lyapunov", "scaled", "lqr", "optimised", "robust", 
 SOLVED: tuple[Solved, ...] = ("lyapunov", "scaled", "lqr")
 """The candidates that solve a Lyapunov equation."""
 BEYOND: tuple[Beyond, ...] = ("neural", "polynomial")
-"""Those that are learned for a set beyond the ellipsoid of another one."""
+"""The candidates that are learned for a set beyond the ellipsoid of another one."""
 
 
 @dataclass(frozen=True, slots=True)

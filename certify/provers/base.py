@@ -1,4 +1,4 @@
-"""What every engine takes and gives. No engine is trusted: the checker decides."""
+"""The interface of all provers. No prover is trusted: the checker decides."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Budget:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What an engine is asked for: a claim of this kind about the largest set {V <= c2}, c2 up to `target`.
+    """A claim of this kind to prove about the largest set {V <= c2}, c2 up to `target`.
 
     `exactly` says that less than `target` is of no use; `witness` is the violation that made `target` what it is.
     """
@@ -55,11 +55,11 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Where a proof stands: `level` is proved, `target` aimed at, `boxes` were bounded and `open` wait.
+    """The state of a proof: `level` is proved, `target` aimed at, `boxes` were bounded and `open` wait.
 
     A pass outwards has a target above its level, one inwards, `down`, a target below. `proved` is the share of the
-    ring's volume that is done; `left` is how many operations the rest probably takes, None at first; `seconds_left` is
-    that in seconds, where somebody knows the pace; `name` is the candidate's."""
+    ring's volume that is done; `left` estimates the operations of the rest, None at first; `seconds_left` is that in
+    seconds, if the pace is known; `name` is the candidate's."""
 
     level: float
     target: float
@@ -74,12 +74,12 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class Proof:
-    """What an engine found: a claim with evidence for it, or None and why there is none.
+    """An engine's finding: a claim with evidence for it, or None and why there is none.
 
     `stop` and `detail` say what limits the level; `witness` is the lowest violation met on the way; `partial` are
     levels that were reached without making a claim; `solver` is the record of a solver's answers; `seconds` the
-    stages `local` and `ring`; `direction`, (n,), is that in which boxes had to be halved most, and `left` how many
-    operations the search would still take, both None where unknown.
+    stages `local` and `ring`; `direction`, (n,), is that in which boxes had to be halved most, and `left` estimates
+    the operations that the search would still take, both None where unknown.
     """
 
     claim: Claim | None
@@ -98,7 +98,7 @@ class Proof:
 
 @dataclass(frozen=True, slots=True)
 class SearchState:
-    """A search that can be gone on with: the levels, boxes bounded and proved so far, the lowest violation met, and the
+    """A search that can be resumed: the levels, boxes bounded and proved so far, the lowest violation met, and the
     tree in preorder, in which 254 is an open leaf, with the keys (B,) of these, by which they are taken."""
 
     inner: float
@@ -114,11 +114,11 @@ Report = Callable[[Progress], None]
 
 
 class Attempt(Protocol):
-    """A proof in the making: it can be asked at any time for what it has, and go on."""
+    """A proof in progress: at any time it gives what it has, and can be continued."""
 
     @property
     def done(self) -> bool:
-        """Whether more time would gain nothing."""
+        """True if more effort would gain nothing."""
 
     @property
     def boxes(self) -> int:
@@ -126,7 +126,7 @@ class Attempt(Protocol):
 
     @property
     def seconds(self) -> Mapping[str, float]:
-        """That its stages took so far."""
+        """Seconds that its stages took so far."""
 
     @property
     def level(self) -> float | None:
@@ -134,7 +134,7 @@ class Attempt(Protocol):
 
     @property
     def gained(self) -> bool:
-        """Whether the search has added anything to what was there at its beginning."""
+        """True if the search has added anything to what was there at its beginning."""
 
     @property
     def expected(self) -> float:
@@ -147,10 +147,10 @@ class Attempt(Protocol):
         """The best claim of the task's kind so far."""
 
     def state(self) -> SearchState | None:
-        """The search, to go on with another time, also one that is done; None if there is none."""
+        """The search, to be resumed another time, also one that is done; None if there is none."""
 
     def restore(self, state: SearchState) -> None:
-        """Go on with a search for the same task in the same coordinates.
+        """Resume a search for the same task in the same coordinates.
 
         Raises
         ------
@@ -181,7 +181,7 @@ class Once:
 
     @property
     def done(self) -> bool:
-        """Whether it has been worked on."""
+        """True if it has been worked on."""
         return self.found is not None
 
     @property
@@ -201,12 +201,12 @@ class Once:
 
     @property
     def gained(self) -> bool:
-        """Whether anything was proved."""
+        """True if anything was proved."""
         return self.level is not None
 
     @property
     def expected(self) -> float:
-        """None: there is no going on."""
+        """0: it cannot be continued."""
         return 0.0
 
     def advance(self, budget: Budget, report: Report | None = None) -> None:
@@ -214,11 +214,11 @@ class Once:
         self.found = self.found or self.prove(budget, report)
 
     def proof(self) -> Proof:
-        """What was found."""
+        """The proof that was found."""
         return self.found or Proof(None, None, Stop.EFFORT)
 
     def state(self) -> None:
-        """None: there is no going on."""
+        """None: it cannot be resumed."""
 
     def restore(self, state: SearchState) -> None:
-        raise InputError("a search for this claim, or of this engine, cannot be gone on with; begin it anew.")
+        raise InputError("a search for this claim, or of this engine, cannot be resumed; begin it anew.")

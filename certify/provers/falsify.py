@@ -25,10 +25,10 @@ from certify.loop.rigorous import evaluate_increment, evaluate_policy
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-_RATIO, _LEVELS, _LOWER = 1.4, 60, 13  # of a survey: between levels, how many, and how many steps of 8 further it goes
+_RATIO, _LEVELS, _LOWER = 1.4, 60, 13  # a survey: ratio of levels, their number, further steps of 8
 _CALL, _EACH = 3e5, 0.3  # operations of evaluating few states at once; of an operation at one, with its derivative
 _TOGETHER = 15  # levels that are looked at in one batch
-_APART = 1e-7  # of a state's or an input's size, between the points of a difference
+_APART = 1e-7  # share of a state's or an input's size between the points of a difference
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class Witness:
 @dataclass(frozen=True, slots=True)
 class Band:
     """Levels between which sampling found no violation; `below` and `above` are their neighbours, at which it did,
-    or the ends of what was sampled."""
+    or the ends of the samples."""
 
     below: float
     floor: float
@@ -90,7 +90,7 @@ def falsify(
 
 
 def is_violated(problem: Problem, T: Array, limit: float, samples: int = 4000, seed: int = 0) -> bool:
-    """Whether a violation is sampled in {V <= limit}, at any level, in floats: nothing is shown of it."""
+    """True if a violation is sampled in {V <= limit}, at any level, in floats: nothing is shown of it."""
     search = _Search(problem, T)
     direction = np.random.default_rng(seed).standard_normal((samples, problem.loop.system.n))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -111,7 +111,7 @@ def survey(
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
 
     def clear(level: Array, steps: int) -> list[bool]:
-        """Of each level (k,), whether its samples show no violation after so many steps of ascent."""
+        """True for each level (k,) whose samples show no violation after so many steps of ascent."""
         found: list[bool] = []
         for k in range(0, len(level), _TOGETHER):
             each = np.repeat(level[k : k + _TOGETHER], samples)[:, None]
@@ -194,7 +194,7 @@ class _Search:
 
     @np.errstate(all="ignore")
     def _inputs(self, x: Array) -> tuple[Array, Array, list[Array]]:
-        """u (B, m), what it is before the clip, and what the layers and the squash give on the way there."""
+        """u (B, m), its values before the clip, and the values after each layer and the squash."""
         network, passed, h = self.network, list[Array](), x
         for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
             if k:
@@ -222,7 +222,7 @@ class _Search:
         return values[0][0], values[1][0], gradients[0], gradients[1]
 
     def _backwards(self, slope: Array, whole: Array, passed: list[Array]) -> Array:
-        """The slope in the states (B, n) of what has this slope in the inputs (B, m)."""
+        """The slope in the states (B, n) that follows from a slope in the inputs (B, m)."""
         network = self.network
         if network.clip is not None:
             slope = np.where((whole > network.clip[0]) & (whole < network.clip[1]), slope, 0.0)
@@ -234,7 +234,7 @@ class _Search:
         return slope
 
     def _worst(self) -> list[tuple[list[Array], float | Array]]:
-        """Values (C, 1) of what is uncertain and steps, one for all or (C, 1, 1), at which D' is looked at together."""
+        """Corners (C, 1) of the ranges and steps, one for all or (C, 1, 1), at which D' is looked at together."""
         rows = [[float(q) for q in corner.values()] for corner in self.corners]
 
         def columns(times: int) -> list[Array]:
@@ -259,7 +259,7 @@ class _Search:
         return result
 
     def bad(self, z: Array) -> Mask:
-        """Where a condition fails (B,)."""
+        """True (B,) where a condition fails."""
         vdot, excess = self.violation(z)
         return (vdot >= 0) | (excess > 0) if self.check_inputs else vdot >= 0
 

@@ -86,7 +86,7 @@ class Flow:
         return self.period / math.ceil(self.period / step) if self.period else step
 
     def steps_between(self, step: float) -> int:
-        """How many of these steps lie between two instants of which the claim speaks."""
+        """The number of these steps between two instants of which the claim speaks."""
         return max(round(self.period / step), 1)
 
     def input(self, x: Array, held: Array | None, k: int, step: float) -> Array | None:

@@ -22,7 +22,7 @@ class TimingInWords(Timing):
 
     @classmethod
     def of_result(cls, result: Mapping[str, Any]) -> Self:
-        """Of the object that `certify roa --json` prints; what it does not say is as it always was."""
+        """The timing in the object of `certify roa --json`; a missing entry means continuous time without a rate."""
         claim = result.get("claim") or {}
         sample = claim.get("sample")
         ends = None if sample is None else (Fraction(sample[0]), Fraction(sample[1]))

@@ -107,7 +107,7 @@ def _span(duration: float | None, system: System) -> dict[str, Any]:
 
 @contextmanager
 def _progress() -> Iterator[tuple[Callable[[str], None], Callable[[RunProgress], None]]]:
-    """Show progress: on a terminal as a bar, with the time that is left, elsewhere as lines on standard error."""
+    """Show progress: on a terminal as a bar with the remaining time, elsewhere as lines on standard error."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

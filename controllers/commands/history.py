@@ -23,7 +23,9 @@ def history(
         Path | None,
         typer.Option("--evaluations", help="CSV file of `train --evaluations`: draws the share that settles."),
     ] = None,
-    time_limit: Annotated[float, typer.Option("--time-limit", help="Seconds for the proof of one policy.")] = 50.0,
+    effort: Annotated[
+        float, typer.Option("--effort", help="Effort of the proof of one policy, as of `certify roa`.")
+    ] = 1.0,
     candidate: Annotated[str, typer.Option("--candidate", help="Source of P, as of `certify roa`.")] = "auto",
     every: Annotated[int, typer.Option("--every", help="Prove each policy of so many; the last one always.")] = 1,
     no_proofs: Annotated[bool, typer.Option("--no-proofs", help="Draw the gain only, and prove nothing.")] = False,
@@ -46,7 +48,7 @@ def history(
 
         if every < 1:
             raise OptionError(f"`every` must be at least 1; found {every}.")
-        options = ProvingOptions(time_limit=time_limit, candidate=cast("Candidate", candidate))
+        options = ProvingOptions(effort=effort, candidate=cast("Candidate", candidate))
         policies = read_policies(kept)
         plant = system_of(policies[0].policy) if system is None else chosen_plant(system)[0]
         seed = int(policies[0].policy.training.get("seed", 0))

@@ -24,7 +24,7 @@ from controllers.comparison.runs import RunProgress, WantedRun, read_run
 from controllers.comparison.stopping import Plan
 from controllers.options import TrainingOptions
 
-_MOST_BYTES = 2**31  # of a run's files that come back: a checkpoint with a full replay buffer has a tenth of it
+_MOST_BYTES = 2**31  # size of a run's files that come back: a checkpoint with a full replay buffer has a tenth of it
 
 
 def train_at(
@@ -64,7 +64,7 @@ def train_at(
                 if outcome.result:
                     _keep(outcome.result, run, run_folder(runs, run, training), system, training, plan)
                 found = read_run(run, run_folder(runs, run, training), system, training, plan)
-            except InputError as error:  # of this run: the others continue
+            except InputError as error:  # an error of this run: the others continue
                 lost[outcome.key] = str(error)
                 continue
             steps = 0 if found is None else found.finished.steps

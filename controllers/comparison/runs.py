@@ -190,7 +190,7 @@ def _require_asked(run: Run, path: Path, system: System, training: TrainingOptio
 def _load(run: Run, path: Path, system: System, training: TrainingOptions) -> Trained:
     if run in ("ours", "before", "uncentred"):
         policy = load_policy(path)
-        for name in ("identification", "centre"):  # what tells these runs apart
+        for name in ("identification", "centre"):  # the options that tell these runs apart
             asked, found = getattr(variant(run, training), name), policy.training.get(name)
             if found != asked:
                 raise InputError(f"{path}: `{name}` must be {asked!r} for the run {run}; it is {found!r}.")

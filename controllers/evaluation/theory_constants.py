@@ -11,7 +11,7 @@ is asymptotically stable.
 
 Both are matrix inequalities. Their solutions are found in floats and count for nothing until the inequality itself
 holds in Arb balls, for the plant's nominal equations, which are exact, the policy's numbers and the very float that
-is given. What is about more than the linear part is a largest value over simulations, and called estimated.
+is given. A constant about more than the linear part is a largest value over simulations, and called estimated.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ Relation = Literal["<=", ">=", "="]
 _SLACK = 1e-6  # by which an inequality is solved more strictly than it is asked, relative
 
 
-_DOUBLINGS, _HALVINGS = 60, 10  # of the search for a largest epsilon: 0.1 % at the end
+_DOUBLINGS, _HALVINGS = 60, 10  # steps of the search for a largest epsilon: 0.1 % at the end
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +179,7 @@ def _bounding_cost(F: flint.arb_mat, Q: Array, discount: float) -> tuple[float |
     try:
         if not np.abs(np.linalg.eigvals(middle)).max() < 1:
             return None, ": not shown, since in floats the sum has no end"
-        with warnings.catch_warnings(), np.errstate(all="ignore"):  # what comes out is checked
+        with warnings.catch_warnings(), np.errstate(all="ignore"):  # the solution is checked
             warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)
             S = scipy.linalg.solve_discrete_lyapunov(middle.T, (1 + _SLACK) * np.diag(Q))
             S = (S + S.T) / 2
@@ -224,7 +224,7 @@ def _distance(J: flint.arb_mat, K: Array | None) -> Constant:
         return Constant("distance", None, "<=", "proved", "the record has no gain")
     off = J + _exactly(K)
     sizes = [off[i, j].abs_upper() for i in range(off.nrows()) for j in range(off.ncols())]
-    # Of the sizes, which are numbers: a ball around 0 has no square in Arb, and no root of one.
+    # The norm of the sizes, which are numbers: a ball around 0 has no square in Arb, and no root of one.
     square = sum((size * size for size in sizes), flint.arb(0))
     return Constant(
         "distance", rounded_up(square.sqrt().abs_upper()), "<=", "proved", "||J_mu(0) + K||, Frobenius norm"
@@ -344,7 +344,7 @@ def _largest(holds: Callable[[float], bool]) -> float | None:
 
 def _riccati(solve: Callable[[], Array]) -> Array | None:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)  # what comes out is checked
+        warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)  # the solution is checked
         try:
             P = np.asarray(solve(), dtype=np.float64)
         except (np.linalg.LinAlgError, ValueError):

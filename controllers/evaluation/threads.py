@@ -1,4 +1,4 @@
-"""How many threads torch works on."""
+"""The number of threads on which torch works."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from controllers.figures.style import DEEP, MUTED, WIDTH, drawn, log_scale, name
 from controllers.history.gain_distance import Distances
 
 Array = NDArray[np.float64]
-_LINES = (  # of Distances: what it is called, colour, line
+_LINES = (  # a field of Distances, its name, colour, line
     ("K", "learned K", DEEP["ours"], "-"),
     ("mean", "Jacobian of\nthe mean action", DEEP["sac"], "-"),
     ("A", "learned A", MUTED, "--"),
@@ -37,7 +37,7 @@ def draw_gain(
         above, ends = panels[0], []
         for name, label, colour, style in _LINES:
             values = np.array([getattr(each, name) for each in found])
-            if np.isnan(values).all():  # of a run that learns no gain
+            if np.isnan(values).all():  # a run that learns no gain
                 continue
             thin = name in ("A", "B")
             above.plot(

@@ -18,12 +18,12 @@ Array = NDArray[np.float64]
 
 
 def draw_curves(system: System, curves: Sequence[tuple[Run, int, Sequence[CurvePoint]]]) -> bytes:
-    """Floor and cost against steps, as PNG: a line a seed, their median in bold, a ring where a run ended.
+    """Floor and cost against steps, as PNG: a line for each seed, their median in bold, a ring where a run ended.
 
     Parameters
     ----------
     curves : kind of run, seed, and the run's evaluations. A kind's median is over all its seeds, so it ends where the
-        first of them did. What is infinite, because most trajectories diverged, is a gap.
+        first of them did. An infinite value, because most trajectories diverged, is a gap.
 
     Raises
     ------

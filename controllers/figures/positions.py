@@ -1,4 +1,4 @@
-"""Positions over time as a page shows them: a column a kind of run, mean actions above and sampled ones below."""
+"""Positions over time as a page shows them: a column for each kind of run, mean actions above, sampled ones below."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def draw_growth(system: System, seed: int, proofs: Sequence[Proof], options: Pro
         claims = sorted({proof.claim for proof in proofs if proof.claim}) or ["none"]
         figure.suptitle(
             f"{system.name}, seed {seed}: the proved set over training (claim: {', '.join(claims)})\n"
-            f"accepted by the checker for {accepted} of {len(proofs)} policies, at most {options.time_limit:g} s each",
+            f"accepted by the checker for {accepted} of {len(proofs)} policies, effort {options.effort:g} each",
             x=0.01,
             ha="left",
         )

@@ -1,4 +1,4 @@
-"""Trajectories of every state, a column a method: the whole of what was simulated, wider than a page."""
+"""Trajectories of every state, a column for each method: the whole simulation, wider than a page."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MOST = 50  # trajectories in a panel
 
 
 def draw_states(system: System, dt: float, responses: Sequence[Response]) -> bytes:
-    """Fifty trajectories at most of every state, positions first; one column a method, all of the first seed."""
+    """Fifty trajectories at most of every state, positions first; a column for each method, all of the first seed."""
 
     def build() -> Any:
         from matplotlib.figure import Figure

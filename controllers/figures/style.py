@@ -28,7 +28,7 @@ COLOURS: dict[Run, str] = {  # Okabe and Ito's, told apart with any colour visio
     "sb3-sac": "#009e73",
     "sb3-ppo": "#cc79a7",
 }
-DEEP: dict[Run, str] = {  # of the same hues, for letters: those above are too light on white
+DEEP: dict[Run, str] = {  # the same hues for letters: those above are too light on white
     "ours": "#005f96",
     "sac": "#b34e00",
     "before": "#1f7cb4",

@@ -67,7 +67,7 @@ def with_value_at_origin(network: TanhNetwork, value: Array) -> TanhNetwork:
 
 
 def _last_bias(weight: Array, h: Array, wanted: Array) -> Array:
-    # Where nothing arrives the bias is the value itself: a file may hold it in double, and exactness may rest on it.
+    # If nothing arrives, the bias is the value itself: a file may hold it in double, and exactness may rest on it.
     return _single(wanted - weight @ h) if np.any(h) else np.array(wanted)
 
 

@@ -19,7 +19,7 @@ from certify.errors import InputError
 from certify.loop.policies import TanhNetwork
 
 Array = NDArray[np.float64]
-_LEAST = 1e-6  # of singular values, relative: below it an input follows from the others, up to single precision
+_LEAST = 1e-6  # ratio of singular values: below it an input follows from the others, up to single precision
 
 
 def regained(network: TanhNetwork, u_eq: Sequence[Fraction], J: Array, box: Array) -> TanhNetwork:
@@ -27,7 +27,7 @@ def regained(network: TanhNetwork, u_eq: Sequence[Fraction], J: Array, box: Arra
 
     `G x` is the smallest state, relative to the box, at which the old Jacobian asks for what J asks for at x:
     `G = D (J_pi D)^+ J`, D the diagonal matrix of `box`. So the policy's own shape stays, along the m directions
-    in which it acts; what it did in the other n - m is gone. What enters the first hidden layer at 0 is its bias as it
+    in which it acts; its action in the other n - m is gone. The input of the first hidden layer at 0 is its bias as it
     was, and with it pi(0) and the centring stay exactly.
 
     Parameters

@@ -1,7 +1,7 @@
 """The proofs of a run's history: the set that can be proved of each of its policies.
 
 A policy is proved by itself, with the same options as all others, and counts as proved if the checker accepts what
-`certify_roa` writes down. Where that comes to nothing in its time, the history has a gap, which says nothing about the
+`certify_roa` writes down. If nothing is proved with its effort, the history has a gap, which says nothing about the
 policy.
 """
 
@@ -58,20 +58,20 @@ class ProvingOptions:
 
     Parameters
     ----------
-    time_limit : seconds for one policy.
+    effort : counted work for one policy, as `certify_roa` takes it.
     candidate : where P comes from, as `certify_roa` names it.
 
     Raises
     ------
-    InputError : the limit is not positive and finite, or there is no such candidate.
+    OptionError : the effort is not positive and finite, or there is no such candidate.
     """
 
-    time_limit: float = 50.0
+    effort: float = 1.0
     candidate: Candidate = "auto"
 
     def __post_init__(self) -> None:
-        if not 0 < self.time_limit < math.inf:
-            raise OptionError(f"`time_limit` must be positive and finite; found {self.time_limit}.")
+        if not 0 < self.effort < math.inf:
+            raise OptionError(f"`effort` must be positive and finite; found {self.effort}.")
         if self.candidate not in get_args(Candidate):
             raise OptionError(f"`candidate` must be one of {', '.join(get_args(Candidate))}; found {self.candidate!r}.")
 
@@ -98,7 +98,7 @@ def prove(kept: RunPolicy, system: System, folder: Path, options: ProvingOptions
         else:
             return _proof(kept.step, proved)
     try:
-        result = certify_roa(system, kept.policy, folder, candidate=options.candidate, time_limit=options.time_limit)
+        result = certify_roa(system, kept.policy, folder, candidate=options.candidate, effort=options.effort)
     except InputError as error:
         return Proof(kept.step, Verdict.UNKNOWN, str(error))
     if result.verdict is not Verdict.PROVED or result.raw is None:

@@ -31,9 +31,9 @@ def chosen_plant(name: str) -> tuple[System, Plant]:
     if name in available_plants():
         return get_system(name), get_plant(name)
     if name in available_systems():
-        return get_system(name), get_plant(name)  # which says that there are no options for it
+        return get_system(name), get_plant(name)  # its error says that there are no options for it
     if not (name.endswith(".toml") or name.rpartition(":")[0].endswith(".py")):
-        get_plant(name)  # which knows none of this name
+        get_plant(name)  # its error says that there is none of this name
     system = chosen_system(name)
     if system.name in available_systems():
         raise InputError(

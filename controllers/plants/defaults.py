@@ -1,8 +1,8 @@
 """Defaults of training for a plant of one's own, from its domain and its input bounds.
 
 A plant that ships has a file with its preset. One in a TOML file may choose in a table `[training]` there; the rest is
-computed here, and the command line overrides both. What is computed has sizes for units: every weight is relative to
-how far a state or an input may go (Bryson's rule), so that millimetres and metres train alike.
+computed here, and the command line overrides both. Computed weights have no units: each is relative to the largest
+value of a state or an input (Bryson's rule), so that millimetres and metres train alike.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 STEPS = 20_000
-RESOLUTION = 0.2  # of the time step, in units of 1 / (fastest rate of the LQR loop)
+RESOLUTION = 0.2  # the time step in units of 1 / (fastest rate of the LQR loop)
 
 
 def default_plant(system: System) -> Plant:

@@ -2,8 +2,8 @@
 
 The paper is Quartz, Zhou, De Sterck, Liu, "Stochastic Reinforcement Learning with Stability Guarantees for Control of
 Unknown Nonlinear Systems" (AAAI 2025, arXiv 2409.08382). Each departure was made for a reason, and each can be undone:
-alone, to see what it costs, or with all others, which is the preset `paper`. What the paper leaves open has no entry:
-there a preset named after it holds the number of ours. `docs/departures.md` gives the reasons and what was measured.
+alone, to see what it costs, or with all others, which is the preset `paper`. A number that the paper leaves open has no
+entry: there a preset named after it has ours. `docs/departures.md` gives the reasons and the measurements.
 """
 
 from __future__ import annotations

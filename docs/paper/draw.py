@@ -24,12 +24,7 @@ ROOT = Path(__file__).parents[2]
 PAGE = Path(__file__).parent
 OUT = ROOT / "out" / "paper"
 LARGEST = 200_000  # bytes of a picture
-TIME_LIMITS = {
-    "pendulum": 30,
-    "cartpole": 60,
-    "quadrotor2d": 60,
-    "quadrotor3d": 120,
-}  # seconds for a policy of a history
+EFFORTS = {"pendulum": 0.6, "cartpole": 1.2, "quadrotor2d": 1.2, "quadrotor3d": 2.4}  # for a policy of a history
 SECONDS = {"quadrotor2d": ("--duration", "30")}  # its slowest mode takes that long
 BASELINES: tuple[Run, ...] = ("sac", "sb3-sac", "sb3-ppo")
 COMPARED = {
@@ -97,7 +92,7 @@ def look_back(plant: str, folder: Path, name: str, adds: str) -> bool:
     out, evaluations = OUT / f"{plant}-{name}", kept.with_suffix(".csv")
     used = [*kept.glob("*.pt"), *([evaluations] if evaluations.is_file() else [])]
     say_differences(folder, [f"{plant}/{name}"], used)
-    words = ["controllers", "history", str(kept), "--out", str(out), "--time-limit", str(TIME_LIMITS[plant])]
+    words = ["controllers", "history", str(kept), "--out", str(out), "--effort", str(EFFORTS[plant])]
     Command((*words, *(("--evaluations", str(evaluations)) if evaluations.is_file() else ()))).run()
     for figure in LOOKED_BACK:
         keep(out / f"{plant}-{figure}.png", PAGE / f"{plant}{adds}-{figure}.png")
@@ -148,10 +143,10 @@ def main() -> None:
         raise SystemExit(f"RUNS must be a folder of runs; {folder} is none. docs/paper.md says how to get one.")
     OUT.mkdir(parents=True, exist_ok=True)
     drawn = {}
-    for plant in TIME_LIMITS:
+    for plant in EFFORTS:
         looked_back = (look_back(plant, folder, name, adds) for name, adds in HISTORIES.items())
         drawn[plant] = compare(plant, folder), *looked_back
-    sections = [text for plant in TIME_LIMITS if (text := section(plant))]
+    sections = [text for plant in EFFORTS if (text := section(plant))]
     (PAGE / "figures.txt").write_text("\n".join(sections), "utf-8")
     print(json.dumps(drawn))
 

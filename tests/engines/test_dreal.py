@@ -288,7 +288,7 @@ def test_missing_dreal_is_unknown_when_named_and_a_notice_when_not(
     monkeypatch.setenv("CERTIFY_ENGINE", "dreal")
     assert _run(arguments, True) == 0
     out, err = capsys.readouterr()
-    assert json.loads(out)["checked"] == "ACCEPTED" and "engine bounds in the place of dreal" in err
+    assert json.loads(out)["checked"] == "ACCEPTED" and "engine bounds instead of dreal" in err
     monkeypatch.setenv("CERTIFY_ENGINE", "both")
     monkeypatch.delenv("CERTIFY_ENGINE")
     assert _run([*arguments, "--engine", "both"], True) == 0

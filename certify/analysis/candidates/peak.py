@@ -2,7 +2,7 @@
 
 What pushes the loop off the origin (a disturbance, a parameter that moves its equilibrium, a policy that is not
 centred) makes a floor that P shapes. To first order the least floor c0 of {x'Px <= 1} at an edge k is a linear
-matrix inequality in P at each corner of what is uncertain (the peak of a bounded input: Boyd, El Ghaoui, Feron,
+matrix inequality in P at each corner of the ranges (the peak of a bounded input: Boyd, El Ghaoui, Feron,
 Balakrishnan 1994, section 6.1), and P >= W keeps the set inside one that the local rule proves without the push.
 """
 
@@ -21,9 +21,9 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import at_values, corners
 
 Array = NDArray[np.float64]
-_EDGES = (0.3, 0.5, 0.65, 0.8)  # of the slowest rate at which V can fall
-_ROUND = 1e-3  # of the floor, for a set that is not small where it need not be
-_FOR_W = 0.6  # of the effort
+_EDGES = (0.3, 0.5, 0.65, 0.8)  # shares of the slowest rate at which V can fall
+_ROUND = 1e-3  # share of the floor, for a set that is not small where it need not be
+_FOR_W = 0.6  # share of the effort
 _MOST = 16  # corners
 
 
@@ -32,7 +32,7 @@ def peak_candidate(loop: ClosedLoop, effort: Effort = UNLIMITED) -> Array:
 
     Parameters
     ----------
-    loop : the closed loop, with what is uncertain; without that, and centred, its linearisation is stable.
+    loop : the closed loop, with its ranges; without them, and centred, its linearisation is stable.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def _alone(loop: ClosedLoop) -> ClosedLoop:
 
 
 def _corners(loop: ClosedLoop) -> list[tuple[Array, Array]]:
-    """To first order, at corners of what is uncertain: L (n, n) and f (n, 1) with G = L x + f."""
+    """G to first order at corners of the ranges: L (n, n) and f (n, 1) with G = L x + f."""
     system, found = loop.system, []
     origin = np.zeros(system.n)
     u, field = loop.policy(origin[None])[0], system.uncertain_function()

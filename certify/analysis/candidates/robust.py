@@ -34,19 +34,19 @@ if TYPE_CHECKING:
     import cvxpy
 
 Array = NDArray[np.float64]
-_TRUST, _MOST_TRUST, _LEAST_TRUST = 0.4, 0.6, 0.01  # of the eigenvalues of X
+_TRUST, _MOST_TRUST, _LEAST_TRUST = 0.4, 0.6, 0.01  # bounds of the eigenvalues of X
 _WIDER, _NARROWER = 1.5, 0.5  # the next trust region, after a gain as foretold and after none
-_FORETOLD = 0.5  # of the gain that the program promises
-_WORTH = 0.005  # of the logarithm of a volume: less is no gain
+_FORETOLD = 0.5  # share of the gain that the program promises
+_WORTH = 0.005  # gain of the logarithm of a volume: less is none
 _DIFFERENCE = 1e-3
 _AS_ASKED = 1.05  # a level above which there is little hope, where 1 was asked for
 _TOGETHER = 16  # balls that are looked at in one go
-_FAR = -1.0  # of a margin
+_FAR = -1.0  # a margin
 PROGRAM, CONE = 2e7, 30.0  # operations of a program, however small, and for each product of its sizes
-_AT_ONCE = 0.5  # of the effort, for the loop whose input follows at once, where one is held
+_AT_ONCE = 0.5  # share of the effort for the loop whose input follows at once, where one is held
 _LEFT = 3e-3  # share of the decay that is to be left
-_INSIDE = 0.995  # of the room of an input or a state
-_BELOW = 1 - 1e-9  # of the domain's limit
+_INSIDE = 0.995  # share of the room of an input or a state
+_BELOW = 1 - 1e-9  # share of the domain's limit
 
 
 def robust_candidate(loop: ClosedLoop, effort: Effort = UNLIMITED) -> Array:
@@ -73,13 +73,14 @@ def robust_candidate(loop: ClosedLoop, effort: Effort = UNLIMITED) -> Array:
 
 
 def solve(problem: cvxpy.Problem) -> bool:
-    """Whether the solver comes to an end with a semidefinite program; what it found may be inaccurate, and is judged by
-    the checker's rules."""
+    """Solve a semidefinite program; True if the solver comes to an end.
+
+    The solution may be inaccurate, and is judged by the checker's rules."""
     import cvxpy
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that it may be inaccurate
+            warnings.simplefilter("ignore")  # the solution may be inaccurate
             problem.solve(solver=cvxpy.CLARABEL)
     except cvxpy.SolverError:
         return False
@@ -101,7 +102,7 @@ def _climbed(known: Paths, best: Array, effort: Effort, quick: bool) -> Array:
         found = None if asked is None else _scaled(known, asked, effort, best if quick else None)
         gain = -math.inf if found is None else _log_volume(found) - _log_volume(best)
         as_foretold = asked is not None and gain > _FORETOLD * (_log_volume(asked) - _log_volume(best))
-        if fresh:  # what older derivatives foretell says little of how far new ones reach
+        if fresh:  # older derivatives say little about how far new ones reach
             trust = min(_WIDER * trust, _MOST_TRUST) if as_foretold else _NARROWER * trust
         if found is not None and gain > _WORTH:
             best, about, fresh = found, about.at(found) if quick and as_foretold else None, False
@@ -141,7 +142,7 @@ def _problem(known: Paths, P: Array) -> tuple[Problem, Array]:
 class _Linearised:
     """The rule around {x'Px <= 1}, x = J d where X = 0.
 
-    A row holds what the decay leaves at each corner of what is uncertain, (n, n) each, between the `roots`, the
+    A row holds what the decay leaves at each corner of the ranges, (n, n) each, between the `roots`, the
     inverses of those of the decays at X = 0, and how far inputs and states move, who have that `room`, (m + n,): `here`
     at this X. `slopes` are its derivatives at 0 by the entries of X on and above the diagonal.
     """
@@ -241,7 +242,7 @@ def _directions(n: int) -> list[Array]:
 
 
 def _balls(J: Array, changes: Array) -> Array:
-    """Those of 1 + X for each X of `changes`, (N, n, n) both."""
+    """The balls of 1 + X for each X of `changes`, (N, n, n) both."""
     values, vectors = np.linalg.eigh(np.eye(len(J)) + changes)
     return np.asarray(J @ (vectors / np.sqrt(values)[:, None]) @ np.swapaxes(vectors, 1, 2))
 

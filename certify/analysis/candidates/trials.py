@@ -35,13 +35,13 @@ from certify.provers.falsify import Witness, falsify, survey
 Array = NDArray[np.float64]
 _BELOW = 1e-9  # relative distance from a limit that is itself out of reach (the domain's open condition)
 _BELOW_WITNESS = 1e-3
-_SMALLEST = 1e-120  # of levels: squares of states and products of bounds must not underflow
+_SMALLEST = 1e-120  # the least level: squares of states and products of bounds must not underflow
 _BLENDS = (0.05, 0.15, 0.3)
 _MANY = 6  # states, beyond which there is next to nothing but the local set
 OPTIMISING = 0.2  # share of the effort that the optimised candidate may take
-SAMPLING = 0.25  # of that, how much more it may take to sample what a candidate could give
+SAMPLING = 0.25  # further share of that for sampling what a candidate could give
 FOR_PEAK = 0.4  # share of the effort for a candidate that may be the only one
-_SAMPLES, _MANY_SAMPLES = 4000, 20_000  # of a search for violations, one of many and the only one; a proof finds others
+_SAMPLES, _MANY_SAMPLES = 4000, 20_000  # samples for one of many candidates and for the only one; a proof finds others
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +165,7 @@ def optimised(loop: ClosedLoop, options: RoaOptions, effort: Effort) -> Trial | 
     """The candidate of the largest sampled set, or None if it is not to be had.
 
     Under `practical` it is that of the loop whose policy is centred: near the origin no V decreases under this one, and
-    away from it the two differ little. Of an input that is held it is that of the loop whose input follows at once: a
+    away from it the two differ little. If an input is held, it is that of the loop whose input follows at once: a
     period is short, and Vdot cheap.
     """
     try:

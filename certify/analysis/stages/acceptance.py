@@ -24,7 +24,7 @@ from certify.loop.closed_loop import ClosedLoop
 
 _LONG = 1_000_000  # bytes of a certificate, from which on several processes check it
 _MOST_JOBS = 64
-_CHECK = 2.0  # of the operations that bound a box: what the checker takes for a leaf
+_CHECK = 2.0  # the checker's work for a leaf, relative to the operations that bound a box
 
 
 def operations_of_check(loop: ClosedLoop) -> float:
@@ -58,7 +58,7 @@ class Acceptance:
 
 @dataclass(frozen=True)
 class _Desk:
-    """Where certificates are checked."""
+    """The place where certificates are checked."""
 
     state: State
     tools: Tools
@@ -77,7 +77,7 @@ class _Desk:
         )
 
     def _checked(self, path: Path) -> Mapping[str, Any]:
-        """The checker's answer about a file, patiently where it would be refused for what it takes else."""
+        """The checker's answer about a file, patient if the file needs more work than the checker allows otherwise."""
         answer = self._answered(path, patient=False)
         if (answer.get("rule"), answer.get("at")) == ("limits", "operations"):
             answer = self._answered(path, patient=True)

@@ -35,14 +35,14 @@ from certify.lyapunov import volume
 from certify.provers.base import FEW, Attempt, Budget
 from certify.provers.falsify import Witness
 
-_HEAT = 0.04  # of the effort, for a candidate's first heat
-_SEARCH = 0.6  # of the effort that is left, for a search that cannot be interrupted
+_HEAT = 0.04  # share of the effort for a candidate's first heat
+_SEARCH = 0.6  # share of the effort that is left for a search that cannot be interrupted
 _GRACE, _LEAST = 1.0 * UNIT, 0.05  # operations, or of the whole, for a local level where nothing is proved yet
-_FOR_PROOF = 0.4  # of the whole, that no further candidate is optimised in
+_FOR_PROOF = 0.4  # share of the whole in which no further candidate is optimised
 _WORTH = 1.05  # growth of a volume that another candidate must promise
-_SMALL = 0.1  # of the volume within a candidate's reach: where less is proved, another one is worth its effort
+_SMALL = 0.1  # share of the volume within a candidate's reach: if less is proved, another one is worth its effort
 _NEAR = 1e-3  # the same: where less is proved, its own correction is not
-_MISLED = 0.9  # of its reach: a violation below it is one that the samples missed
+_MISLED = 0.9  # share of its reach: a violation below it is one that the samples missed
 
 Make = Callable[[RoaOptions, Effort], Trial | None]
 
@@ -245,7 +245,7 @@ class _Choice:
         return _granted(self.effort, self.tools.whole, share)
 
     def _enter_alone(self, trial: Trial) -> None:
-        """With a heat of what is left, where a search cannot be interrupted."""
+        """Enter a trial with a heat of the effort that is left if a search cannot be interrupted."""
         self.race.enter([trial], self.race.heat if self.state.interruptible else _SEARCH * self.effort.left)
 
     def _is_left_for_more(self) -> bool:

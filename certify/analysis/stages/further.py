@@ -22,8 +22,8 @@ from certify.lyapunov.function import Quadratic
 from certify.provers.base import Budget
 
 Array = NDArray[np.float64]
-_FOR_SEARCH = 0.5  # of what is left, the rest being for the check
-_FOR_LEARNING = 0.4  # of what is left, the rest being for the proof and its check
+_FOR_SEARCH = 0.5  # share of the effort that is left, the rest being for the check
+_FOR_LEARNING = 0.4  # share of the effort that is left, the rest being for the proof and its check
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class Beyond:
         )
 
     def _learned(self, state: State, claim: Claim, effort: Effort) -> Neural | Polynomial:
-        """A function whose set may reach beyond the ellipsoid, learned with a share of what is left."""
+        """A function whose set may reach beyond the ellipsoid, learned with a share of the effort that is left."""
         from certify.lyapunov.learning import fit_polynomial, learn
 
         options, problem = state.options, state.contest.best.trial.task.problem

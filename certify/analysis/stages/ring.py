@@ -23,9 +23,9 @@ from certify.certificates.verdict import Stop
 from certify.effort import UNIT, Effort
 from certify.provers.base import Budget, Progress, Proof
 
-_PATIENCE = 0.1  # of the whole, for a ring that gains nothing
+_PATIENCE = 0.1  # share of the whole for a ring that gains nothing
 _SAVING = 60.0  # seconds between two savings of a search
-_MUCH = 0.1  # of the whole: where more was kept for the check it is said
+_MUCH = 0.1  # share of the whole: if more was kept for the check, a notice says so
 _YEAR = 3.156e7  # seconds
 
 

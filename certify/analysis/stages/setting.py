@@ -92,11 +92,11 @@ def _kind_of(loop: ClosedLoop, options: RoaOptions) -> tuple[Kind, str | None]:
 
 
 def _rest(loop: ClosedLoop, options: RoaOptions) -> tuple[Rest | None, ClosedLoop]:
-    """Where the loop rests, if that is worth saying, and the loop as seen from where V is to be 0.
+    """The loop's equilibrium, if that is worth saying, and the loop as seen from where V is to be 0.
 
     Raises
     ------
-    OptionError : V is to be 0 where the loop rests, and no stable point of rest is found.
+    OptionError : V is to be 0 at the equilibrium, and no stable one is found.
     """
     if loop.network.is_moved:
         return None, loop

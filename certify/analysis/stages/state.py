@@ -101,7 +101,7 @@ class Tools:
     ----------
     whole : operations of the run, of which stages take shares.
     show : called with the bytes of a certificate that the run ends with if they are accepted, before they are checked.
-    load : seconds spent on reading before.
+    load : seconds of reading before the run.
     """
 
     out: Path
@@ -139,7 +139,7 @@ class Tools:
             self.progress(stage, None)
 
     def report(self, state: Progress, stage: StageName = "ring") -> None:
-        """Report where a stage stands, and in how many seconds the run ends at the latest, at the pace so far."""
+        """Report a stage's progress, and the seconds until the run ends at the latest, at the pace so far."""
         if self.progress is not None:
             left = self.effort.left if state.left is None else min(state.left, self.effort.left)
             self.progress(stage, replace(state, left=left, seconds_left=self.effort.seconds_for(left)))

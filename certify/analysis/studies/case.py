@@ -39,7 +39,7 @@ TABLES, PLANT_OPTIONS = (
     tuple(name for name, option in declared(PlantChanges).items() if (option.kind == "ranges") is table)
     for table in (True, False)
 )
-"""The fields of `PlantChanges`: tables of a study, and what is among its options."""
+"""The fields of `PlantChanges`: tables of a study, and those among its options."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class File:
 
     @property
     def sha256(self) -> str:
-        """Of its bytes."""
+        """The hash of its bytes."""
         return hashlib.sha256(self.content).hexdigest()
 
     def put(self, folder: Path) -> Path:
@@ -121,8 +121,8 @@ class Case:
 def readable_ids(coordinates: Sequence[Mapping[str, str]], listed: Sequence[str]) -> list[str]:
     """A folder's name for each case: policy, plant, what is varied with its values, and the candidate.
 
-    A name does not depend on which other values there are, unless policies of two folders are called alike. What a
-    folder cannot be called is replaced, and a hash then tells names apart.
+    A name does not depend on the other values, unless policies of two folders are called alike. Characters that a
+    folder's name cannot have are replaced, and a hash then tells names apart.
     """
     stems = Counter(Path(policy).stem for policy in {where["policies"] for where in coordinates})
     parts = [_parts(where, listed, stems) for where in coordinates]
@@ -150,7 +150,7 @@ def _parts(where: Mapping[str, str], listed: Sequence[str], stems: Mapping[str, 
 
 @cache
 def _program() -> dict[str, str | None]:
-    """What of this program decides on a case: its version, the checker's source, and the plants that ship."""
+    """The parts of this program that decide a case: its version, the checker's source, and the plants that ship."""
     digest = hashlib.sha256()
     for path in sorted(Path(plants.__path__[0]).glob("*.py")):
         digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())

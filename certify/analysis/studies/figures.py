@@ -1,8 +1,8 @@
-"""What a sweep looks like: a map over two quantities, a line over one, points over names.
+"""The figures of a sweep: a map over two quantities, a line over one, points over names.
 
 A verdict is a word or a sign of its own, never a colour alone: a cell without a proof is hatched and says so, and a
-marker has a shape. Where more is varied than a figure has directions, there is a figure for each combination of the
-rest; what would be too many is in the table, and the page says so.
+marker has a shape. If more is varied than a figure has directions, there is a figure for each combination of the rest;
+if these are too many, they are in the table, and the page says so.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _SIGNS = {"unknown": "?", "refuted": "R", "trusted": "T", "error": "E", "not run
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """The figures, and what is said of those that are left out; nothing if there are none."""
+    """The figures, and a sentence about those that are left out; empty if there are none."""
 
     pictures: tuple[Picture, ...]
     left_out: str = ""
@@ -225,7 +225,7 @@ def _line(across: Axis, size: str, curves: Sequence[tuple[str, Mapping[str, Row]
 
 
 def _ticks(axis: Any, values: Axis, turned: bool = False) -> str:
-    """The values as they stand in the study, so many that they can be read; what was cut from all of them alike."""
+    """Label an axis with the study's values, as many as can be read; the text that was cut from all of them."""
     every = -(-len(values.values) // _MOST_TICKS)
     places = range(0, len(values.values), every)
     shown, cut = (_rounded(values.values), "") if values.is_numeric else _distinct(values.values)
@@ -255,7 +255,7 @@ def _distinct(values: Sequence[str]) -> tuple[list[str], str]:
 
 
 def _alike(rows: Sequence[Sequence[str]]) -> int:
-    """How many entries all rows begin with."""
+    """The number of entries with which all rows begin."""
     count = 0
     while count < min(map(len, rows)) and len({row[count] for row in rows}) == 1:
         count += 1
@@ -263,7 +263,7 @@ def _alike(rows: Sequence[Sequence[str]]) -> int:
 
 
 def _size(row: Row) -> str:
-    """What a volume is called, with its unit."""
+    """The name of a volume, with its unit."""
     name = volume_name(len(row.states))
     return f"{name} ({row.volume_unit})" if row.volume_unit else name
 

@@ -99,5 +99,5 @@ def _number(value: float | None) -> Cell:
 
 
 def _or_least(value: Any) -> float:
-    """What is absent comes before all numbers."""
+    """A number to sort by; an absent value comes before all numbers."""
     return -1.0 if value is None else float(value)

@@ -38,14 +38,14 @@ class Row:
     ----------
     case, coordinates : its name, and the text of each entry of the study.
     inputs : the hash of all that it depends on.
-    verdict : UNKNOWN too where the case could not be run: `error` says why.
+    verdict : UNKNOWN too if the case could not be run: `error` says why.
     claim, stop, reason, candidate, notice : as a run of `certify roa` says them.
     levels, volume, volume_unit, semi_axes, extents : of the set that the certificate states, None without one;
         volume, in the product of the states' units, and lengths are certain lower bounds.
     states : their names; none where the case could not be run.
     units : of states, parameters and disturbances, by name.
     witness : the violation at which the sampled limit lies: its state, kind and values; None without one.
-    boxes, leaves, seconds : of the work.
+    boxes, leaves, seconds : the work.
     certificate, certificate_sha256, checked : the file, relative to the sweep's folder, its hash, and what the checker
         of this machine said of it.
     """
@@ -101,7 +101,7 @@ class Row:
         for left in (
             *folder.glob("certificate.*.unchecked.json"),
             *folder.glob("row.*.partial"),
-        ):  # of one that was killed
+        ):  # left by a run that was killed
             left.unlink(missing_ok=True)
         if self.certificate is None:
             set_aside(folder)  # of an attempt that was refused

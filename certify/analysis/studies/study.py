@@ -1,9 +1,9 @@
-"""A study: which policies, plants, values, candidates and options are crossed, as a TOML file says it.
+"""A study: the policies, plants, values, candidates and options that a TOML file crosses.
 
-A list always means "each of these", in every table, so that whatever a run can be given can be varied, and nobody has
-to remember what may be. What is a list by nature, such as the diagonal of Q or an interval, is therefore written as on
-the command line, as text: `Q = "1,1"`, `m = "0.135..0.165"`. Values stay text, in decimals or as a fraction, from the
-file to the very run: nothing is rounded on the way, and a case's name, its folder and its column say what was run.
+A list always means "each of these", in every table, so that every entry can be varied, and nobody has to remember
+which. A value that is a list by nature, such as the diagonal of Q or an interval, is therefore written as on the
+command line, as text: `Q = "1,1"`, `m = "0.135..0.165"`. Values stay text, in decimals or as a fraction, from the file
+to the very run: nothing is rounded on the way, and a case's name, its folder and its column say what was run.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ KNOWN = (*OPTIONS, *PLANT_OPTIONS)
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """What cases differ in, or share: the values of one entry of the file.
+    """An entry of the file with its values, in which cases differ, or which they share.
 
     Parameters
     ----------
-    key : of the entry, as in `parameters.m`; `policies`, `systems`, `candidates`.
+    key : the entry's, as in `parameters.m`; `policies`, `systems`, `candidates`.
     values : text, in the file's order; numbers exactly.
-    listed : whether the file gives them as a list or a range: only then they are part of a case's name.
+    listed : True if the file gives them as a list or a range: only then they are part of a case's name.
     """
 
     key: str
@@ -54,13 +54,13 @@ class Axis:
 
     @property
     def is_numeric(self) -> bool:
-        """Whether all values are numbers."""
+        """True if all values are numbers."""
         return self.key not in _LISTS and all(map(_is_number, self.values))
 
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """What a study's file says; `files` holds the bytes of all that it names, by what it calls them."""
+    """The content of a study's file; `files` holds the bytes of all files that it names, by their names there."""
 
     name: str
     axes: tuple[Axis, ...]

@@ -1,7 +1,7 @@
-"""The sweep: what is done is kept, what is missing is done, and the table is written however it ends.
+"""The sweep: cases that are done are kept, missing ones are done, and the table is written however it ends.
 
-A case is done once its row lies in its folder and what it says is found out again. Rows are written one by one, so that
-a sweep that is interrupted, is killed, or loses its cluster goes on where it was; a case whose run could not even be
+A case is done once its row lies in its folder and its facts are found out again. Rows are written one by one, so that
+a sweep that is interrupted, is killed, or loses its cluster resumes where it was; a case whose run could not even be
 tried is tried again.
 """
 
@@ -34,14 +34,14 @@ Watch = Callable[[Row, int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """What a sweep found: a row for each case that is done, in the study's order.
+    """The result of a sweep: a row for each case that is done, in the study's order.
 
     Parameters
     ----------
-    cases : how many there are.
-    kept : how many were done before.
+    cases : the number of all.
+    kept : the number of those done before.
     files : the table, by kind (`csv`, `parquet`, `html`).
-    seconds : that this run took.
+    seconds : the time that this run took.
     """
 
     study: Study
@@ -53,13 +53,13 @@ class Sweep:
 
     @property
     def verdicts(self) -> dict[str, int]:
-        """How many cases have each verdict."""
+        """The number of cases with each verdict."""
         found = Counter(row.verdict for row in self.rows)
         return {verdict.value: found[verdict] for verdict in Verdict}
 
     @property
     def errors(self) -> int:
-        """How many cases could not be run; their verdict is UNKNOWN."""
+        """The number of cases that could not be run; their verdict is UNKNOWN."""
         return sum(row.failed for row in self.rows)
 
     @property
@@ -132,8 +132,8 @@ def _kept(cases: Sequence[Case], out: Path) -> Iterator[Row]:
 
 
 def _done(cases: Sequence[Case], out: Path, place: Place) -> Iterator[Row]:
-    """The rows of cases, as they are done. What somebody else's worker refutes is tried again here: unlike a proof, a
-    refutation comes without anything that could be checked."""
+    """The rows of cases, as they are done. A refutation by somebody else's worker is tried again here: unlike a proof,
+    it comes without anything that could be checked."""
     own, again = _is_own(place), list[Case]()
     for case, row in _judged(cases, out, place, own):
         if not own and row.verdict is Verdict.REFUTED:
@@ -147,7 +147,7 @@ def _done(cases: Sequence[Case], out: Path, place: Place) -> Iterator[Row]:
 
 
 def _is_own(place: Place) -> bool:
-    """Whether this program does the work there, on this machine."""
+    """True if this program does the work there, on this machine."""
     return isinstance(place, Processes)
 
 
@@ -166,13 +166,13 @@ def _judged(cases: Sequence[Case], out: Path, place: Place, own: bool) -> Iterat
             while waiting:
                 yield from _taken(waiting, None)
         except (KeyboardInterrupt, BackendError, SoundnessError):
-            found = [future.result() for future in waiting if future.exception() is None]  # what came before the end
+            found = [future.result() for future in waiting if future.exception() is None]  # came before the end
             yield from ((case, row) for case, row in found if not row.failed)  # a checker may have ended with the rest
             raise
 
 
 def _taken(waiting: set[Future[tuple[Case, Row]]], patience: float | None) -> Iterator[tuple[Case, Row]]:
-    """Take what is done out of `waiting`, after so many seconds at most."""
+    """Take finished futures out of `waiting`, after `patience` seconds at most."""
     done, _ = wait(waiting, patience, FIRST_COMPLETED)
     for future in done:
         waiting.remove(future)

@@ -1,7 +1,7 @@
-"""What is done of a case where it is done: the run of `certify roa`, in a folder of its own that goes with it.
+"""The work on a case, at its place: the run of `certify roa`, in a temporary folder.
 
-What comes back is one line of JSON and the certificate's bytes. An error is an answer too, so that it ends the case and
-not the sweep; one that says that two rigorous results contradict each other comes back with the files that show it.
+One line of JSON and the certificate's bytes come back. An error is an answer too, so that it ends the case and not the
+sweep; one that says that two rigorous results contradict each other comes back with the files that show it.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from certify.analysis.run import certify_roa
 from certify.analysis.studies.case import Case
 from certify.errors import CertifyError, InputError, SoundnessError
 
-_MOST_BYTES = 16 * 2**20  # of a file that shows a contradiction
+_MOST_BYTES = 16 * 2**20  # size of a file that shows a contradiction
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a worker says of a case.
+    """A worker's answer about a case.
 
     Parameters
     ----------
     kind : `result`; `error`, the case could not be run; `contradiction`, two rigorous results are at odds.
     data : `RoaResult.to_dict()` of a result.
-    message : of an error.
-    notices : what had to be known about plant and policy.
+    message : the sentence of an error.
+    notices : facts about plant and policy that had to be known.
     raw : the certificate's bytes, None without one.
-    files : that show a contradiction.
+    files : the files that show a contradiction.
     """
 
     kind: Literal["result", "error", "contradiction"]
@@ -68,7 +68,7 @@ def work(case: Case) -> bytes:
 
 
 def answer_in(sent: bytes) -> Answer:
-    """What `work` sent.
+    """The answer that `work` sent.
 
     Raises
     ------

@@ -58,7 +58,7 @@ AXIOMS = frozenset(f"{module}.{name}" for module, names in _LIBRARY.items() for 
 """On which a theorem may rest, as Coq prints them where nothing is imported."""
 MODULES = tuple(_LIBRARY)
 REALS = frozenset({"ClassicalDedekindReals", "FunctionalExtensionality", "Classical_Prop"})
-"""Of these modules, those that the real numbers need; the others are about the processor."""
+"""The modules among these that the real numbers need; the others are about the processor."""
 _ASSUMING = re.compile(  # words by which a theory could assume something, or switch off a check
     r"\b(Axioms?|Conjectures?|Parameters?|Admitted|admit|Primitive|Declare|bypass_check|Unset|Load|Redirect)\b",
     re.ASCII,

@@ -281,7 +281,7 @@ def _require_exponent(base: Expression, exponent: Expression) -> None:
 
 
 SUM, PRODUCT, MINUS, POWER, ATOM = range(5)
-"""How tightly a node binds: what binds less than its place asks for is put into brackets."""
+"""The binding of a node: one that binds less than its place asks for is put into brackets."""
 
 
 def binding(node: Expression) -> int:

@@ -181,7 +181,7 @@ class _Writer(pickle._Pickler):  # whose methods the stubs leave out
         self.arrays: list[Numbers] = []
 
     def persistent_id(self, node: Any) -> Any:
-        """What stands outside of the pickle."""
+        """The reference of an object outside of the pickle."""
         return node.reference if isinstance(node, Persistent) else None
 
     def _array(self, array: Numbers) -> None:

@@ -1,8 +1,8 @@
-"""The box of ranges cut into cells, in each of which the models are affine in what is uncertain.
+"""The box of ranges cut into cells, in each of which the models are affine in the uncertain quantities.
 
-Where the gradients of F move in a straight line with the uncertain quantities one cell is enough, whatever its extent.
-What is left of them beyond that line is charged to the decay as a norm, and cells make it small. How many there are is
-chosen where the rest is nothing, at the origin.
+One cell is enough, whatever its extent, if the gradients of F move in a straight line with the uncertain quantities.
+Their departure from that line is charged to the decay as a norm, and cells make it small. Their number is chosen at the
+origin, where the terms of higher order vanish.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from certify.provers.ball.steps import Cell, Steps
 
 Array = NDArray[np.float64]
 _MOST = 64  # cells
-_FEW = 8  # that do not show anything at the origin: then more will not
-_ENOUGH = 0.9  # of the decay at the origin that what is left of the gradients may leave at least
-_WORTH = 0.01  # of the decay: what twice the cells have to gain
+_FEW = 8  # cells that do not show anything at the origin: then more will not
+_ENOUGH = 0.9  # share of the decay at the origin that the gradients' departures have to leave
+_WORTH = 0.01  # share of the decay that twice the cells have to gain
 
 
 def cut(ranges: list[Interval], cuts: tuple[int, ...]) -> list[Cell]:

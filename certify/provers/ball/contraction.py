@@ -14,7 +14,7 @@ from certify.errors import InputError
 from certify.provers.ball.local import Array, ball_around
 from certify.provers.ball.models import paths
 
-_LEAST = 1e-12  # of the decay: a weight must not be 0
+_LEAST = 1e-12  # share of the decay: a weight must not be 0
 
 
 def contraction(problem: Problem, T: Array, floor: float) -> Contraction | None:

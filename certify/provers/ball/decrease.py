@@ -2,8 +2,8 @@
 
 On the ball x = J d, `d'J'RJ d + 2 d'J'P F(J d) < 0` for 0 < ||d|| <= 1 if the decay -(J'RJ + B + B') dominates bounds
 of what the models of F add to their gradients (checker/FORMAT.md, `decrease`). An error kept apart keeps its direction;
-errors of several components taken jointly may cancel, as those of a plant's inputs do. What the tanhs leave, and the
-third order, take multipliers that follow from one `weight` of directions: there would be a thousand of them.
+errors of several components taken jointly may cancel, as those of a plant's inputs do. The errors of the tanhs and the
+third order take multipliers that follow from one `weight` of directions: there would be a thousand of them.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from certify.provers.ball.models import Models
 
 Array = NDArray[np.float64]
-_ROUNDS = 16  # of weights that look at bad directions more and more
+_ROUNDS = 16  # rounds of weights that look at bad directions more and more
 _FOCUS, _LEAST_WEIGHT = 2.0, 1e-4
-_SETTLED = 2e-3  # of a margin: more rounds are not worth less
-_NEGLIGIBLE, _ROUNDING = 1e-9, 1e-12  # of the bounds; of the decay, where a checker's Q is not quite 0
-_SHARE = 0.25  # of 1 against d in products of the two, as the checker has it
+_SETTLED = 2e-3  # the least gain of a margin by further rounds
+_NEGLIGIBLE, _ROUNDING = 1e-9, 1e-12  # shares: of the bounds; of the decay, where a checker's Q is not quite 0
+_SHARE = 0.25  # weight of 1 against d in products of the two, as the checker has it
 _SHORT = 5  # bits of a multiplier: the checker's rationals stay short
 
 
@@ -196,9 +196,9 @@ def rest_of(models: Models, b: Array, multipliers: Multipliers) -> Array:
 
 
 def multipliers_for(models: Models, b: Array, weight: Array, joint: bool | None = None) -> Multipliers:
-    """Those with the least trace of weight times the sum of the bounds, for weight (k, k) positive definite.
+    """The multipliers with the least trace of weight times the sum of the bounds, for weight (k, k) positive definite.
 
-    `joint` says whether the Q of all components are taken jointly or all apart; None is what has the smaller trace.
+    `joint` says whether the Q of all components are taken jointly or all apart; None takes the smaller trace.
     """
     return _multipliers_of([(models, b, weight)], joint)
 
@@ -243,7 +243,7 @@ def _multipliers_of(
     joint = np.sum(np.sqrt(spread * diagonal)) <= apart_in_all if joint is None else joint
     if joint or not np.all(np.isfinite(beta)):
         beta, g = np.zeros_like(beta), np.maximum(g, least)
-    else:  # what has no Q stays joint, at next to no cost
+    else:  # a component without Q stays joint, at next to no cost
         g = np.full_like(g, least)
     unused = np.zeros(k - n)
     alpha, beta = (np.append(row, unused) for row in (np.where(np.isfinite(alpha), alpha, 0.0), beta))
@@ -257,7 +257,7 @@ def _joint(models: Models, b: Array, chosen: NDArray[np.bool_]) -> Array:
 
 def _cubic(models: Models, b: Array, chosen: NDArray[np.bool_]) -> Array:
     """N_l'N_l for each l, (k, k, k): N is the mean of the sum of the chosen b_i K_i over all orders of four indices."""
-    N = np.tensordot(b[chosen].T, models.K[chosen], 1)  # K_i is symmetric: what is left is which index is that of b
+    N = np.tensordot(b[chosen].T, models.K[chosen], 1)  # K_i is symmetric: only the index of b is open
     return _squares((N + N.transpose(1, 0, 2, 3) + N.transpose(1, 2, 0, 3) + N.transpose(1, 2, 3, 0)) / 4)
 
 

@@ -28,7 +28,7 @@ TANH4, TANH5, ATAN4 = 4.1, 16.0, 4.7  # no derivative of this order is larger
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Basis:
-    """Of the symmetric forms of order two and three in k variables."""
+    """A basis of the symmetric forms of order two and three in k variables."""
 
     k: int
     pairs: tuple[NDArray[np.intp], ...]  # i <= j, of the entries of a matrix
@@ -108,17 +108,17 @@ class Sizes:
 
 
 def sizes(a: Array, Q: Array, K: Array, E: Array) -> Sizes:
-    """Of rows a (N, k), and Q, K, E in their basis."""
+    """The sizes of rows a (N, k), and of Q, K, E in their basis."""
     slope, bend, twist, rest = (np.sqrt(np.einsum("ij,ij->i", part, part)) for part in (a, Q, K, E))
     return Sizes(slope, bend, twist, bend + twist + rest)
 
 
 def beyond_tangent(a: Array, squares: Array, Q: Array, K: Array, second: Array, third: Array) -> tuple[Array, Array]:
-    """What a function adds to its tangent, but for its `remainder`: H and K, one a row.
+    """The terms that a function adds to its tangent, but for its `remainder`: H and K, in rows.
 
     Parameters
     ----------
-    squares : those of the gradients a, in their basis.
+    squares : the squares of the gradients a, in their basis.
     second, third : (N,), phi''/2 and phi'''/6 at the middle.
     """
     b, x = basis(a.shape[1]), np.newaxis
@@ -210,7 +210,7 @@ class Jet:
         return Jet(f0, f1 * a, f1 * Q + H, f1 * K + cubic, f1 * self.B, abs(f1) * self.E + R, self.errors)
 
     def _nowhere(self) -> Jet:
-        """Of all balls, where one of them has no finite model."""
+        """The jet on all balls if one of them has no finite model."""
         return Jet(math.nan, self.a, self.Q, self.K, self.B, self.E + math.inf, self.errors)
 
     def inverse(self) -> Jet:
@@ -224,7 +224,7 @@ class Jet:
         if not np.all(least > 0) or is_extreme(self.c):
             return self._nowhere()
         s, w = math.sqrt(self.c), np.sqrt(least)
-        fourth = (5 * s**2 + 4 * s * w + w**2) / (16 * s**5 * (s + w) ** 4)  # what is left of a root w, over D^4
+        fourth = (5 * s**2 + 4 * s * w + w**2) / (16 * s**5 * (s + w) ** 4)  # the remainder of a root w, over D^4
         return self.compose(s, 1 / (2 * s), -1 / (4 * s**3), 3 / (8 * s**5), fourth)
 
     def exp(self) -> Jet:

@@ -26,18 +26,18 @@ Array = NDArray[np.float64]
 _LEAST = 1e-280  # a level, below which binary64 holds nothing more
 _MARGIN = 1e-3  # share of the decay that is left to the checker's rounding
 _ENOUGH = 1.01 * _MARGIN
-_WIDER = 1 + 1e-9  # of the ball, which has to contain {V <= c1} beyond all rounding
+_WIDER = 1 + 1e-9  # factor of the ball, which has to contain {V <= c1} beyond all rounding
 _WEIGHINGS, _WEIGHING = 8, 7e5  # rounds of multipliers on a ball, and operations of one, however small
-_ORDER = 4  # of the series in time, where an input is held
+_ORDER = 4  # order of the series in time, where an input is held
 _FAR, _NEAR = 1e-2, 0.3  # from one level to the next lower one, where all below one is good, and where not
 _LOWER = 0.5  # from one level to the next, while floors fall with them
-_NOTHING = 1e-10  # of the limit: no floor is asked to be lower
-_EDGES = 400  # that are tried
+_NOTHING = 1e-10  # share of the limit: no floor is asked to be lower
+_EDGES = 400  # edges that are tried
 _AMPLE = 0.3  # a margin that is good enough for the multipliers of a floor
-_ROUNDS = 3  # of multipliers and edge, each best for the other
-_WORTH = 0.01  # of a floor: less is no gain
-_ROUNDING = 1e-12  # of the decay, of which the checker's numbers are in doubt at d = 0 as well
-_ABOVE = 1 + 1e-3  # of the least floor that is shown
+_ROUNDS = 3  # rounds of multipliers and edge, each best for the other
+_WORTH = 0.01  # share of a floor: less is no gain
+_ROUNDING = 1e-12  # share of the decay: the checker's numbers are in doubt by it at d = 0 as well
+_ABOVE = 1 + 1e-3  # factor of the least floor that is shown
 
 
 def prove_local(
@@ -201,13 +201,13 @@ class Rule:
 
     @property
     def operations_of_models(self) -> float:
-        """Those of the models alone."""
+        """The operations of the models alone."""
         cells = max(1, len(self.cells)) * (1 if self.steps.is_plain else 3) + (20 if self.problem.loop.step else 0)
         return cells * self.steps.known.operations
 
     def shown(self, level: float, enough: float = math.inf) -> Shown:
         """At rest, on the ball of a level."""
-        with np.errstate(all="ignore"):  # what overflows is not shown
+        with np.errstate(all="ignore"):  # an overflow shows nothing
             corners = self._corners(level)
             return NOT_SHOWN if corners is None else best_at(corners, enough)
 
@@ -230,8 +230,8 @@ class Rule:
             return best
 
     def _least(self, corners: Sequence[Corner], V: Array, by: Multipliers) -> _Around:
-        """Where `edge floor - start > linear' (D - edge V)^-1 linear` and D > edge V, D being what of the decay is
-        left, at all corners."""
+        """The least floor, and its edge, with `edge floor - start > linear' (D - edge V)^-1 linear` and D > edge V at
+        all corners; D is the part of the decay that the bounds leave."""
         from scipy.linalg import eigh
 
         parts = []
@@ -250,7 +250,7 @@ class Rule:
         return _Around(float(worst[at]), float(edges[at]), by) if worst[at] < math.inf else _NOWHERE
 
     def models(self, J: Array, level: float) -> list[Models]:
-        """Of a step on a ball that holds {V <= level}, in each cell."""
+        """The models of a step on a ball that holds {V <= level}, in each cell."""
         return self.models_on(J[None], level)[0]
 
     def models_on(self, balls: Array, level: float) -> list[list[Models]]:

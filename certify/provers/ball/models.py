@@ -1,11 +1,11 @@
-"""Third-order models of the closed loop on a ball, in floats: what rules `local` and `tube` bound.
+"""Third-order models of the closed loop on a ball, in floats, which rules `local` and `tube` bound.
 
 On the ball x = m + J d, ||d|| <= 1, the components of F are jets (jets.py), and the bounds hold for every smaller
-radius too and leave no hole at its middle m. What each tanh adds to its tangent reaches the output through the products
-of weights and slopes at m, `Paths`, in which it cancels as it does in truth; they do not depend on the ball. What is
-left of each tanh beyond its third order, e_q, stays apart to the end: F has all of them in a linear combination that is
-known exactly, and so they keep the directions that they have in x. d may have more entries than x: along a path its
-last is the motion.
+radius too and leave no hole at its middle m. The terms that each tanh adds to its tangent reach the output through the
+products of weights and slopes at m, `Paths`, and cancel there as they do in truth; the products do not depend on the
+ball. The remainder of each tanh beyond its third order, e_q, stays apart to the end: F has all of them in a linear
+combination that is known exactly, and so they keep the directions that they have in x. d may have more entries than x:
+along a path its last is the motion.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from certify.provers.ball.ranged import RangedJet
 
 Array = NDArray[np.float64]
 _CALL, _EACH, _ENTRY = 3e5, 1e5, 0.12  # operations of a layer, of one of the equations, of an entry of a product
-_MOST_NUMBERS, _MOST_PRODUCTS = 2**25, 2**33  # of the sums over paths: the checker refuses more
-_MARGIN = 1e-3  # of an input's range, left to the checker's rounding where a clip begins
+_MOST_NUMBERS, _MOST_PRODUCTS = 2**25, 2**33  # size of the sums over paths: the checker refuses more
+_MARGIN = 1e-3  # share of an input's range, left to the checker's rounding where a clip begins
 _UNIT = 2.0**-51  # twice what a checker counts for each term of a sum, relative to the sum's size
 _ROUNDED = 2.0**-49  # and for anything else that it computes
 
@@ -52,8 +52,8 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """How f and A of models move with y, N numbers in [-1, 1]: f + moves.y within `error` (n,), A + turns.y within
-    `slack` (n,), a norm for each row; `moves` (N, n), `turns` (N, n, k)."""
+    """The motion of f and A of models with y, N numbers in [-1, 1]: f + moves.y within `error` (n,), A + turns.y
+    within `slack` (n,), a norm for each row; `moves` (N, n), `turns` (N, n, k)."""
 
     moves: Array
     turns: Array
@@ -95,7 +95,7 @@ class Models:
 
     @property
     def finite(self) -> bool:
-        """Whether F has a finite model on the ball."""
+        """True if F has a finite model on the ball."""
         s = self.spread
         of_spread = () if s is None else (s.moves, s.turns, s.error, s.slack)
         parts = (self.f, self.A, self.Q, self.K, self.E, self.squares, *of_spread)
@@ -103,7 +103,7 @@ class Models:
 
     @property
     def admitted(self) -> bool:
-        """Whether every input is certain to lie in its bounds and inside its clip, and the states in the domain."""
+        """True if every input is certain to lie in its bounds and inside its clip, and the states in the domain."""
         return self.stays and bool(np.all(np.linalg.norm(self.inputs.A, axis=1) + self.inputs.curve < self.inputs.room))
 
 
@@ -122,8 +122,8 @@ class _Layer:
 
 @dataclass(frozen=True, slots=True)
 class _Policy:
-    """Of the outputs before scaling: gradients (m, k), Q and K in their basis; their errors are `shares` (m, N) of
-    those that R, N rows, bounds."""
+    """The outputs before scaling: gradients (m, k), Q and K in their basis; their errors are `shares` (m, N) of the
+    errors that R, N rows, bounds."""
 
     G: Array
     Q: Array
@@ -152,7 +152,7 @@ class Driven:
     def models(
         self, F: Sequence[Jet | RangedJet], number: int, spread: Spread | None = None, stays: bool = True
     ) -> Models:
-        """Those with these components, which are of several balls, on the one of this number."""
+        """The models with these components, which are of several balls, on the ball of this number."""
         form, B = basis(self.G.shape[1]), np.concatenate([v.B for v in F])
         a, Q, K, E = (np.array([getattr(v, part)[number] for v in F]) for part in ("a", "Q", "K", "E"))
         inputs = Inputs(self.G, form.matrices(self.Q), form.forms(self.K), self.curve, self.room, B)
@@ -283,8 +283,8 @@ def paths(loop: ClosedLoop, at: Array | None = None, resting: bool = True) -> Pa
 
 
 def _room(loop: ClosedLoop, u: Array) -> Array:
-    """How far inputs may move from u: inside the clip, which has no second derivative at its corners, and within the
-    bounds."""
+    """The distance that inputs may move from u inside the clip, which has no second derivative at its corners, and
+    within the bounds."""
     network, bounds = loop.network, loop.system.input_bounds
     room = np.full(len(u), np.inf)
     if network.clip is not None:

@@ -1,13 +1,13 @@
 """Jets on a ball where something is uncertain: value and gradient are affine in it, all else is as at its worst.
 
 In a cell of the box of ranges each quantity is its middle plus half its width times y_j in [-1, 1]; the length of a
-period may be one more of them. What decides a stiff loop is how the gradients of F move with y: they move in directions
-that the decay can afford, which a norm of them does not know.
-So `v(0) = c + moves.y` within `error`, the gradient is `a + turns.y` within `slack`, and what moves in the
-second and third order, where the ball is what makes it small, is part of E (checker/FORMAT.md, cells).
+period may be one more of them. A stiff loop is decided by the way the gradients of F move with y: they move in
+directions that the decay can afford, which a norm of them does not know.
+So `v(0) = c + moves.y` within `error`, the gradient is `a + turns.y` within `slack`, and the motion of the second and
+third order, which the ball makes small, is part of E (checker/FORMAT.md, cells).
 
-An error without a y_j is also what a quantity is that may differ from place to place, and what a state is that is only
-known to be near another.
+A quantity that may differ from place to place, and a state that is only known to be near another, are errors without
+a y_j.
 """
 
 from __future__ import annotations
@@ -59,19 +59,19 @@ class RangedJet:
 
     @property
     def away(self) -> Array:
-        """How far v(0) may be from c, (M,)."""
+        """The largest distance of v(0) from c, (M,)."""
         return np.asarray(np.sum(np.abs(self.moves)) + self.error)
 
     @property
     def tilt(self) -> Array:
-        """How far y may turn the gradient, (M,)."""
+        """The largest turn of the gradient by y, (M,)."""
         if not len(self.turns):
             return np.zeros_like(self.slack)
         return np.asarray(np.sum(np.linalg.norm(self.turns, axis=2), axis=0))
 
     @property
     def turned(self) -> Array:
-        """How far the gradient may be from a, (M,)."""
+        """The largest distance of the gradient from a, (M,)."""
         return self.tilt + self.slack
 
     @property
@@ -80,7 +80,7 @@ class RangedJet:
 
     @property
     def sizes(self) -> Sizes:
-        """For every value of what is uncertain."""
+        """Bounds for every value of the uncertain quantities."""
         found = sizes(self.a, self.Q, self.K, self.rest)
         return replace(found, slope=found.slope + self.turned)
 
@@ -94,7 +94,7 @@ class RangedJet:
         return abs(self.c) + self.away
 
     def _spread(self, size: Sizes) -> Array:
-        """What Q, K and the errors e_j come to together."""
+        """The sizes of Q, K and the errors e_j added up."""
         e = np.linalg.norm(of_inputs(self.B, self.errors, self.E), axis=1)
         return np.asarray(size.bend + size.twist + e)
 
@@ -267,7 +267,7 @@ _FUNCTIONS = {"sqrt": _sqrt, "exp": _exp, "tanh": _tanh, "atan": _atan, "sin": _
 
 
 class RangedJets(Algebra[RangedJet]):
-    """Such jets on M balls, in k variables and N uncertain quantities, with the errors that they share."""
+    """Ranged jets on M balls, in k variables and N uncertain quantities, with the errors that they share."""
 
     def __init__(self, M: int, k: int, N: int, errors: Array) -> None:
         b = basis(k)

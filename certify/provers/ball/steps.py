@@ -1,4 +1,4 @@
-"""Models of a step on a ball around the origin, in cells of what is uncertain: G, by which V's increment is decided.
+"""Models of a step on a ball around the origin, in cells of the ranges: G, by which V's increment is decided.
 
 G is F itself in continuous time, F - x in discrete time, and where the input is held over h the mean of f over the
 period: `x_1 + h x_2 + ... + h^(r-1) x_r` by the power series of the solution, whose last coefficient is taken at states
@@ -28,7 +28,7 @@ _ATTEMPTS, _FURTHER = 4, 1.25  # at how far the states move in a period, each fr
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """What the closed loop does in a step.
+    """The closed loop's map over a step.
 
     Parameters
     ----------
@@ -50,11 +50,11 @@ class Steps:
 
     @property
     def is_plain(self) -> bool:
-        """Whether G is F, and nothing is uncertain."""
+        """True if G is F and nothing is uncertain."""
         return not self.longest and not self.known.loop.system.ranges
 
     def models(self, J: Array, cells: Sequence[Cell], reach: Array) -> list[Models]:
-        """Of G on the ball x = J d for each cell; no state of interest there is larger than `reach`, (n,)."""
+        """The models of G on the ball x = J d for each cell; no state of interest there exceeds `reach`, (n,)."""
         return self.models_on(J[None], cells, reach[None])[0]
 
     def models_on(self, balls: Array, cells: Sequence[Cell], reach: Array) -> list[list[Models]]:
@@ -63,7 +63,7 @@ class Steps:
             return [[models] for models in self.known.models_on(balls)]
         driven, sample = [self.known.driven(J) for J in balls], self.known.loop.system.sample
         walks = [_Walk(self, balls, driven, cell) for cell in cells]
-        # what comes after x_1 is of the whole ranges, and so the same for every cell
+        # the terms after x_1 hold for the whole ranges, and so are the same for every cell
         later = None if sample is None else _later(walks[0], self.order, sample, reach)
         in_cells = [self._in_cell(walk, driven, later) for walk in walks]
         return [list(of_ball) for of_ball in zip(*in_cells, strict=True)]
@@ -87,7 +87,7 @@ class Steps:
 
 
 def steps_of(known: Paths, at_rest: bool, order: int) -> Steps:
-    """Those of a loop."""
+    """The steps of a loop."""
     loop = known.loop
     return Steps(known, at_rest, order, loop.system.uncertain_dynamics() if loop.system.ranges else loop.dynamics)
 
@@ -109,7 +109,7 @@ class _Walk:
         return self.steps.known.loop
 
     def states(self, near: tuple[Array, Array] | None = None) -> list[RangedJet]:
-        """x, or what is as `near` to it: v(0) and gradients within these, (n, N) each."""
+        """x, or a state as `near` to it: v(0) and gradients within these, (n, N) each."""
         rows = np.swapaxes(self.balls, 0, 1)
         if near is None:
             return [self.algebra.state(0.0, of_state) for of_state in rows]
@@ -152,7 +152,7 @@ class _Later:
 
 
 def _later(walk: _Walk, order: int, sample: Interval, reach: Array) -> _Later:
-    """Of a walk in any cell; without finite numbers where the states are not known to stay anywhere."""
+    """The later terms of a walk in any cell, not finite if the states are not known to stay anywhere."""
     hi = float(sample[1])
     moved = _within_a_period(walk, hi)
     if moved is None:
@@ -173,8 +173,9 @@ def _later(walk: _Walk, order: int, sample: Interval, reach: Array) -> _Later:
 
 
 def _within_a_period(walk: _Walk, hi: float) -> tuple[tuple[Array, Array], Array] | None:
-    """Bounds, (n, N), of how far v(0) and gradients of the states move from x within a period, and their rates; None if
-    none is found on some ball. What is found for one ball does not depend on the others."""
+    """Bounds, (n, N), of how far v(0) and gradients of the states move from x within a period, and their rates.
+
+    None if none is found on some ball. The bounds of one ball do not depend on the others."""
     balls, n, _ = walk.balls.shape
     at_rest, far, along = walk.steps.at_rest, np.zeros((n, balls)), np.zeros((n, balls))
     for _ in range(_ATTEMPTS + 1):

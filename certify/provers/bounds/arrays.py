@@ -33,7 +33,7 @@ def chosen(mask: Mask) -> Index:
 
 
 def is_whole(index: Index, count: int) -> bool:
-    """Whether these are all of so many boxes, in order."""
+    """True if these are all of so many boxes, in order."""
     return len(index) == count and (not count or bool(index[0] == 0 and index[-1] == count - 1))
 
 

@@ -1,6 +1,6 @@
-"""What the plant does in a sampling period, while its input is held, in Taylor models on boxes.
+"""The plant's motion in a sampling period, while its input is held, in Taylor models on boxes.
 
-Wanted is G = (phi(h) - x)/h, the mean of f over the period, for every period in a range and whatever the uncertain
+G = (phi(h) - x)/h, the mean of f over the period, is wanted for every period in a range and whatever the uncertain
 quantities do in it. The series in time is taken along x, but for its last coefficient, which is the remainder of
 Taylor's formula and has to hold all along the solution: it is taken along an enclosure of that, found beforehand by the
 argument that a solution cannot be the first to leave what it would need longer than a period to leave (Moore 1966;
@@ -42,7 +42,7 @@ class Flow:
     ----------
     dynamics : f, in the order of the states.
     sample : the shortest and the longest period, in units of time.
-    order : of the series in time, at least 1.
+    order : order of the series in time, at least 1.
     """
 
     def __init__(self, dynamics: Sequence[Expression], sample: Interval, order: int) -> None:

@@ -35,7 +35,7 @@ class _Prepared:
     """A layer with the memory that it works in.
 
     `h` and `errors` come in as matrices (K, ...), `y` and `through` are what W and |W| make of them. `error`, the fresh
-    errors and the older ones (H, 2, B), and `slope` (H, B) go on into the backward pass. `ranges`, `chords` and `bend`
+    errors and the older ones (H, 2, B), and `slope` (H, B) enter the backward pass. `ranges`, `chords` and `bend`
     are the arguments of these kernels.
     """
 
@@ -124,7 +124,7 @@ class FusedLayers:
         return self._form.copy(), self._error_backwards(loops, x_error), share / share.sum(0)
 
     def _error_backwards(self, loops: Loops, x_error: Array) -> Array:
-        """What all errors on the way add to the outputs (m, B), by the magnitudes of their weights."""
+        """The sum of all errors on the way in the outputs (m, B), by the magnitudes of their weights."""
         self._result[:] = 0.0
         self._weights[0][: len(self.scale)] = np.diag(self.scale)[:, :, None]
         for each, weight, on in zip(reversed(self._layers), self._weights, self._weights[1:], strict=False):

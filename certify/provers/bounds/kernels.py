@@ -1,4 +1,4 @@
-"""What is done with the numbers of a batch of boxes between two products of matrices: formulas, and loops over them.
+"""The formulas for a batch of boxes between two products of matrices, and loops over them.
 
 A formula is written once, for arrays and for single numbers alike: `vectors.py` gives it the arrays of numpy, and the
 loops here, which `compiled.py` compiles, a number each. Both do the same IEEE operations in the same order, so that
@@ -32,9 +32,9 @@ from certify.provers.bounds.tape import (
     TANH,
 )
 
-Line: TypeAlias = NDArray[np.float64]  # of one dimension, in C's order
-Plane: TypeAlias = NDArray[np.float64]  # of two
-Block: TypeAlias = NDArray[np.float64]  # of three
+Line: TypeAlias = NDArray[np.float64]  # one dimension, in C's order
+Plane: TypeAlias = NDArray[np.float64]  # two dimensions
+Block: TypeAlias = NDArray[np.float64]  # three dimensions
 Steps: TypeAlias = NDArray[np.int64]
 Real: TypeAlias = Any  # a number where it is compiled, else an array too
 Two: TypeAlias = tuple[Real, Real]
@@ -47,7 +47,7 @@ LOST = 2.0**-500  # more than a 2-norm loses where squares underflow
 
 
 def _number_by_number(function: Callable[[float], float]) -> Callable[[Real], Real]:
-    """A function of libm on an array, where numpy's own may differ by a rounding from what is compiled."""
+    """A function of libm on an array, because numpy's own may differ by a rounding from the compiled one."""
 
     def at(v: float) -> float:
         try:
@@ -312,8 +312,8 @@ def bend(
 
 
 def backwards(weight: Block, errors: Block, slope: Plane, result: Plane) -> None:
-    """Add what a layer's fresh errors, `errors[:, 0]` of (H, 2, B), weigh in the outputs (m, B), whose weights
-    (H, m, B) then go on through the slopes of tanh."""
+    """Add what a layer's fresh errors, `errors[:, 0]` of (H, 2, B), weigh in the outputs (m, B), and multiply their
+    weights (H, m, B) by the slopes of tanh."""
     units, outputs, batch = weight.shape
     total = np.zeros((outputs, batch))
     for i in range(units):

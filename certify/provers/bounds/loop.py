@@ -1,4 +1,4 @@
-"""What a loop's equations are evaluated at on boxes: its states, inputs and uncertain quantities as Taylor models."""
+"""A loop's states, inputs and uncertain quantities as Taylor models on boxes, at which its equations are evaluated."""
 
 from __future__ import annotations
 

@@ -63,8 +63,8 @@ class _Units:
 
 @dataclass(frozen=True, slots=True)
 class _Bent:
-    """What the tanh of a layer's units was evaluated with: their models a, t = tanh(c), the products g_i g_j as rows of
-    a quadratic part, and G, Q of them; `rest` is the remainder of tanh(a)."""
+    """The terms of the tanh of a layer's units: their models a, t = tanh(c), the products g_i g_j as rows of a
+    quadratic part, and G, Q of them; `rest` is the remainder of tanh(a)."""
 
     a: _Units
     t: Array
@@ -88,7 +88,7 @@ class NeuralModels:
 
     @property
     def share(self) -> Array:
-        """How much each axis (n, B) spreads the units of the first layer that err most, in all 1."""
+        """The share of each axis (n, B) in the spread of the units of the first layer that err most, in all 1."""
         return self._share(self.layers[:1], 0.0)
 
     def _share(self, first: Sequence[_Bent], more: Array | float) -> Array:
@@ -100,8 +100,8 @@ class NeuralModels:
         return np.asarray(share / (share.sum(0) + TINY))
 
     def along(self, F: Sequence[Taylor], index: Index) -> tuple[Taylor, Array]:
-        """N'F on the boxes `index`, F being what it is there, and `share` (n, B): how much each axis spreads the units
-        of the first layer that err most."""
+        """N'F on the boxes `index`, where F is given, and `share` (n, B): how much each axis spreads the units of the
+        first layer that err most."""
         layers = self.layers if is_whole(index, len(self.value.c)) else [layer.at(index) for layer in self.layers]
         y, size = _packed(F)
         errors: Array | float = 0.0
@@ -126,7 +126,7 @@ class NeuralEnclosure:
         reach = self.magnitudes[-1]
         for magnitude in reversed(self.magnitudes[1:-1]):
             reach = reach @ magnitude
-        self.reach = reach.T  # how far, at most, N moves with a unit of the first layer (units, 1)
+        self.reach = reach.T  # the most that N moves with a unit of the first layer (units, 1)
 
     def least(self, x: Array, error: Array, level: float) -> Array:
         """A lower bound of N (B,), good where boxes are large; -inf where N is not above the level at the centre."""
@@ -155,7 +155,7 @@ class NeuralEnclosure:
 
 
 def _block(j: int) -> slice:
-    """Where the coefficients of d_0 d_j to d_j d_j are."""
+    """The rows with the coefficients of d_0 d_j to d_j d_j."""
     return slice(j * (j + 1) // 2, (j + 1) * (j + 2) // 2)
 
 
@@ -194,7 +194,7 @@ def _composed(a: _Units, square: Array, f0: Array, f1: Array, f2: Array, rest: A
 
 
 def _tanh(a: _Units) -> tuple[_Bent, _Units, Array]:
-    """tanh of a, what it was evaluated with, and a bound of |c| + G + Q of it."""
+    """tanh of a, its terms, and a bound of |c| + G + Q of it."""
     g, N = a.g, a.symbols
     square = np.empty((N * (N + 1) // 2, *g.shape[1:]))
     for j in range(N):

@@ -28,11 +28,11 @@ class SymbolicModels:
 
     @property
     def share(self) -> Array:
-        """How much each axis (n, B) is charged with a remainder: all of them the same."""
+        """The share of a remainder that each axis (n, B) is charged with: all of them the same."""
         return np.full_like(self.value.g, 1 / self.function.n)
 
     def along(self, F: Sequence[Taylor], index: Index) -> tuple[Taylor, Array]:
-        """N'F on the boxes `index`, F being what it is there, and `share` (n, B), the same for each axis."""
+        """N'F on the boxes `index`, where F is given, and `share` (n, B), the same for each axis."""
         n, symbols = self.function.n, len(F[0].g)
         more = np.zeros((symbols - n, len(index)))
         zeros = np.zeros((symbols, symbols, len(index)))

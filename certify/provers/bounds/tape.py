@@ -31,7 +31,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """What stands for a Taylor model: the result of a step, or an input, of which no step is made."""
+    """A placeholder of a Taylor model: the result of a step, or an input, of which no step is made."""
 
     steps: list[Step] = field(repr=False)
     number: int
@@ -75,7 +75,7 @@ class Value:
 
 
 class Recording(ConstantsLast[Value]):
-    """The arithmetic that records what is done with its values."""
+    """The arithmetic that records each operation on its values."""
 
     def __init__(self, steps: list[Step]) -> None:
         self._steps = steps
@@ -100,7 +100,7 @@ class Tape:
 
 def recorded(inputs: int, calculation: Callable[[Sequence[Value], Recording], Value]) -> Tape:
     """The tape of a calculation with that many inputs, whose result is not one of them."""
-    steps = [Step(CONSTANT, 0, 0)] * inputs  # which are never played
+    steps = [Step(CONSTANT, 0, 0)] * inputs  # they are never played
     result = calculation([Value(steps, i) for i in range(inputs)], Recording(steps))
     needed = _needed(steps, result.number)
     last = {number: at for at in needed for number in (steps[at].left, steps[at].right)}

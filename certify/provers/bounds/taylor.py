@@ -20,7 +20,7 @@ from certify.provers.bounds.arrays import Array, Index, product
 
 EPS = 2.0**-50
 TINY = 2.0**-900
-EXP_END = 64.0  # of the exponent, beyond which the checker knows nothing of exp
+EXP_END = 64.0  # the exponent beyond which the checker knows nothing of exp
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +122,7 @@ class Taylor:
 
 
 class Arithmetic(Protocol):
-    """What models have in common with what stands for them."""
+    """The operations that models and their placeholders share."""
 
     def __add__(self, other: Self, /) -> Self: ...
 

@@ -1,4 +1,4 @@
-"""How much work a pass has taken, and how much it probably still will."""
+"""The work that a pass has taken, and an estimate of the rest."""
 
 from __future__ import annotations
 

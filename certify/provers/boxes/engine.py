@@ -21,12 +21,12 @@ from certify.provers.execution import Runner
 from certify.provers.falsify import Band, Witness, survey
 
 Array = NDArray[np.float64]
-_SHARE = 0.6  # of the effort, for finding c2 before c0
-_FOR_BALL = 0.5  # of the effort, for a ring from a ball, and of that for the ball
-_EQUAL = 0.01  # of a level
-_NOTHING = 1e-9  # of a level: no smaller floor is looked for
-_ABOVE = (1.5, 1.1)  # of the least floor, in few and in many states, where leaves do not lower it any more
-_TRIES = 4  # inner levels from which c2 is looked for, each with half of what is left of the effort
+_SHARE = 0.6  # share of the effort for finding c2 before c0
+_FOR_BALL = 0.5  # share of the effort for a ring from a ball, and of that for the ball
+_EQUAL = 0.01  # share of a level
+_NOTHING = 1e-9  # share of a level: no smaller floor is looked for
+_ABOVE = (1.5, 1.1)  # factors of the least floor, in few and in many states, where leaves do not lower it any more
+_TRIES = 4  # inner levels from which c2 is looked for, each with half of the effort that is left
 
 
 class BoundsEngine(Engine):
@@ -145,7 +145,7 @@ class BoundsEngine(Engine):
 
 
 def _is_better(one: Proof, other: Proof) -> bool:
-    """Whether a practical claim is about a larger set, or about nearly the same with a lower floor."""
+    """True if a practical claim is about a larger set, or about nearly the same with a lower floor."""
     a, b = one.claim, other.claim
     if a is None or a.floor is None or b is None or b.floor is None:
         return a is not None
@@ -155,7 +155,7 @@ def _is_better(one: Proof, other: Proof) -> bool:
 
 
 def _is_ample(proof: Proof, target: float) -> bool:
-    """Whether a practical claim is about all that is within reach, with a floor that is next to nothing."""
+    """True if a practical claim is about all that is within reach, with a floor that is next to nothing."""
     claim = proof.claim
     if claim is None or claim.floor is None:
         return False
@@ -207,7 +207,7 @@ class _Outwards:
 
     def restore(self, state: SearchState) -> None:
         if self.inner is None or self.inner < state.inner:
-            raise InputError("the search cannot be gone on with: the local set is smaller here; run without --resume.")
+            raise InputError("the search cannot be resumed: the local set is smaller here; run without --resume.")
         if self.ring is None or state.outer <= self.inner:
             return  # the local set is as large as what the search could still reach, or larger
         self.ring.restore(state)

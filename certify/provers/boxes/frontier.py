@@ -38,7 +38,7 @@ class Frontier:
         self._away: list[tuple[Array, NDArray[np.uint32]]] = []  # keys, ascending, and numbers
 
     def copy(self) -> Frontier:
-        """The same boxes; what is done with one of the two does not show in the other."""
+        """The same boxes; a change of one of the two does not show in the other."""
         other = copy.copy(self)
         other._away = list(self._away)  # its arrays are never written to
         return other
@@ -95,7 +95,7 @@ class Frontier:
         return min((float(lowest[0]) for lowest, _ in self._away), default=np.inf)
 
     def _cut_away(self, level: float) -> None:
-        """Drop what was put away and lies above `level`."""
+        """Drop the boxes that were put away and lie above `level`."""
         if any(lowest[-1] > level for lowest, _ in self._away):
             kept = [(lowest[k], number[k]) for lowest, number in self._away for k in [lowest <= level]]
             self._away = [chunk for chunk in kept if len(chunk[0])]

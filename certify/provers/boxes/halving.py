@@ -11,8 +11,7 @@ from certify.provers.boxes.partition import Partition
 
 
 class Undecided(Protocol):
-    """What is asked of a rule's answer for boxes: `proved` (B,), `bound` (B,), and `score` (n, B), what each axis adds
-    to the bound."""
+    """A rule's answer for boxes: `proved` (B,), `bound` (B,), and `score` (n, B), which each axis adds to the bound."""
 
     @property
     def proved(self) -> Mask: ...

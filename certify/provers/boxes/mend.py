@@ -1,4 +1,4 @@
-"""What to do about a leaf that the checker refuses: split it again, or keep the level below it.
+"""Remedies for a leaf that the checker refuses: split it again, or keep the level below it.
 
 Producer and checker round in their own ways, and a bound that is barely negative for the one may be barely positive for
 the other. Neither remedy starts anew: the tree stays, with one leaf more finely cut, or with a lower level.

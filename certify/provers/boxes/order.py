@@ -1,9 +1,9 @@
-"""How long the series in time is taken on boxes, where an input is held: by what a few points say.
+"""The order of the series in time on boxes, where an input is held: a few points decide it.
 
-A longer series costs more a box and leaves less that no splitting takes away. What counts is how far D' is from 0 by
-the bound at a point, because boxes must be as small as that allows: their number grows about as its power -n/2. Most
-boxes lie where that is worst, and so those places are looked for. Costs are fixed numbers and not measured, so that a
-run gives the same certificate each time.
+A longer series costs more for each box and leaves a smaller remainder, which no splitting takes away. The distance of
+D' from 0 by the bound at a point counts, because boxes must be as small as it allows: their number grows about as its
+power -n/2. Most boxes lie where that is worst, and so those places are looked for. Costs are fixed numbers and not
+measured, so that a run gives the same certificate each time.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from certify.certificates.claims import Problem
 from certify.provers.boxes.rule import VdotBound
 
 Array = NDArray[np.float64]
-_COSTS = {2: 1.0, 3: 1.5, 4: 2.1}  # of a box, by the order
+_COSTS = {2: 1.0, 3: 1.5, 4: 2.1}  # cost of a box relative to order 2, by the order
 _POINTS, _WORST, _ROUNDS = 64, 8, 4  # points of a round, and how many of them the next one starts from
-_LEAST = 1e-2  # of the decay by the longest series: below it a point cannot be had at any price
+_LEAST = 1e-2  # share of the decay by the longest series: below it a point cannot be had at any price
 
 
 def choose_order(problem: Problem, T: Array, inner: float, outer: float) -> int:

@@ -1,7 +1,7 @@
 """The partition that a pass grows, bounded in memory.
 
 A split is five bytes (parent and axis), because everything else follows from them: the certificate is written from it,
-and corners are rebuilt by replaying the same midpoints. What was grown elsewhere comes as the bytes of its trees.
+and corners are rebuilt by replaying the same midpoints. Trees that were grown elsewhere come as bytes.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from certify.errors import CertificateFormatError
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 LEAF = 255
-MAX_DEPTH = 4096  # of a certificate's tree
-MOST_SPLITS = 40_000_000  # what a certificate can hold, and two gibibytes
+MAX_DEPTH = 4096  # the most of a certificate's tree
+MOST_SPLITS = 40_000_000  # the most that a certificate can hold, and two gibibytes
 _ROUNDING = 1e-12  # relative, of a width
 OPEN, LOOK = 254, 253  # leaves of a tree that grows still: not bounded yet; to be looked at by whoever asked for it
 
@@ -67,7 +67,7 @@ class Partition:
         return np.arange(2 * first + self._whole, 2 * self.splits + self._whole)
 
     def halvings(self) -> Numbers:
-        """How often each axis was halved, (n,)."""
+        """The number of halvings of each axis, (n,)."""
         return np.bincount(self._axes[: self.splits], minlength=len(self.root))
 
     def leaves(self) -> Numbers:
@@ -107,7 +107,7 @@ class Partition:
         return np.argsort(self._place()[boxes])
 
     def _place(self) -> NDArray[np.uint32]:
-        """Where each box is in preorder."""
+        """Each box's place in preorder."""
         calls = [slice(a, b) for a, b in zip(self._calls[:-1], self._calls[1:], strict=True)]
         whole = self._whole
         size = np.ones(2 * self.splits + whole, dtype=np.uint32)
@@ -122,7 +122,7 @@ class Partition:
         return place
 
     def mark(self) -> tuple[int, int]:
-        """Where it stands, for `back_to`."""
+        """The partition's present size, for `back_to`."""
         return self.splits, len(self._calls)
 
     def back_to(self, mark: tuple[int, int]) -> None:
@@ -187,7 +187,7 @@ def _halve(lo: Array, hi: Array, column: Numbers, axis: Numbers, upper: NDArray[
 
 
 def _links(nodes: NDArray[np.uint8], n: int, count: int) -> tuple[Numbers, Numbers]:
-    """Where each of so many trees begins (count,), and for each split where its upper half does.
+    """The node at which each of so many trees begins (count,), and for each split that of its upper half.
 
     Before a node in preorder, a tree has as many boxes open as splits less leaves so far: the upper half is the next
     node before which there are as many as before the split.

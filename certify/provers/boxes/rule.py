@@ -10,7 +10,7 @@ point where {V <= c2} touches {D' >= 0} the two gradients are parallel, and the 
 order: close to the largest level this saves tenfold in boxes.
 
 A bound over a step keeps something that no splitting takes away, because a solution leaves each box, however small.
-Whether a box's centre can be proved at all is therefore asked of the centre alone, before the box is split for ever.
+The centre of a box is therefore bounded alone: if it cannot be proved, no splitting would help.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from certify.provers.boxes.form import FormBound
 _SLACK = 1e-9  # relative distance from the inner level at which a box counts as inside
 _ENDS = 1e-11  # relative distance kept from the ends of the domain
 _EACH = 2.0  # operations of an entry of a model
-_PIECES = 2  # of the policy, at most, in one of a batch
-_POINT = 2.0**-20  # of a box: what is left of it around its centre
+_PIECES = 2  # the most pieces of the policy in one of a batch
+_POINT = 2.0**-20  # share of a box that is left of it around its centre
 
 
 class BoxBounds(NamedTuple):
-    """What is known of each box: `proved` (B,), `bound` of D' (B,), `score` (n, B): what each axis adds to the bound,
-    `violated` (B,): a condition fails at the centre, or cannot be proved there; `smooth` (B,): what is asked inside
-    the inner level holds."""
+    """Bounds of each box: `proved` (B,), `bound` of D' (B,), `score` (n, B): what each axis adds to the bound,
+    `violated` (B,): a condition fails at the centre, or cannot be proved there; `smooth` (B,): the conditions inside
+    the inner level hold."""
 
     proved: Mask
     bound: Array
@@ -65,8 +65,8 @@ class VdotBound:
     """Upper bounds of D', which is Vdot in continuous time, and bounds of V, over boxes in the coordinates z.
 
     With `inside`, a box on which V is below the inner level is proved if F is enclosed there and the inputs keep their
-    bounds, and where time has steps if none leads from it to V of at least that level; otherwise such a box is
-    nobody's concern here. `order` is that of the series in time where the input is held.
+    bounds, and, if time has steps, no step leads from it to V of at least that level; without `inside` nothing is
+    required there. `order` is that of the series in time where the input is held.
     """
 
     def __init__(self, problem: Problem, T: Array, inside: bool = False, order: int = 2) -> None:
@@ -86,9 +86,9 @@ class VdotBound:
         self.flow = None if sample is None else Flow(self.dynamics, sample, order)
         self.order = 1 if self.flow is None else order
         self.step = loop.step
-        self.tape: Tape | None = None  # of D, recorded when it is first played
+        self.tape: Tape | None = None  # the tape of D, recorded when it is first played
         self.ends = np.array([[float(end) for end in pair] for pair in loop.system.domain]).T[:, :, None]
-        self.extent = (np.sqrt(np.diag(np.linalg.inv(self.P))) * (1 + 1e-9))[:, None]  # of {V <= 1}
+        self.extent = (np.sqrt(np.diag(np.linalg.inv(self.P))) * (1 + 1e-9))[:, None]  # half-widths of {V <= 1}
 
     def levels(self, lo: Array, hi: Array) -> tuple[Array, Array]:
         """Bounds of V from below and above on boxes (n, B)."""
@@ -137,8 +137,8 @@ class VdotBound:
             decrease = decrease + self.V.model(centre, radius, decrease).scaled(2 * self.rate)
         bound, excess = upper_bound(decrease)
         smooth = np.isfinite(bound)  # a component of F that is not enclosed leaves a NaN in the sum over all
-        # At the box's centre, and for the worst values of what is uncertain, only the inputs' errors, what is of second
-        # order in all these, and the remainder are left.
+        # At the box's centre, and for the worst values of the uncertain quantities, only the inputs' errors, the terms
+        # of second order in all these, and the remainder are left.
         known = n + self.system.m
         doubt = np.abs(decrease.g[n:known]).sum(0) + np.abs(decrease.Q[n:, n:]).sum((0, 1)) + decrease.r
         violated = decrease.c + np.abs(decrease.g[known:]).sum(0) - doubt >= 0
@@ -146,7 +146,7 @@ class VdotBound:
         proved = bound < 0
         if self.inside and self.step == 0:
             proved = smooth & (proved | (self.levels(lo, hi)[1] < inner * (1 - _SLACK)))
-        # What the inputs' errors and the remainder add is charged to the axes that spread the network.
+        # The inputs' errors and the remainder are charged to the axes that spread the network.
         extra = excess[n:].sum(0) + decrease.r
         score = excess[:n] + share * extra
         score = np.where(np.isfinite(score), score, np.abs(slopes_x).sum(0))
@@ -172,7 +172,7 @@ class VdotBound:
             if self.tape is None:
                 count = self.system.n + self.system.m + len(self.system.uncertain)
                 self.tape = recorded(count, self._at_rates)
-            how = loops(0)  # what the policy asks for counts
+            how = loops(0)  # the policy's own output counts
             return played(how, self.tape, self.system, x, error, mid, slopes, wide), None
         states, inputs, quantities = loop_models(self.system, x, error, mid, slopes, wide, self.flow.symbols)
         here = list(states.values())
@@ -202,7 +202,7 @@ class VdotBound:
         return algebra.total(None, terms)
 
     def _in_domain(self, states: list[Taylor], least: Array, most: Array, outer: float) -> Mask:
-        """Where (B,) the solution from V <= outer stays inside the domain over the longest period."""
+        """True (B,) if the solution from V <= outer stays inside the domain over the longest period."""
         centre = np.stack([model.c for model in states])
         reach = np.stack([model.radius() for model in states])
         wide = outer**0.5 * self.extent
@@ -250,8 +250,8 @@ class VdotBound:
 
 
 def input_bounds_kept(system: System, mid: Array, slopes: Array, wide: Array) -> list[tuple[Mask, Mask]]:
-    """For each input, enclosed by `mid + slopes.d` within `wide`, on which boxes (B,) it lies in its bounds, and on
-    which it certainly leaves them at the centre."""
+    """Two masks (B,) for each input, enclosed by `mid + slopes.d` within `wide`: it lies in its bounds on the box, and
+    it certainly leaves them at the centre."""
     reach, kept = np.abs(slopes).sum(1) + wide + 1e-11 * np.abs(mid), []
     for j, (low, high) in enumerate(system.input_bounds):
         slack = 1e-11 * (abs(float(low)) + abs(float(high)))
@@ -262,11 +262,11 @@ def input_bounds_kept(system: System, mid: Array, slopes: Array, wide: Array) ->
 
 
 def lessened(bound: Array, decrease: Taylor, gap: Taylor, n: int, most: float = np.inf) -> Array:
-    """The bound (B,) of a model, made tighter where it is not negative by multiples of what is >= 0 where it counts.
+    """The bound (B,) of a model, made tighter where it is not negative by multiples of a gap that is >= 0 in the ring.
 
     Parameters
     ----------
-    gap : the model of that, whose first n symbols are the box coordinates.
+    gap : its model, whose first n symbols are the box coordinates.
     most : the largest multiplier, which is tried too if it is finite.
     """
     scale = gap.r + EPS * sum(gap.norms())

@@ -143,7 +143,7 @@ def _root(problem: Problem, T: Array, level: float) -> Array:
 
 
 class Pass:
-    """A pass that can be asked at any time for what it has proved, and go on."""
+    """A pass that gives at any time what it has proved, and can be continued."""
 
     def __init__(self, sweep: Sweep, root: Array, runner: Runner, rule: VdotBound) -> None:
         self.sweep, self.root, self.runner, self.rule = sweep, root, runner, rule
@@ -155,7 +155,7 @@ class Pass:
         self.boxes = self.proved = 0
         self.covered = True
         self.halvings = 0.0
-        self.lost = ""  # what is said of a cluster that went away
+        self.lost = ""  # a sentence about a cluster that went away
         self._stop = Stop.REQUESTED
         self._account = Account()
         first = np.zeros(1, dtype=np.int64)
@@ -163,7 +163,7 @@ class Pass:
 
     @property
     def done(self) -> bool:
-        """Whether no box is open: the pass has nothing left to gain."""
+        """True if no box is open: the pass has nothing left to gain."""
         return not self._open()
 
     @property
@@ -179,7 +179,7 @@ class Pass:
         return min(self.frontier.least(), math.inf if self.abroad is None else self.abroad.least())
 
     def advance(self, budget: Budget, report: Report | None = None) -> Stop | None:
-        """Take boxes, bound them, give way to violations, halve what is undecided; what ran out, or None if done."""
+        """Take boxes, bound them, give way to violations, halve undecided ones; the limit reached, or None if done."""
         most = self.boxes + budget.boxes
         with self.runner.start(self.rule) as bound, self._elsewhere(budget):
             while not self.done:
@@ -204,7 +204,7 @@ class Pass:
 
     @contextmanager
     def _elsewhere(self, budget: Budget) -> Iterator[None]:
-        """Have boxes grown elsewhere, where that can be; what is out at the end comes back."""
+        """Have boxes grown elsewhere, if that can be; boxes that are out at the end come back."""
         with self.runner.jobs(Subtrees(self.growth)) as jobs:
             if jobs is not None and not self.lost:
                 self.abroad = Abroad(jobs, self.growth, self.partition, budget.batch, budget.least_width)
@@ -236,7 +236,7 @@ class Pass:
         self.abroad = None
 
     def _exchanged(self, bound: Bound, budget: Budget) -> bool:
-        """Send boxes out, and take in what has been grown; False if that is not worth it."""
+        """Send boxes out, and take in grown trees; False if that is not worth it."""
         if self.abroad is None:
             return False
         sweep = self.sweep
@@ -288,7 +288,7 @@ class Pass:
         return len(self.frontier) * math.exp2(min(1000.0, self.halvings))
 
     def settle(self) -> None:
-        """Take the levels that are proved for good: what is open lies outside of them, and needs at most one look."""
+        """Take the levels that are proved for good: open boxes lie outside of them, and need at most one look."""
         self.sweep.inner, self.sweep.outer = self.sweep.reached(self._least())
 
     def state(self) -> SearchState:
@@ -315,10 +315,10 @@ class Pass:
                 np.zeros(1, np.int64), *self.partition.corners(np.zeros(1, np.int64)), state.tree
             )
         except CertificateFormatError as error:
-            raise InputError(f"the search cannot be gone on with: {error}") from error
+            raise InputError(f"the search cannot be resumed: {error}") from error
         fits = sweep.inner >= state.inner and state.outer <= sweep.outer and not len(looked.number)
         if not fits or len(opened.number) != len(state.keys) or np.isnan(state.keys).any():
-            raise InputError("the search cannot be gone on with: it is of another ring.")
+            raise InputError("the search cannot be resumed: it is of another ring.")
         self.frontier = Frontier(self.partition)
         self.frontier.add(opened.lo, opened.hi, state.keys, opened.number)
         sweep.outer, sweep.witness = state.outer, state.witness
@@ -326,7 +326,7 @@ class Pass:
         self._stop = Stop.REQUESTED if state.witness is None else Stop.WITNESS
 
     def proof(self, stop: Stop | None = None) -> RingProof:
-        """What is proved, `stop` being what ran out."""
+        """The ring that is proved; `stop` is the limit that was reached."""
         stop = stop or self._stop
         (inner, outer), witness, covered = self.levels, self.sweep.witness, self.covered and self.done
         if outer <= inner:  # nothing beyond the inner level

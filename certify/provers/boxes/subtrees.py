@@ -1,15 +1,15 @@
-"""Boxes that are grown elsewhere: what is sent, what is done with it there, and what comes back.
+"""Boxes that are grown elsewhere: the job that is sent, the work on it, and the answer.
 
 A job is some open boxes with the levels of the moment; its answer are the bytes of their trees, whose leaves are
 proved, still open, or to be looked at by whoever asked: there a condition fails, or halving has come to its end, and a
 level has to give way, which is not decided elsewhere. Boxes do not know of each other: as long as no level moves, the
-tree is the same whoever grows which, how far, and in which order. A job ends after so many boxes: what it leaves open
-comes back, and is shared out anew. That is all there is of balancing loads.
+tree is the same whoever grows which, how far, and in which order. A job ends after so many boxes; the boxes that it
+leaves open come back and are shared out anew, which balances the loads.
 
-An answer is bytes, and is believed nothing: it must be sealed for its job, lengths, counts and trees must fit, and a
-key that is no number is refused, as is a box that is halved beyond the least width, or an answer that left all boxes as
-they were. What a tree calls proved the checker sees again. An answer that is refused, or never comes, is worked out
-here.
+An answer is bytes and is not believed: it must be sealed for its job, lengths, counts and trees must fit, and a key
+that is no number is refused, as is a box that is halved beyond the least width, or an answer that left all boxes as
+they were. The checker sees again every leaf that a tree calls proved. An answer that is refused, or never comes, is
+worked out here.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ def enough(places: int) -> int:
 
 
 class Growth(ABC):
-    """What a pass knows of its boxes: a bound at its levels, and the order in which they are taken.
+    """A pass's rule for its boxes: a bound at its levels, and the order in which they are taken.
 
     Parameters
     ----------
-    bound : of boxes.
+    bound : the rule that bounds boxes.
     half : (n, 1) half-widths, in which the least width of a box is given.
     """
 
@@ -77,11 +77,11 @@ class Growth(ABC):
 
     @abstractmethod
     def gives_way(self, lo: Array, hi: Array, found: Any) -> Mask:
-        """Which boxes (B,), of corners (n, B), a level has to give way to."""
+        """True for the boxes (B,), of corners (n, B), to which a level has to give way."""
 
     @abstractmethod
     def opened(self, halves: Halves, found: Any, key: Array) -> tuple[Mask, Array]:
-        """Which halves (H,) still have to be decided, and the keys (H,) of all, from those of the batch (B,)."""
+        """True for halves (H,) that still have to be decided, and the keys (H,) of all, by those of the batch (B,)."""
 
 
 class Subtrees:
@@ -116,14 +116,14 @@ class Subtrees:
 
 
 def _seal(job: bytes, counts: tuple[int, ...], body: bytes) -> bytes:
-    """What ties an answer to its job: a damaged answer, or another job's, has another one."""
+    """The hash that ties an answer to its job: a damaged answer, or another job's, has another one."""
     return hashlib.blake2b(job + struct.pack("<4Q", *counts) + body, digest_size=16).digest()
 
 
 def _grow(
     growth: Growth, partition: Partition, frontier: Frontier, now: Boxes, found: Any, least_width: float
 ) -> Index:
-    """Halve what is not proved; the numbers of the boxes that somebody else has to look at."""
+    """Halve the boxes that are not proved; the numbers of those that somebody else has to look at."""
     look = growth.gives_way(now.lo, now.hi, found) & ~found.proved
     rest = type(found)(*(value.compress(~look, -1) for value in found))
     lo, hi, number, key = (value.compress(~look, -1) for value in now)
@@ -134,7 +134,7 @@ def _grow(
 
 
 class Answer(NamedTuple):
-    """What came back: boxes bounded and proved, and the bytes of the trees with the keys of their open leaves."""
+    """The answer to a job: boxes bounded and proved, and the bytes of the trees with the keys of their open leaves."""
 
     boxes: int
     proved: int
@@ -161,7 +161,7 @@ def _read(job: bytes, answer: bytes) -> Answer:
     trees, known = body[:length], np.frombuffer(body[length:])
     if np.isnan(known).any() or trees.count(OPEN) != opened:
         raise CertificateFormatError("an answer must have a number for each open leaf.")
-    # Each node is bounded once at most, and what is proved is a leaf.
+    # Each node is bounded once at most, and a proved one is a leaf.
     if not proved <= boxes <= length or proved > trees.count(LEAF):
         raise CertificateFormatError(f"{boxes} boxes bounded and {proved} proved are not those of {length} nodes.")
     if opened == length:
@@ -215,7 +215,7 @@ class Abroad:
         return numbers, np.concatenate([np.zeros(0), *(boxes.key for boxes in held)])
 
     def is_worth(self, frontier: Frontier) -> bool:
-        """Whether to go on elsewhere; if nobody is there, what was out comes back into the frontier."""
+        """True if work elsewhere pays; if nobody is there, boxes that were sent out come back into the frontier."""
         places = self.jobs.places
         if not places:
             self.recall(frontier)

@@ -33,7 +33,7 @@ _STATUS: Mapping[str, Status] = {"unsat": "unsat", "delta-sat": "delta-sat"}
 _MEANING: Mapping[Status, str] = {
     "unsat": "the condition holds, on dReal's word",
     "delta-sat": "the perturbed formula holds within delta; no violation was shown",
-    "timeout": "no answer in time",
+    "timeout": "no answer before the limit",
     "failed": "no answer",
 }
 _EXACT = Context(prec=2000, Emax=10**6, Emin=-(10**6))
@@ -51,7 +51,7 @@ _INSTALL = (
 
 @dataclass(frozen=True, slots=True)
 class Backend:
-    """Where dReal is: `kind` is "module" or "binary"; `command` starts it."""
+    """An installed dReal: `kind` is "module" or "binary"; `command` starts it."""
 
     kind: Literal["module", "binary"]
     command: tuple[str, ...]
@@ -60,7 +60,7 @@ class Backend:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What dReal said of a query: `box` for "delta-sat" (name to [lo, hi]), `detail` for a failure.
+    """The answer of dReal to a query: `box` for "delta-sat" (name to [lo, hi]), `detail` for a failure.
 
     `seconds` is the whole process, `solver_seconds` dReal alone where it is known.
     """
@@ -74,7 +74,7 @@ class Answer:
 
     @property
     def meaning(self) -> str:
-        """What the answer says about the condition, in words."""
+        """The answer's meaning for the condition, in words."""
         return _MEANING[self.status]
 
 

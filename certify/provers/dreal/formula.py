@@ -252,7 +252,7 @@ class _Writer:
         return self._atoms[key]
 
     def atom(self, key: object, tree: Callable[[], Tree], residues: Sequence[int]) -> str:
-        """The name of what is the same each time."""
+        """The name of a term that is the same each time."""
         if key not in self._atoms:
             written = tree()
             name = f"t.{len(self._atoms)}"

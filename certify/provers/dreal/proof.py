@@ -37,12 +37,12 @@ from certify.provers.dreal.backend import Answer, Backend, decide, find_backend
 from certify.provers.falsify import Witness, confirm
 
 Array = NDArray[np.float64]
-_LOCAL_RATIO, _RING_RATIO = 1.05, 1.002  # at which bisection stops
+_LOCAL_RATIO, _RING_RATIO = 1.05, 1.002  # ratios of levels at which bisection stops
 _BELOW_WITNESS = 1e-3
-_LEAST = 1e-12  # of the guess, below which no local level is looked for
+_LEAST = 1e-12  # share of the guess below which no local level is looked for
 _MARGIN = 4  # dReal's deltas that a set keeps from the domain
 _SECONDS = 600.0
-_LOCAL_SHARE = 0.3  # of the time, after which a local level that is there will do
+_LOCAL_SHARE = 0.3  # share of dReal's seconds after which a local level that is there will do
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Where work is done: on threads of this machine, or by a cluster. Another place is another `Runner`."""
+"""The places where work is done: threads of this machine, or a cluster. Another place is another `Runner`."""
 
 from __future__ import annotations
 

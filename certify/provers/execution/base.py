@@ -29,7 +29,7 @@ class Jobs(Protocol):
 
     @property
     def places(self) -> int:
-        """How many jobs are done at once now; 0 if nobody is there."""
+        """The number of jobs that are done at once now; 0 if nobody is there."""
 
     def give(self, job: bytes) -> int:
         """Have a job done; its number."""
@@ -54,10 +54,10 @@ class Runner(Protocol):
 
     @property
     def remark(self) -> str | None:
-        """What a person should know of the places; None if there is nothing to say."""
+        """A remark on the places for a person; None if there is nothing to say."""
 
     def start(self, bound: Bound) -> AbstractContextManager[Bound]:
         """`bound`, a function of corners (n, B) and two levels to a named tuple of arrays (..., B), as run here."""
 
     def jobs(self, work: Work) -> AbstractContextManager[Jobs | None]:
-        """Where `work`, which can be pickled, is done elsewhere; None if all is done here."""
+        """The jobs by which `work`, which can be pickled, is done elsewhere; None if all is done here."""

@@ -31,7 +31,7 @@ _DEAF = 20.0  # seconds without a word from the scheduler, after which it is los
 _FETCH = 10.0  # seconds for answers that are there
 _FAREWELL = 5.0  # seconds for taking leave of it
 _OVER = ("error", "lost", "cancelled")
-_PLAIN = ["dask", "msgpack"]  # of results: bytes and numbers, nothing that unpickling would run
+_PLAIN = ["dask", "msgpack"]  # serialisers of results: bytes and numbers, nothing that unpickling would run
 
 
 @contextmanager
@@ -117,11 +117,11 @@ class ClusterRunner:
 
     @property
     def remark(self) -> str | None:
-        """Whether the scheduler went away, or jobs had to be done here."""
+        """A remark if the scheduler went away, or jobs had to be done here."""
         said = [self._lost.rstrip(".")] if self._lost else []
         if self._failed or self._refused:
             said.append(
-                f"of the cluster's jobs {self._failed} failed and {self._refused} had answers that were refused; they "
+                f"{self._failed} jobs of the cluster failed and {self._refused} had answers that were refused; they "
                 "were done here. Its workers need the same versions of certify, Python and numpy as this machine"
             )
         return "; ".join(said) or None
@@ -212,7 +212,7 @@ class ClusterJobs:
         """Do without the answers to these jobs."""
         for number in numbers:
             if number in self._futures:
-                self._futures.pop(number).release()  # who holds nothing any more is told so later on
+                self._futures.pop(number).release()  # a worker that holds nothing any more is told so later
 
     def close(self) -> None:
         """Forget all jobs, and the work."""

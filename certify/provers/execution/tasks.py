@@ -1,10 +1,9 @@
 """Pieces of work that know nothing of each other: each in a process of its own here, or on a cluster's workers.
 
-A sweep's cases and a comparison's training runs are such pieces. Where they are done must not show in what comes back:
-so a piece is a function of a module with its arguments, its result is bytes, and a place gives results as they come, in
-no order. A piece whose process died, or that raised, is lost, and the others go on: whoever asked decides what that
-means. One piece at a time in a process, because BLAS's threads, flint's precision and numpy's generator are the
-process's.
+A sweep's cases and a comparison's training runs are such pieces. The place must not show in the results: so a piece is
+a function of a module with its arguments, its result is bytes, and a place gives results as they come, in no order. A
+piece whose process died, or that raised, is lost, and the others continue: the caller decides what that means. A
+process does one piece at a time, because BLAS's threads, flint's precision and numpy's generator are the process's.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of a piece: its `result`, or None and the `reason` why it is lost."""
+    """A piece's outcome: its `result`, or None and the `reason` why it is lost."""
 
     key: str
     result: bytes | None
@@ -62,8 +61,7 @@ class Place(Protocol):
     """Does pieces of work."""
 
     def run(self, pieces: Iterable[Piece]) -> Generator[Outcome | None, None, None]:
-        """The outcomes, as they come, and None about once a second where none comes; closing it ends what is still at
-        work.
+        """The outcomes, as they come, and None about once a second where none comes; closing it ends unfinished pieces.
 
         Raises
         ------
@@ -244,7 +242,7 @@ def _done(work: Callable[..., bytes], arguments: tuple[Any, ...]) -> bytes:
 
 
 def _killed(future: Future) -> bool:
-    """Whether the workers that had a piece died."""
+    """True if the workers that had a piece died."""
     return future.status == "error" and type(future.exception()).__name__ == "KilledWorker"
 
 
@@ -257,7 +255,7 @@ def _unpacked(key: str, sent: Any) -> Outcome:
 
 
 def _received(end: Connection, key: str, process: BaseProcess) -> Outcome:
-    """What a child sent, or how it ended."""
+    """The result that a child sent, or how it ended."""
     with end:
         try:
             sent = end.recv_bytes()

@@ -1,8 +1,8 @@
 """Threads of this machine.
 
-A batch is cut into pieces of the same boxes whatever the number of threads, so that this shows nowhere. What a library
-of linear algebra would share out among threads of its own it does on one: pieces stay in a core's cache and meet once a
-batch, where its threads meet at every product.
+A batch is cut into pieces of the same boxes whatever the number of threads, so that this shows nowhere. A library of
+linear algebra works on one thread here: pieces stay in a core's cache and meet once a batch, while its own threads
+would meet at every product.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _PIECE = 256  # boxes, at least
 
 
 def cores() -> int:
-    """How many cores this process may use: OMP_NUM_THREADS, or all that the system gives it."""
+    """The number of cores this process may use: OMP_NUM_THREADS, or all that the system gives it."""
     asked = os.environ.get("OMP_NUM_THREADS", "").split(",")[0].strip()
     return int(asked) if asked.isdigit() and int(asked) else len(os.sched_getaffinity(0))
 

@@ -27,14 +27,14 @@ _SAMPLES, _CLIMBERS, _FEW = 65_536, 512, 128
 _ON_A_FACE, _FEW_THERE = 4096, 32
 _CALL = 2e5  # operations of evaluating few states at once
 _CLIMB, _DESCENT = 40, 80  # steps
-_APART = 1e-6  # of the domain, between the points of a difference
+_APART = 1e-6  # share of the domain between the points of a difference
 _PUSH = 0.05  # away from the edge of what violates, beside a step along it
 
 
 @dataclass(frozen=True, slots=True)
 class Rise:
     """A state `x` (n,) in the domain and outside of {V < c2} with N'F >= 0 (kind `rise`) or an input out of bounds
-    (`input`), in floats; `level` is N(x). `values` are those of what is uncertain, at which it is so."""
+    (`input`), in floats; `level` is N(x). `values` are those of the uncertain quantities."""
 
     x: Array
     level: float
@@ -66,7 +66,7 @@ class Falsifier:
         self.check_inputs = not bounded_by_form(problem.loop.network, self.system.input_bounds)
 
     def rates(self, x: Array) -> tuple[Array, Array]:
-        """(N'F at each corner of what is uncertain (C, B), how far the worst input lies outside its bounds (B,))."""
+        """(N'F at each corner of the ranges (C, B), how far the worst input lies outside its bounds (B,))."""
         self.effort.charge(_CALL + 2 * len(x) * len(self.corners) * self.problem.loop.operations)
         u, gradient = self.problem.loop.policy(x), self.N.gradient(x)
         rows = [(gradient * self.f(x, u, [float(q) for q in values.values()])).sum(-1) for values in self.corners]
@@ -77,14 +77,14 @@ class Falsifier:
         return np.nan_to_num(self.N(x), nan=np.inf, posinf=np.inf, neginf=-np.inf)
 
     def violation(self, x: Array) -> Array:
-        """What is at least 0 where a condition fails (B,)."""
+        """A number (B,) that is at least 0 where a condition fails."""
         rates, excess = self.rates(x)
         worst = np.nan_to_num(rates.max(0), nan=-np.inf)
         # Either counts, and where both fail the input's stays out of the way of a difference.
         return np.where(self.check_inputs & (worst < 0) & (excess > 0), excess, worst)
 
     def asked(self, x: Array) -> NDArray[np.bool_]:
-        """Where a condition is asked: in the domain, V >= c2."""
+        """True where a condition is asked: in the domain, V >= c2."""
         inside: NDArray[np.bool_] = np.all((x >= self.low) & (x <= self.high), axis=-1)
         return inside & (self.problem.V(x) >= self.c2)
 

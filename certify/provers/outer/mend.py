@@ -1,4 +1,4 @@
-"""What to do about a leaf of an outer set's trees that the checker refuses: split it again (see `bounds.mend`)."""
+"""The remedy for a leaf of an outer set's trees that the checker refuses: split it again (see `boxes.mend`)."""
 
 from __future__ import annotations
 

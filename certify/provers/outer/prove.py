@@ -28,10 +28,10 @@ from certify.provers.outer.rule import FaceBound, FallBound
 from certify.provers.outer.search import Cover, count
 
 Array = NDArray[np.float64]
-_BESIDE_FACE = 1e-4  # of N's span, kept from the least N on the faces
-_BESIDE_RISE = 1e-3  # of N's span, kept from a violation
-_FOR_FACES = 0.25  # of the effort, at most
-_AGAIN = 0.05  # of N's span: how far the level must have fallen for smaller trees of the faces
+_BESIDE_FACE = 1e-4  # share of N's span, kept from the least N on the faces
+_BESIDE_RISE = 1e-3  # share of N's span, kept from a violation
+_FOR_FACES = 0.25  # the largest share of the effort
+_AGAIN = 0.05  # share of N's span that the level must have fallen for smaller trees of the faces
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class OuterProof:
 
 @dataclass(frozen=True, slots=True)
 class Nothing:
-    """That nothing beyond {V <= c2} is proved, and `why`."""
+    """No set beyond {V <= c2} is proved, and `why`."""
 
     why: str
 
@@ -196,7 +196,7 @@ def _faces(
 
 
 def _ended_by(stop: Stop) -> str:
-    """What ended a pass that proved nothing, and what may help."""
+    """The end of a pass that proved nothing, and what may help."""
     if stop in (Stop.EFFORT, Stop.TIME):
         return f"the {stop.value} for that ended: more of it, or a cluster, may do"
     return "a smaller level, or another function, is needed" if stop is Stop.WITNESS else f"it ended by {stop.value}"

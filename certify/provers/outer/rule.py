@@ -1,8 +1,8 @@
 """The rules for a box of an outer set's trees: N falls on it, or nothing is asked there (FORMAT.md, `faces`, `outer`).
 
-What is cheap comes first, and only the boxes that it leaves open go on: where a box lies in the domain and in V, then
-N's model, then the policy, the plant and N'F. What is proved for a level n2 is proved for each lower one, because
-`k (n2 - N)` only falls with it and the multipliers do not depend on it.
+Cheap tests come first, and only the boxes that they leave open go further: the box's place in the domain and in V, then
+N's model, then the policy, the plant and N'F. A proof for a level n2 holds for each lower one, because `k (n2 - N)`
+only falls with it and the multipliers do not depend on it.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ _NUMBERS = 2**19  # in the largest tensor of a piece of a batch, so that it stay
 
 
 class OuterBounds(NamedTuple):
-    """What is known of each box: `proved` (B,), `bound` (B,) of what has to be negative, `score` (n, B): what each axis
-    adds to the bound, `lowest` (B,): N is at least that where something is asked, infinite where nothing is; and
-    `violated` (B,): N at the centre where a condition fails there, else infinite."""
+    """Bounds of each box: `proved` (B,), `bound` (B,) of what has to be negative, `score` (n, B): what each axis adds
+    to the bound, `lowest` (B,): N is at least that where something is asked, infinite where nothing is; and `violated`
+    (B,): N at the centre where a condition fails there, else infinite."""
 
     proved: Mask
     bound: Array
@@ -59,7 +59,7 @@ def enclosure_of(function: Neural | Symbolic) -> NeuralEnclosure | SymbolicEnclo
 
 
 class FallBound:
-    """Whether N falls on boxes in the coordinates z, x = T z, wherever N <= n2 and V >= c2 in the domain."""
+    """The rule that N falls on boxes in the coordinates z, x = T z, wherever N <= n2 and V >= c2 in the domain."""
 
     def __init__(self, problem: Problem, c2: float, T: Array, function: Neural | Symbolic) -> None:
         self.system, self.c2 = problem.loop.system, c2
@@ -73,7 +73,7 @@ class FallBound:
         symbols = self.system.n + self.system.m + len(self.system.uncertain)
         equations = sum(1 for _ in nodes(*self.dynamics)) + 3 * self.system.n
         own = _EACH * (1 + symbols) ** 2 * (equations + 4 * self.N.units)
-        self.operations = operations_of_policy(problem.loop.network) + own  # of a box, about
+        self.operations = operations_of_policy(problem.loop.network) + own  # of a box, roughly
         self.piece = max(16, _NUMBERS // (self.N.units * (1 + symbols) * (2 + symbols) // 2))
 
     @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
@@ -109,7 +109,7 @@ class FallBound:
         return found
 
     def _outside(self, x: Array, error: Array) -> Mask:
-        """Which boxes (B,) lie outside of the domain."""
+        """True for the boxes (B,) that lie outside of the domain."""
         reach = np.abs(x[:, 1:]).sum(1) + error
         low, high = self.ends
         slack = _ENDS * (np.abs(low) + np.abs(high) + np.abs(x[:, 0]) + reach)
@@ -117,7 +117,7 @@ class FallBound:
         return outside
 
     def _inside(self, x: Array) -> Mask:
-        """Which points (n, B) lie in the domain."""
+        """True for the points (n, B) that lie in the domain."""
         low, high = self.ends
         slack = _ENDS * (np.abs(low) + np.abs(high))
         inside: Mask = ((x > low + slack) & (x < high - slack)).all(0)
@@ -151,7 +151,7 @@ class FallBound:
         inputs = n + self.system.m
         doubt = np.abs(fall.g[n:inputs]).sum(0) + np.abs(fall.Q[n:, n:]).sum((0, 1)) + fall.r
         rises = fall.c + np.abs(fall.g[inputs:]).sum(0) - doubt >= 0
-        # What the inputs' errors add is charged to the axes that spread the policy, and what is left to those of N.
+        # The inputs' errors are charged to the axes that spread the policy, and the rest to those of N.
         score = excess[:n] + share * excess[n:].sum(0) + spread * fall.r
         smooth = np.isfinite(bound)
         for model in (N, *F):  # a component that is multiplied by 0 must be enclosed as well
@@ -186,7 +186,7 @@ class FallBound:
 
 
 class FaceBound:
-    """Whether N > n2 on boxes of a face of the domain, in the states themselves.
+    """The rule that N > n2 on boxes of a face of the domain, in the states themselves.
 
     `side` is 0 at the lower end of state `axis`, and 1 at the upper one.
     """

@@ -1,10 +1,10 @@
 """One best-first pass over a box, at whose end a rule holds on each leaf for a level that only falls.
 
-Boxes are taken in the order of the lowest N known of them, so that there is an answer whenever the pass stops: what is
-still open has N above the level that is left. What cannot be proved, a violation or a box too small to halve, takes the
-level below it. No leaf is proved twice, because what holds for a level holds for each lower one; and none is left
-unproved, because an open box that a lower level settles is looked at once more for itself: a bound of the box from
-which it was cut is none of its own.
+Boxes are taken in the order of the lowest N known of them, so that there is an answer whenever the pass stops: the
+boxes still open have N above the level that is left. A violation, or a box too small to halve, takes the level below
+it. No leaf is proved twice, because a proof for a level holds for each lower one; and none is left unproved, because
+an open box that a lower level settles is looked at once more for itself: a bound of the box from which it was cut is
+none of its own.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from certify.provers.boxes.subtrees import Abroad, Growth, Subtrees
 from certify.provers.execution import Bound, Counted, Runner
 from certify.provers.outer.rule import OuterBounds
 
-_SLACK = 1e-9  # of the level's span: how far below a bound the level stays
+_SLACK = 1e-9  # share of the level's span that the level stays below a bound
 _LAST_LOOK = 0.5  # operations of a box that a lower level settles, in those of one of all that were looked at
 _BATCH = 4e6  # operations of a batch, however small
 
@@ -53,7 +53,7 @@ class _CoverGrowth(Growth):
         return gives_way
 
     def opened(self, halves: Halves, found: OuterBounds, key: Array) -> tuple[Mask, Array]:
-        # what a box's bound leaves unknown, its place in the order still says
+        # a box's place in the order still bounds N where its own bound does not
         keys = np.maximum(found.lowest, key)[halves.origin]
         return np.ones_like(keys, dtype=np.bool_), keys
 
@@ -90,14 +90,14 @@ class Cover:
         self.boxes = self.leaves = 0
         self.done_share = 0.0
         self.stop = Stop.REQUESTED
-        self.lost = ""  # what is said of a cluster that went away
+        self.lost = ""  # a sentence about a cluster that went away
         self.abroad: Abroad | None = None
         self._account = Account()
         self.frontier.add(lo, hi, np.full(1, -math.inf), np.zeros(1, dtype=np.int64))
 
     @property
     def proved(self) -> float:
-        """The level for which all is proved but what is open; -inf at first."""
+        """The level for which all but the open boxes is proved; -inf at first."""
         abroad = math.inf if self.abroad is None else self.abroad.least()
         return min(self.level, min(self.frontier.least(), abroad) - self.slack)
 
@@ -116,7 +116,7 @@ class Cover:
             while self._open() and self.level > self.floor:
                 if ended is None:
                     ended = self._ended(budget, most)
-                    if ended is not None:  # what is left has N above this
+                    if ended is not None:  # the boxes left have N above this
                         self.stop, self.level = ended, self.proved
                         continue
                 left, before = math.inf if ended is not None else budget.effort.left, self.boxes
@@ -137,7 +137,7 @@ class Cover:
 
     @contextmanager
     def _elsewhere(self, budget: Budget) -> Iterator[None]:
-        """Have boxes grown elsewhere, where that can be; what is out at the end comes back."""
+        """Have boxes grown elsewhere, if that can be; boxes that are out at the end come back."""
         with self.runner.jobs(Subtrees(self.growth)) as jobs:
             if jobs is not None:
                 self.abroad = Abroad(jobs, self.growth, self.partition, budget.batch, budget.least_width)
@@ -158,7 +158,7 @@ class Cover:
         return budget.ended_by if kept >= budget.effort.left else None
 
     def _exchanged(self, bound: Bound, left: float, budget: Budget) -> bool:
-        """Send boxes out, and take in what has been grown; False if that is not worth it."""
+        """Send boxes out, and take in grown trees; False if that is not worth it."""
         if self.abroad is None:
             return False
         try:

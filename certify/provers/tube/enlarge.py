@@ -20,11 +20,11 @@ from certify.provers.tube.tube import Tube, find_tube
 
 Array = NDArray[np.float64]
 _FINE = 1.02  # ratio of sizes at which a search ends
-_BELOW = 1 - 1e-9  # of the domain's limit, which the start may not reach
+_BELOW = 1 - 1e-9  # share of the domain's limit, which the start may not reach
 _FIRST = 1.6  # growth of the size from one try to the next, as long as tubes are found
-_NARROW = 1e-6  # of the largest size in the domain, below which no tube around a state is tried
-_TRIED, _SHORTER = 0.1, 0.2  # of that size, the first; of a size that is refused, the next as long as none is found
-_WORTH = 1.02  # of the best volume: what another shape must promise
+_NARROW = 1e-6  # share of the largest size in the domain below which no tube around a state is tried
+_TRIED, _SHORTER = 0.1, 0.2  # shares: of that size, the first; of a refused size, the next as long as none is found
+_WORTH = 1.02  # factor of the best volume that another shape must promise
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Found:
 
     @property
     def volume(self) -> float:
-        """Of its start."""
+        """The volume of its start."""
         return volume(self.tube.start, 1.0)
 
 

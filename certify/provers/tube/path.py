@@ -37,10 +37,10 @@ from certify.provers.tube.tube import (
 
 Array = NDArray[np.float64]
 Flow = Callable[[Array], Array]
-_SHARE = 0.25  # of a slab's ball, that the motion of its middle takes
+_SHARE = 0.25  # share of a slab's ball that the motion of its middle takes
 _ROOM = 1 / (1 - _SHARE**2)
 _FIRST, _LONGEST, _LONGER = 0.02, 0.5, 1.5  # units of time of a slab; growth from one to the next
-_STEPS = 8  # of the simulation, for each slab
+_STEPS = 8  # steps of the simulation for each slab
 _MOST_TIME = 1000.0  # units of time, after which a path that has not arrived is given up
 _GROWN = 12.0  # logarithm of a volume, relative to the start, at which a tube is given up
 
@@ -65,7 +65,7 @@ def find_path(
     P, c, rate, duration = start, centre, None, _FIRST
     begin, most = np.linalg.slogdet(start)[1], min(MOST_SLABS, MOST_WORK // len(start) ** 4)
     spent = 0.0
-    with np.errstate(all="ignore"):  # what overflows is not shown
+    with np.errstate(all="ignore"):  # an overflow shows nothing
         while not slabs or not _has_arrived(P, c, goal):
             if effort.over:
                 return None, f"the effort ended after {len(slabs)} slabs, which take {spent:.3g} units of time"
@@ -164,9 +164,9 @@ def _slab(
 
 
 def _multipliers(models: Models, J: Array, moved: Array, P: Array, weight: Array) -> _Along:
-    """Those with the least trace of weight times what widens the ellipsoid.
+    """The multipliers with the least trace of weight times the terms that widen the ellipsoid.
 
-    What the motion takes costs its share of the edge, by which the motion's own direction is weighed.
+    The motion costs its share of the edge, by which the motion's own direction is weighed.
     """
     n = len(P)
     whole = np.zeros((n + 1, n + 1))

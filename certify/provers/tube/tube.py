@@ -24,15 +24,15 @@ from certify.provers.ball.models import Models, Paths
 
 Array = NDArray[np.float64]
 Growth = Callable[[Array], Array]
-WIDER = 1.05  # of a slab's ball, relative to the ellipsoid halfway: how far the ends may differ from that
-_FILLED = 0.9  # of what `WIDER` allows, by the first guess of a slab's duration
+WIDER = 1.05  # size of a slab's ball relative to the ellipsoid halfway: so far may the ends differ from that
+_FILLED = 0.9  # share of what `WIDER` allows that the first guess of a slab's duration fills
 _LONGEST = 0.5  # units of time of a slab
 _SURPLUS = 1e-3  # decrease of V per unit of time that is left to the checker's rounding
-_CORRECTIONS, SHORTENINGS = 5, 12  # of a slab's rate, of its duration
+_CORRECTIONS, SHORTENINGS = 5, 12  # corrections of a slab's rate, shortenings of its duration
 MOST_SLABS, MOST_WORK = 4000, 2**26  # the second over n^4: the checker refuses more
-_GROWTHS = 6  # of V that a slab asks for
+_GROWTHS = 6  # growths of V that a slab asks for
 _GROWN = 8.0  # logarithm of a volume, relative to the start, at which a tube is given up
-INSIDE = 1 - 1e-6  # of the goal, beyond all rounding
+INSIDE = 1 - 1e-6  # share of the goal, beyond all rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ def find_tube(known: Paths, start: Array, goal: Array, effort: Effort = UNLIMITE
     P, rate = start, None
     begin, domain = np.linalg.slogdet(start)[1], known.loop.system.domain
     most = min(MOST_SLABS, MOST_WORK // len(start) ** 4)
-    with np.errstate(all="ignore"):  # what overflows is not shown
+    with np.errstate(all="ignore"):  # an overflow shows nothing
         while not np.linalg.eigvalsh(P * INSIDE - goal)[0] > 0 or not slabs:
             if effort.over or len(slabs) == most or leaves_domain(P, 1.0, domain):
                 return None
@@ -164,7 +164,7 @@ def _symmetric(X: Array) -> Array:
 
 
 def _contains(J: Array, P: Array, room: float) -> bool:
-    """Whether {x'Px <= room} lies in {J d : ||d|| <= 1}."""
+    """True if {x'Px <= room} lies in {J d : ||d|| <= 1}."""
     return bool(np.linalg.eigvalsh(J.T @ P @ J)[0] > room / INSIDE)
 
 

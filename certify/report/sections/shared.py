@@ -20,7 +20,7 @@ from certify.report.words import ABSENT, above, number, point, symbol
 
 
 def timing_of(certificate: Certificate) -> TimingInWords:
-    """How time passes in its loop, and the rate at which V is claimed to fall."""
+    """The timing of its loop, with the rate at which V is claimed to fall."""
     return TimingInWords.of(certificate.system, certificate.claim.rate)
 
 

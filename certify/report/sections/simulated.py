@@ -34,7 +34,7 @@ def simulated_of(roa: SimulatedRoa, certificate: Certificate) -> dict[str, str]:
 
 
 def _integrated(roa: SimulatedRoa, timing: TimingInWords) -> str:
-    """How the runs of a grid come about; {} stands for the values that are held."""
+    """The integration of a grid's runs in words; {} stands for the values that are held."""
     step = f"step {number(roa.step, 3)} s"
     if timing.discrete:
         return "the loop's own steps{}"

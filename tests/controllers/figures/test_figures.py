@@ -256,7 +256,7 @@ PROOFS = [
 
 
 def test_only_what_was_accepted_is_drawn_as_proved_and_gaps_are_told(kept):
-    _png(draw_growth(get_system("pendulum"), 5, PROOFS, ProvingOptions(time_limit=9.0)))
+    _png(draw_growth(get_system("pendulum"), 5, PROOFS, ProvingOptions(effort=0.2)))
     _assert_nothing_is_cut_off(kept[0])
     sets, sizes = kept[0].axes[:2]
     outlines = [np.array(line.get_data()) for line in sets.lines if len(line.get_xdata()) > 5]
@@ -270,7 +270,7 @@ def test_only_what_was_accepted_is_drawn_as_proved_and_gaps_are_told(kept):
     told = [text.get_text() for text in sizes.get_legend().get_texts()]
     assert told[0] == "accepted by the checker" and told[1].startswith("gap: unknown") and "refuted" in told[2]
     title = kept[0]._suptitle.get_text()
-    assert "seed 5" in title and "2 of 4 policies, at most 9 s each" in title
+    assert "seed 5" in title and "2 of 4 policies, effort 0.2 each" in title
 
 
 def test_growth_in_many_states_is_a_volume_and_may_have_nothing(kept):

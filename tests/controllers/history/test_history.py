@@ -30,7 +30,7 @@ from controllers.training.trainer import Trainer, train
 PENDULUM = get_system("pendulum")
 OPTIONS = replace(preset("pendulum"), steps=200, warm_up=80, n_A=50, n_B=50, batch=16, critic=(8, 8))
 TRAIN = ["--steps", 200, "--warm-up", 80, "--n-A", 50, "--n-B", 50, "--batch", 16, "--critic", "8,8"]
-QUICK = ProvingOptions(time_limit=20.0, candidate="lyapunov")
+QUICK = ProvingOptions(effort=0.4, candidate="lyapunov")
 
 runner = CliRunner()
 
@@ -240,7 +240,7 @@ def told(tmp_path_factory):
 
 def test_the_command_draws_what_was_accepted_and_writes_the_table(told, tmp_path):
     out = tmp_path / "new" / "out"
-    arguments = ["history", told, "--out", out, "--candidate", "lyapunov", "--time-limit", 20, "--json"]
+    arguments = ["history", told, "--out", out, "--candidate", "lyapunov", "--effort", 0.4, "--json"]
     done = _run(*arguments)
     assert done.exit_code == 0, done.stderr
     result = json.loads(done.stdout)
@@ -280,7 +280,7 @@ def test_the_command_without_proofs_and_of_every_second_policy(told, tmp_path, m
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["--time-limit", "0"], "--time-limit must be positive"),
+        (["--effort", "0"], "--effort must be positive"),
         (["--every", "0"], "--every must be at least 1"),
         (["--evaluations", "missing.csv"], "missing.csv cannot be read"),
         (["--candidate", "mine"], "candidate"),
