@@ -28,7 +28,7 @@ from certify.provers.boxes.rule import VdotBound
 from certify.provers.boxes.search import prove_inwards, prove_outwards
 from certify.provers.execution import ThreadRunner
 from certify.provers.falsify import falsify, refutes
-from tests.engines.test_vdot import boxes, cartpole_case
+from tests.provers.test_vdot import boxes, cartpole_case
 from tests.support.loops import box, pendulum_network, scalar_tanh, valve
 from tests.support.marks import slow_after
 

@@ -24,7 +24,7 @@ from certify.cli.main import _run, app
 from certify.cli.options import FIRST
 from docs.hooks import on_page_markdown
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parent.parent.parent
 SHIPPED = ROOT / "examples" / "policies" / "pendulum.pt"
 DECLARED = {**declared(RoaOptions), **declared(PlantChanges)}
 BY_NAME = pytest.mark.parametrize("option", DECLARED.values(), ids=DECLARED)

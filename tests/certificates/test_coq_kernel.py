@@ -33,7 +33,7 @@ from certify.certificates.verdict import Verdict
 from certify.cli import doctor
 from certify.cli.main import _run
 from certify.errors import BackendError, InputError
-from tests.coq.cases import pendulum, raw, scalar
+from tests.certificates.coq_cases import pendulum, raw, scalar
 from tests.support.certificates import edited
 
 GOOD = """Axioms:

@@ -27,7 +27,7 @@ from tests.support.loops import box, pendulum_network
 from tests.support.marks import slow_after
 from tests.support.single import Machine, adversarial, by_torch, f32, off_by, units
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
+EXAMPLES = Path(__file__).parent.parent.parent / "examples"
 POLICIES = sorted((EXAMPLES / "policies").rglob("*.pt"), key=lambda path: path.stat().st_size)
 U = 2.0**-24
 MACHINES = [

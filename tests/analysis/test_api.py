@@ -28,7 +28,7 @@ from certify.lyapunov import volume
 from tests.support.foreign import mlp, plant
 from tests.support.loops import pendulum_network, scalar_tanh
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parent.parent.parent
 SHIPPED = ROOT / "examples" / "policies" / "pendulum.pt"
 BICYCLE = ROOT / "examples" / "plants" / "bicycle.toml"
 QUICK = RoaOptions(candidate="lyapunov", level=0.05)

@@ -32,7 +32,7 @@ from tests.support.certificates import write
 from tests.support.loops import box
 from tests.support.marks import slow_after
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
+EXAMPLES = Path(__file__).parent.parent.parent / "examples"
 F = Fraction
 
 

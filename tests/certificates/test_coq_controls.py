@@ -28,7 +28,7 @@ from certify.certificates.coq.expression import Expression
 from certify.certificates.coq.kernel import compile_folder, find_coqc, theory_files, write_folder
 from certify.certificates.coq.search import search
 from certify.certificates.coq.text import ASSUMPTIONS, PROOF, dyadic, expression, ratio
-from tests.coq.cases import pendulum, raw
+from tests.certificates.coq_cases import pendulum, raw
 from tests.support.certificates import edited, encode, make
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(shutil.which("coqc") is None, reason="needs coqc")]

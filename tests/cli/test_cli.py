@@ -29,8 +29,8 @@ from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
 from certify.provers.base import Progress
 from tests.support.loops import chain, pendulum_network
 
-SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
-VAN_DER_POL = Path(__file__).parent.parent / "examples" / "van_der_pol.toml"
+SHIPPED = Path(__file__).parent.parent.parent / "examples" / "policies" / "pendulum.pt"
+VAN_DER_POL = Path(__file__).parent.parent.parent / "examples" / "van_der_pol.toml"
 
 
 def saved(path: Path) -> Path:

@@ -159,7 +159,7 @@ def test_the_range_of_a_parameter_holds_its_value_or_moves_it(tmp_path: Path) ->
 
 
 def test_a_range_of_what_the_operating_point_depends_on_is_refused() -> None:
-    maglev = load_system(Path(__file__).parent.parent / "examples" / "plants" / "maglev.toml")
+    maglev = load_system(Path(__file__).parent.parent.parent / "examples" / "plants" / "maglev.toml")
     with pytest.raises(
         InputError, match=r"h0 must have one value, because the operating point of maglev depends on it"
     ):

@@ -17,8 +17,8 @@ from certify.certificates.coq.search import Found, Limits, jacobian, search
 from certify.certificates.coq.slopes import Boxes, Interval, Quantity, bounds
 from certify.certificates.coq.text import evidence_text
 from certify.errors import InputError
-from tests.coq.cases import Document, everything, pendulum, raw, scalar, van_der_pol
-from tests.coq.test_data import in_file
+from tests.certificates.coq_cases import Document, everything, pendulum, raw, scalar, van_der_pol
+from tests.certificates.test_coq_data import in_file
 from tests.support.certificates import edited, encode, make, rehash
 
 Array = np.ndarray

@@ -32,7 +32,7 @@ from certify.provers.boxes.engine import BoundsEngine
 from certify.provers.boxes.search import prove_inwards
 from certify.provers.execution import ThreadRunner
 from certify.provers.falsify import survey
-from tests.engines.test_bounds import planted, vdot
+from tests.provers.test_bounds import planted, vdot
 from tests.support.cases import Case, case_of
 from tests.support.loops import box, pendulum_network, scalar_tanh
 

@@ -20,7 +20,7 @@ from certify.errors import BackendError
 from certify.provers.execution import Work
 from tests.support.loops import scalar_tanh
 
-CERTIFICATE = Path(__file__).parent.parent / "docs" / "published" / "two_machines.json"
+CERTIFICATE = Path(__file__).parent.parent.parent / "docs" / "published" / "two_machines.json"
 Answer = Callable[[Work, bytes, int], bytes | None]
 
 

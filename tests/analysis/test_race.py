@@ -24,7 +24,7 @@ from certify.lyapunov import solve_lyapunov
 from certify.provers.base import Budget, Proof, Report
 from tests.support.loops import chain, scalar_tanh
 
-SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
+SHIPPED = Path(__file__).parent.parent.parent / "examples" / "policies" / "pendulum.pt"
 
 
 class Reaches:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from certify.provers.boxes.frontier import _HANDFUL, Frontier
 from certify.provers.boxes.partition import LEAF, Partition
-from tests.engines.test_bounds import leaves
+from tests.provers.test_bounds import leaves
 
 
 def grown(seed: int, calls: int = 30, n: int = 3) -> tuple[Partition, dict[int, tuple[np.ndarray, np.ndarray]]]:

@@ -29,9 +29,9 @@ from certify.provers.boxes.partition import MAX_DEPTH, Partition
 from certify.provers.boxes.search import Pass, RingProof, outwards, prove_inwards, prove_outwards
 from certify.provers.execution import ThreadRunner
 from certify.provers.outer import Nothing, OuterProof, prove_outer
-from tests.engines.test_outer import planar, wells
-from tests.engines.test_steps import held, stepped, uncertain_pendulum
-from tests.engines.test_vdot import cartpole_case
+from tests.provers.test_outer import planar, wells
+from tests.provers.test_steps import held, stepped, uncertain_pendulum
+from tests.provers.test_vdot import cartpole_case
 from tests.support.cases import case_of
 from tests.support.jobs import LEAF, LOOK, OPEN, Play, PlayedJobs, PlayedRunner, Troupe, boxes_of, parts, sealed
 from tests.support.loops import box, chain, pendulum_network

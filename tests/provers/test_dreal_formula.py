@@ -17,7 +17,7 @@ from certify.loop.plants import get_system
 from certify.provers.dreal import backend
 from certify.provers.dreal.backend import to_smt2
 from certify.provers.dreal.formula import Formula, formula
-from tests.claims.test_queries import CASES, quadrotor, values
+from tests.certificates.test_queries import CASES, quadrotor, values
 from tests.support.cases import case_of
 from tests.support.loops import pendulum_network
 from tests.support.oracle import value_of

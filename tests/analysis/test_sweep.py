@@ -43,7 +43,7 @@ from tests.support import pieces
 from tests.support.browser import Browser, find_browser
 from tests.support.pieces import Here
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parent.parent.parent
 POLICIES = ROOT / "examples" / "policies"
 QUICK = f"""
 policies = ["{POLICIES}/pendulum.pt"]

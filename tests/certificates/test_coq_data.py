@@ -16,7 +16,7 @@ import pytest
 from certify.certificates.coq.data import read_claim
 from certify.certificates.coq.text import claim_text, dyadic, number
 from certify.errors import CertifyError, InputError
-from tests.coq.cases import Document, everything, pendulum, raw, scalar
+from tests.certificates.coq_cases import Document, everything, pendulum, raw, scalar
 from tests.support.certificates import edited, encode, policy_hash, rehash
 
 # Reading Coq's text: numbers, names, applications, lists and pairs.

@@ -18,7 +18,7 @@ from certify.loop.plants import get_system
 from certify.loop.policies import load_policy
 from tests.support.loops import pendulum_network
 
-POLICIES = Path(__file__).parent.parent / "examples" / "policies"
+POLICIES = Path(__file__).parent.parent.parent / "examples" / "policies"
 
 
 def test_a_part_is_charged_to_the_whole() -> None:

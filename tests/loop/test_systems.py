@@ -28,7 +28,7 @@ from certify.loop.plants.toml import parse_expression
 from tests.support.algebra import same
 from tests.support.loops import box
 
-VAN_DER_POL = Path(__file__).parent.parent / "examples" / "van_der_pol.toml"
+VAN_DER_POL = Path(__file__).parent.parent.parent / "examples" / "van_der_pol.toml"
 
 
 def test_text_is_decimal_and_a_float_is_binary() -> None:

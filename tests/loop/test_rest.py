@@ -34,7 +34,7 @@ from certify.lyapunov.function import Quadratic
 from controllers.evaluation.proved_set import count_covered, require_same_loop, require_same_question
 from tests.support.loops import box
 
-PLAIN = Path(__file__).parent.parent / "examples" / "policies" / "without_gain" / "pendulum.pt"
+PLAIN = Path(__file__).parent.parent.parent / "examples" / "policies" / "without_gain" / "pendulum.pt"
 
 
 def scalar(f: Expression, weight: float, bias: float, clip: tuple[float, float] | None = None) -> ClosedLoop:

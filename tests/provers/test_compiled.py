@@ -29,14 +29,14 @@ from certify.provers.bounds.loop import played
 from certify.provers.boxes.rule import BoxBounds, VdotBound
 from certify.provers.boxes.search import prove_outwards
 from certify.provers.execution import ThreadRunner
-from tests.engines.test_steps import alone, stepped, uncertain_pendulum
-from tests.engines.test_vdot import CASES, cartpole_case
+from tests.provers.test_steps import alone, stepped, uncertain_pendulum
+from tests.provers.test_vdot import CASES, cartpole_case
 from tests.support.cases import case_of
 from tests.support.loops import pendulum_network
 from tests.support.marks import slow_after
 from tests.support.ways import WAYS, Way, bounded
 
-POLICIES = Path(__file__).parent.parent / "examples" / "policies"
+POLICIES = Path(__file__).parent.parent.parent / "examples" / "policies"
 Both = tuple[Problem, np.ndarray]
 
 

@@ -28,7 +28,7 @@ from certify.provers.boxes import subtrees
 from certify.provers.boxes.search import outwards, prove_outwards
 from certify.provers.execution import ThreadRunner
 from certify.provers.execution.cluster import ClusterJobs, ClusterRunner, connect
-from tests.engines.test_vdot import cartpole_case
+from tests.provers.test_vdot import cartpole_case
 from tests.support.dask import ROOT, Cluster, cluster, echo
 
 pytest.importorskip("distributed")

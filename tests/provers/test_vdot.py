@@ -8,7 +8,7 @@ import pytest
 from certify.loop.plants import get_system
 from certify.provers.boxes.rule import VdotBound
 from certify.provers.execution import ThreadRunner
-from tests.engines.test_bounds import vdot
+from tests.provers.test_bounds import vdot
 from tests.support.cases import Case, case_of
 from tests.support.loops import lqr_gain, pendulum_network, saturated_lqr, scalar_tanh
 

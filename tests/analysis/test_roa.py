@@ -38,7 +38,7 @@ from certify.provers.falsify import Witness, refutes
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
 from tests.support.marks import slow_after
 
-SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
+SHIPPED = Path(__file__).parent.parent.parent / "examples" / "policies" / "pendulum.pt"
 
 
 @pytest.mark.parametrize("n", slow_after(1, [3, 2, 4, 5, 6]))
