@@ -1,4 +1,4 @@
-"""Effort: counted work, so that the same command gives the same answer on any machine and under any load.
+"""Effort: counted work, so that the same command gives the same answer, however fast or busy the machine is.
 
 A search is limited by the elementary operations that it asks for, counted from sizes, and never by a clock. The counts
 are calibrated on two quiet cores, where `UNIT` operations take about a second; elsewhere they take longer or shorter

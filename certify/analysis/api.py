@@ -138,6 +138,7 @@ def certify_roa(
 
     Examples
     --------
+    >>> import numpy as np
     >>> from certify import TanhNetwork, certify_roa, get_system
     >>> K = [[8.0, 2.0]]
     >>> law = TanhNetwork((-np.array(K),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")

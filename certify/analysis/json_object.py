@@ -93,7 +93,7 @@ def _claim(result: RoaResult) -> dict[str, Any]:
 
 
 def _rest(result: RoaResult, rest: Rest) -> dict[str, Any]:
-    """Where the loop rests, also by the states' values; `origin` says that V is 0 there."""
+    """The point at which the loop rests, also by the states' values; `origin` says that V is 0 there."""
     moved = map(Fraction, result.network.origin.tolist())  # x is in deviations from where the plant was to rest
     each = zip(result.system.exact_x_eq(), moved, rest.x, strict=True)
     values = [float(at - by + Fraction(x)) for at, by, x in each]

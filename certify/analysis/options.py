@@ -87,7 +87,7 @@ class RoaOptions:
     seed: int = option(0, "candidate", "whole", help="Seed of the learning: the same seed learns the same N.")
     effort: float = option(1.0, "effort", "number", _POSITIVE, first=True, help=(
         "Scale the counted work of every stage: 1 is what two quiet cores do in about 50 s, 0.1 and 10 are quicker and "
-        "more thorough. The same effort gives the same certificate on any machine."))
+        "more thorough. The same effort gives the same certificate, however fast or busy the machine is."))
     time_limit: float | None = option(None, "effort", "number", _ABOVE_0, metavar="SECONDS", help=(
         "Stop after SECONDS at the latest; what was found until then is checked and kept for --resume. Off by "
         "default."))

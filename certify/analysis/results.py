@@ -1,4 +1,4 @@
-"""What a run found, as a typed value, and what one asks of it in Python.
+"""The result of a run, as a typed value, with its questions and pictures in Python.
 
 All that a result says of the proved set comes from the numbers that the checker accepted: membership is decided in
 rationals, sizes are rounded down, and pictures are drawn from the very bytes that were checked.

@@ -103,7 +103,7 @@ def effort_of(options: RoaOptions, load_seconds: float = 0.0) -> Effort:
 
 @contextmanager
 def _runner_for(options: RoaOptions) -> Iterator[Runner]:
-    """Where boxes are bounded."""
+    """The place where boxes are bounded."""
     if options.cluster is not None:
         from certify.provers.execution.cluster import ClusterRunner, connect
 

@@ -740,7 +740,7 @@ def test_a_disturbance_that_always_acts_is_refused_where_it_would_be_left_out(
 
 def test_no_condition_is_exported_that_was_not_proved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Of a policy that rests beside the origin Vdot < 0 is false around it, and nothing may say that it was proved."""
-    policy = Path(__file__).parents[1] / "examples" / "policies" / "without_gain" / "pendulum.pt"
+    policy = Path(__file__).parents[2] / "examples" / "policies" / "without_gain" / "pendulum.pt"
     status, out, err = run(capsys, "export-smt2", "--policy", policy, "--out", tmp_path / "o")
     assert status == 2 and "pi(0)" in err and out == ""
     assert not list(tmp_path.rglob("*.smt2"))

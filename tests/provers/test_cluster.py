@@ -85,7 +85,9 @@ def test_answers_are_bytes_and_the_rest_is_none(local: ClusterRunner, capfd: pyt
         found = answers(jobs, len(given))
         assert found == {n: None if job in (b"fail", b"wrong", b"number") else job for n, job in given.items()}
         assert answers(jobs, 1, 0.5) == {} and jobs.places == 2 and jobs.failed == 3
-    assert local.remark is not None and "3 failed" in local.remark and "same versions" in local.remark
+    assert (
+        local.remark is not None and "3 jobs of the cluster failed" in local.remark and "same versions" in local.remark
+    )
     assert capfd.readouterr() == ("", "")
 
 

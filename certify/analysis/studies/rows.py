@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 SCHEMA = "certify-sweep-row/2"
-ERROR = "error"  # in the place of a stop, where a case could not be run
+ERROR = "error"  # instead of a stop, where a case could not be run
 ANSWERS = {Verdict.PROVED: "ACCEPTED", Verdict.TRUSTED: "TRUSTED"}
 FILE = "row.json"
 

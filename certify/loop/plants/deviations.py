@@ -20,7 +20,7 @@ def in_deviations(
 
     A rate is the same there; the state one step later is a deviation as well. Where x_eq is 0 nothing changes.
 
-    >>> h, h0 = symbols(["h", "h0"])
+    >>> h, h0 = Symbol("h"), Symbol("h0")
     >>> in_deviations([1 - h0 / h], [h], [h0])
     (1 - h0/(h0 + h),)
     """

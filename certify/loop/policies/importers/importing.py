@@ -179,7 +179,7 @@ def import_bytes(
 
 
 def _record(reading: Reading, options: ImportOptions, plant: System, difference: Difference) -> dict[str, Any]:
-    """Where a policy came from, for its file."""
+    """The origin of a policy, for its file."""
     record: dict[str, Any] = {
         "plant_states": [s.name for s in plant.states],
         "options": options.given,
