@@ -26,6 +26,7 @@ from certify.provers.base import Budget, Progress, Proof
 _PATIENCE = 0.1  # share of the whole for a ring that gains nothing
 _SAVING = 60.0  # seconds between two savings of a search
 _MUCH = 0.1  # share of the whole: if more was kept for the check, a notice says so
+_CAUTION = 1.5  # on the check, where a limit on the clock must hold on a machine of unknown pace
 _YEAR = 3.156e7  # seconds
 
 
@@ -38,7 +39,7 @@ class Ring:
     def extend(self, state: State, effort: Effort) -> State:
         """With the proof, and the claim that it makes; at its end, where it makes none."""
         race, tools = state.contest, self.tools
-        check = operations_of_check(state.loop)
+        check = operations_of_check(state.loop) * (1.0 if state.options.time_limit is None else _CAUTION)
         if race.open:
             tools.keeper.winner = race.open[0]
             self._grow(state, race.open[0], effort, check)
