@@ -135,7 +135,7 @@ def one_pass(given: Path) -> None:
     loop = ClosedLoop(get_system(policy.system).with_parameters(policy.parameters), policy.network)
     P = np.array(asked["P"], dtype=np.float64)
     problem, T = Problem(loop, Quadratic(P)), diagonalising_coordinates(P, loop.linearise()[0])
-    budget = Budget(seconds=3600.0, boxes=asked["max"])
+    budget = Budget(boxes=asked["max"])  # both trees know that one
     bounded, counts = 0, False
     while not counts:
         counts = bounded >= _WARM

@@ -50,6 +50,7 @@ from controllers.training.record import parameters_of
 from controllers.training.trainer import Trainer
 
 EVERY = 5_000  # steps between checkpoints
+_AMPLE = 100.0  # an effort that the limit on the clock ends first, as in the rows that are kept
 JUDGED = CompareOptions(states=100, start_seed=1)
 HEAD = (
     "undone",
@@ -120,7 +121,7 @@ def measured(system: System, options: TrainingOptions, folder: Path, seconds: fl
         record |= {"A": found.A.tolist(), "B": found.B.tolist(), "K": found.K.tolist()}
     policy = Policy(network, system.name, parameters_of(system), training=record)
     save_policy(folder / "policy.pt", policy)
-    result = certify_roa(system, policy, folder, time_limit=seconds)
+    result = certify_roa(system, policy, folder, effort=_AMPLE, time_limit=seconds)
     proved = result.verdict is Verdict.PROVED
     return row | {
         "verdict": result.verdict.value,

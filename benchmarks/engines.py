@@ -25,6 +25,7 @@ from intervals import PlainIntervals
 from certify.certificates.claims import Problem
 from certify.certificates.claims.conditions import ring_condition
 from certify.certificates.claims.queries import Query, query
+from certify.effort import Effort
 from certify.errors import BackendError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import get_system
@@ -107,7 +108,7 @@ def ring(
     """Verdict, seconds and detail of this project's branch and bound, with its own rule or with plain intervals."""
     start = time.perf_counter()
     rule = PlainIntervals(problem, T) if plain else None
-    budget = Budget(seconds=options.limit, boxes=10**8)
+    budget = Budget(Effort(seconds=options.limit), boxes=10**8)
     proof = prove_outwards(problem, T, inner, outer, budget, ThreadRunner(options.threads), rule=rule)
     seconds = time.perf_counter() - start
     if proof.outer >= outer:

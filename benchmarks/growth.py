@@ -18,6 +18,7 @@ import numpy as np
 from fitted import chain, fit_policy, spread_of
 
 from certify.certificates.claims import Problem
+from certify.effort import Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, get_system
 from certify.lyapunov import diagonalising_coordinates, domain_limit, solve_lyapunov
@@ -76,7 +77,7 @@ def main() -> None:
             continue
         start = time.perf_counter()
         proof = prove_outwards(
-            problem, T, inner, target, Budget(seconds=options.seconds), ThreadRunner(options.threads)
+            problem, T, inner, target, Budget(Effort(seconds=options.seconds)), ThreadRunner(options.threads)
         )
         seconds = time.perf_counter() - start
         layers = "-".join(map(str, problem.loop.network.layers))

@@ -1,6 +1,6 @@
 """Sets of neural Lyapunov functions beside the published ones: the same checkpoints, plants and boxes.
 
-Run with `python benchmarks/published.py [--folder FOLDER] [--only NAME ...] [--time-limit 1800] [--learning 300]
+Run with `python benchmarks/published.py [--folder FOLDER] [--only NAME ...] [--effort 36] [--learning 6]
 [--out out/published]`. The folder holds checkpoints that others trained (of Two-Stage, NeurIPS 2025); rows whose files
 are not there are left out, and say so. Each of these imports policy and function, proves, has the certificate checked,
 and prints what was proved with the seconds that it took. The other rows learn a function for a loop, and print which
@@ -93,7 +93,7 @@ ROWS = (
 )
 
 
-def run(row: Row, folder: Path, out: Path, limit: float) -> RoaResult | None:
+def run(row: Row, folder: Path, out: Path, effort: float) -> RoaResult | None:
     """The row's result; None if its file is not there."""
     path = folder / f"{row.file}.pth"
     if not path.is_file():
@@ -109,7 +109,7 @@ def run(row: Row, folder: Path, out: Path, limit: float) -> RoaResult | None:
     network = import_policy(path, system, options).policy.network
     N = import_lyapunov(path, system, options).stored.function
     start = time.perf_counter()
-    result = certify_roa(system, network, out / row.file, lyapunov=N, time_limit=limit)
+    result = certify_roa(system, network, out / row.file, lyapunov=N, effort=effort)
     seconds = time.perf_counter() - start
     print(f"\n{row.file} (sha256 {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}...)")
     print(f"  published  {row.published}")
@@ -187,10 +187,10 @@ def _sides(half: str) -> tuple[Fraction, Fraction]:
     return -Fraction(half), Fraction(half)
 
 
-def learn(loop: Loop, out: Path, limit: float) -> RoaResult:
+def learn(loop: Loop, out: Path, effort: float) -> RoaResult:
     """The loop's result, with a function that is learned."""
     start = time.perf_counter()
-    result = certify_roa(loop.system, loop.network, out / loop.name, candidate="neural", time_limit=limit)
+    result = certify_roa(loop.system, loop.network, out / loop.name, candidate="neural", effort=effort)
     seconds = time.perf_counter() - start
     checked = "nothing" if result.checker is None else result.checker["result"]
     print(f"\n{loop.name}")
@@ -223,13 +223,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--folder", type=Path, default=FOLDER)
     parser.add_argument("--only", nargs="*", default=None)
-    parser.add_argument("--time-limit", type=float, default=1800.0)
-    parser.add_argument("--learning", type=float, default=300.0, help="seconds for a loop with a learned function")
+    parser.add_argument("--effort", type=float, default=36.0)
+    parser.add_argument("--learning", type=float, default=6.0, help="effort for a loop with a learned function")
     parser.add_argument("--out", type=Path, default=Path("out") / "published")
     options = parser.parse_args(arguments)
     for row in ROWS:
         if options.only is None or row.file in options.only:
-            run(row, options.folder, options.out, options.time_limit)
+            run(row, options.folder, options.out, options.effort)
     for loop in loops():
         if options.only is None or loop.name in options.only:
             learn(loop, options.out, options.learning)

@@ -1,6 +1,6 @@
 """The whole job on the shipped policies, and the engine's throughput against the machine's matrix product.
 
-Run with `python benchmarks/roa.py [--runs 5] [--threads 2] [--candidate lqr] [--time-limit 100] [POLICY ...]`. One
+Run with `python benchmarks/roa.py [--runs 5] [--threads 2] [--candidate lqr] [--effort 2] [POLICY ...]`. One
 warm-up run is not counted; the figures are medians of the counted runs in this one process. Absolute times are this
 machine's; the ratios are what to compare. With `--against REV` the working tree and another commit run side by side
 instead (`against.py`).
@@ -103,18 +103,18 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--candidate", default="lyapunov", choices=("auto", "lyapunov", "scaled", "lqr", "optimised"))
-    parser.add_argument("--time-limit", type=float, default=100.0, help="seconds for a ring")
+    parser.add_argument("--effort", type=float, default=2.0)
     parser.add_argument("--against", metavar="REV", help="another commit, to be compared with")
     parser.add_argument("--boxes", type=int, default=20_000, help="in a pass of that comparison, at most")
     options = parser.parse_args()
     if options.against is not None:
-        chosen = ["--candidate", options.candidate, "--time-limit", str(options.time_limit)]
+        chosen = ["--candidate", options.candidate, "--effort", str(options.effort)]
         compare(options.against, options.policies, options.runs, options.threads, options.boxes, chosen)
         return
     os.environ["OMP_NUM_THREADS"] = str(options.threads)  # a runner reads it
     print(f"numpy {np.__version__}, {options.threads} threads, median of {options.runs} runs")
     for path in options.policies:
-        whole_job(path, RoaOptions(candidate=options.candidate, time_limit=options.time_limit), options.runs)
+        whole_job(path, RoaOptions(candidate=options.candidate, effort=options.effort), options.runs)
         throughput(path, options.runs)
 
 

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from certify.certificates import Certificate, PartitionTree, leaves, read_certificate
 from certify.certificates.claims import Problem
+from certify.effort import UNIT
 from certify.loop.closed_loop import ClosedLoop
 from certify.provers.boxes import subtrees
 from certify.provers.boxes.partition import Partition
@@ -225,7 +226,7 @@ def simulate(tree: Tree, costs: Costs, workers: int) -> Outcome:
             now = frontier.take(count, _SHELL * max(least, 0.0))
             clock, busy = clock + costs.job, busy + costs.job
             when, worker = heapq.heappop(free)
-            seconds, boxes, opened = _grow(tree, costs, now, subtrees.turn(workers))
+            seconds, boxes, opened = _grow(tree, costs, now, subtrees.turn(workers) / UNIT)
             end = max(when, clock) + seconds
             heapq.heappush(free, (end, worker))
             jobs, out = jobs + 1, out + 1

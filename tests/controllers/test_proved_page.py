@@ -72,7 +72,7 @@ def test_a_certificate_that_is_there_counts_for_this_policy_on_this_plant_alone(
         assert page.proved("pendulum", run) is None and not searched  # in vain, just so, before
     monkeypatch.setattr(page, "shipped_system", lambda _: PENDULUM)
     assert page.proved("pendulum", run) is None and searched.pop()  # another plant is another question
-    monkeypatch.setitem(page.SECONDS, "pendulum", 61)
+    monkeypatch.setitem(page.EFFORT, "pendulum", 1.3)
     assert page.proved("pendulum", run) is None and searched.pop()  # and so is another time
     (out / "certificate.json").write_bytes(raw)
     save_policy(run / "policy.pt", _law([[8.5, 2.0]]))
