@@ -47,14 +47,13 @@ class Effort:
 
     def share(self, of_what_is_left: float) -> Effort:
         """A share of the operations that are left."""
-        return self.part(of_what_is_left * self.left) if self.left < math.inf else self.part(math.inf)
+        left = self.left
+        return self.part(of_what_is_left * left if left < math.inf else left)
 
     @property
     def left(self) -> float:
         """Operations that may still be done, 0 at least."""
-        left = self.granted - self.spent
-        if self._end is not None:
-            left = min(left, self._worth(self._end - time.monotonic()))
+        left = min(self.granted - self.spent, self._worth)
         if self._whole is not None and not self._alone:
             left = min(left, self._whole.left)
         return max(0.0, left)
@@ -64,7 +63,7 @@ class Effort:
         """True if the clock leaves less than the count does."""
         if self._whole is not None:
             return self._whole.is_short_of_time
-        return self._end is not None and self._worth(self._end - time.monotonic()) < self.granted - self.spent
+        return self._worth < self.granted - self.spent
 
     @property
     def over(self) -> bool:
@@ -81,8 +80,10 @@ class Effort:
         elapsed = time.monotonic() - self._start
         return (self.spent + UNIT) / (elapsed + 1.0)
 
-    def _worth(self, seconds: float) -> float:
-        return seconds * self._pace
+    @property
+    def _worth(self) -> float:
+        """Operations that the rest of the time is worth at that pace; infinite without a limit on the clock."""
+        return math.inf if self._end is None else (self._end - time.monotonic()) * self._pace
 
 
 class _Unlimited(Effort):

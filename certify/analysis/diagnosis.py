@@ -190,7 +190,7 @@ def _next(
             "than of the policy's linear part: a flatter policy that does the same may be proved on more"
         )
         return Step((), why, flattens=True)
-    if result.stop in (Stop.EFFORT, Stop.TIME, Stop.BOXES):
+    if result.stop.ran_out or result.stop is Stop.BOXES:
         step = _longer(result, options, proof, effort)
         return step if result.search is None else replace(step, options=(*step.options, ("--resume", "")))
     if options.claim == "asymptotic" and options.only is not None and options.P is None and options.level is None:

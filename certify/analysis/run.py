@@ -22,7 +22,7 @@ from certify.analysis.stages.further import Beyond, Equilibrium, Route, Tube
 from certify.analysis.stages.ring import Ring
 from certify.analysis.stages.setting import Setting, setting_of
 from certify.analysis.stages.state import Report, Stage, State, Tools
-from certify.certificates import set_aside, sole_writer
+from certify.certificates import PartitionTree, set_aside, sole_writer
 from certify.certificates.verdict import Stop
 from certify.effort import WHOLE, Effort
 from certify.errors import InputError, SoundnessError
@@ -127,7 +127,7 @@ def _result(state: State, tools: Tools) -> RoaResult:
         raise
     result, first = state.result, tools.keeper.first
     gained = first is not None and first.attempt.gained
-    cut = result.stop in (Stop.EFFORT, Stop.TIME, Stop.CLUSTER) or (result.stop is Stop.BOXES and gained)
+    cut = result.stop.ran_out or result.stop is Stop.CLUSTER or (result.stop is Stop.BOXES and gained)
     if tools.keeper.gains and cut:
         tools.keeper.keep()
     else:
@@ -160,12 +160,13 @@ def _extended(state: State, stages: Sequence[Stage], effort: Effort) -> State:
 def _stages_after(state: State, tools: Tools) -> list[Stage]:
     """The stages that follow the search, by the claim and what is asked for beside it."""
     options, stages = state.options, list[Stage]()
-    if options.enlarges:
-        stages.append(Tube(tools) if state.centre is None else Route(tools))
-    if state.converging:
-        stages.append(Equilibrium(tools))
-    if options.goes_beyond:
-        stages.append(Beyond(tools))
+    if isinstance(state.evidence, PartitionTree):  # nothing can be added to a solver's word
+        if options.enlarges:
+            stages.append(Tube(tools) if state.centre is None else Route(tools))
+        if state.converging:
+            stages.append(Equilibrium(tools))
+        if options.goes_beyond:
+            stages.append(Beyond(tools))
     stages.append(Acceptance(tools))
     if options.engine == "both":
         stages.append(Confirmation(tools))

@@ -89,6 +89,11 @@ class Stop(Enum):
     SPECTRUM = "spectrum"
     UNSTABLE = "unstable linearisation"
 
+    @property
+    def ran_out(self) -> bool:
+        """True if what was granted ended the search: its effort, or its time."""
+        return self in (Stop.EFFORT, Stop.TIME)
+
     def explain(self, detail: str = "") -> str:
         """The message with its detail."""
         return f"{self.value}: {detail}" if detail else self.value

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from certify.analysis.asked import ellipsoid_in
 from certify.analysis.facts import TubeFacts
 from certify.analysis.stages.state import State, Tools
-from certify.certificates import PartitionTree
 from certify.certificates.claims import Claim, Problem
 from certify.effort import Effort
 from certify.errors import OptionError
@@ -36,10 +35,8 @@ class Equilibrium:
         """With the stronger claim, where the loop contracts around the floor."""
         from certify.provers.ball.contraction import contraction
 
-        claim, evidence, best = state.claim, state.evidence, state.contest.best.trial
-        if claim is None or claim.floor is None or not isinstance(evidence, PartitionTree):
-            return state
-        closer = contraction(best.task.problem, best.T, claim.floor)
+        (claim, evidence), best = state.proved, state.contest.best.trial
+        closer = None if claim.floor is None else contraction(best.task.problem, best.T, claim.floor)
         if closer is None:
             return state
         return replace(state, claim=claim.converging(), evidence=replace(evidence, contraction=closer))
@@ -56,9 +53,7 @@ class Tube:
         from certify.provers.ball.models import paths
         from certify.provers.tube.enlarge import enlarge
 
-        claim, evidence, race = state.claim, state.evidence, state.contest
-        if claim is None or not isinstance(evidence, PartitionTree):
-            return state
+        (claim, evidence), race = state.proved, state.contest
         trial, box = race.best.trial, state.options.box
         by_proved = sorted(race.contenders, key=lambda c: -c.proved)
         shapes = {c.trial.name: c.trial.P for c in (race.best, *by_proved)}
@@ -87,10 +82,7 @@ class Route:
         """With the widest tube that the effort finds; `missed` says why there is none."""
         from certify.provers.tube.enlarge import surround
 
-        claim, evidence, centre = state.claim, state.evidence, state.centre or ()
-        trial = state.contest.best.trial
-        if claim is None or not isinstance(evidence, PartitionTree):
-            return state
+        (claim, evidence), centre, trial = state.proved, state.centre or (), state.contest.best.trial
         if holds(trial.task.problem, claim.roa, centre):
             return replace(state, missed="the checker accepted only a lower level, and the state lies above it")
         with self.tools.timing("tube"):
@@ -136,9 +128,7 @@ class Beyond:
         """
         from certify.provers.outer import Nothing, prove_outer
 
-        tools, claim, evidence, trial = self.tools, state.claim, state.evidence, state.contest.best.trial
-        if claim is None or not isinstance(evidence, PartitionTree):
-            return state
+        tools, (claim, evidence), trial = self.tools, state.proved, state.contest.best.trial
         system, options = state.loop.system, state.options
         function = options.lyapunov or self._learned(state, claim, effort)
         if function.n != system.n:

@@ -48,10 +48,10 @@ class Ring:
             tools.seconds[stage] = sum(c.attempt.seconds.get(stage, 0.0) for c in race.contenders)
         proof = best.attempt.proof()
         result = _described(state, best, proof)
-        kept = check * proof.leaves
-        if proof.stop in (Stop.EFFORT, Stop.TIME) and best is tools.keeper.winner and kept > _MUCH * tools.whole:
-            result = replace(result, detail=f"about {kept / tools.whole:.0%} of it were kept for the check")
-        if proof.stop in (Stop.EFFORT, Stop.TIME) and proof.claim is not None and best.hopeless:
+        kept = check * proof.leaves / tools.whole
+        if proof.stop.ran_out and best is tools.keeper.winner and kept > _MUCH:
+            result = replace(result, detail=f"about {kept:.0%} of it was kept for the check")
+        if proof.stop.ran_out and proof.claim is not None and best.hopeless:
             result = _stalled(result, best, proof, state)
         state = replace(state, proof=proof, claim=proof.claim, evidence=proof.evidence)
         return _short(replace(state, result=result), best, proof)

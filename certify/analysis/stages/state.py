@@ -80,6 +80,13 @@ class State:
             raise ValueError("no candidate has entered the race")
         return self.race
 
+    @property
+    def proved(self) -> tuple[Claim, PartitionTree]:
+        """The claim and the tree that shows it, where the prover gave one."""
+        if self.claim is None or not isinstance(self.evidence, PartitionTree):
+            raise ValueError("no claim with a tree is proved")
+        return self.claim, self.evidence
+
     def noting(self, *notes: str | None) -> State:
         """With further remarks."""
         return replace(self, notes=(*self.notes, *(note for note in notes if note is not None)))

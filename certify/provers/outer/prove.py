@@ -197,7 +197,7 @@ def _faces(
 
 def _ended_by(stop: Stop) -> str:
     """The end of a pass that proved nothing, and what may help."""
-    if stop in (Stop.EFFORT, Stop.TIME):
+    if stop.ran_out:
         return f"the {stop.value} for that ended: more of it, or a cluster, may do"
     return "a smaller level, or another function, is needed" if stop is Stop.WITNESS else f"it ended by {stop.value}"
 
