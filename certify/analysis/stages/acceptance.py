@@ -41,7 +41,7 @@ class Acceptance:
     tools: Tools
 
     def extend(self, state: State, effort: Effort) -> State:
-        """At its end, unless a solver is to be asked as well.
+        """Have the certificate accepted, and state the verdict.
 
         Raises
         ------
@@ -108,7 +108,7 @@ class _Desk:
 
 
 def _with_facts(state: State, accepted: Accepted) -> State:
-    """With what the result says of the accepted claim beside its levels."""
+    """Add to the result the facts of the accepted claim beside its levels."""
     claim, problem, result = accepted.certificate.claim, state.contest.best.trial.task.problem, state.result
     if claim.kind != state.kind:
         result = replace(result, claim=claim.kind)
@@ -123,7 +123,7 @@ def _with_facts(state: State, accepted: Accepted) -> State:
 
 
 def _concluded(state: State, accepted: Accepted) -> State:
-    """With the verdict: UNKNOWN where the accepted claim is less than was asked for."""
+    """State the verdict: UNKNOWN if the accepted claim is less than was asked for."""
     from certify.analysis.stages.further import holds
 
     trial, options, result = state.contest.best.trial, state.options, state.result
@@ -168,7 +168,7 @@ class Confirmation:
     tools: Tools
 
     def extend(self, state: State, effort: Effort) -> State:
-        """With dReal's answers.
+        """Add dReal's answers.
 
         Raises
         ------

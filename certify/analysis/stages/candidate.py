@@ -54,7 +54,7 @@ class Candidate:
     tools: Tools
 
     def extend(self, state: State, effort: Effort) -> State:
-        """With a race in which at least one candidate has been worked on, or refuted at once."""
+        """Let the candidates race; end the run if the level that was asked for is refuted at once."""
         tools, options = self.tools, state.options
         race = Race(partial(self._begun, state, effort), effort, 0.0, options.max_boxes, None)
         race.heat = _HEAT * effort.left if state.interruptible else self._only_heat(state, effort)
@@ -102,7 +102,7 @@ def _granted(effort: Effort, whole: float, share: float = OPTIMISING) -> Effort:
 
 
 def _resumed(state: State, tools: Tools) -> State:
-    """With the contender whose search an earlier run has left, as the winner if that was decided.
+    """Enter the contender whose search an earlier run has left, as the winner if that was decided.
 
     Raises
     ------

@@ -32,7 +32,7 @@ class Equilibrium:
     tools: Tools
 
     def extend(self, state: State, effort: Effort) -> State:
-        """With the stronger claim, where the loop contracts around the floor."""
+        """Strengthen the claim if the loop contracts around the floor."""
         from certify.provers.ball.contraction import contraction
 
         (claim, evidence), best = state.proved, state.contest.best.trial
@@ -49,7 +49,7 @@ class Tube:
     tools: Tools
 
     def extend(self, state: State, effort: Effort) -> State:
-        """With the largest tube that the effort finds; a note says if there is none."""
+        """Add the largest tube that the effort finds; a note says if there is none."""
         from certify.provers.ball.models import paths
         from certify.provers.tube.enlarge import enlarge
 
@@ -79,7 +79,7 @@ class Route:
     tools: Tools
 
     def extend(self, state: State, effort: Effort) -> State:
-        """With the widest tube that the effort finds; `missed` says why there is none."""
+        """Add the widest tube that the effort finds; `missed` says why there is none."""
         from certify.provers.tube.enlarge import surround
 
         (claim, evidence), centre, trial = state.proved, state.centre or (), state.contest.best.trial
@@ -120,7 +120,7 @@ class Beyond:
     tools: Tools
 
     def extend(self, state: State, effort: Effort) -> State:
-        """With the outer set; a note says why there is none.
+        """Add the outer set; a note says why there is none.
 
         Raises
         ------

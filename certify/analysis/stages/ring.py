@@ -37,7 +37,7 @@ class Ring:
     tools: Tools
 
     def extend(self, state: State, effort: Effort) -> State:
-        """With the proof, and the claim that it makes; at its end, where it makes none."""
+        """Grow the ring of the best candidate and take over its claim; end the run if it makes none."""
         race, tools = state.contest, self.tools
         check = operations_of_check(state.loop) * (1.0 if state.options.time_limit is None else _CAUTION)
         if race.open:
@@ -107,7 +107,7 @@ def _stalled(result: RoaResult, best: Contender, proof: Proof, state: State) -> 
 
 
 def _short(state: State, best: Contender, proof: Proof) -> State:
-    """At its end, where nothing is proved, or less than was asked for."""
+    """End the run if nothing is proved, or less than was asked for."""
     task, claim, witness = best.trial.task, proof.claim, state.result.witness
     if claim is not None and not (task.exactly and claim.roa < task.target):
         return state

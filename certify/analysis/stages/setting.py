@@ -116,7 +116,7 @@ def _rest(loop: ClosedLoop, options: RoaOptions) -> tuple[Rest | None, ClosedLoo
 
 
 def _by_spectrum(state: State, rest: Rest | None) -> State:
-    """At its end, where an eigenvalue decides; with `rest` otherwise."""
+    """End the run if an eigenvalue decides; otherwise add the point of rest."""
     options = state.options
     if state.kind == "asymptotic":
         unstable = by_spectrum(state.loop)

@@ -88,15 +88,15 @@ class State:
         return self.claim, self.evidence
 
     def noting(self, *notes: str | None) -> State:
-        """With further remarks."""
+        """The state with further remarks."""
         return replace(self, notes=(*self.notes, *(note for note in notes if note is not None)))
 
     def with_result(self, **changes: Any) -> State:
-        """With changes of the result."""
+        """The state with changes of the result."""
         return replace(self, result=replace(self.result, **changes))
 
     def finished(self, result: RoaResult) -> State:
-        """At its end, with this result."""
+        """The final state, with this result."""
         return replace(self, result=result, done=True)
 
 
