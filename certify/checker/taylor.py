@@ -1,145 +1,143 @@
 """Second-order Taylor models on a box, batched: what the rules for leaves evaluate the plant in.
 
-A model of a function v over symbols d in [-1, 1]^N is `v(d) in c + g.d + d'Q d + [-r, r]`. The symbols are the box
-coordinates of the leaf and one error symbol for each input. c, g and Q are numbers that mean themselves;
-the roundings made in computing them, and all terms of third order, are bounded in r. In the bounds below G = sum
-|g_i|, Q = sum |Q_ij| and N = |c| + G + Q. Arrays carry the batch on their last axis, or on their last two.
+A model of a function v over symbols d in [-1, 1]^N is `v(d) in c + g.d + sum_(i <= j) q_ij d_i d_j + [-r, r]`. The
+symbols are the box coordinates of the leaf and one error symbol for each input. c, g and q are numbers that mean
+themselves; r bounds the rest: all terms of third order, and the roundings of c, g and q. Below, G = sum |g_i| and
+H = sum |q_ij|. Arrays carry the batch on their last axis.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
+from functools import cache, cached_property
+from math import isqrt
 from typing import Any
 
 import numpy as np
 
-from .elementary import Expansion, elementary
-from .float64 import EPS, Array, float_with_error, gamma, total, up
+from .functions import FUNCTIONS, Expansion
+from .near import ZERO, Above, Array, Form, Near, combined, near, products, size
+
+
+@cache
+def pairs(N: int) -> tuple[Array, Array]:
+    """i and j of the terms of second order, i <= j."""
+    i, j = np.triu_indices(N)
+    return i, j
 
 
 @dataclass(frozen=True)
 class Taylor:
-    """`c` (B,), `g` (N, B), `Q` (N, N, B) and remainder `r` (B,), r >= 0."""
+    """`c` (B,), the coefficients `p` (N + N (N + 1) / 2, B), g and then q as `pairs` has them, and remainder `r`."""
 
     c: Array
-    g: Array
-    Q: Array
-    r: Array
+    p: Array
+    r: Above
 
     @cached_property
-    def linear(self) -> Array:
-        """Upper bound of the linear part on the box."""
-        return total(np.abs(self.g), 0)
+    def symbols(self) -> int:
+        """N."""
+        return (isqrt(9 + 8 * len(self.p)) - 3) // 2
+
+    @property
+    def g(self) -> Array:
+        return self.p[: self.symbols]
+
+    @property
+    def q(self) -> Array:
+        return self.p[self.symbols :]
 
     @cached_property
-    def quadratic(self) -> Array:
-        """Upper bound of the quadratic part on the box."""
-        return total(total(np.abs(self.Q), 0), 0)
+    def linear(self) -> Above:
+        """G."""
+        return size(self.g).sum()
 
     @cached_property
-    def size(self) -> Array:
-        """Upper bound of |c| + G + Q."""
-        return up(np.abs(self.c) + self.linear + self.quadratic)
+    def quadratic(self) -> Above:
+        """H."""
+        return size(self.q).sum()
+
+    @cached_property
+    def beyond(self) -> Form:
+        """v - c without the remainder."""
+        found = Form(self.p)
+        found.size = self.linear + self.quadratic
+        return found
+
+    @cached_property
+    def moved(self) -> Above:
+        """Upper bound of |v - c| on the box."""
+        return self.beyond.size + self.r
+
+    @cached_property
+    def size(self) -> Above:
+        """Upper bound of |v| on the box."""
+        return size(self.c) + self.moved
+
+    @property
+    def range(self) -> Near:
+        """v as a number."""
+        return Near(self.c, self.moved)
 
     def at(self, index: Array) -> Taylor:
         """The models of some members of the batch."""
-        return Taylor(self.c[..., index], self.g[..., index], self.Q[..., index], self.r[..., index])
-
-    def scaled(self, k: Any) -> Taylor:
-        """Product with a number, or with one for each member of the batch (B,)."""
-        r = up(np.abs(k) * self.r + EPS * (np.abs(k) * self.size))
-        return Taylor(k * self.c, k * self.g, k * self.Q, r)
+        return Taylor(self.c[index], self.p[:, index], self.r[index])
 
     def __add__(self, other: Taylor) -> Taylor:
-        r = up(self.r + other.r + EPS * (self.size + other.size))
-        return Taylor(self.c + other.c, self.g + other.g, self.Q + other.Q, r)
+        return combination((1.0, self), (1.0, other))
 
     def __neg__(self) -> Taylor:
-        return Taylor(-self.c, -self.g, -self.Q, self.r)
+        return Taylor(-self.c, -self.p, self.r)
+
+    def scaled(self, k: Any) -> Taylor:
+        """Product with an exact number, or with one for each member of the batch (B,)."""
+        return combination((k, self))
 
     def __mul__(self, other: Taylor) -> Taylor:
+        """r bounds the constants times the remainders, all of third and fourth order, and a remainder times the rest."""
         a, b = self, other
-        Ga, Gb, Qa, Qb = a.linear, b.linear, a.quadratic, b.quadratic
-        ca, cb = np.abs(a.c), np.abs(b.c)
-        r = (
-            ca * b.r
-            + cb * a.r  # constant times remainder
-            + Ga * Qb
-            + Gb * Qa
-            + Qa * Qb  # third and fourth order
-            + a.r * (Gb + Qb + b.r)
-            + b.r * (Ga + Qa)
-            + EPS * ((ca + Ga + Qa) * (cb + Gb + Qb))  # rounding of all coefficients; infinite if one overflows
-        )
-        joint = 0.5 * (a.g[:, None] * b.g[None, :])
-        Q = a.c * b.Q + b.c * a.Q + (joint + joint.swapaxes(0, 1))
-        return Taylor(a.c * b.c, a.c * b.g + b.c * a.g, Q, up(r))
+        c, ca, cb = a.c * b.c, size(a.c), size(b.c)
+        r = ca * b.r + cb * a.r + a.linear * b.quadratic + a.quadratic * b.beyond.size
+        r = r + a.r * b.moved + b.r * a.beyond.size
+        p, wrong = combined((a.c, b.beyond), (b.c, a.beyond), (1.0, a.squared(b)))
+        return Taylor(c, p, r + wrong + size(c).ulps(1))
 
-    @cached_property
-    def reach(self) -> Array:
-        """Upper bound of |v - c| on the box."""
-        return up(self.linear + up(self.quadratic + self.r))
-
-    def widened(self, symbols: int) -> Taylor:
-        """The same among so many symbols, of which those that come after its own do not matter to it."""
-        more = symbols - len(self.g)
-        flat = [(0, 0)] * self.c.ndim
-        return Taylor(self.c, np.pad(self.g, [(0, more), *flat]), np.pad(self.Q, [(0, more), (0, more), *flat]), self.r)
+    def squared(self, other: Taylor) -> Form:
+        """The terms of second order in the product of what is of first order."""
+        return products(self.g, other.g, self.linear * other.linear, *pairs(self.symbols))
 
     def function(self, name: str) -> Taylor:
-        """phi(v) for a function phi that elementary.py knows."""
-        return self.composed(elementary(name, self.c, 0.0, self.reach))
+        """phi(v) for a function phi of the table."""
+        return self.composed(FUNCTIONS[name].expansion(Near(self.c), self.moved))
 
     def composed(self, phi: Expansion) -> Taylor:
-        """phi(v) = f0 + f1 D + f2 D^2 + R, v = c + D, |R| <= third |D|^3, for phi expanded at c where |D| <= `reach`.
+        """phi(v) = f0 + f1 D + f2 D^2 + R, v = c + D, |R| <= third |D|^3, for phi expanded at c where |D| <= `moved`.
 
-        |D| <= rho = G + Q + r, and D^2 differs from (g.d)^2 by at most 2 G q + q^2, q = Q + r.
+        D^2 differs from (g.d)^2 by at most 2 G w + w^2, w = H + r.
         """
-        G, q = self.linear, up(self.quadratic + self.r)
-        rho = self.reach
-        (f0, f1, f2, _), (e0, e1, e2, _) = phi.f, phi.e
-        r = (
-            np.abs(f1) * self.r
-            + np.abs(f2) * up(2 * G * q + q * q)
-            + phi.third * rho * rho * rho
-            + e0
-            + e1 * rho
-            + e2 * rho * rho
-            + EPS * (np.abs(f0) + np.abs(f1) * rho + np.abs(f2) * up(G * G))
-        )
-        Q = f1 * self.Q + f2 * (self.g[:, None] * self.g[None, :])
-        return Taylor(f0, f1 * self.g, Q, up(r))
+        f0, f1, f2 = phi.stored
+        w, D = self.quadratic + self.r, self.moved
+        p, wrong = combined((f1.value, self.beyond), (f2.value, self.squared(self)))
+        r = f1.size * self.r + f1.error * D + f2.size * ((self.linear * 2 + w) * w)
+        r = r + (f2.error + phi.third * D) * (D * D) + f0.error + wrong
+        return Taylor(f0.value, p, r)
 
 
-def affine(c: Array, g: Array, r: Array | float = 0.0) -> Taylor:
+def combination(*terms: tuple[Any, Taylor]) -> Taylor:
+    """`sum_t k_t v_t` for exact numbers k_t, or one for each member of the batch."""
+    c, off = combined(*((k, Near(v.c, v.r)) for k, v in terms))
+    p, wrong = combined(*((k, v.beyond) for k, v in terms))
+    return Taylor(c, p, off + wrong)
+
+
+def affine(c: Array, g: Array, r: Above = ZERO) -> Taylor:
     """c + g.d within r, c (B,), g (N, B)."""
-    return Taylor(c, g, np.zeros((len(g), *g.shape)), r + np.zeros_like(c))
+    N = len(g)
+    return Taylor(c, np.concatenate([g, np.zeros((N * (N + 1) // 2, *g.shape[1:]))]), r)
 
 
 def constant(q: Fraction, symbols: int, batch: int) -> Taylor:
     """A rational, the same over the batch."""
-    value, error = float_with_error(q)
-    return affine(np.full(batch, value), np.zeros((symbols, batch)), error)
-
-
-def upper_bound(model: Taylor) -> Array:
-    """An upper bound of the model over the box, shape (B,); the separable part is maximised exactly.
-
-    max over |t| <= 1 of `g t + q t^2` is at most g^2 / (-4q) if q < 0, and at most max(|g|, -2q) + q; the first is the
-    maximum if |g| < -2q, the second otherwise.
-    """
-    g = np.abs(model.g)
-    N = g.shape[0]
-    q = np.array([model.Q[i, i] for i in range(N)])
-    inside = (q < 0) & (g < -2 * q)
-    ratio = g / np.where(inside, -q, 1.0)  # below 2; squaring g first could underflow, and 4 q overflow
-    axes = np.where(inside, 0.25 * (g * ratio), np.maximum(g, -2 * q) + q)
-    cross = np.zeros_like(model.c)
-    for i in range(N):
-        for j in range(i):
-            cross = cross + np.abs(model.Q[i, j] + model.Q[j, i])
-    value = model.c + np.sum(axes, axis=0) + cross + model.r
-    size = np.abs(model.c) + total(np.abs(axes) + 2 * g + np.abs(q), 0) + cross + model.r  # infinite if any part is
-    return value + up((gamma(N * N) + EPS) * size)
+    number = near(q)
+    return affine(np.full(batch, number.value), np.zeros((symbols, batch)), number.error)

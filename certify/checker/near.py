@@ -1,0 +1,576 @@
+"""All rounding of the checker: numbers in binary64 that carry a bound of their error.
+
+`Above` is an upper bound of a number that is not negative, `Near` are numbers near others, in a norm. The other files
+are formulas over these two, over rationals, and over binary64 numbers that mean exactly what they say.
+
+u = 2^-53 is the unit roundoff. fl(a op b) = (a op b)(1 + d) with |d| <= u for sums, products, quotients and roots, but
+for underflow: sums and roots have none, a product or quotient loses at most 2^-1075. So the rule of every bound here is
+
+    the exact number is at most v (1 + 2u)^k,
+
+v being computed from non-negative numbers in k or fewer roundings, each of which takes at most 1/(1 - u) <= 1 + 2u away;
+products and quotients add LEAST = 2^-1022 to v. k stays below 2^11, where (1 + 2u)^k < 1 + 2^-41.
+
+Sums and matrix products are bounded for any order of summation and with or without fused multiply-add:
+|fl(AB) - AB| <= gamma_n |A||B| with gamma_n = n u / (1 - n u) <= 2 n u (Higham 2002, section 3.5).
+
+Overflow never helps: it makes a bound infinite or NaN, and a comparison that has to hold is then False. NaN means that
+nothing is known.
+
+tanh, sin, cos, exp and atan use a table of values on a grid of step h = 2^-5, which Arb computes at start-up, an
+addition theorem, and Taylor polynomials on |d| <= h/2 = 2^-6. No libm value is trusted; the square root is IEEE's own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from fractions import Fraction
+from functools import cached_property, reduce
+from operator import add
+from typing import Any, Self
+
+import numpy as np
+from flint import arb, ctx, fmpq
+
+Array = Any  # of binary64; numpy's own types say nothing of shapes
+U = 2.0**-53
+LEAST = 2.0**-1022
+_MORE = 1 + 2.0**-40
+_MOST_ROUNDINGS = 1000
+_STEP = 2.0**-5
+_TANH_END = 20.0  # 1 - tanh(20) < 2^-56
+_ANGLE_END = 64.0  # beyond, sin and cos are only known to lie in [-1, 1]
+_EXP_END = 64.0  # beyond, nothing is known of exp; below -64 it lies between 0 and 2^-92
+
+
+# ----------------------------------------------------------------------------------------------------------- upper bounds
+
+
+class Above:
+    """Upper bounds of numbers that are not negative: each is at most `v (1 + 2u)^k`."""
+
+    __slots__ = ("k", "v")
+
+    def __init__(self, v: Any, k: int = 0) -> None:
+        """v is a number or an array, without negative entries.
+
+        The first line keeps the promise with k = 0: fl(v _MORE) >= v (1 + 2^-40)(1 - u) >= v (1 + 2u)^k for k < 2^11;
+        where v is below 2^-1022, LEAST makes up for what that product loses.
+        """
+        if k > _MOST_ROUNDINGS:
+            v, k = v * _MORE + LEAST, 0
+        self.v, self.k = v, k
+
+    @property
+    def top(self) -> Any:
+        """The bounds as binary64 numbers, rounded up."""
+        return self.v * _MORE + LEAST
+
+    def __add__(self, other: Above | float) -> Above:
+        if not isinstance(other, Above):
+            return Above(self.v + other, self.k + 1)
+        if self is ZERO or other is ZERO:
+            return other if self is ZERO else self
+        return Above(self.v + other.v, (self.k if self.k > other.k else other.k) + 1)
+
+    def __mul__(self, other: Above | float) -> Above:
+        """What is bounded by ZERO is 0, and so is its product with any number, whatever bounds that."""
+        if not isinstance(other, Above):
+            return Above(self.v * other + LEAST, self.k + 2)
+        if self is ZERO or other is ZERO:
+            return ZERO
+        return Above(self.v * other.v + LEAST, self.k + other.k + 2)
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def over(self, least: Any) -> Above:
+        """Quotient by a number that is at least `least`; NaN unless that is positive and finite.
+
+        Its overflow is infinite. Underflow of the quotient is at most 2^-1075.
+        """
+        return Above(self.v / np.where((least > 0) & (least < np.inf), least, np.nan) + LEAST, self.k + 2)
+
+    @property
+    def root(self) -> Above:
+        """Square roots."""
+        return Above(np.sqrt(self.v), self.k + 1)
+
+    def ulps(self, roundings: int) -> Above:
+        """2 u times the numbers, so many times: what that many roundings in a row, of numbers that are not larger, come
+        to (gamma_n <= 2 n u)."""
+        return Above(self.v * (2 * roundings * U) + LEAST, self.k + 2)
+
+    def least(self, other: Above) -> Above:
+        """The lesser of two bounds of the same numbers; NaN where either is."""
+        return Above(np.minimum(self.v, other.v), max(self.k, other.k))
+
+    def most(self, other: Above) -> Above:
+        """The larger of two, which bounds both."""
+        return Above(np.maximum(self.v, other.v), max(self.k, other.k))
+
+    def sum(self, axis: int | tuple[int, ...] = 0) -> Above:
+        """Sums along axes, in any order: of n numbers they lose a factor 1 - n u, and 4 n u makes up for it."""
+        added = np.sum(self.v, axis=axis)
+        n = np.size(self.v) // max(np.size(added), 1)
+        return Above(added * (1 + 4 * n * U), self.k + 2)
+
+    def max(self, axis: int = 0) -> Above:
+        """The largest along an axis."""
+        return Above(np.max(self.v, axis=axis, initial=0.0), self.k)
+
+    def norm(self, axis: int | tuple[int, ...] = 0) -> Above:
+        """2-norms along axes."""
+        return (self * self).sum(axis).root
+
+    def through(self, W: Array) -> Above:
+        """|W| x for an exact matrix W, the numbers x along the first axis."""
+        n = W.shape[1]
+        return Above(np.tensordot(np.abs(W), self.v, 1) * (1 + 4 * n * U) + n * LEAST, self.k + 3)
+
+    def __getitem__(self, index: Any) -> Above:
+        return self if self is ZERO else Above(self.v[index], self.k)
+
+    def where(self, condition: Any, other: Above) -> Above:
+        """These where the condition holds, others elsewhere."""
+        return Above(np.where(condition, self.v, other.v), max(self.k, other.k))
+
+
+ZERO = Above(0.0)
+
+
+def size(x: Any) -> Above:
+    """The magnitude of exact numbers."""
+    return Above(np.abs(x))
+
+
+def norm(x: Any, axis: int | tuple[int, ...] = 0) -> Above:
+    """The 2-norm of exact numbers along axes."""
+    return size(x).norm(axis)
+
+
+# ------------------------------------------------------------------------------------------------------- numbers near others
+
+
+class Near:
+    """Numbers near `value`: each lies within its `error` of it.
+
+    With `axes` leading axes, which `value` has and `error` has not, an error is one for all numbers along them: a bound
+    of the sum of their distances. So on the box |d_i| <= 1 a form with these coefficients is within `error` of the one
+    that is stored.
+    """
+
+    axes: tuple[int, ...] = ()
+
+    def __init__(self, value: Any, error: Above = ZERO) -> None:
+        self.value, self.error = value, error
+
+    def length(self, x: Above) -> Above:
+        """The norm of magnitudes x."""
+        return x
+
+    @cached_property
+    def size(self) -> Above:
+        """Upper bound of the norm of the numbers."""
+        return self.length(size(self.value)) + self.error
+
+    @property
+    def ends(self) -> tuple[Any, Any]:
+        """(lo, hi), binary64 numbers around each number.
+
+        b = 4u |value| + error is computed as `top`, at least b (1 + 2^-41); then fl(value - top) <= value - top
+        + u (|value| + top) <= value - error. So with the other end.
+        """
+        if self.error is ZERO:
+            return self.value, self.value
+        reach = (self.error + size(self.value).ulps(2)).top
+        return self.value - reach, self.value + reach
+
+    def __add__(self, other: Near) -> Self:
+        """The norm of a sum's roundings is at most u times that of the terms."""
+        value = self.value + other.value
+        made = self.size + other.size if self.axes else size(value)
+        return type(self)(value, self.error + other.error + made.ulps(1))
+
+    def __neg__(self) -> Self:
+        return type(self)(-self.value, self.error)
+
+    def __sub__(self, other: Near) -> Self:
+        return self + -other
+
+    def __mul__(self, other: Near | float) -> Self:
+        """Products with one number for all that share an error. |xy - XY| <= |x||y - Y| + |x - X||Y|."""
+        x, y = other if isinstance(other, Near) else Near(other), self
+        of_x = size(x.value)
+        made = of_x * (y.error + y.size.ulps(1))
+        return type(self)(x.value * y.value, made if x.error is ZERO else made + x.error * y.size)
+
+    __rmul__ = __mul__
+
+    def over(self, k: float) -> Self:
+        """Quotients by an exact positive number."""
+        return type(self)(self.value / k, (self.error + self.size.ulps(1)).over(k))
+
+    def __getitem__(self, index: Any) -> Self:
+        """Some of those that have an error each."""
+        place = (*(slice(None) for _ in self.axes), *(index if isinstance(index, tuple) else (index,)))
+        return type(self)(self.value[place], self.error[index])
+
+    def through(self, W: Array) -> Self:
+        """W x for an exact matrix W, the numbers x along the first axis of `error`, which is the last or last but one of
+        `value`.
+
+        A row's roundings are at most gamma_n sum_l |W_il| times the norms of the x_l, and so is what underflows.
+        """
+        flat = np.ndim(self.value) == len(self.axes) + 1
+        value = self.value @ W.T if flat else np.matmul(W, self.value)
+        return type(self)(value, (self.error + self.size.ulps(W.shape[1])).through(W))
+
+
+class Form(Near):
+    """Coefficients along the first axis of symbols in [-1, 1], with one error for all."""
+
+    axes = (0,)
+
+    def length(self, x: Above) -> Above:
+        return x.sum(0)
+
+
+class Uniform(Near):
+    """Numbers along the first axis, with one error that bounds each of them."""
+
+    axes = (0,)
+
+    def length(self, x: Above) -> Above:
+        return x.max(0)
+
+
+def combined(*terms: tuple[Any, Near]) -> tuple[Any, Above]:
+    """`sum_t k_t x_t`, and what it is away at most, for exact numbers k_t, one for all that share an error.
+
+    Of N terms each coefficient has N roundings or fewer: they come to at most gamma_N sum_t |k_t||x_t|.
+    """
+    made, wrong = ZERO, ZERO
+    for k, x in terms:
+        of_k = size(k)
+        made, wrong = made + of_k * x.size, wrong + of_k * x.error
+    return reduce(add, (k * x.value for k, x in terms)), wrong + made.ulps(len(terms))
+
+
+def products(x: Array, y: Array, both: Above, first: Array, second: Array) -> Form:
+    """As many zeros as x has entries; then x_i y_j for i = j, and x_i y_j + x_j y_i for i < j, for all pairs
+    (first, second) = (i, j) of exact numbers, `both` being the product of their sums of magnitudes.
+
+    That is the sum of the magnitudes of all terms, too; each number has three roundings or fewer.
+    """
+    N = len(x)
+    whole = np.zeros((N + len(first), *x.shape[1:]))
+    np.multiply(x[first], y[second], out=whole[N:])
+    whole[N:] += np.where((first != second)[:, None], x[second], 0.0) * y[first]
+    found = Form(whole, both.ulps(3))
+    found.size = both + found.error
+    return found
+
+
+def near(q: Fraction) -> Near:
+    """The binary64 number nearest to a rational; infinitely far if it is too large."""
+    try:
+        value = float(q)
+    except OverflowError:
+        return Near(np.float64(np.inf), Above(np.float64(np.inf)))
+    left = abs(Fraction(value) - q)
+    return Near(np.float64(value), Above(np.float64(left) + LEAST, 2) if left else ZERO)
+
+
+def all_near(numbers: Iterable[Fraction]) -> Near:
+    """Rationals as an array."""
+    found = [near(q) for q in numbers]
+    return Near(np.array([x.value for x in found]), Above(np.array([0.0 if x.error is ZERO else x.error.top for x in found])))
+
+
+def near_ball(x: arb) -> Near:
+    """Every point of an Arb ball."""
+    value = float(x.mid())
+    return Near(np.float64(value), Above(np.float64((x - arb(value)).abs_upper()), 1) + LEAST)
+
+
+def near_atanh(q: Fraction) -> Near:
+    """`atanh(q)` for a rational q in (-1, 1)."""
+    return near_ball(arb(fmpq(q.numerator, q.denominator)).atanh())
+
+
+def within(bounds: tuple[Fraction, Fraction], x: Near) -> Any:
+    """Elementwise: x certainly lies in the bounds."""
+    (_, least), (most, _) = (near(q).ends for q in bounds)
+    lo, hi = x.ends
+    return (lo >= least) & (hi <= most)
+
+
+def lower(x: Near) -> Any:
+    """Lower bounds of |x|, NaN unless they are positive and finite."""
+    least = np.where(x.value < 0, -x.ends[1], x.ends[0])
+    return np.where((least > 0) & (least < np.inf), least, np.nan)
+
+
+# -------------------------------------------------------------------------------------------------------------- functions
+
+
+def _table(values: Iterable[arb]) -> Array:
+    """The binary64 numbers nearest to these values."""
+    pairs = [near_ball(x) for x in values]
+    # At 128 bits the midpoint rounds to within u |value| (1 + 2^-50) of the ball.
+    if any(x.error.top > U * abs(x.value) * (1 + 2.0**-20) + 4 * LEAST for x in pairs):
+        raise ArithmeticError("a table entry is not accurate to one rounding")
+    return np.array([x.value for x in pairs])
+
+
+ctx.prec = 128
+_GRID = [arb(k) * _STEP for k in range(int(_ANGLE_END / _STEP) + 1)]
+_TANHS = [x.tanh() for x in _GRID[: int(_TANH_END / _STEP) + 1]]
+_TANH, _SECH2 = _table(_TANHS), _table(1 - t * t for t in _TANHS)
+_SIN, _COS = _table(x.sin() for x in _GRID), _table(x.cos() for x in _GRID)
+_EXP, _ATAN = _table(x.exp() for x in _GRID), _table(x.atan() for x in _GRID[: int(1 / _STEP) + 1])
+_RIGHT_ANGLE = near_ball(arb.pi() / 2).value
+
+
+def _split(y: Array, end: float) -> tuple[Any, Array]:
+    """Index k and remainder d with y = k h + d exactly, for 0 <= y <= end: |d| <= h/2, or k = 0 and d = y <= h.
+
+    k h has at most 11 bits. If k = 0, d = y. Otherwise y >= h, so d is a multiple of ulp(y) >= 2^-57 with
+    |d| <= 2^-6: it has at most 51 bits, and the subtraction is exact.
+    """
+    k = np.where(y < _STEP, 0.0, np.rint(y * (1 / _STEP)))
+    return k.astype(np.intp), y - k * _STEP
+
+
+def _tanh(y: Array) -> tuple[Array, Above]:
+    """(t, e) with |tanh(y) - t| <= e for every finite y; NaN where y is not finite.
+
+    With k and d from `_split`, `tanh(kh + d) = T + q`, `q = (1 - T^2) s / (1 + T s)`, T = tanh(kh), s = tanh(d).
+    s = d - d^3/3 + 2 d^5/15 - 17 d^7/315 + 62 d^9/2835 + r: the series alternates and its terms decrease for |d| <= h,
+    so |r| <= 1382/155925 |d|^11 < 0.08u |d|. What Horner's rule adds to d is below |d|/3000, so that its roundings
+    are below 0.01u |d|: s is within 1.1u |s|. If k = 0, q = s exactly. Otherwise 1 - T^2 and T come with u each, and
+    T s <= 2^-6: q is within (1 + 1.1 + 1)u + 1.1u + u < 6u of itself, and the last addition adds u (T + |q|): t is
+    within 2u T + 7u |q|, and 2u |q| if k = 0. For y > 20 the value 1 is within 2^-56: 3u T + 8u |q| covers that. As
+    tanh is concave, |q| <= |d| T/(kh) <= T/(2k): at most T/2, and T/4 where q < 0, since k >= 2 there. Either way
+    3u T + 8u |q| <= 6.7u |T + q|. The claim is 7u |t|.
+    """
+    finite = np.isfinite(y)
+    k, d = _split(np.fmin(np.abs(y), _TANH_END), _TANH_END)
+    w = d * d
+    s = d + d * (w * (-1 / 3 + w * (2 / 15 + w * (-17 / 315 + w * (62 / 2835)))))
+    T = _TANH[k]
+    t = np.where(finite, np.copysign(T + _SECH2[k] * s / (1 + T * s), y), np.nan)
+    return t, size(t).ulps(4)
+
+
+def _sin_cos(y: Array) -> tuple[Near, Near]:
+    """sin(y) and cos(y); NaN where y is not finite.
+
+    sin(kh + d) = S cos(d) + C sin(d) and cos(kh + d) = C cos(d) - S sin(d) on the same grid. The Taylor polynomials of
+    degree 9 and 8 leave out less than |d|^11 / 11! and |d|^10 / 10!, |d| <= h; as above, sin(d) and cos(d) are within
+    1.1u of themselves. S and C come with u each: a product is within 3.2u of itself, and the sum adds u of both. The
+    claim is 5u times the products' magnitudes. For |y| > 64: 0 within 1.
+    """
+    finite, close = np.isfinite(y), np.abs(y) <= _ANGLE_END
+    k, d = _split(np.where(close, np.abs(y), 0.0), _ANGLE_END)
+    w = d * d
+    sd = d + d * (w * (-1 / 6 + w * (1 / 120 + w * (-1 / 5040 + w * (1 / 362880)))))
+    cd = 1 + w * (-1 / 2 + w * (1 / 24 + w * (-1 / 720 + w * (1 / 40320))))
+    S, C = _SIN[k], _COS[k]
+
+    def known(value: Array, large: Array, small: Array) -> Near:
+        error = (size(large) + size(small)).ulps(3)
+        value, bound = (np.where(finite, np.where(close, v, far), np.nan) for v, far in ((value, 0.0), (error.v, 1.0)))
+        return Near(value, Above(bound, error.k))
+
+    return (
+        known(np.copysign(1.0, y) * (S * cd + C * sd), S, C * sd),
+        known(C * cd - S * sd, C, S * sd),
+    )
+
+
+def _exp(y: Array) -> Near:
+    """exp(y) for finite y up to 64; NaN where y is larger or not finite.
+
+    exp(kh + d) = E p, E = exp(kh), p = exp(d), for |y|, and its inverse for y < 0. The Taylor polynomial of degree 8
+    leaves out less than 1.1 |d|^9 / 9!, |d| <= h: below 2^-63 and so 0.001u. What Horner's rule adds to 1 is below
+    |d| (1 + h) and within 4u of itself, so p is within 1.2u of itself. E comes with u, the product adds u and the
+    inverse another: v is within 4.3u of itself, and the claim is 6u. For y < -64: v = 0, e = 2^-92 > exp(-64).
+    """
+    with_table = np.abs(y) <= _EXP_END
+    k, d = _split(np.where(with_table, np.abs(y), 0.0), _EXP_END)
+    p = 1 / 5040 + d * (1 / 40320)
+    for coefficient in (1 / 720, 1 / 120, 1 / 24, 1 / 6, 1 / 2, 1.0, 1.0):
+        p = coefficient + d * p
+    v = _EXP[k] * p
+    v = np.where(y < 0, 1 / v, v)
+    beyond = np.isfinite(y) & (y < 0)
+    error = size(v).ulps(3)
+    v, bound = (np.where(with_table, a, np.where(beyond, b, np.nan)) for a, b in ((v, 0.0), (error.v, 2.0**-92)))
+    return Near(v, Above(bound, error.k))
+
+
+def _atan(y: Array) -> Near:
+    """atan(y) for every finite y; NaN where y is not finite.
+
+    For |y| <= 1, atan(y) = A + atan(q), A = atan(kh), q = d / (1 + kh y), y = kh + d as in `_split`. q comes with 3.1u,
+    or is d if k = 0. The Taylor polynomial of degree 11 leaves out less than |q|^13 / 13, |q| <= h: below 0.001u |q|;
+    what Horner's rule adds to q is below |q|/3000. So atan(q) is within 4.2u of itself; A comes with u, and the last
+    addition adds u (A + |q|): the claim is 3u A + 8u |q|. For |y| > 1, atan(|y|) = pi/2 - atan(1/|y|), where 1/|y| <= 1
+    comes with u of itself, pi/2 with 2u, and the subtraction adds 2u: the claim is 6u more.
+    """
+    finite, far = np.isfinite(y), np.abs(y)
+    large = far > 1
+    w = np.where(finite, np.where(large, 1 / np.where(large, far, 1.0), far), 0.0)
+    k, d = _split(w, 1.0)
+    q = d / (1 + k * _STEP * w)
+    s = q * q
+    v = q + q * (s * (-1 / 3 + s * (1 / 5 + s * (-1 / 7 + s * (1 / 9 + s * (-1 / 11))))))
+    A = _ATAN[k]
+    v, error = A + v, size(A).ulps(2) + size(q).ulps(4)
+    v = np.copysign(np.where(large, _RIGHT_ANGLE - v, v), y)
+    error = (error + 6 * U).where(large, error)
+    return Near(np.where(finite, v, np.nan), Above(np.where(finite, error.v, np.nan), error.k))
+
+
+def tanh(x: Near) -> Near:
+    """tanh of numbers near others; its slope is at most 1. The same holds of sin, cos and atan."""
+    t, error = _tanh(x.value)
+    return Near(t, error + x.error)
+
+
+def sin_cos(x: Near) -> tuple[Near, Near]:
+    s, c = _sin_cos(x.value)
+    return Near(s.value, s.error + x.error), Near(c.value, c.error + x.error)
+
+
+def atan(x: Near) -> Near:
+    a = _atan(x.value)
+    return Near(a.value, a.error + x.error)
+
+
+def exp(x: Near) -> Near:
+    """exp; its slope is at most its value at the upper end."""
+    e = _exp(x.value)
+    return Near(e.value, e.error + x.error * _exp(x.ends[1]).size)
+
+
+def sqrt(x: Near) -> Near:
+    """Square roots; NaN unless x is certainly positive. |s - w| = |s^2 - w^2| / (s + w), s + w at least the root of s^2."""
+    least = lower(x)
+    root = np.sqrt(np.where(x.value > 0, x.value, np.nan))
+    return Near(root, size(root).ulps(1) + x.error.over(lower(Near(np.sqrt(least), size(np.sqrt(least)).ulps(1)))))
+
+
+def inverse(x: Near) -> Near:
+    """1/x; NaN unless x is certainly not 0. |1/x - 1/y| = |x - y| / |x y|."""
+    least, value = lower(x), 1 / x.value
+    return Near(value, size(value).ulps(1) + x.error.over(least).over(least))
+
+
+# ------------------------------------------------------------------------------------------------------- fused operations
+
+
+def lines_around_tanh(centre: Array, radius: Above) -> tuple[Array, Array, Above]:
+    """Parallel lines around tanh: (s, m, gap) with |tanh(y) - s y - m| <= gap for all |y - centre| <= radius.
+
+    The slope s is *any* number in [0, 1] (here near the chord's). D(y) = tanh(y) - s y is odd: what is shown of
+    [lo, hi] around |centre|, where hi > 0 and |lo| <= hi, holds around -|centre| with the signs changed. On y >= 0
+    tanh is concave, so D lies below its tangent at any p >= 0 and is least at an end; on y <= 0 it is convex, so D is
+    largest at an end. Hence sup D is at most D(lo) or the larger end of the tangent over [max(lo, 0), hi]. And inf D
+    is at least D(hi) or, if lo >= 0, D(lo), else, as D is odd, minus the larger end over [0, -lo] of the tangent at any
+    p >= 0 (at 0 the tangent is not below D(0) = 0). p should be the critical point, or the end that is nearest to it,
+    but nothing depends on that.
+
+    Roundings, with |y| <= hi and so |t| <= t_hi (1 + 14u): `t - s y` is within 9u t_hi + 3u s hi, and `excess` within
+    18u (7u of t twice, and three roundings); the product with a part of the width adds 2u of it, and the last sum u of
+    all: 10u t_hi + 4u s hi + 21u (hi - start) is less than `slack`.
+    """
+    lo, hi = Near(np.abs(centre), radius).ends
+    t_lo, _ = _tanh(lo)
+    t_hi, _ = _tanh(hi)
+    slope = np.maximum(np.minimum((t_hi - t_lo) / (hi - lo), 1.0), 0.0)
+    start = np.maximum(lo, 0.0)
+    p = np.minimum(np.maximum(np.arctanh(np.sqrt(1 - slope)), start), hi)
+    t, _ = _tanh(p)
+
+    def tangent(p: Array, t: Array, start: Array | float, end: Array) -> Array:
+        excess = 1 - t * t - slope
+        return t - slope * p + np.maximum(excess * (start - p), excess * (end - p))
+
+    at_lo, at_hi, below = t_lo - slope * lo, t_hi - slope * hi, -lo
+    upper = np.maximum(at_lo, tangent(p, t, start, hi))
+    least = -tangent(np.minimum(p, below), np.where(p < below, t, -t_lo), 0.0, below)
+    lower = np.minimum(at_hi, np.where(lo < 0, least, at_lo))
+    slack = Above(32 * U * (t_hi + slope * hi + (hi - start)) + LEAST)
+    shift = np.where(centre < 0, -0.5, 0.5) * (upper + lower)
+    gap = Above(0.5 * np.maximum(upper - lower, 0.0), 2) + (size(upper) + size(lower)).ulps(1) + slack
+    return slope, shift, gap
+
+
+def clip_of(v: Near, least: Array, most: Array) -> tuple[Array, Array, Above]:
+    """(s, m, gap) with |min(max(v, least), most) - s v - m| <= gap for all numbers v between the ends of these.
+
+    clip(v) - s v is linear between the corners of clip, so that its extremes over the range of v lie at the range's
+    ends or at corners in it; s is *any* number in [0, 1], here near the chord's slope.
+    """
+    lo, hi = v.ends
+    width = np.clip(hi, least, most) - np.clip(lo, least, most)
+    s = np.clip(width / (hi - lo), 0.0, 1.0)
+    at = np.array([lo, hi, np.clip(least, lo, hi), np.clip(most, lo, hi)])
+    away = Near(np.clip(at, least, most)) - Near(at) * Near(s)
+    lows, highs = away.ends
+    upper, lower = np.max(highs, axis=0), np.min(lows, axis=0)
+    m = 0.5 * (upper + lower)
+    return s, m, (Near(upper) - Near(m)).size.most((Near(lower) - Near(m)).size)
+
+
+def spectral_norm(W: Array) -> Above:
+    """||W||_2 by repeated squaring.
+
+    ||G||_2^2 = ||G'G||_2 <= ||fl(G'G)||_2 + gamma_k ||G||_F^2. Six squarings leave the Frobenius norm at the end,
+    which is at most n^(1/128) times too large. G is divided by a power of two first, which is exact
+    but for underflow: at most 2^-1075 an entry, and so is what underflows in G'G.
+    """
+    G = W if W.shape[0] >= W.shape[1] else W.T
+    steps: list[tuple[float, Above]] = []
+    for _ in range(6):
+        whole = float(norm(G, (0, 1)).top)
+        if not whole < np.inf:
+            return Above(np.inf)
+        scale = math.ldexp(1.0, math.frexp(whole)[1])
+        G, part = G / scale, Above(whole).over(scale)
+        steps.append((scale, (part * part).ulps(G.shape[0]) + G.size * LEAST))
+        G = G.T @ G
+    bound = norm(G, (0, 1))
+    for scale, error in reversed(steps):
+        bound = (bound + error).root * scale
+    return bound
+
+
+def self_test() -> None:
+    """Fail closed unless this machine rounds to nearest even and keeps subnormal numbers.
+
+    Raises
+    ------
+    ArithmeticError : a rounding mode other than nearest, flushed subnormals, or a matrix product whose
+        error exceeds its bound.
+    """
+    one, least = np.full(64, 1.0), np.full(64, LEAST)
+    integers = np.array([k * 0x9E3779B97F4A7C15 % 2**54 - 2**53 for k in range(288)], dtype=object).reshape(2, 12, 12)
+    A, B = integers.astype(np.float64)
+    found = Near(B).through(A)
+    products = zip(found.value.ravel(), (integers[0] @ integers[1]).ravel(), found.error.top.ravel(), strict=True)
+    good = (
+        np.all(one + U == 1.0)
+        and np.all(one + 3 * U == 1.0 + 4 * U)
+        and np.all(-one - U == -1.0)
+        and np.all(one - U / 2 == 1.0)
+        and np.all((least * 0.5) * 2 == least)
+        and np.all(np.sqrt(one * 2) == float.fromhex("0x1.6a09e667f3bcdp+0"))
+        and np.all(one / 3 == float.fromhex("0x1.5555555555555p-2"))
+        and all(abs(int(product) - exact) <= bound for product, exact, bound in products)
+    )
+    if not good:
+        raise ArithmeticError("this machine's binary64 arithmetic is not IEEE round-to-nearest with subnormals")
