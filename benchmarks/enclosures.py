@@ -11,7 +11,7 @@ import argparse
 
 import numpy as np
 
-from certify.checker.float64 import sin_cos, tanh
+from certify.checker.near import Near, sin_cos, tanh
 from certify.checker.taylor import Taylor, affine
 
 
@@ -28,12 +28,13 @@ def main() -> None:
     uniform = generator.uniform(-1, 1, count)
     tiny = 2.0 ** generator.uniform(-60, 0, count)
     for where, y in (("|y| < 20", 20 * uniform), ("2^-60 < y < 1", tiny), ("|y| < 1.5", 1.5 * uniform)):
-        (t, t_error), (s, c, s_error, c_error) = tanh(y), sin_cos(y)
-        quotient = _point(y).sin() * _point(y).cos().inv()
-        rows = {"tanh": (t, t_error), "sin": (s, s_error), "cos": (c, c_error), "tan": (quotient.c, quotient.r)}
+        t, (s, c) = tanh(Near(y)), sin_cos(Near(y))
+        quotient = _point(y).function("sin") * _point(y).function("cos").function("inv")
+        rows = {"tanh": t, "sin": s, "cos": c, "tan": Near(quotient.c, quotient.r)}
         print(f"{where}, {count:,} arguments: width in ulp, median and largest; in ulp of 1, largest")
-        for name, (value, error) in rows.items():
-            width = 2 * error / np.spacing(np.abs(value))
+        for name, number in rows.items():
+            error = number.error.top
+            width = 2 * error / np.spacing(np.abs(number.value))
             print(f"  {name:5}{np.median(width):8.1f}{np.max(width):14.4g}{2 * np.max(error) / 2.0**-52:14.4g}")
 
 

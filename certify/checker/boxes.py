@@ -14,9 +14,9 @@ from flint import fmpq_mat
 from .case import Case, Failures
 from .exact import fraction
 from .expression import evaluate
-from .float64 import EPS, Array, float_with_error, gamma, norm, total, up, within
+from .near import Above, Array, Form, Near, all_near, near, size, within
 from .parts import Batch
-from .taylor import Taylor, affine, constant, upper_bound
+from .taylor import Taylor, affine, combination, constant, pairs, upper_bound
 
 LEAF = 255
 MAX_DEPTH = 4096
@@ -29,8 +29,7 @@ class Leaves:
     boxes: Boxes
     numbers: Array  # in the tree
     place: str  # of one, before its number
-    mid: Array  # (m, B): the inputs lie within `reach` of this
-    reach: Array
+    inputs: Near  # (m, B)
     bound: Array  # an upper bound of the margin
     hold: Array  # where what is asked holds
 
@@ -43,37 +42,42 @@ class Boxes:
         self.case, self.c, self.T, self.net = case, case.c, T, case.net
         self.n, self.m, self.k = len(case.c.states), len(case.c.inputs), len(case.c.uncertain)
         self.symbols = self.n + self.m + self.k + more
-        value, error = np.moveaxis(np.array([[float_with_error(fraction(v)) for v in row] for row in S.tolist()]), 2, 0)
-        self.S = np.diag(value)[:, None]  # the diagonal, (n, 1)
-        self.S_rest = up(np.abs(value - np.diag(self.S[:, 0])) + error)  # bounds what S is beside it
+        rows = [all_near(fraction(v) for v in row) for row in S.tolist()]
+        whole, axes = np.array([row.value for row in rows]), np.eye(self.n, dtype=bool)
+        self.S = np.diag(whole)  # the diagonal
+        wrong = Above(np.array([row.error.v for row in rows]), max(row.error.k for row in rows))
+        self.S_rest = wrong + size(np.where(axes, 0.0, whole))  # bounds what S is beside it
 
     def levels(self, lo: Array, hi: Array) -> tuple[Array, Array]:
-        """Bounds of V from below and above on the boxes; a lower bound that has overflowed is -infinity."""
+        """Bounds of V from below and above on the boxes; NaN where they overflow."""
         far = np.maximum(np.abs(lo), np.abs(hi))
-        near = np.where((lo <= 0) & (hi >= 0), 0.0, np.minimum(np.abs(lo), np.abs(hi)))  # corners are exact
-        cross = self.cross(far)
-        least = np.sum(self.S * near * near, axis=0) * (1 - gamma(self.n + 4)) - cross - 2.0**-960
-        most = up(total(self.S * far * far, 0) + cross)
-        least = least - EPS * np.abs(least) - EPS * cross
-        return np.where(least < np.inf, least, -np.inf), most
+        close = np.where((lo <= 0) & (hi >= 0), 0.0, np.minimum(np.abs(lo), np.abs(hi)))  # corners are exact
+        cross = self.cross(size(far))
+        least, most = self.diagonal(close), self.diagonal(far)
+        return Near(least.value, least.error + cross).ends[0], Near(most.value, most.error + cross).ends[1]
 
-    def states(self, centre: Array, radius: Array) -> tuple[Array, Array]:
-        """x = T z on the boxes as affine forms (n, n + 1, B), and a bound of their rounding errors (n, B)."""
-        slopes = self.T[:, :, None] * radius[None]
-        x = np.concatenate([np.matmul(self.T, centre)[:, None], slopes], axis=1)
-        error = gamma(self.n) * (norm(self.T, 1)[:, None] * norm(centre, 0)) + EPS * total(np.abs(slopes), 1)
-        return x, up(error)
+    def diagonal(self, z: Array) -> Near:
+        """sum_i S_ii z_i^2 at exact z (n, B)."""
+        return (Near(z) * Near(z)).through(self.S[None])[0]
 
-    def affine(
-        self, x: Array, error: Array, mid: Array, slopes: Array, wide: Array
-    ) -> tuple[list[Taylor], list[Taylor]]:
+    def cross(self, far: Above) -> Above:
+        """Upper bound of the off-diagonal part of V in magnitude where |z| <= far."""
+        return (far * (self.S_rest[:, :, None] * far).sum(1)).sum()
+
+    def states(self, centre: Array, radius: Array) -> Form:
+        """x = T z on the boxes, (n + 1, n, B)."""
+        z = np.concatenate([centre[None], np.eye(self.n)[:, :, None] * radius])
+        return Form(z).through(self.T)
+
+    def models(self, x: Form, u: Form) -> tuple[list[Taylor], list[Taylor]]:
         """States and inputs on the boxes; symbols: n box coordinates, m input errors, k uncertain quantities, and the
         period if it has a range."""
-        batch = wide.shape[1]
-        zeros, errors = np.zeros((self.symbols - self.n, batch)), np.eye(self.m)[:, :, None] * wide[:, None]
-        states = [affine(v[0], np.concatenate([v[1:], zeros]), e) for v, e in zip(x, error, strict=True)]
-        parts = zip(mid, slopes, errors, strict=True)
-        inputs = [affine(v, np.concatenate([slope, own, zeros[self.m :]])) for v, slope, own in parts]
+        batch = u.error.v.shape[1]
+        zeros, errors = np.zeros((self.symbols - self.n, batch)), np.eye(self.m)[:, :, None] * u.error.top[:, None]
+        states = [affine(x.value[0, i], np.concatenate([x.value[1:, i], zeros]), x.error[i]) for i in range(self.n)]
+        inputs = [
+            affine(u.value[0, j], np.concatenate([u.value[1:, j], errors[j], zeros[self.m :]])) for j in range(self.m)
+        ]
         return states, inputs
 
     def quantities(self, batch: int) -> list[Taylor]:
@@ -91,24 +95,22 @@ class Boxes:
     def number(self, pair: tuple[Fraction, Fraction], symbol: int, batch: int) -> Taylor:
         """A number of a range, by its symbol."""
         (lo, hi), g = pair, np.zeros((self.symbols, batch))
-        (middle, error), (reach, doubt) = float_with_error((lo + hi) / 2), float_with_error((hi - lo) / 2)
-        g[symbol] = reach
-        return affine(np.full(batch, middle), g, up(error + doubt))
+        middle, reach = near((lo + hi) / 2), near((hi - lo) / 2)
+        g[symbol] = reach.value
+        return affine(np.full(batch, middle.value), g, middle.error + reach.error)
 
     def gap(self, centre: Array, radius: Array, level: float, sign: float) -> Taylor:
-        """sign (level - V) on the boxes, which is not negative on the part of a leaf that lies in the ring."""
-        far = up(np.abs(centre) + radius)
-        size = up(level + total(self.S * far * far, 0))
-        zeros = np.zeros((self.symbols - self.n, centre.shape[1]))
-        g = np.concatenate([-2 * sign * self.S * centre * radius, zeros])
-        q = np.concatenate([-sign * self.S * radius * radius, zeros])
-        c = sign * (level - np.sum(self.S * centre * centre, axis=0))
-        r = up(self.cross(far) + gamma(self.n + 8) * size)
-        return Taylor(c, g, np.eye(len(q))[:, :, None] * q, r)
+        """sign (level - V) on the boxes, which is not negative on the part of a leaf that lies in the ring.
 
-    def cross(self, far: Array) -> Array:
-        """Upper bound of the off-diagonal part of V in magnitude where |z| <= far."""
-        return total(far * total(self.S_rest[:, :, None] * far[None, :], 1), 0)
+        V is `sum S_ii (centre_i + radius_i d_i)^2` within `cross`.
+        """
+        S, i_j = -sign * self.S[:, None], pairs(self.symbols)
+        c = Near(sign * level) + self.diagonal(centre) * -sign
+        g, q = _by(S, 2 * centre, radius), _by(S, radius, radius)
+        p = np.zeros((self.symbols + len(i_j[0]), centre.shape[1]))
+        p[: self.n] = g.value
+        p[self.symbols :][np.flatnonzero(i_j[0] == i_j[1])[: self.n]] = q.value
+        return Taylor(c.value, p, c.error + g.error.sum() + q.error.sum() + self.cross(size(centre) + radius))
 
     def least_bound(self, rise: Taylor, gaps: Sequence[Callable[[Array], Taylor]]) -> Array:
         """An upper bound of `rise` where no gap is negative: that of `rise` or of `rise + k gap` for one gap and some
@@ -119,9 +121,14 @@ class Boxes:
             gap, part = gap_on(left), rise.at(left)
             for k in multipliers(part.g[: self.n], gap.g[: self.n], gap.c):
                 still = np.flatnonzero(np.logical_not(bound[left] < 0))
-                other = upper_bound(part.at(still) + gap.at(still).scaled(k[still]))
+                other = upper_bound(combination((1.0, part.at(still)), (k[still], gap.at(still))))
                 bound[left[still]] = np.fmin(bound[left[still]], other)
         return bound
+
+
+def _by(S: Array, x: Array, y: Array) -> Near:
+    """S x y for exact numbers."""
+    return Near(S) * Near(x) * Near(y)
 
 
 def multipliers(a: Array, b: Array, c: Array) -> Array:
@@ -137,7 +144,13 @@ def multipliers(a: Array, b: Array, c: Array) -> Array:
 def middle(lo: Array, hi: Array) -> tuple[Array, Array]:
     """Centre and radius of boxes."""
     centre = 0.5 * lo + 0.5 * hi
-    return centre, up(np.maximum(hi - centre, centre - lo))
+    ends = (Near(hi) - Near(centre)).ends[1], (Near(centre) - Near(lo)).ends[1]
+    return centre, np.maximum(*ends)
+
+
+def on_box(u: Form) -> Near:
+    """Forms as numbers."""
+    return Near(u.value[0], size(u.value[1:]).sum() + u.error)
 
 
 def keeps_inputs(leaves: Leaves) -> Failures:
@@ -145,11 +158,11 @@ def keeps_inputs(leaves: Leaves) -> Failures:
     c = leaves.boxes.c
     if leaves.boxes.case.bounded:
         return 0
-    for name, bounds, mid, reach in zip(c.inputs, c.input_bounds, leaves.mid, leaves.reach, strict=True):
-        hold = within(bounds, mid, reach)
+    for j, (name, bounds) in enumerate(zip(c.inputs, c.input_bounds, strict=True)):
+        hold = within(bounds, leaves.inputs[j])
         if not np.all(hold):
             yield f"{leaves.place}{leaves.numbers[np.argmin(hold)]}", f"{name} may leave its bounds"
-    return int(leaves.mid.size)
+    return int(leaves.inputs.value.size)
 
 
 def is_whole(tree: bytes, axes: Sequence[int], where: str = "") -> Failures:

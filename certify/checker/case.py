@@ -12,7 +12,7 @@ from flint import fmpq_mat
 
 from .document import Array, Certificate, Intervals, LocalBall, Outer, OuterTree, Partition, Slab
 from .exact import exactly, gershgorin_lower, inverse_diagonal
-from .float64 import float_with_error, up
+from .near import near
 from .network import Folded, fold
 from .parts import Part
 
@@ -58,8 +58,7 @@ class Case:
     @property
     def longest(self) -> float:
         """At or above the longest period."""
-        value, error = float_with_error(self.c.step)
-        return float(up(value + error))
+        return float(near(self.c.step).ends[1])
 
     @property
     def tube(self) -> tuple[Slab, ...]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from .document import Policy
 from .expression import MAX_BITS
+from .functions import FUNCTIONS, Undecided
 
 MAX_INVERSE_BITS = 2**14  # of a number in a matrix all of whose inverse is wanted, times the matrix's size
 MAX_MATRIX_BITS = 2**16  # of a number in a matrix, times the matrix's size: beyond, a decision takes minutes
@@ -86,10 +87,6 @@ def fraction(q: fmpq) -> Fraction:
     return Fraction(int(q.p), int(q.q))
 
 
-class Undecided(Exception):
-    """There is no value, or it is too long."""
-
-
 @dataclass(frozen=True)
 class Exact:
     """A number on the tape: a rational, or None for one that is none or is not known to be: functions are known at
@@ -115,19 +112,7 @@ class Exact:
         return Exact(None if self.value is None or other.value is None else self.value * other.value)
 
     def function(self, name: str) -> Exact:
-        value = self.value
-        if value is None:
-            return self
-        if name == "inv":
-            if value == 0:
-                raise Undecided("a division by 0")
-            return Exact(1 / value)
-        if name == "sqrt":
-            if value <= 0:
-                raise Undecided("the root of a number that is not positive")
-            root = Fraction(isqrt(value.numerator), isqrt(value.denominator))
-            return Exact(root if root * root == value else None)
-        return Exact(Fraction(int(name in ("cos", "exp"))) if value == 0 else None)
+        return self if self.value is None else Exact(FUNCTIONS[name].exact(self.value))
 
 
 def raw_at_origin(policy: Policy) -> list[Fraction | None]:

@@ -17,6 +17,7 @@ from operator import add
 from typing import Any
 
 from .expression import Tape, evaluate
+from .functions import FUNCTIONS
 
 Constant = Callable[[Fraction], Any]
 
@@ -49,49 +50,9 @@ class Series:
         return self._of(found)
 
     def function(self, name: str) -> Series:
-        """phi(v): k phi_k = sum_(j=1..k) j v_j w_(k-j), w = phi'(v), or what is multiplied out for 1/v and the root."""
-        v, whole = self.parts, range(1, self.count if len(self.parts) > 1 else 1)
-        y = [v[0].function(name)]
-        if name == "inv":
-            for k in whole:
-                y.append(-(self._sum(v, y, 1, k) * y[0]))
-        elif name == "sqrt":
-            half = self.constant(Fraction(1, 2)) * y[0].function("inv")
-            for k in whole:
-                known = [v[k]] if k < len(v) else []
-                known += [-(y[i] * y[k - i]) for i in range(1, k)]
-                y.append(half * reduce(add, known) if known else self.constant(Fraction(0)))
-        elif name in ("sin", "cos"):
-            other = [v[0].function("cos" if name == "sin" else "sin")]
-            for k in whole:
-                rise, fall = self._step(other, k), self._step(y, k)
-                y.append(rise if name == "sin" else -rise)
-                other.append(-fall if name == "sin" else fall)
-        elif name == "exp":
-            for k in whole:
-                y.append(self._step(y, k))
-        elif name == "tanh":
-            slope: list[Any] = []
-            for k in whole:
-                square = reduce(add, [y[i] * y[k - 1 - i] for i in range(k)])
-                slope.append(self.constant(Fraction(1)) + -square if k == 1 else -square)
-                y.append(self._step(slope, k))
-        elif name == "atan":
-            slopes = (self._of([self.constant(Fraction(1))]) + self * self).function("inv").parts
-            for k in whole:
-                y.append(self._step(slopes, k))
-        else:
-            raise ValueError(f"nothing is known of {name}")
-        return self._of(y)
-
-    def _step(self, w: list[Any], k: int) -> Any:
-        """sum_(j=1..k) j v_j w_(k-j) / k."""
-        v = self.parts
-        terms = [self.constant(Fraction(j, k)) * (v[j] * w[k - j]) for j in range(1, min(k, len(v) - 1) + 1)]
-        return reduce(add, terms) if terms else self.constant(Fraction(0))
-
-    def _sum(self, v: list[Any], y: list[Any], first: int, k: int) -> Any:
-        return reduce(add, [v[j] * y[k - j] for j in range(first, min(k, len(v) - 1) + 1)])
+        """phi(v) for a function phi of the table."""
+        count = self.count if len(self.parts) > 1 else 1
+        return self._of(FUNCTIONS[name].series(self.parts, count, self.constant))
 
 
 def coefficients(

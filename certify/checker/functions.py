@@ -54,6 +54,11 @@ class Expansion:
         return Near(f0.value, f0.error + e0), Near(f1.value, f1.error + e1), Near(f2.value, f2.error + e2), Near(f3.value, f3.error + e3)
 
     @property
+    def derivative(self) -> Derivative:
+        """The expansion of phi' that models on boxes ask for."""
+        return Derivative(self)
+
+    @property
     def v(self) -> Near:
         """All that v may be."""
         return Near(self.v0.value, self.v0.error + self.radius)
@@ -69,6 +74,14 @@ class Expansion:
     @cached_property
     def last(self) -> Above:
         return self.phi.last(self)
+
+
+class Derivative:
+    """phi' around v0: its first three terms, `stored` as those of an expansion, leave at most `third` |D|^3."""
+
+    def __init__(self, e: Expansion) -> None:
+        _, f1, f2, f3 = e.f
+        self.stored, self.third = (f1, f2 * 2, f3 * 3), e.last
 
 
 class Function(ABC):

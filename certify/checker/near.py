@@ -109,6 +109,10 @@ class Above:
         """The larger of two, which bounds both."""
         return Above(np.maximum(self.v, other.v), max(self.k, other.k))
 
+    def less(self, x: Any) -> Above:
+        """The differences from exact numbers, or 0 where these are larger."""
+        return Above(np.maximum(self.top - x, 0.0), 1)
+
     def sum(self, axis: int | tuple[int, ...] = 0) -> Above:
         """Sums along axes, in any order: of n numbers they lose a factor 1 - n u, and 4 n u makes up for it."""
         added = np.sum(self.v, axis=axis)
@@ -211,6 +215,12 @@ class Near:
         """Quotients by an exact positive number."""
         return type(self)(self.value / k, (self.error + self.size.ulps(1)).over(k))
 
+    def sum(self) -> Near:
+        """The sums along the first axis, of numbers with an error each; gamma_n bounds what is rounded."""
+        value = np.sum(self.value, axis=0)
+        made = size(self.value).sum().ulps(len(self.value))
+        return Near(value, made if self.error is ZERO else made + self.error.sum())
+
     def __getitem__(self, index: Any) -> Self:
         """Some of those that have an error each."""
         place = (*(slice(None) for _ in self.axes), *(index if isinstance(index, tuple) else (index,)))
@@ -228,12 +238,18 @@ class Near:
 
 
 class Form(Near):
-    """Coefficients along the first axis of symbols in [-1, 1], with one error for all."""
+    """Coefficients along the first axis, of 1 and of symbols in [-1, 1], with one error for all."""
 
     axes = (0,)
 
     def length(self, x: Above) -> Above:
         return x.sum(0)
+
+    def raised(self, b: Near) -> Form:
+        """The sum with numbers, at the first coefficient."""
+        value = self.value.copy()
+        value[0] += b.value
+        return Form(value, self.error + b.error + size(value[0]).ulps(1))
 
 
 class Uniform(Near):
@@ -243,6 +259,20 @@ class Uniform(Near):
 
     def length(self, x: Above) -> Above:
         return x.max(0)
+
+    def times(self, k: Array) -> Uniform:
+        """Products with an exact number for each."""
+        return Uniform(self.value * k, (self.error + self.size.ulps(1)) * size(k).max(0))
+
+    def through(self, W: Array) -> Uniform:
+        """W x for an exact matrix W, the numbers x along the first axis; |W| has rows of sums up to the largest."""
+        value = np.tensordot(W, self.value, 1)
+        return Uniform(value, (self.error + self.size.ulps(W.shape[1])) * size(W).sum(1).max(0))
+
+
+def where(condition: Any, x: Near, y: Near) -> Near:
+    """x where the condition holds, else y."""
+    return Near(np.where(condition, x.value, y.value), x.error.where(condition, y.error))
 
 
 def combined(*terms: tuple[Any, Near]) -> tuple[Any, Above]:
@@ -266,7 +296,8 @@ def products(x: Array, y: Array, both: Above, first: Array, second: Array) -> Fo
     N = len(x)
     whole = np.zeros((N + len(first), *x.shape[1:]))
     np.multiply(x[first], y[second], out=whole[N:])
-    whole[N:] += np.where((first != second)[:, None], x[second], 0.0) * y[first]
+    apart = first != second
+    whole[N:][apart] += x[second[apart]] * y[first[apart]]
     found = Form(whole, both.ulps(3))
     found.size = both + found.error
     return found
@@ -282,10 +313,14 @@ def near(q: Fraction) -> Near:
     return Near(np.float64(value), Above(np.float64(left) + LEAST, 2) if left else ZERO)
 
 
+def stacked(numbers: Sequence[Near]) -> Near:
+    """Single numbers as an array."""
+    return Near(np.array([x.value for x in numbers]), Above(np.array([0 * x.value if x.error is ZERO else x.error.top for x in numbers])))
+
+
 def all_near(numbers: Iterable[Fraction]) -> Near:
     """Rationals as an array."""
-    found = [near(q) for q in numbers]
-    return Near(np.array([x.value for x in found]), Above(np.array([0.0 if x.error is ZERO else x.error.top for x in found])))
+    return stacked([near(q) for q in numbers])
 
 
 def near_ball(x: arb) -> Near:
@@ -361,7 +396,7 @@ def _tanh(y: Array) -> tuple[Array, Above]:
     s = d + d * (w * (-1 / 3 + w * (2 / 15 + w * (-17 / 315 + w * (62 / 2835)))))
     T = _TANH[k]
     t = np.where(finite, np.copysign(T + _SECH2[k] * s / (1 + T * s), y), np.nan)
-    return t, size(t).ulps(4)
+    return t, size(t) * (7 * U)
 
 
 def _sin_cos(y: Array) -> tuple[Near, Near]:
@@ -380,7 +415,7 @@ def _sin_cos(y: Array) -> tuple[Near, Near]:
     S, C = _SIN[k], _COS[k]
 
     def known(value: Array, large: Array, small: Array) -> Near:
-        error = (size(large) + size(small)).ulps(3)
+        error = (size(large) + size(small)) * (5 * U)
         value, bound = (np.where(finite, np.where(close, v, far), np.nan) for v, far in ((value, 0.0), (error.v, 1.0)))
         return Near(value, Above(bound, error.k))
 
@@ -406,7 +441,7 @@ def _exp(y: Array) -> Near:
     v = _EXP[k] * p
     v = np.where(y < 0, 1 / v, v)
     beyond = np.isfinite(y) & (y < 0)
-    error = size(v).ulps(3)
+    error = size(v) * (6 * U)
     v, bound = (np.where(with_table, a, np.where(beyond, b, np.nan)) for a, b in ((v, 0.0), (error.v, 2.0**-92)))
     return Near(v, Above(bound, error.k))
 
@@ -428,7 +463,7 @@ def _atan(y: Array) -> Near:
     s = q * q
     v = q + q * (s * (-1 / 3 + s * (1 / 5 + s * (-1 / 7 + s * (1 / 9 + s * (-1 / 11))))))
     A = _ATAN[k]
-    v, error = A + v, size(A).ulps(2) + size(q).ulps(4)
+    v, error = A + v, size(A) * (3 * U) + size(q) * (8 * U)
     v = np.copysign(np.where(large, _RIGHT_ANGLE - v, v), y)
     error = (error + 6 * U).where(large, error)
     return Near(np.where(finite, v, np.nan), Above(np.where(finite, error.v, np.nan), error.k))

@@ -15,15 +15,15 @@ from math import nextafter
 import numpy as np
 from flint import fmpq, fmpq_mat
 
-from .boxes import Boxes, Leaves, batches, is_whole, middle
+from .boxes import Boxes, Leaves, batches, is_whole, middle, on_box
 from .case import Case, Failures
 from .document import Network
-from .elementary import derivative, elementary
 from .exact import exactly, inverse
 from .expression import Tape, evaluate
-from .float64 import EPS, Array, ends, float_with_error, gamma, spectral_norm, total, up
+from .functions import FUNCTIONS
+from .near import ZERO, Above, Array, Form, Near, near
 from .flow import Series
-from .network import Folded, Layer, enclose_on_boxes
+from .network import Folded, enclose_on_boxes, layer
 from .parts import Batch
 from .taylor import Taylor, affine, constant, upper_bound
 
@@ -32,7 +32,7 @@ _MOST_NUMBERS, _MOST_VALUES = 2**22, 2**26  # of a box: in the models of a netwo
 
 
 class Layers:
-    """A network's models: each layer's values before the next tanh, one row per unit."""
+    """A network's models: each layer's values before the next tanh, one row per unit, (width, B) and more behind."""
 
     def __init__(self, net: Network) -> None:
         self.net, self.values = net, max(len(W) for W in net.weights)
@@ -40,14 +40,12 @@ class Layers:
     @cached_property
     def as_policy(self) -> Folded:
         """The same network as a policy, for the enclosure of rule `ring`."""
-        pairs, zero = zip(self.net.weights, self.net.biases, strict=True), np.zeros(1)
-        layers = tuple(Layer(W, b, np.zeros_like(b), spectral_norm(W)) for W, b in pairs)
-        return Folded(layers, False, np.ones(1), zero, zero)
+        layers = tuple(layer(W, b) for W, b in zip(self.net.weights, self.net.biases, strict=True))
+        return Folded(layers, False, np.ones(1), Near(np.zeros(1)))
 
-    def least(self, x: Array, error: Array) -> Array:
+    def least(self, x: Form) -> Array:
         """A lower bound of N (B,), affine on the boxes: good where these are large."""
-        mid, slopes, wide = enclose_on_boxes(self.as_policy, x, error)
-        least: Array = ends(mid[0], up(total(np.abs(slopes[0]), 0) + wide[0]))[0]
+        least: Array = on_box(enclose_on_boxes(self.as_policy, x)).ends[0][0]
         return least
 
     def is_small(self, symbols: int) -> bool:
@@ -71,8 +69,8 @@ class Layers:
         first, *later = self.net.weights
         y = _through(first, _stacked(F))
         for W, a in zip(later, models, strict=False):
-            slope = a.composed(derivative(elementary("tanh", a.c, 0.0, a.reach)))
-            y = _through(W, slope.widened(len(y.g)) * y)
+            slope = a.composed(FUNCTIONS["tanh"].expansion(Near(a.c), a.moved).derivative)
+            y = _through(W, slope.widened(y.symbols) * y)
         return _row(y)
 
 
@@ -86,9 +84,9 @@ class Formula:
         """True if the models in so many symbols take acceptable time."""
         return len(self.tape.operations) * symbols**2 <= _MOST_VALUES
 
-    def least(self, x: Array, error: Array) -> Array:
+    def least(self, x: Form) -> Array:
         """No bound before there are models."""
-        return np.full(x.shape[2], -np.inf)
+        return np.full(x.value.shape[2], -np.inf)
 
     def models(self, states: Sequence[Taylor]) -> list[Taylor]:
         """The states."""
@@ -102,7 +100,7 @@ class Formula:
     def along(self, models: Sequence[Taylor], F: Sequence[Taylor]) -> Taylor:
         """N'F."""
         number = _numbers(F[0])
-        series = [Series([x.widened(len(f.g)), f], 2, number) for x, f in zip(models, F, strict=True)]
+        series = [Series([x.widened(f.symbols), f], 2, number) for x, f in zip(models, F, strict=True)]
         N: Series = evaluate(self.tape, lambda q: Series([number(q)], 2, number), series)[0]
         rise: Taylor = N.parts[1] if len(N.parts) > 1 else number(Fraction(0))
         return rise
@@ -127,13 +125,13 @@ def is_above_on_faces(case: Case) -> Failures:
         yield from is_whole(tree, others, where)
         if not all(np.all(np.isfinite(widest[j])) for j in others):
             yield f"{where}root", "no binary64 numbers enclose the domain"
-        end, error = float_with_error(case.c.domain[i][side])
-        lo, hi = np.array([(end, end) if j == i else pair for j, pair in enumerate(widest)]).T
-        doubt = np.where(np.arange(n) == i, error, 0.0)[:, None]
+        end = near(case.c.domain[i][side])
+        lo, hi = np.array([(end.value, end.value) if j == i else pair for j, pair in enumerate(widest)]).T
+        doubt = np.where(np.arange(n) == i, end.error.top if end.error is not ZERO else 0.0, 0.0)[:, None]
         for first, lower, upper in case.part.own(batches(tree, lo, hi, _batch(n * n * function.values))):
             centre, radius = middle(lower, upper)
-            x = np.concatenate([centre[:, None], np.eye(n)[:, :, None] * radius], axis=1)
-            left = _below_level(function, x, doubt + np.zeros_like(centre), claim.level)[0]
+            x = np.concatenate([centre[None], np.eye(n)[:, :, None] * radius])
+            left = _below_level(function, Form(x, Above(doubt + np.zeros_like(centre))), claim.level)[0]
             if len(left):
                 yield f"{where}leaf {first + left[0]}", "N must be above its level"
             count += centre.shape[1]
@@ -176,7 +174,7 @@ class Beyond(Boxes):
         claim, evidence = case.outer
         super().__init__(case, evidence.T, case.seen_from(evidence.T))
         self.function, self.level, self.evidence = _function(case), claim.level, evidence
-        ends_of = [[ends(*float_with_error(end))[side] for side, end in enumerate(pair)] for pair in self.c.domain]
+        ends_of = [[near(end).ends[side] for side, end in enumerate(pair)] for pair in self.c.domain]
         self.least, self.largest = np.array(ends_of).T[:, :, None]  # at or beyond the domain's ends, (n, 1)
 
     def leaves(self) -> Iterator[Batch]:
@@ -189,27 +187,25 @@ class Beyond(Boxes):
     def examine(self, first: int, lo: Array, hi: Array) -> Leaves:
         """The leaves with these corners, numbered from `first`, of which N'F is asked."""
         centre, radius = middle(lo, hi)
-        x, error = self.states(centre, radius)
-        near = np.flatnonzero(np.logical_not(self.is_outside(x, error) | (self.levels(lo, hi)[1] < self.c.c2)))
-        left, models = _below_level(self.function, x[:, :, near], error[:, near], self.level)
-        left, N = near[left], self.function.value(models).widened(self.symbols)
-        x, error, centre, radius = x[:, :, left], error[:, left], centre[:, left], radius[:, left]
-        mid, slopes, wide = enclose_on_boxes(self.net, x, error)
-        states, held = self.affine(x, error, mid, slopes, wide)
+        x = self.states(centre, radius)
+        close = np.flatnonzero(np.logical_not(self.is_outside(x) | (self.levels(lo, hi)[1] < self.c.c2)))
+        left, models = _below_level(self.function, x[:, close], self.level)
+        left, N = close[left], self.function.value(models).widened(self.symbols)
+        x, centre, radius = x[:, left], centre[:, left], radius[:, left]
+        u = enclose_on_boxes(self.net, x)
+        states, held = self.models(x, u)
         F = self.f(states, [*held, *self.quantities(len(left))])
         rise = self.function.along(models, F)
         below = constant(Fraction(self.level), self.symbols, len(left)) + -N
         bound = self.least_bound(
             rise, [below.at, lambda few: self.gap(centre[:, few], radius[:, few], self.c.c2, -1.0)]
         )
-        finite = np.all([np.isfinite(v.size + v.r) for v in (N, *F)], axis=0)
-        return Leaves(
-            self, first + left, "outer leaf ", mid, up(total(np.abs(slopes), 1) + wide), bound, (bound < 0) & finite
-        )
+        finite = np.all([np.isfinite(v.size.top) for v in (N, *F)], axis=0)
+        return Leaves(self, first + left, "outer leaf ", on_box(u), bound, (bound < 0) & finite)
 
-    def is_outside(self, x: Array, error: Array) -> Array:
+    def is_outside(self, x: Form) -> Array:
         """True on each box that certainly lies outside the domain, along one of the states."""
-        lo, hi = ends(x[:, 0], up(total(np.abs(x[:, 1:]), 1) + error))
+        lo, hi = on_box(x).ends
         outside: Array = np.any((lo > self.largest) | (hi < self.least), axis=0)
         return outside
 
@@ -224,41 +220,39 @@ def _batch(numbers: int) -> int:
     return max(1, min(4096, _BATCH_NUMBERS // numbers))
 
 
-def _below_level(function: Layers | Formula, x: Array, error: Array, level: float) -> tuple[Array, list[Taylor]]:
+def _below_level(function: Layers | Formula, x: Form, level: float) -> tuple[Array, list[Taylor]]:
     """The boxes, by their indices, on which N is not certainly above the level, and the function's models on these."""
-    left = np.flatnonzero(np.logical_not(function.least(x, error) > level))
-    states = [affine(own[0], own[1:], e) for own, e in zip(x[:, :, left], error[:, left], strict=True)]
-    models = function.models(states)
+    left = np.flatnonzero(np.logical_not(function.least(x) > level))
+    x = x[:, left]
+    models = function.models([affine(x.value[0, i], x.value[1:, i], x.error[i]) for i in range(x.value.shape[1])])
     N = function.value(models)
-    above = np.isfinite(N.size + N.r) & (upper_bound(-N) < -level)
+    above = np.isfinite(N.size.top) & (upper_bound(-N) < -level)
     still = np.flatnonzero(np.logical_not(above))
     return left[still], [v.at(still) for v in models]
 
 
 def _numbers(like: Taylor) -> Callable[[Fraction], Taylor]:
     """The function that gives a rational's model."""
-    return lambda q: constant(q, len(like.g), len(like.c))
+    return lambda q: constant(q, like.symbols, len(like.c))
 
 
 def _stacked(models: Sequence[Taylor]) -> Taylor:
     """Models as rows of one."""
-    c, r = (np.array([getattr(v, part) for v in models]) for part in ("c", "r"))
-    return Taylor(c, np.stack([v.g for v in models], 1), np.stack([v.Q for v in models], 2), r)
+    c, p = np.stack([v.c for v in models]), np.stack([v.p for v in models], 1)
+    return Taylor(c, p, Above(np.stack([v.r.top + np.zeros_like(v.c) for v in models])))
 
 
 def _row(models: Taylor) -> Taylor:
     """The first of such models."""
-    return Taylor(models.c[0], models.g[:, 0], models.Q[:, :, 0], models.r[0])
+    return Taylor(models.c[0], models.p[:, 0], models.r[0])
 
 
 def _through(W: Array, v: Taylor, b: Array | None = None) -> Taylor:
     """`W v + b` of models in rows (width, B)."""
-    made, c = gamma(W.shape[1]), np.matmul(W, v.c)
-    r = np.matmul(np.abs(W), v.r + up(made * v.size)) * (1 + made)
+    c, p = Near(v.c, v.r).through(W), v.beyond.through(W)
     if b is not None:
-        c = c + b[:, None]
-        r = r + EPS * (np.abs(c) + np.abs(b)[:, None])
-    return Taylor(c, np.matmul(W, v.g), np.matmul(W, v.Q), up(r))
+        c = c + Near(b[:, None])
+    return Taylor(c.value, p.value, c.error + p.error)
 
 
 def _below(q: Fraction) -> float:

@@ -11,14 +11,14 @@ from operator import add
 import numpy as np
 from flint import fmpq
 
-from .boxes import Boxes, Leaves, batches, is_whole, middle, multipliers
+from .boxes import Boxes, Leaves, batches, is_whole, middle, multipliers, on_box
 from .case import Case, Failures
 from .exact import fraction, root_above
-from .float64 import Array, ends, float_with_error, total, up
+from .near import Above, Array, Near, near, size
 from .flow import later
 from .network import enclose_on_boxes
 from .parts import Batch
-from .taylor import Taylor, affine, upper_bound
+from .taylor import Taylor, affine, combination, pairs, upper_bound
 
 _BATCH_NUMBERS = 800_000  # in the largest array of a batch: more would not stay in a cache
 _ATTEMPTS = 4  # at the a-priori enclosure
@@ -60,13 +60,13 @@ class Ring(Boxes):
         met = np.flatnonzero(np.logical_not(outside | inside if self.case.covered else outside))
         lo, hi, meet, beyond = lo[:, met], hi[:, met], np.logical_not(inside[met]), beyond[met]
         centre, radius = middle(lo, hi)
-        x, error = self.states(centre, radius)
-        mid, slopes, wide = enclose_on_boxes(self.net, x, error)
-        states, held = self.affine(x, error, mid, slopes, wide)
+        x = self.states(centre, radius)
+        u = enclose_on_boxes(self.net, x)
+        states, held = self.models(x, u)
         G, ends = self.increment(states, held)
         rise = self.rise(states, G)
         if self.c.rate:
-            rise = rise + self.gap(centre, radius, 0.0, -1.0).scaled(2 * self.c.rate)
+            rise = combination((1.0, rise), (2 * self.c.rate, self.gap(centre, radius, 0.0, -1.0)))
         if self.case.covered or not self.c.step:
             bound = self.bound(rise, centre, radius)
         else:
@@ -74,9 +74,8 @@ class Ring(Boxes):
         hold = bound < 0
         if not (self.case.covered or self.c.step or np.all(meet)):
             # a division by a range that contains 0 has no finite model
-            hold = np.where(meet, hold, np.all([np.isfinite(g.size + g.r) for g in G], axis=0))
-        reach = up(total(np.abs(slopes), 1) + wide)
-        return RingLeaves(self, first + met, "leaf ", mid, reach, bound, hold, meet, ends)
+            hold = np.where(meet, hold, np.all([np.isfinite(g.size.top) for g in G], axis=0))
+        return RingLeaves(self, first + met, "leaf ", on_box(u), bound, hold, meet, ends)
 
     def misses(self, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
         """True on boxes with certainly V > c2 everywhere; with certainly V < c1; with certainly V >= c1."""
@@ -103,15 +102,15 @@ class Ring(Boxes):
         """Enclose the states during a period, and f of them; NaN where none of a few attempts is an enclosure."""
         h, way = self.case.longest, np.zeros((self.n, len(held[0].c)))
         for attempt in range(1 + _ATTEMPTS):
-            during = [replace(x, r=up(x.r + own)) for x, own in zip(states, way, strict=True)]
+            during = [replace(x, r=x.r + own) for x, own in zip(states, way, strict=True)]
             F = self.f(during, held)
-            most = up(h * np.array([up(f.size + f.r) for f in F]))
+            most = np.array([(f.size * h).top for f in F])
             good = np.all(most < way, axis=0)
             if np.all(good):
                 break
             way = np.where(good, way, 1.25 * most if attempt < _ATTEMPTS else np.nan)
         else:
-            during = [replace(x, r=up(x.r + own)) for x, own in zip(states, way, strict=True)]
+            during = [replace(x, r=x.r + own) for x, own in zip(states, way, strict=True)]
             F = self.f(during, held)
         return during, F
 
@@ -119,21 +118,21 @@ class Ring(Boxes):
         """Between what the states lie that start in {V <= c2} and move as fast as F for a period at most."""
         h, found = self.case.longest, []
         for x, f, p in zip(states, F, self.case.P_inverse, strict=True):
-            value, error = float_with_error(fraction(root_above(self.c2 * fmpq(p.numerator, p.denominator))))
-            widest = up(value + error)
-            (lo, hi), (slowest, fastest) = (ends(v.c, up(v.linear + v.quadratic + v.r)) for v in (x, f))
-            lo, hi = np.maximum(lo, -widest), np.minimum(hi, widest)
-            away = up(h * np.maximum(-slowest, 0.0)), up(h * np.maximum(fastest, 0.0))
-            found.append((ends(lo, away[0])[0], ends(hi, away[1])[1]))
+            widest = near(fraction(root_above(self.c2 * fmpq(p.numerator, p.denominator)))).ends[1]
+            (lo, hi), (slowest, fastest) = x.range.ends, f.range.ends
+            down, up = (Above(np.maximum(v, 0.0)) * h for v in (-slowest, fastest))
+            low, high = Near(np.maximum(lo, -widest), down), Near(np.minimum(hi, widest), up)
+            found.append((low.ends[0], high.ends[1]))
         return np.moveaxis(np.array(found), 1, 0)
 
     def of_mean(self, f: Taylor) -> Taylor:
         """A model with the symbols of uncertain quantities, as their means: what is of second order in them, whose mean
         is another, becomes part of the remainder."""
-        own = slice(self.n + self.m, self.n + self.m + self.k)
-        Q = f.Q.copy()
-        Q[own, own] = 0.0
-        return replace(f, Q=Q, r=up(f.r + total(total(np.abs(f.Q[own, own]), 0), 0)))
+        i, j = (self.n + self.m <= index for index in pairs(self.symbols))
+        own = self.symbols + np.flatnonzero(i & j & (pairs(self.symbols)[1] < self.n + self.m + self.k))
+        p = f.p.copy()
+        p[own] = 0.0
+        return Taylor(f.c, p, f.r + size(f.p[own]).sum())
 
     def rise(self, states: list[Taylor], G: list[Taylor]) -> Taylor:
         """D = sum_i G_i (2 P x + h P G)_i."""
@@ -141,7 +140,7 @@ class Ring(Boxes):
         if self.c.step:
             step = self.number(self.c.sample or (self.c.step,) * 2, self.symbols - 1, len(states[0].c))
             along = [v + step * g for v, g in zip(along, G, strict=True)]
-        rows = [reduce(add, [v.scaled(p) for p, v in zip(row, along, strict=True)]) for row in self.c.P.tolist()]
+        rows = [combination(*zip(row, along, strict=True)) for row in self.c.P.tolist()]
         return reduce(add, [row * g for row, g in zip(rows, G, strict=True)])
 
     def bound_of_steps(self, rise: Taylor, centre: Array, radius: Array) -> Array:
@@ -153,7 +152,7 @@ class Ring(Boxes):
         tried = multipliers(rise.g[: self.n], gap.g[: self.n], gap.c)
         bound = upper_bound(rise)
         for k in [*np.minimum(tried, most), np.full_like(bound, most)]:
-            bound = np.fmin(bound, upper_bound(rise + gap.scaled(k)))
+            bound = np.fmin(bound, upper_bound(combination((1.0, rise), (k, gap))))
         return bound
 
     def bound(self, rise: Taylor, centre: Array, radius: Array) -> Array:
@@ -178,7 +177,7 @@ def stays(leaves: RingLeaves) -> Failures:
     if not c.sample:
         return 0
     for i, (name, (lo, hi)) in enumerate(zip(c.states, c.domain, strict=True)):
-        (_, least), (most, _) = (ends(*float_with_error(q)) for q in (lo, hi))
+        (_, least), (most, _) = near(lo).ends, near(hi).ends
         hold = (leaves.ends[0, i] > least) & (leaves.ends[1, i] < most)
         if not np.all(hold):
             yield f"leaf {leaves.numbers[np.argmin(hold)]}", f"{name} may leave the domain during a period"
@@ -198,7 +197,7 @@ def decreases(leaves: RingLeaves) -> Failures:
 
 def _between(v: Taylor) -> Taylor:
     """Replace a model's symbols by its range."""
-    return affine(v.c, np.zeros_like(v.g), up(v.linear + v.r))
+    return affine(v.c, np.zeros_like(v.g), v.moved)
 
 
 def _itself(v: Taylor) -> Taylor:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from .functions import FUNCTIONS, Expansion
+from .functions import FUNCTIONS, Derivative, Expansion
 from .near import ZERO, Above, Array, Form, Near, combined, near, products, size
 
 
@@ -82,7 +82,15 @@ class Taylor:
 
     def at(self, index: Array) -> Taylor:
         """The models of some members of the batch."""
-        return Taylor(self.c[index], self.p[:, index], self.r[index])
+        return Taylor(self.c[..., index], self.p[..., index], self.r[..., index])
+
+    def widened(self, symbols: int) -> Taylor:
+        """The same among so many symbols, of which those that come after its own do not matter to it."""
+        i, j = pairs(symbols)
+        p = np.zeros((symbols + len(i), *self.p.shape[1:]))
+        p[: self.symbols] = self.g
+        p[symbols + np.flatnonzero((i < self.symbols) & (j < self.symbols))] = self.q
+        return Taylor(self.c, p, self.r)
 
     def __add__(self, other: Taylor) -> Taylor:
         return combination((1.0, self), (1.0, other))
@@ -111,7 +119,7 @@ class Taylor:
         """phi(v) for a function phi of the table."""
         return self.composed(FUNCTIONS[name].expansion(Near(self.c), self.moved))
 
-    def composed(self, phi: Expansion) -> Taylor:
+    def composed(self, phi: Expansion | Derivative) -> Taylor:
         """phi(v) = f0 + f1 D + f2 D^2 + R, v = c + D, |R| <= third |D|^3, for phi expanded at c where |D| <= `moved`.
 
         D^2 differs from (g.d)^2 by at most 2 G w + w^2, w = H + r.
@@ -141,3 +149,47 @@ def constant(q: Fraction, symbols: int, batch: int) -> Taylor:
     """A rational, the same over the batch."""
     number = near(q)
     return affine(np.full(batch, number.value), np.zeros((symbols, batch)), number.error)
+
+
+def upper_bound(model: Taylor) -> Array:
+    """An upper bound of the model over the box, (B,); the lesser of two."""
+    bound = _separately(model)
+    left = np.flatnonzero(np.logical_not(bound < 0))
+    if len(left):
+        bound[left] = np.fmin(bound[left], _at_a_corner(model.at(left)))
+    return bound
+
+
+def _separately(model: Taylor) -> Array:
+    """Each symbol's part is maximised exactly, and the mixed terms are taken at their largest.
+
+    max over |t| <= 1 of `g t + q t^2` is g^2 / (-4q) if |g| < -2q, and at most max(|g|, -2q) + q in any case.
+    """
+    i, j = pairs(model.symbols)
+    g, q = np.abs(model.g), model.q[i == j]
+    inside = g < -2 * q
+    peak = (size(g) * size(g)).over(np.where(inside, -4 * q, 1.0)).top
+    edge = (Near(np.maximum(g, -2 * q)) + Near(q)).ends[1]
+    axes = Near(np.where(inside, np.minimum(peak, edge), edge))
+    mixed = size(model.q[i != j]).sum()
+    found: Array = (Near(model.c) + axes.sum() + Near(0 * model.c, mixed + model.r)).ends[1]
+    return found
+
+
+def _at_a_corner(model: Taylor) -> Array:
+    """The value at the corner s to which the gradient points, and what the terms of second order may add elsewhere.
+
+    With d_i = s_i (1 - w_i), 0 <= w_i <= 2, and R_ij = s_i s_j Q_ij, Q symmetric, `g.d + d'Q d` is
+    `sum |g_i| + s'Q s - sum_i w_i (|g_i| + 2 sum_j R_ij) + w'R w`; and `w'R w <= 2 sum_i w_i sum_j max(R_ij, 0)`, since
+    `w_i w_j <= w_i + w_j`. So the two sums add at most `2 sum_i max(0, 2 sum_j max(-R_ij, 0) - |g_i|)`.
+    """
+    i, j = pairs(model.symbols)
+    s = np.where(model.g < 0, -1.0, 1.0)
+    R = s[i] * s[j] * model.q  # R_ii, and 2 R_ij
+    down = np.where((i == j)[:, None], 2.0, 1.0) * np.maximum(-R, 0.0)
+    meets = np.zeros((model.symbols, len(i)))
+    meets[i, np.arange(len(i))] = meets[j, np.arange(len(j))] = 1.0
+    more = Above(down).through(meets).less(np.abs(model.g)).sum() * 2
+    at = Near(model.c) + Near(np.abs(model.g)).sum() + Near(R).sum()
+    found: Array = (at + Near(0 * model.c, more + model.r)).ends[1]
+    return found

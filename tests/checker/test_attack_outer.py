@@ -21,13 +21,12 @@ from flint import arb, ctx
 from certify.checker.boxes import batches, middle
 from certify.checker.case import Case
 from certify.checker.document import Network
-from certify.checker.elementary import derivative, elementary
 from certify.checker.outer import Beyond, Layers, _above, _below
-from certify.checker.taylor import Taylor, affine
 from tests.checker.test_cubic_attack import sizes
 from tests.support.certificates import LEAF, Document, edited, encode, make, parse, verdict
 from tests.support.outer import expression, stated
 from tests.support.outer_loops import PLAIN, scalar
+from tests.support.plain import Taylor, affine, form, slope_of_tanh
 
 Array = np.ndarray
 Generator = np.random.Generator
@@ -128,9 +127,10 @@ def test_what_is_known_of_a_box_is_so_exactly(count: int) -> None:
         n, c2 = beyond.n, Fraction(beyond.c.c2)
         T, P = ([exactly(row) for row in matrix] for matrix in (beyond.T, beyond.c.P))
         centre, radius = middle(lo, hi)
-        x, error = beyond.states(centre, radius)
-        outside, below = beyond.is_outside(x, error), beyond.levels(lo, hi)[1] < beyond.c.c2
-        gap = beyond.gap(centre, radius, beyond.c.c2, -1.0)
+        found = beyond.states(centre, radius)
+        x, error = np.moveaxis(found.value, 0, 1), found.error.top
+        outside, below = beyond.is_outside(found), beyond.levels(lo, hi)[1] < beyond.c.c2
+        gap = Taylor.of(beyond.gap(centre, radius, beyond.c.c2, -1.0))
 
         def states(z: Sequence[Fraction], T: Any = T) -> list[Fraction]:
             return [sum((t * v for t, v in zip(row, z, strict=True)), Fraction(0)) for row in T]
@@ -271,12 +271,14 @@ def test_networks_of_any_size_lie_in_their_models(count: int) -> None:
             continue
         all_symbols = n + int(generator.integers(1, 3))
         x = np.concatenate([centre[:, None], np.diag(radius)], axis=1)[:, :, None]
-        least = float(function.least(x, error[:, None])[0])
-        models = function.models([affine(own[0], own[1:], e) for own, e in zip(x, error[:, None], strict=True)])
+        least = float(function.least(form(x, error[:, None]))[0])
+        states = [affine(own[0], own[1:], e) for own, e in zip(x, error[:, None], strict=True)]
+        plain = function.models([v.model for v in states])
+        models = [Taylor.of(v) for v in plain]
         sized = [of_any_size(generator, n, *shape, 1, widest=(-20, 20))
                  for shape in ((), (all_symbols,), (all_symbols, all_symbols))]  # fmt: skip
         F = [Taylor(c, g, Q, np.zeros(1)) for c, g, Q in zip(*sized, strict=True)]
-        rise = function.along(models, F)
+        rise = Taylor.of(function.along(plain, [f.model for f in F]))
         for corner in (True, True, False):
             d = [arb(v) for v in symbols(generator, all_symbols, corner)]
             off = [arb(v) for v in generator.choice([-1.0, 0.0, 1.0], n).tolist()]
@@ -313,7 +315,7 @@ def test_the_slope_of_tanh_at_any_size(count: int) -> None:
         c, radius = float(of_any_size(generator, 1)[0]), float(np.abs(of_any_size(generator, 1))[0])
         if seed % 2:
             c, radius = float(generator.uniform(-6, 6)), float(10.0 ** generator.uniform(-18, 2))
-        phi = derivative(elementary("tanh", np.array(c), 0.0, np.array(radius)))
+        phi = slope_of_tanh(c, radius)
         (f0, f1, f2), (e0, e1, e2) = ([arb(float(v)) for v in part[:3]] for part in (phi.f, phi.e))
         for share in (1.0, -1.0, float(generator.uniform(-1, 1))):
             D = arb(radius) * arb(share)

@@ -23,7 +23,6 @@ from certify.checker import document
 from certify.checker.ball import Ball
 from certify.checker.case import Case
 from certify.checker.errors import Rejected
-from certify.checker.network import enclose_on_boxes
 from certify.checker.rules import check
 from certify.reference import rules as reference
 from certify.reference.document import read
@@ -32,6 +31,7 @@ from certify.reference.network import Network
 from tests.support.certificates import LEAF, Document, decode, dump, encode
 from tests.support.certificates import make as stated
 from tests.support.oracle import value_of
+from tests.support.plain import enclose_on_boxes
 
 EXACTLY = 6000  # bits: more than any sum of products of two binary64 numbers spans
 

@@ -21,9 +21,7 @@ from flint import acb, arb, ctx
 from certify.checker.boxes import middle
 from certify.checker.case import Case
 from certify.checker.document import Certificate, Network
-from certify.checker.elementary import derivative, elementary
 from certify.checker.outer import Beyond, Layers
-from certify.checker.taylor import Taylor, affine
 from tests.checker.test_cubic_attack import climb, random_loop, random_tree, sizes
 from tests.support.certificates import LEAF, Document, edited, encode, parse, verdict
 from tests.support.leaves import beyond_on_boxes
@@ -44,6 +42,7 @@ from tests.support.outer import (
 )
 from tests.support.outer_forgeries import stripped
 from tests.support.outer_loops import SQUARE, UNUSED, base, of_chance, planar, saturated, scalar
+from tests.support.plain import Taylor, affine, slope_of_tanh
 from tests.support.reached import dot
 from tests.support.uncertain import random_plant
 
@@ -176,7 +175,7 @@ def test_what_the_derivative_of_tanh_leaves(radius: float) -> None:
     """Within all that is said of it, and next to it where the fourth derivative of tanh is largest near c."""
     closest = 0.0
     for c in np.linspace(-3, 3, 61):
-        phi = derivative(elementary("tanh", np.array(c), 0.0, np.array(radius)))
+        phi = slope_of_tanh(c, radius)
         f, e = ([float(v) for v in part[:3]] for part in (phi.f, phi.e))
         for share in (-1.0, -0.5, 0.0, 0.3, 1.0):
             D = arb(float(share * radius))
@@ -198,7 +197,7 @@ def test_layers_that_cancel_leave_roundings_alone(width: int) -> None:
         x, W = generator.normal(size=(width, 50)), size * generator.normal(size=(1, width))
         x[-1] = -(W[0, :-1] @ x[:-1]) / W[0, -1]
         states = [affine(v, np.zeros((1, 50))) for v in x]
-        model = Layers(Network((W,), (np.zeros(1),))).models(states)[-1]
+        model = Taylor.of(Layers(Network((W,), (np.zeros(1),))).models([v.model for v in states])[-1])
         for k in range(50):
             each = zip(W[0].tolist(), x[:, k].tolist(), strict=True)
             off = abs(Fraction(float(model.c[0, k])) - sum(Fraction(a) * Fraction(b) for a, b in each))

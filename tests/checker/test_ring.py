@@ -16,10 +16,10 @@ from certify.checker.boxes import multipliers
 from certify.checker.case import Case
 from certify.checker.exact import exactly, fraction
 from certify.checker.ring import Ring
-from certify.checker.taylor import Taylor, upper_bound
 from tests.checker.test_rules import honest, scalar_claim
 from tests.support.certificates import grow, parse, verdict
 from tests.support.leaves import on_boxes
+from tests.support.plain import Taylor, upper_bound
 from tests.support.oracle import policies_in_arb, value_of
 
 Array = np.ndarray
@@ -33,7 +33,7 @@ def ring_of(name: str) -> Ring:
 
 def vdot_on(ring: Ring, centre: Array, radius: Array) -> Taylor:
     states, F, _ = on_boxes(ring, centre, radius)
-    return ring.rise(states, F)
+    return Taylor.of(ring.rise(states, F))
 
 
 def ends(model: Taylor, index: int, d: list[Fraction]) -> tuple[Fraction, Fraction]:
@@ -59,7 +59,7 @@ def test_the_gap_contains_what_it_stands_for(name: str, seed: int, magnitude: fl
     centre = generator.standard_normal((n, 3)) * 10.0**magnitude
     radius = np.abs(generator.standard_normal((n, 3))) * 10.0 ** generator.uniform(-14, 6)
     level = float(10.0 ** generator.uniform(-9, 6))
-    model = ring.gap(centre, radius, level, sign)
+    model = Taylor.of(ring.gap(centre, radius, level, sign))
     assert not np.any(model.g[n:]) and not np.any(model.Q[n:]) and not np.any(model.Q[:, n:])
     for index in range(3):
         for _ in range(3):
@@ -97,19 +97,19 @@ def test_every_multiplier_is_tried_and_none_depends_on_the_level(name: str) -> N
     it is another one for another level. The models are any that could be met: the property is not one of Vdot.
     """
     ring = ring_of(name)
-    c, n, count = ring.c, ring.n, 20_000
+    c, n, count, S = ring.c, ring.n, 20_000, ring.S[:, None]
     generator = np.random.default_rng(2)
-    direction = generator.standard_normal((n, count)) / np.sqrt(ring.S)
-    direction /= np.sqrt((direction**2 * ring.S).sum(0))
+    direction = generator.standard_normal((n, count)) / np.sqrt(S)
+    direction /= np.sqrt((direction**2 * S).sum(0))
     centre = direction * np.sqrt(c.c2 * generator.uniform(0.7, 1.3, count))
-    radius = np.sqrt(c.c2 / ring.S) * 10.0 ** generator.uniform(-2, -0.3, (n, count))
+    radius = np.sqrt(c.c2 / S) * 10.0 ** generator.uniform(-2, -0.3, (n, count))
     like = vdot_on(ring, centre, radius)
     bend = 0.2 * generator.standard_normal((*like.g.shape[:1], *like.g.shape))
     vdot = Taylor(0.3 * generator.standard_normal(count), generator.standard_normal(like.g.shape), bend, like.r)
     with np.errstate(divide="ignore", invalid="ignore"):
-        bound, best, decided = ring.bound(vdot, centre, radius), [], 0
+        bound, best, decided = ring.bound(vdot.model, centre, radius), [], 0
         for level, sign in ((c.c2, 1.0), (0.5 * c.c2, 1.0), (c.c1, -1.0)):
-            gap = ring.gap(centre, radius, level, sign)
+            gap = Taylor.of(ring.gap(centre, radius, level, sign))
             tried = multipliers(vdot.g[:n], gap.g[:n], gap.c)
             best.append(np.sort(tried, axis=0))
             if level == 0.5 * c.c2:
@@ -126,7 +126,7 @@ def test_a_multiplier_that_is_no_number_proves_nothing() -> None:
     ring = ring_of("rotor")
     centre, radius = np.full((2, 1), 0.1), np.full((2, 1), 1e-3)
     vdot = vdot_on(ring, centre, radius)
-    gap = ring.gap(centre, radius, ring.c.c2, 1.0)
+    gap = Taylor.of(ring.gap(centre, radius, ring.c.c2, 1.0))
     with np.errstate(all="ignore"):
         for k in (np.nan, np.inf):
             assert not upper_bound(vdot + gap.scaled(np.array([k])))[0] < 0
@@ -138,7 +138,7 @@ def test_the_bound_holds_wherever_a_box_meets_the_ring(name: str) -> None:
     ring = ring_of(name)
     c, n, count = ring.c, ring.n, 200
     generator = np.random.default_rng(0)
-    diagonal = ring.S
+    diagonal = ring.S[:, None]
     direction = generator.standard_normal((n, count)) / np.sqrt(diagonal)
     direction /= np.sqrt((direction**2 * diagonal).sum(0))
     level = np.where(np.arange(count) % 2 == 0, c.c2, c.c1)
@@ -148,7 +148,7 @@ def test_the_bound_holds_wherever_a_box_meets_the_ring(name: str) -> None:
     )
     vdot = vdot_on(ring, centre, radius)
     with np.errstate(divide="ignore", invalid="ignore"):
-        bound = ring.bound(vdot, centre, radius)
+        bound = ring.bound(vdot.model, centre, radius)
     assert np.all(bound <= upper_bound(vdot))
     assert np.sum((bound < 0) & (upper_bound(vdot) >= 0)) >= 2  # the multipliers decide some boxes
     ctx.prec = 128

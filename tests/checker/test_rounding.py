@@ -27,11 +27,13 @@ import pytest
 from flint import arb, ctx
 from numpy.typing import NDArray
 
-from certify.checker import float64, taylor
+from certify.checker import near
 from certify.checker import network as checker
 from certify.checker.case import Case
 from certify.checker.document import Certificate, Policy
+from certify.checker.boxes import middle
 from certify.checker.ring import Ring
+from certify.checker.taylor import upper_bound
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, cos, sin, symbols, tan, to_tree
 from certify.loop.plants import System, get_system
@@ -40,6 +42,7 @@ from certify.loop.policies.network import Centre, Squash
 from certify.loop.rigorous import evaluate_policy
 from certify.provers.bounds import PolicyEnclosure
 from certify.provers.bounds import taylor as producer_taylor
+from tests.support import plain
 from tests.support.certificates import make, parse
 from tests.support.leaves import on_boxes
 from tests.support.loops import box
@@ -307,7 +310,7 @@ def model_residual(function: Callable[[arb], arb]) -> Callable[..., arb]:
 
 def checker_model(name: str) -> Callable[[Columns], Any]:
     def function(parts: Columns) -> Any:
-        result = taylor.Taylor(*parts).function(name)
+        result = plain.Taylor(*parts).function(name)
         return result.c, result.g, result.Q, result.r
 
     return function
@@ -326,21 +329,21 @@ def sine(y: float, s: float) -> arb:
     return arb(y).sin() - arb(s)
 
 
-TANH_END, ANGLE_END = float64._TANH_END, float64._ANGLE_END
-EXP_END = float64._EXP_END
+TANH_END, ANGLE_END = near._TANH_END, near._ANGLE_END
+EXP_END = near._EXP_END
 INVERSE, SINE, COSINE = (model_residual(f) for f in (lambda v: 1 / v, lambda v: v.sin(), lambda v: v.cos()))
 TANH, EXP, ATAN, SQRT = (model_residual(f) for f in (arb.tanh, arb.exp, arb.atan, arb.sqrt))
 ELEMENTARY = {
     "checker tanh": Elementary(
-        TANH_END, value_claim(float64.tanh, 0, 1), lambda y, t: arb(y).tanh() - arb(t), 1.0
+        TANH_END, value_claim(plain.tanh, 0, 1), lambda y, t: arb(y).tanh() - arb(t), 1.0
     ),
-    "checker sin": Elementary(ANGLE_END, value_claim(float64.sin_cos, 0, 2), sine, 1.0),
+    "checker sin": Elementary(ANGLE_END, value_claim(plain.sin_cos, 0, 2), sine, 1.0),
     "checker cos": Elementary(
-        ANGLE_END, value_claim(float64.sin_cos, 1, 3), lambda y, c: arb(y).cos() - arb(c), 1.0
+        ANGLE_END, value_claim(plain.sin_cos, 1, 3), lambda y, c: arb(y).cos() - arb(c), 1.0
     ),
-    "checker exp": Elementary(EXP_END, value_claim(float64.exp, 0, 1), lambda y, v: arb(y).exp() - arb(v), 0.7),
-    "checker atan": Elementary(8.0, value_claim(float64.atan, 0, 1), lambda y, v: arb(y).atan() - arb(v), 1.0),
-    "checker relax_tanh": Elementary(TANH_END, line_claim(checker.relax_tanh), line_residual, 0.9),
+    "checker exp": Elementary(EXP_END, value_claim(plain.exp, 0, 1), lambda y, v: arb(y).exp() - arb(v), 0.7),
+    "checker atan": Elementary(8.0, value_claim(plain.atan, 0, 1), lambda y, v: arb(y).atan() - arb(v), 1.0),
+    "checker relax_tanh": Elementary(TANH_END, line_claim(plain.relax_tanh), line_residual, 0.9),
     "checker model of 1/v": Elementary(ANGLE_END, model_claim(checker_model("inv")), INVERSE, 0.5),
     "checker model of sin": Elementary(ANGLE_END, model_claim(checker_model("sin")), SINE, 0.7),
     "checker model of tanh": Elementary(TANH_END, model_claim(checker_model("tanh")), TANH, 0.7),
@@ -518,7 +521,7 @@ def test_policies_on_boxes(first: int, second: int, report: Report) -> None:
         squash, centre = FORMS[number % len(FORMS)]
         s = situation(generator, squash, centre, number % 20 == 19, second)
         truth = policies_in_arb(s.policy, s.u_eq, [s.state(k, b) for k in range(EACH) for b in range(second)])
-        s.judge(trusted, truth, *checker.enclose_on_boxes(checker.fold(s.policy, s.u_eq), s.x, s.x_error))
+        s.judge(trusted, truth, *plain.enclose_on_boxes(checker.fold(s.policy, s.u_eq), s.x, s.x_error))
         s.judge(untrusted, truth, *producer_bounds(s, squash, centre))
         s.judge(fast, truth, *producer_bounds(s, squash, centre, "compiled"))
     report("checker", trusted, 0.9)
@@ -543,7 +546,7 @@ def test_errors_of_folding_are_enclosed(who: str, squash: Squash, centre: Centre
     s = Situation(policy, (Fraction(0),), x, np.zeros((1, 3)), np.zeros((1, EACH, 3)), np.ones((1, 3)))
     truth = policies_in_arb(policy, s.u_eq, [s.state(k, b) for k in range(EACH) for b in range(3)])
     if who == "checker":
-        s.judge(tally, truth, *checker.enclose_on_boxes(checker.fold(policy, s.u_eq), s.x, s.x_error))
+        s.judge(tally, truth, *plain.enclose_on_boxes(checker.fold(policy, s.u_eq), s.x, s.x_error))
     else:
         s.judge(tally, truth, *producer_bounds(s, squash, centre, "numpy" if who == "numpy" else "compiled"))
     assert tally.violations == 0, (tally.worst, tally.examples)
@@ -648,11 +651,10 @@ def random_ring(generator: Generator, name: str, squash: Squash, centre: Centre)
 def vdot_bounds(ring: Ring, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
     """Lower and upper bound of Vdot on boxes, and its upper bound on the part of each box that lies in the ring."""
     centre = 0.5 * lo + 0.5 * hi
-    radius = float64.up(np.maximum(hi - centre, centre - lo))
+    _, radius = middle(lo, hi)
     states, F, _ = on_boxes(ring, centre, radius)
     model = ring.rise(states, F)
-    negated = taylor.Taylor(-model.c, -model.g, -model.Q, model.r)
-    return -taylor.upper_bound(negated), taylor.upper_bound(model), ring.bound(model, centre, radius)
+    return -upper_bound(-model), upper_bound(model), ring.bound(model, centre, radius)
 
 
 def states_in_arb(T: Array, z: Array) -> list[list[arb]]:

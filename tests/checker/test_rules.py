@@ -36,7 +36,7 @@ from certify.checker.case import Case
 from certify.checker.document import Policy
 from certify.checker.errors import Rejected
 from certify.checker.exact import raw_at_origin
-from certify.checker.float64 import within
+from certify.checker.near import Above, Near, within
 from certify.checker.ring import Ring, is_partition
 from certify.checker.rules import Tally
 from tests.support import outer_loops
@@ -848,15 +848,15 @@ def test_a_lower_bound_of_V_that_overflows_puts_no_leaf_outside() -> None:
 @given(st.fractions(-5, 5), st.fractions(-5, 5), st.floats(-5, 5), st.floats(0, 5))
 def test_input_bounds_are_compared_in_the_safe_direction(p: Fraction, q: Fraction, mid: float, radius: float) -> None:
     lo, hi = sorted((p, q))
-    if within((lo, hi), np.array(mid), np.array(radius)):
+    if within((lo, hi), Near(np.array(mid), Above(np.array(radius)))):
         assert lo <= Fraction(mid) - Fraction(radius) and Fraction(mid) + Fraction(radius) <= hi
 
 
 def test_input_bounds_beyond_binary64_hold_nothing_and_harm_nothing() -> None:
     huge = Fraction(10) ** 400
-    assert not within((-huge, huge), np.array(0.0), np.array(1.0))
-    assert not within((huge, 2 * huge), np.array(1e308), np.array(0.0))
-    assert not within((Fraction(-1), Fraction(1)), np.array(np.nan), np.array(0.0))
+    assert not within((-huge, huge), Near(np.array(0.0), Above(np.array(1.0))))
+    assert not within((huge, 2 * huge), Near(np.array(1e308), Above(np.array(0.0))))
+    assert not within((Fraction(-1), Fraction(1)), Near(np.array(np.nan), Above(np.array(0.0))))
 
 
 # ------------------------------------------------------------------------------------- each rule is there for a reason

@@ -23,12 +23,12 @@ from certify.checker.ball import Ball
 from certify.checker.case import Case
 from certify.checker.jets import Jet, constant, uncertain
 from certify.checker.ring import Ring
-from certify.checker.taylor import Taylor
 from tests.checker.test_ball import BITS, contains, points, states
 from tests.support.balls import enlarged_from, reached_from, with_ball
 from tests.support.certificates import Document, edited, encode, grow, make, parse, rehash, verdict
 from tests.support.jets import given
 from tests.support.leaves import on_boxes
+from tests.support.plain import Taylor
 from tests.support.marks import slow_after
 from tests.support.oracle import ball, policy_in_arb, value_of
 from tests.support.uncertain import FACTORS, drawn, largest, random_plant, ranges_of, refutation
@@ -567,7 +567,7 @@ def test_leaf_models_enclose_Vdot_at_every_value(seed: int) -> None:
     centre, radius = 0.2 * generator.standard_normal((n, 3)), 10.0 ** generator.uniform(-3, -0.7, (n, 3))
     with np.errstate(all="ignore"):
         states, F, _ = on_boxes(ring, centre, radius)
-        vdot = ring.rise(states, F)
+        vdot, F = Taylor.of(ring.rise(states, F)), [Taylor.of(f) for f in F]
     ranges, T, P = ranges_of(data), ring.c.evidence.T.tolist(), ring.c.P.tolist()
     for index in range(3):
         for _ in range(6):

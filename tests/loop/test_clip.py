@@ -40,6 +40,7 @@ from certify.provers.falsify import falsify
 from certify.reference import leaves as reference
 from certify.reference import rules as reference_rules
 from certify.report import render_html
+from tests.support import plain
 from tests.support.cases import case_of
 from tests.support.certificates import edited, encode, grow, make, rehash, verdict
 from tests.support.loops import box, pendulum_network, scalar_clip
@@ -55,7 +56,7 @@ Enclosure = tuple[float, list[float], float]
 def by_checker(mid: float, slopes: list[float], error: float, lo: float, hi: float) -> Enclosure:
     ends = np.array([lo]), np.array([hi])
     with np.errstate(all="ignore"):
-        a, b, c = checker.clipped(np.array([[mid]]), np.array([slopes])[:, :, None], np.array([[error]]), *ends)
+        a, b, c = plain.clipped(np.array([[mid]]), np.array([slopes])[:, :, None], np.array([[error]]), *ends)
     return float(a[0, 0]), b[0, :, 0].tolist(), float(c[0, 0])
 
 
@@ -171,7 +172,7 @@ def test_the_policy_on_boxes_and_at_points(squash: str, centre: str) -> None:
     for size in (1e-3, 0.05, 0.4, 3.0):
         x = generator.standard_normal((2, 3, 6)) * np.array([1.0, size, size])[None, :, None]
         nothing = np.zeros((2, 6))
-        forms = [checker.enclose_on_boxes(checker.fold(theirs, loop.u_eq), x, nothing)]
+        forms = [plain.enclose_on_boxes(checker.fold(theirs, loop.u_eq), x, nothing)]
         forms.append(producer.PolicyEnclosure(loop)(x, nothing)[:3])
         with ctx.workprec(300):
             for b, d in itertools.product(range(6), [*itertools.product([-1.0, 1.0], repeat=2), (0.25, -0.5)]):

@@ -23,7 +23,6 @@ from certify.certificates.claims.queries import query
 from certify.certificates.verdict import Verdict
 from certify.checker import expression as checker_expression
 from certify.checker import jets as checker_jets
-from certify.checker import taylor as checker_taylor
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import (
@@ -49,6 +48,7 @@ from certify.reference import rules as reference_rules
 from certify.reference import taylor as reference_taylor
 from certify.reference.refusal import Refused
 from certify.reference.symmetric import orders, triples
+from tests.support import plain as plain_models
 from tests.support.balls import with_ball
 from tests.support.cases import case_of
 from tests.support.certificates import Document, edited, grow, make, verdict
@@ -189,8 +189,8 @@ def test_models_of_random_equations_contain_them(tree: Any, seed: int, size: flo
         compiled = reference_expressions.equations([tree], {"x", "y"}, "plant")
         tape = checker_expression.parse([tree], ("x", "y"), "plant.dynamics")
         # boxes
-        states = [checker_taylor.affine(np.array([c]), g[:, None]) for c, g in zip(centre, slopes, strict=True)]
-        [v] = checker_expression.evaluate(tape, lambda q: checker_taylor.constant(q, 2, 1), states)
+        states = [plain_models.affine(np.array([c]), g[:, None]) for c, g in zip(centre, slopes, strict=True)]
+        [v] = checker_expression.evaluate(tape, lambda q: plain_models.constant(q, 2, 1), states)
         if np.isfinite((v.size + v.r)[0]):
             for d in points:
                 off = abs(

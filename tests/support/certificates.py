@@ -23,7 +23,7 @@ from certify.checker import document, exact, rules
 from certify.checker.case import Case
 from certify.checker.document import Certificate
 from certify.checker.errors import Rejected
-from certify.checker.float64 import within
+from certify.checker.near import within
 from certify.checker.outer import Beyond
 from certify.checker.ring import Ring
 
@@ -228,8 +228,8 @@ def passes(boxes: Ring | Beyond, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     good = np.ones(lo.shape[1], dtype=bool)
     good[leaves.numbers] = leaves.hold
     if not boxes.case.bounded:
-        for bounds, mid, reach in zip(boxes.c.input_bounds, leaves.mid, leaves.reach, strict=True):
-            good[leaves.numbers] &= within(bounds, mid, reach)
+        for j, bounds in enumerate(boxes.c.input_bounds):
+            good[leaves.numbers] &= within(bounds, leaves.inputs[j])
     return good
 
 

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from certify.checker.boxes import middle
-from certify.checker.float64 import Array
 from certify.checker.network import enclose_on_boxes
 from certify.checker.outer import Beyond
 from certify.checker.ring import Ring
-from certify.checker.taylor import Taylor, affine
+from certify.checker.taylor import Taylor as Model
+from certify.checker.taylor import affine
+from tests.support.plain import Array, Taylor, shown
 
 
-def on_boxes(ring: Ring, centre: Array, radius: Array) -> tuple[list[Taylor], list[Taylor], Array]:
+def on_boxes(ring: Ring, centre: Array, radius: Array) -> tuple[list[Model], list[Model], Array]:
     """Models of the states and of G on boxes (n, B) in the coordinates z, and the ends of the states in a period."""
-    x, error = ring.states(centre, radius)
-    mid, slopes, wide = enclose_on_boxes(ring.net, x, error)
-    states, held = ring.affine(x, error, mid, slopes, wide)
+    x = ring.states(centre, radius)
+    states, held = ring.models(x, enclose_on_boxes(ring.net, x))
     G, ends = ring.increment(states, held)
     return states, G, ends
 
@@ -25,10 +23,10 @@ def beyond_on_boxes(beyond: Beyond, lo: Array, hi: Array) -> tuple[Taylor, Taylo
     """What rule `outer` has on boxes (n, B): models of N and N'F, N's least value by other means, and mid, slopes
     and error of the inputs' enclosures."""
     centre, radius = middle(lo, hi)
-    x, error = beyond.states(centre, radius)
-    models = beyond.function.models([affine(own[0], own[1:], e) for own, e in zip(x, error, strict=True)])
-    mid, slopes, wide = enclose_on_boxes(beyond.net, x, error)
-    states, held = beyond.affine(x, error, mid, slopes, wide)
+    x = beyond.states(centre, radius)
+    models = beyond.function.models([affine(x.value[0, i], x.value[1:, i], x.error[i]) for i in range(beyond.n)])
+    u = enclose_on_boxes(beyond.net, x)
+    states, held = beyond.models(x, u)
     F = beyond.f(states, [*held, *beyond.quantities(lo.shape[1])])
     N, rise = beyond.function.value(models), beyond.function.along(models, F)
-    return N, rise, beyond.function.least(x, error) + np.zeros_like(N.c), mid, slopes, wide
+    return Taylor.of(N), Taylor.of(rise), beyond.function.least(x) + 0 * N.c, *shown(u)

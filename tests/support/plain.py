@@ -1,0 +1,196 @@
+"""The checker's arithmetic as plain numbers, which is how tests look at it: a value and an upper bound of its error."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from flint import arb
+from numpy.typing import NDArray
+
+from certify.checker import near, network, taylor
+from certify.checker.functions import FUNCTIONS
+from certify.checker.near import Above, Form, Near
+
+Array = NDArray[np.float64]
+Pair = tuple[Any, Any]
+
+
+def top(bound: Above) -> Any:
+    """An upper bound as binary64 numbers; 0 for what is exact."""
+    return 0.0 if bound is near.ZERO else bound.top
+
+
+def parts(x: Near) -> Pair:
+    """The value and the bound of its error, of one shape."""
+    return x.value, top(x.error) + 0 * np.asarray(x.value)
+
+
+def tanh(y: Array) -> Pair:
+    return parts(near.tanh(Near(y)))
+
+
+def sin_cos(y: Array) -> tuple[Any, Any, Any, Any]:
+    (s, s_error), (c, c_error) = (parts(x) for x in near.sin_cos(Near(y)))
+    return s, c, s_error, c_error
+
+
+def exp(y: Array) -> Pair:
+    return parts(near.exp(Near(y)))
+
+
+def atan(y: Array) -> Pair:
+    return parts(near.atan(Near(y)))
+
+
+def relax_tanh(centre: Array, radius: Array) -> tuple[Array, Array, Array]:
+    slope, shift, gap = near.lines_around_tanh(centre, Above(radius))
+    return slope, shift, gap.top
+
+
+def float_with_error(q: Fraction) -> tuple[float, float]:
+    value, error = parts(near.near(q))
+    return float(value), float(error)
+
+
+def atanh_with_error(q: Fraction) -> tuple[float, float]:
+    value, error = parts(near.near_atanh(q))
+    return float(value), float(error)
+
+
+def arb_with_error(x: arb) -> tuple[float, float]:
+    value, error = parts(near.near_ball(x))
+    return float(value), float(error)
+
+
+def total(array: Array, axis: int) -> Any:
+    return Above(array).sum(axis).top
+
+
+def norm(array: Array, axis: int | tuple[int, ...]) -> Any:
+    return near.norm(array, axis).top
+
+
+def spectral_norm(W: Array) -> float:
+    bound = float(near.spectral_norm(W).top)
+    return np.inf if np.isnan(bound) else bound
+
+
+class Taylor:
+    """A model with the whole symmetric matrix Q (N, N, B)."""
+
+    def __init__(self, c: Array, g: Array, Q: Array, r: Any) -> None:
+        i, j = taylor.pairs(len(g))
+        both = Q[i, j] + np.where((i != j).reshape(-1, *[1] * (Q.ndim - 2)), Q[j, i], 0.0)
+        self.model = taylor.Taylor(c, np.concatenate([g, both]), Above(r + 0 * c))
+
+    @classmethod
+    def of(cls, model: taylor.Taylor) -> Taylor:
+        made = cls.__new__(cls)
+        made.model = model
+        return made
+
+    @property
+    def c(self) -> Array:
+        found: Array = self.model.c
+        return found
+
+    @property
+    def g(self) -> Array:
+        return self.model.g
+
+    @property
+    def Q(self) -> Array:
+        N = self.model.symbols
+        i, j = taylor.pairs(N)
+        Q = np.zeros((N, N, *self.model.c.shape))
+        half = self.model.q * np.where(i == j, 1.0, 0.5).reshape(-1, *[1] * self.model.c.ndim)  # exact
+        Q[i, j], Q[j, i] = half, half
+        return Q
+
+    @property
+    def r(self) -> Array:
+        return np.asarray(top(self.model.r) + 0 * self.model.c)
+
+    @property
+    def size(self) -> Array:
+        found: Array = self.model.size.top
+        return found
+
+    @property
+    def reach(self) -> Array:
+        found: Array = self.model.moved.top
+        return found
+
+    def at(self, index: Any) -> Taylor:
+        return Taylor.of(self.model.at(index))
+
+    def __add__(self, other: Taylor) -> Taylor:
+        return Taylor.of(self.model + other.model)
+
+    def __neg__(self) -> Taylor:
+        return Taylor.of(-self.model)
+
+    def __mul__(self, other: Taylor) -> Taylor:
+        return Taylor.of(self.model * other.model)
+
+    def scaled(self, k: Any) -> Taylor:
+        return Taylor.of(self.model.scaled(k))
+
+    def function(self, name: str) -> Taylor:
+        return Taylor.of(self.model.function(name))
+
+    def widened(self, symbols: int) -> Taylor:
+        return Taylor.of(self.model.widened(symbols))
+
+
+def affine(c: Array, g: Array, r: Any = 0.0) -> Taylor:
+    return Taylor.of(taylor.affine(c, g, Above(r + 0 * c)))
+
+
+def constant(q: Fraction, symbols: int, batch: int) -> Taylor:
+    return Taylor.of(taylor.constant(q, symbols, batch))
+
+
+def upper_bound(model: Taylor) -> Array:
+    return taylor.upper_bound(model.model)
+
+
+def form(x: Array, error: Array) -> Form:
+    """x (n, k, B) within error (n, B), as the checker has it: (k, n, B)."""
+    return Form(np.moveaxis(x, 1, 0), Above(error))
+
+
+def shown(u: Form) -> tuple[Array, Array, Array]:
+    """Its centre (m, B), slopes (m, n, B) and error (m, B)."""
+    return u.value[0], np.moveaxis(u.value[1:], 0, 1), top(u.error) + 0 * u.value[0]
+
+
+def enclose_on_boxes(net: network.Folded, x: Array, x_error: Array) -> tuple[Array, Array, Array]:
+    return shown(network.enclose_on_boxes(net, form(x, x_error)))
+
+
+def clipped(mid: Array, slopes: Array, error: Array, least: Array, most: Array) -> tuple[Array, Array, Array]:
+    x = np.concatenate([mid[:, None], slopes], axis=1)
+    return shown(network.clipped(form(x, error), least, most))
+
+
+def expansion(phi: Any) -> SimpleNamespace:
+    """Values f and errors e of an expansion, and its three bounds."""
+    pairs = [parts(x) for x in (phi.f if hasattr(phi, "f") else phi.stored)]
+    rest = {name: getattr(phi, name).top for name in ("third", "fourth", "last") if hasattr(phi, name)}
+    return SimpleNamespace(f=tuple(v for v, _ in pairs), e=tuple(e for _, e in pairs), **rest)
+
+
+def elementary(name: str, c: Any, error: Any, radius: Any) -> SimpleNamespace:
+    """The expansion of a function at numbers within `error` of c."""
+    known = near.ZERO if np.all(np.asarray(error) == 0) else Above(np.asarray(error, dtype=np.float64))
+    return expansion(FUNCTIONS[name].expansion(Near(np.asarray(c, dtype=np.float64), known), Above(radius)))
+
+
+def slope_of_tanh(c: float, radius: float) -> SimpleNamespace:
+    """The expansion of tanh' at c."""
+    phi = FUNCTIONS["tanh"].expansion(Near(np.array(c)), Above(np.array(radius)))
+    return expansion(phi.derivative)
