@@ -15,10 +15,10 @@ import numpy as np
 
 from .case import Case, Failures
 from .document import Intervals
-from .elementary import elementary
 from .expression import evaluate
-from .float64 import EPS, Array, ends, float_with_error, frobenius, gamma, norm, total, up, within
-from .jets import Jet, between, constant, each, tensor_norm, triples, uncertain, widen
+from .functions import FUNCTIONS
+from .jets import Jet, between, constant, identity, uncertain
+from .near import Above, Array, Cubic, Near, Square, Vector, all_near, mixed, near, size, stacked, triples, within
 from .network import Folded
 
 _MOST_JETS = 2**26  # numbers in the matrices and tensors of all jets
@@ -28,7 +28,7 @@ _MOST_PRODUCTS = 2**33  # in the sums over paths
 
 @dataclass(frozen=True)
 class Units:
-    """The remainder of each tanh q of the network: e_q(d) with |e_q(d)| <= d'R_q d, R (N, k, k). It reaches the inputs
+    """The remainder of each tanh q of the network: e_q(d) with |e_q(d)| <= d'R_q d, R (k, k, N). It reaches the inputs
     as sum_q L_jq e_q, L (m, N)."""
 
     L: Array
@@ -36,8 +36,9 @@ class Units:
 
     @cached_property
     def shares(self) -> Array:
-        """Bounds of these sums, (m, k, k)."""
-        return np.asarray(widen(np.tensordot(np.abs(self.L), self.R, 1), 0.0, gamma(len(self.R)) + EPS))
+        """Bounds of these sums, (k, k, m)."""
+        found: Square = mixed(Square(self.R), Near(np.abs(self.L.T)))
+        return found.majorant
 
 
 @dataclass(frozen=True)
@@ -75,12 +76,12 @@ class Ball:
         n, still = len(self.J), self.motion is None
         m, w = ([Fraction(0)] * n, [Fraction(0)] * n) if self.motion is None else self.motion
         k = n if still else n + 1
-        nothing = constant(Fraction(0), np.zeros((0, k, k)), self.count)
+        nothing = constant(Fraction(0), np.zeros((k, k, 0)), self.count)
         jets = []
         for row, at, by in zip(self.J, m, w, strict=True):
-            (c, error), (step, slack) = float_with_error(at), float_with_error(by)
-            a = row if still else np.append(row, step)
-            jets.append(replace(nothing, c=np.float64(c), error=error, a=a, slack=slack))
+            step = near(by)
+            a = Vector(row) if still else Vector(np.append(row, step.value), step.error)
+            jets.append(replace(nothing, c=near(at), a=a))
         return jets
 
     @cached_property
@@ -89,28 +90,36 @@ class Ball:
         return enclose_on_ball(self.case.net, self.states)
 
     @cached_property
+    def reach(self) -> Near:
+        """The numbers (N, m) with which the units of `outputs` reach the inputs."""
+        return Near(self.outputs.B.value) * Near(self.case.net.scale)
+
+    @cached_property
     def units(self) -> Units:
         """All tanh of the network, the last layer's included, and how they reach the inputs."""
-        h, scale = self.outputs, self.case.net.scale
-        return Units(np.concatenate([scale[:, None] * h.B, np.diag(scale)], 1), np.concatenate([h.U, h.E]))
+        L = np.concatenate([self.reach.value, np.diag(self.case.net.scale)])
+        return Units(L.T, np.concatenate([self.outputs.U, self.outputs.remainder], 2))
 
     @cached_property
     def inputs(self) -> list[Jet]:
         """pi(x) on the ball before the clip, each input with its own error."""
-        net, h, U = self.case.net, self.outputs, self.units.shares
-        if self.starts_at_u_eq:
-            values = [float_with_error(u) for u in self.case.c.u_eq]
-        else:
-            parts = zip(h.c, h.error, net.scale.tolist(), net.offset.tolist(), net.offset_error.tolist(), strict=True)
-            values = [_affine(*part) for part in parts]
-        c, error = np.array(values).T
-        k, column = np.abs(net.scale), net.scale[:, None]
-        a, slack = column * h.a, up(k * h.slack + EPS * (k * h.slope))
-        E = widen(np.zeros_like(h.E), EPS * (k * h.spread) + h.faint)
-        of_y = np.zeros((len(c), self.count)), np.zeros((len(c), self.count, a.shape[1]))
-        lip = up(k * h.lip + 3 * EPS * (k * h.spread))
-        batch = Jet(c, error, a, slack, each(net.scale) * h.Q, column * h.K, E, np.eye(len(c)), U, *of_y, lip)
-        return batch.members
+        h, scale, m = self.outputs, Near(self.case.net.scale), len(self.case.c.inputs)
+        c = all_near(self.case.c.u_eq) if self.starts_at_u_eq else h.c * scale + self.case.net.offset
+        batch = h.a * scale, Square(h.Q.value) * scale, Cubic(h.K.value) * scale
+        E, lip = mixed(Square(h.U), Near(self.reach.error.top)), h.lipschitz * size(scale.value)
+        return [
+            Jet(
+                c[j],
+                *(part[j] for part in batch),
+                E[j],
+                Near(np.eye(m)[j]),
+                self.units.shares,
+                Near(np.zeros(self.count)),
+                Vector(np.zeros((len(h.a.value), self.count))),
+                lip[j],
+            )
+            for j in range(m)
+        ]
 
     def constant(self, q: Fraction) -> Jet:
         """A rational among the jets of this ball."""
@@ -128,7 +137,7 @@ class Ball:
     def shared(self, states: Sequence[Jet]) -> list[Jet]:
         """The states as jets with the inputs' errors."""
         U = self.units.shares
-        return [replace(x, B=np.zeros(len(U)), U=U) for x in states]
+        return [replace(x, B=Near(np.zeros(U.shape[2])), U=U) for x in states]
 
     def symbols(self, cell: Intervals) -> list[Jet]:
         """The uncertain quantities of a cell, as the numbers y have them."""
@@ -139,13 +148,6 @@ class Ball:
     def ranges(self) -> list[Jet]:
         """The uncertain quantities, of which only their whole ranges are known."""
         return [between(lo, hi, self.units.shares, self.count) for lo, hi in self.case.c.ranges]
-
-
-def _affine(h: float, error: float, scale: float, offset: float, offset_error: float) -> tuple[float, float]:
-    """scale * h + offset, h within `error`, and its error."""
-    through = scale * h
-    value = through + offset
-    return value, up(abs(scale) * error + offset_error + EPS * (abs(through) + abs(offset)))
 
 
 def fits(ball: Ball) -> Failures:
@@ -161,7 +163,7 @@ def keeps_inputs(ball: Ball) -> Failures:
     c = ball.case.c
     if not ball.case.bounded:
         for name, bounds, u in zip(c.inputs, c.input_bounds, ball.inputs, strict=True):
-            if not within(bounds, u.c, up(u.error + u.radius)):
+            if not within(bounds, u.range):
                 yield ball.at, f"{name} may leave its bounds"
     return len(c.inputs)
 
@@ -170,7 +172,7 @@ def is_not_clipped(ball: Ball) -> Failures:
     """Every input lies strictly inside the policy's clip, so that the clip does not change its jets."""
     clip = ball.case.net.clip
     for name, u, *limits in zip(ball.case.c.inputs, ball.inputs, *clip, strict=True) if clip else ():
-        low, high = ends(u.c, up(u.error + u.radius))
+        low, high = u.range.ends
         if not limits[0] < low <= high < limits[1]:
             yield ball.at, f"{name} may be clipped: policy.clip"
     return 0
@@ -197,40 +199,29 @@ def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
 
     Every layer's value is y(d) = y(0) + a.d + B A(d), where A_q is the difference of an earlier tanh from its tangent
     at y_q(0), and B the product of weights and slopes with which it reaches y, so that errors cancel as they do in
-    truth. A_q(d) is d'H_q d + C_q[d] + e_q(d), and `sizes` bounds all three. Each column of X = [a, B] lies within its
-    `doubt` of the true one.
+    truth. A_q(d) is d'H_q d + C_q[d] + e_q(d), |e_q(d)| <= d'R_q d, and e_q has the Lipschitz constant lips_q. Each
+    column of X = [a, B] has an error of its own.
     """
-    X, k = np.array([x.a for x in states]), len(states[0].a)
-    y = np.array([x.c for x in states], dtype=np.float64)[:, None, None]
-    error = np.array([x.error for x in states])[:, None]
-    doubt = np.full(k, norm(np.array([x.slack for x in states]), 0))
-    H, C, R = np.zeros((0, k, k)), np.zeros((0, len(triples(k)[0]))), np.zeros((0, k, k))
-    sizes = steep = lips = np.zeros(0)
+    k = len(states[0].a.value)
+    y = stacked([x.c for x in states])
+    X = Vector(np.array([x.a.value for x in states]), stacked([Near(0.0, x.a.error) for x in states]).error.norm() * np.ones(k))
+    H, C, R = np.zeros((k, k, 0)), np.zeros((len(triples(k)[0]), 0)), np.zeros((k, k, 0))
+    lips = Above(np.zeros(0))
     for number, layer in enumerate(net.layers):
-        y, rounding = layer.affine(y, np.abs(y[:, 0]))
-        error = up(layer.widest(error) + rounding)
-        width = layer.W.shape[1]
-        doubt = up(layer.norm2 * doubt + gamma(width) * (frobenius(layer.W) * norm(X, 0)))
-        X = layer.W @ X
+        y, X = y.through(layer.W) + layer.b, X.mapped(layer.W, layer.norm2)
         if number > 0:  # the difference of the tanh just before arrives through W alone
-            X, doubt = np.concatenate([X, layer.W], 1), np.concatenate([doubt, np.zeros(width)])
-        a, B, count = X[:, :k], X[:, k:], len(sizes)
-        Q = np.tensordot(B, H, 1)
-        lost = total(doubt[k:] * sizes + (gamma(count) + EPS) * (np.abs(B) * sizes), 1)
-        E = widen(np.zeros_like(Q), lost)
-        lip = total(np.abs(B) * lips + (doubt[k:] + (gamma(count) + EPS) * np.abs(B)) * steep, 1)
-        slack = np.full(len(a), norm(doubt[:k], 0))
-        of_y = np.zeros((len(a), 0)), np.zeros((len(a), 0, k))  # a policy knows nothing of what is uncertain
-        value = Jet(y[:, 0, 0], error[:, 0], a, slack, (Q + Q.swapaxes(1, 2)) / 2, B @ C, E, B, R, *of_y, lip)
+            X = X.beside(layer.W)
+        B, rows = Near(X.value[:, k:].T, X.error[k:, None]), np.ones(len(y.value))
+        a, Q, K = Vector(X.value[:, :k].T, X.error[:k].norm() * rows), mixed(Square(H), B), mixed(Cubic(C), B)
+        E, lip = identity(Q, (B.error * Square(R).size[:, None]).sum() * rows), (B.size * lips[:, None]).sum()
+        of_y = Near(np.zeros((0, len(rows)))), Vector(np.zeros((k, 0, len(rows))))  # a policy knows nothing of y
+        value = Jet(y, a, Q, K, E, Near(B.value), R, *of_y, lip)
         if number == len(net.layers) - 1:
             break
-        phi = elementary("tanh", value.c, value.error, value.radius)
-        (t, slope, _, _), (e, wrong, _, _) = phi.f, phi.e
-        added = value.beyond_tangent(phi)
-        H, C, R = (np.concatenate(pair) for pair in zip((H, C, R), added, strict=True))
-        sizes = up(frobenius(H) + tensor_norm(C, k) + frobenius(R))
-        lips = np.concatenate([lips, value.lip_beyond_tangent(phi)])
-        steep = up(2 * frobenius(H) + 3 * tensor_norm(C, k) + lips)
-        doubt = up(np.max(up(slope + wrong)) * doubt + (np.max(wrong) + EPS) * norm(X, 0))
-        y, error, X = t[:, None, None], e[:, None], slope[:, None] * X
+        phi = FUNCTIONS["tanh"].expansion(value.v0, value.radius)
+        bent, twisted, rest = value.beyond_tangent(phi)
+        rest = rest + identity(rest, bent.error + twisted.error)
+        H, C, R = (np.concatenate(pair, -1) for pair in ((H, bent.value), (C, twisted.value), (R, rest.majorant)))
+        lips = lips.beside(value.lip_beyond_tangent(phi) + bent.error * 2 + twisted.error * 3)
+        y, X = phi.f[0], X.times(phi.f[1])
     return value.function("tanh") if net.squash else value

@@ -9,12 +9,12 @@ from flint import fmpq, fmpq_mat
 from . import ball
 from .ball import Ball
 from .case import Case, Failures
-from .decrease import Models, are_finite, diagonal, rational
+from .decrease import Models, are_finite, diagonal, rational, vectors
 from .document import Contraction
 from .exact import exactly, is_definite, root_above
-from .float64 import EPS, Array, norm, up
 from .jets import unpacked
 from .local import is_large_enough
+from .near import Array, Tensor
 from .pairs import bound_of_pairs, in_binary64
 
 
@@ -42,7 +42,7 @@ def contracts(ball_: Contracted) -> Failures:
     P, count = exactly(ball_.case.c.P), 0
     for cell in ball_.case.cells:
         F = ball_.F(cell)
-        lips = [float(f.lip) for f in F]
+        lips = [float(f.lipschitz.top) for f in F]
         if not (are_finite(F, ball_.units) and np.all(np.isfinite(lips))):
             yield ball_.at, "F has no finite model"
             return count
@@ -51,7 +51,7 @@ def contracts(ball_: Contracted) -> Failures:
         rest = _turning(models, b, ball_.by.weights.tolist()) + _twisting(models, b, ball_.by.weight)
         for i, lip in enumerate(lips):
             size = root_above(sum((v * v for v in b.tolist()[i]), rational(0.0)))
-            rest += diagonal([2 * size * (rational(float(F[i].slack)) + rational(lip))] * b.ncols())
+            rest += diagonal([2 * size * (rational(F[i].slack.top) + rational(lip))] * b.ncols())
         for corner in models.corners():
             crossed = models.J.transpose() * P * corner.A
             count += 1
@@ -79,5 +79,5 @@ def _twisting(models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:
     if not np.any(models.K):
         return fmpq_mat(k, k)
     row, power = in_binary64(b)
-    T = unpacked(models.K, k).reshape(-1, k * k, k)
-    return 3 * bound_of_pairs(row, up(EPS * norm(row, 1)), T, np.zeros(len(T)), weight) * fmpq(2) ** power
+    T = Tensor(np.moveaxis(unpacked(models.K.T, k), 0, -1).reshape(k, k * k, -1))
+    return 3 * bound_of_pairs(vectors(row), T, weight) * fmpq(2) ** power

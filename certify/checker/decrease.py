@@ -20,8 +20,8 @@ from flint import fmpq, fmpq_mat
 from .ball import Units
 from .document import Multipliers, Path
 from .exact import exactly, is_definite, root_above
-from .float64 import EPS, Array, frobenius, gamma, norm, total, up
-from .jets import Jet, triples, unpacked
+from .jets import Jet, unpacked
+from .near import Array, Near, Tensor, Vector, at_least_0, mixed, norm, size, symmetrised, triples
 from .pairs import bound_of_pairs, in_binary64
 
 _NOTHING = fmpq(0)
@@ -44,18 +44,21 @@ class Models:
         """J is (n, n), v the velocity of a path, `rest` says whether G vanishes at d = 0. Parameters are finite; see
         `are_finite`. Where y is uncertain these are the models at y = 0; see `corners`."""
         self.J, self.units = exactly(J), units
-        self.K, self.twists = np.array([g.K for g in G]), np.array([g.twist for g in G])
-        self.shares = np.array([g.B for g in G])
+        self.K = np.stack([g.K.value for g in G], -1)
+        self.shares = np.array([g.B.value for g in G])
         self.B = exactly(self.shares)
-        self.A = exactly(np.array([g.a for g in G]))
-        self.slack = [rational(g.slack) for g in G]
-        self.error = [fmpq(0) if rest else rational(g.error) for g in G]
-        self.Qs, self.Es = np.array([g.Q.ravel() for g in G]), np.array([g.E for g in G])
-        self.Q = [exactly(g.Q) for g in G]
-        self.E = [exactly(g.E) for g in G]
-        self.f = [] if rest else [rational(g.c) - v for g, v in zip(G, velocity or [fmpq(0)] * len(G), strict=True)]
+        self.A = exactly(np.array([g.a.value for g in G]))
+        self.slack = [rational(g.slack.top) for g in G]
+        self.error = [fmpq(0) if rest else rational(g.error.top) for g in G]
+        self.Qs, self.Es = np.array([g.Q.value.ravel() for g in G]), np.stack([g.remainder for g in G], -1)
+        self.Q = [exactly(g.Q.value) for g in G]
+        self.E = [exactly(g.remainder) for g in G]
+        self.f = []
+        if not rest:
+            self.f = [rational(g.c.value) - v for g, v in zip(G, velocity or [fmpq(0)] * len(G), strict=True)]
         self.by_y = [
-            ([rational(g.c_y[j]) for g in G], exactly(np.array([g.a_y[j] for g in G]))) for j in range(len(G[0].c_y))
+            ([rational(g.c_y.value[j]) for g in G], exactly(np.array([g.a_y.value[:, j] for g in G])))
+            for j in range(len(G[0].c_y.value))
         ]
 
     def corners(self) -> Iterator[Models]:
@@ -78,8 +81,12 @@ def are_usable(by: Multipliers, path: Path | None = None) -> bool:
 
 def are_finite(F: Sequence[Jet], units: Units) -> bool:
     """True if every component has a finite model, and the sums of squares in binary64 are finite."""
-    parts = [part for f in F for part in (f.c, f.error, f.a, f.slack, f.Q, f.E, f.B, f.twist)]
-    return all(np.all(np.isfinite(part)) for part in (*parts, norm(units.L.ravel(), 0), norm(units.R.ravel(), 0)))
+    parts = [
+        part
+        for f in F
+        for part in (f.c.value, f.error.top, f.a.value, f.slack.top, f.Q.value, f.remainder, f.B.value, f.twist.top)
+    ]
+    return all(np.all(np.isfinite(part)) for part in (*parts, norm(units.L, (0, 1)).top, norm(units.R, (0, 1, 2)).top))
 
 
 def shows(models: Models, P: fmpq_mat, R: fmpq_mat, by: Multipliers, path: Path | None = None) -> bool:
@@ -170,29 +177,19 @@ def doubts(
 
 def size_beyond(models: Models, P: Array) -> float:
     """Gamma: an upper bound of ||g||_P / ||d||^2, g the models less (f, A d); maybe infinite, or NaN."""
-    L, often = models.units.L, np.sqrt(triples(models.A.ncols())[-1])
-    c = models.shares @ L
-    wrong = up((gamma(len(L)) + 2 * EPS) * total(norm(models.shares, 1), 0) * norm(L, 0))
-    each = up(np.sqrt(_columns(c, P)) + up(np.sqrt(frobenius(P))) * wrong)
-    quadratic, cubic = (np.sqrt(_gram(rows, P)) for rows in (models.Qs, models.K * often))
-    E = np.array([frobenius(own) for own in models.Es])
-    rest = total(each * frobenius(models.units.R), 0) + total(up(np.sqrt(np.diag(P))) * E, 0)
-    return float(up(quadratic + cubic + rest))
+    L, often = models.units.L, triples(models.A.ncols())[-1]
+    R, E = (norm(M, (0, 1)) for M in (models.units.R, models.Es))
+    c = Near(L).through(models.shares)
+    each = at_least_0((c * c.through(P)).sum())
+    quadratic = at_least_0(form_of(Near(models.Qs.T), models.Qs, P))
+    third = at_least_0(form_of(Near(models.K) * Near(often[:, None]), models.K.T, P))
+    rest = (each.root * R).sum() + (size(np.diag(P)).root * E).sum()
+    return float((quadratic.root + third.root + rest).top)
 
 
-def _gram(rows: Array, P: Array) -> float:
-    """An upper bound of sum_ij P_ij rows_i.rows_j, (n, N)."""
-    (n, N), lengths = rows.shape, norm(rows, 1)
-    value = np.sum(P * (rows @ rows.T))
-    error = (gamma(N) + gamma(n * n) + 3 * EPS) * total(total(np.abs(P) * lengths[:, None] * lengths, 0), 0)
-    return float(up(np.maximum(value, 0.0) + up(error)))
-
-
-def _columns(c: Array, P: Array) -> Array:
-    """Upper bounds of c_q'P c_q for the columns of c (n, N)."""
-    size = np.abs(c)
-    error = (gamma(len(P)) * 2 + 2 * EPS) * np.sum(size * (np.abs(P) @ size), axis=0)
-    return up(np.maximum(np.sum(c * (P @ c), axis=0), 0.0) + up(2 * error))
+def form_of(x: Near, y: Array, P: Array) -> Near:
+    """sum_ij P_ij x_i.y_j, x (N, n) and y (n, N)."""
+    return (x.through(y) * Near(P)).sum().sum()
 
 
 def cubic(models: Models, b: fmpq_mat, by: Multipliers) -> fmpq_mat:
@@ -202,14 +199,11 @@ def cubic(models: Models, b: fmpq_mat, by: Multipliers) -> fmpq_mat:
     if not np.any(models.K):
         return fmpq_mat(k, k)
     row, power = in_binary64(b)
-    K, apart = unpacked(models.K, k), np.array([beta > 0 for beta in by.apart])
-    each, others = row[apart], row[~apart]
-    T = K[apart].reshape(-1, k * k, k)
-    S = bound_of_pairs(each, up(EPS * norm(each, 1)), T, np.zeros(len(T)), by.weight)
-    N = np.tensordot(others.T, K[~apart], 1)
-    N = (N + N.transpose(1, 0, 2, 3) + N.transpose(1, 2, 0, 3) + N.transpose(1, 2, 3, 0)) / 4
-    wrong = np.full(k, up((gamma(len(row)) + EPS) * total(norm(others, 1) * models.twists[~apart], 0)))
-    S += bound_of_pairs(np.eye(k), np.zeros(k), N.reshape(k, k * k, k), wrong, by.weight)
+    apart = np.array([beta > 0 for beta in by.apart])
+    K = np.moveaxis(unpacked(models.K.T, k), 0, -1)  # (k, k, k, n)
+    S = bound_of_pairs(vectors(row[apart]), Tensor(K[..., apart].reshape(k, k * k, -1)), by.weight)
+    N = symmetrised(mixed(Tensor(K[..., ~apart]), row[~apart]))
+    S += bound_of_pairs(Vector(np.eye(k)), Tensor(N.value.reshape(k, k * k, k), N.error), by.weight)
     return S * fmpq(2) ** power
 
 
@@ -219,8 +213,12 @@ def of_units(models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:
     if not np.any(L):
         return fmpq_mat(b.ncols(), b.ncols())
     row, by = in_binary64(models.B.transpose() * b)
-    p, wrong = L.T @ row, (gamma(len(L)) + EPS) * total(np.abs(L) * norm(row, 1)[:, None], 0)
-    return bound_of_pairs(p, up(wrong), R, np.zeros(len(R)), weight) * fmpq(2) ** by
+    return bound_of_pairs(vectors(row.through(L.T)), Tensor(R), weight) * fmpq(2) ** by
+
+
+def vectors(rows: Near) -> Vector:
+    """Rows of numbers with an error each, (N, k), as vectors (k, N)."""
+    return Vector(rows.value.T, rows.error.norm(1))
 
 
 def with_edge(form: fmpq_mat, models: Models, P: fmpq_mat, path: Path) -> fmpq_mat:

@@ -18,9 +18,9 @@ from .case import Case, Failures
 from .decrease import Level, Models, are_finite, are_usable, rational, sides, size_beyond
 from .document import Intervals
 from .exact import contains_ball, exactly, fraction, is_definite, root_above
-from .float64 import Array, norm, up
 from .flow import later
 from .jets import Jet, uncertain
+from .near import Array, Near, Vector, norm
 
 _MOST_CORNERS = 2**16  # of all cells
 _MOST_WORK = 2**26  # corners times n^4, which is what an inequality takes
@@ -60,8 +60,8 @@ class Local(Ball):
         far, along = np.zeros(n), np.zeros(n)
         for _ in range(1 + _ATTEMPTS):
             F = self.f(self.during((far, along)), self.ranges)
-            most = up(h * np.array([0.0 if self.at_rest else f.size for f in F]))
-            steepest = up(h * np.array([f.radius for f in F]))
+            most = np.array([0.0 if self.at_rest else (f.v0.size * h).top for f in F])
+            steepest = np.array([(f.radius * h).top for f in F])
             if np.all((most < far) | self.at_rest) and np.all(steepest < along):
                 return (far, along), F
             far, along = (0 * most if self.at_rest else 1.25 * most), 1.25 * steepest
@@ -75,11 +75,11 @@ class Local(Ball):
     def during(self, way: Way) -> list[Jet]:
         """The states within a way of the ball's."""
         moved = zip(self.states, *way, strict=True)
-        return [replace(x, error=up(x.error + far), slack=up(x.slack + along)) for x, far, along in moved]
+        return [replace(x, c=Near(x.c.value, x.c.error + far), a=Vector(x.a.value, x.a.error + along)) for x, far, along in moved]
 
     def settled(self, v: Jet) -> Jet:
         """Set the value at d = 0 to exactly 0 at rest, where it is 0 in truth."""
-        return replace(v, c=np.float64(0), error=0.0, c_y=0 * v.c_y) if self.at_rest else v
+        return replace(v, c=Near(np.float64(0)), c_y=Near(0 * v.c_y.value)) if self.at_rest else v
 
     @property
     def period(self) -> Jet:
@@ -167,10 +167,10 @@ def stays(local: Local) -> Failures:
         return 0
     _, F = local.enclosed
     for i, (f, name, (lo, hi)) in enumerate(zip(F, c.states, c.domain, strict=True)):
-        reach, of_ball = root_above(rational(c.c1) * _fmpq(local.case.P_inverse[i])), float(norm(local.J[i], 0))
+        reach, of_ball = root_above(rational(c.c1) * _fmpq(local.case.P_inverse[i])), float(norm(local.J[i]).top)
         reach = min(reach, rational(of_ball)) if np.isfinite(of_ball) else reach
-        moved = up(local.case.longest * (f.radius + (0.0 if local.at_rest else f.size)))
-        if not (np.isfinite(moved) and fraction(reach + rational(float(moved))) < min(-lo, hi)):
+        moved = float(((f.radius if local.at_rest else f.radius + f.v0.size) * local.case.longest).top)
+        if not (np.isfinite(moved) and fraction(reach + rational(moved)) < min(-lo, hi)):
             yield local.at, f"{name} may leave the domain during a period"
     return len(c.states)
 

@@ -26,7 +26,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
-from functools import cached_property, reduce
+from functools import cache, cached_property, reduce
+from itertools import combinations_with_replacement, permutations
 from operator import add
 from typing import Any, Self
 
@@ -134,6 +135,14 @@ class Above:
 
     def __getitem__(self, index: Any) -> Above:
         return self if self is ZERO else Above(self.v[index], self.k)
+
+    def shaped(self, *shape: int) -> Above:
+        """The same in another shape."""
+        return Above(self.v.reshape(shape), self.k)
+
+    def beside(self, other: Above) -> Above:
+        """These, and then others."""
+        return Above(np.concatenate([self.v, other.v]), max(self.k, other.k))
 
     def where(self, condition: Any, other: Above) -> Above:
         """These where the condition holds, others elsewhere."""
@@ -270,6 +279,127 @@ class Uniform(Near):
         return Uniform(value, (self.error + self.size.ulps(W.shape[1])) * size(W).sum(1).max(0))
 
 
+class Vector(Near):
+    """Vectors along the first axis, each within its error in the 2-norm."""
+
+    axes: tuple[int, ...] = (0,)
+
+    @cached_property
+    def stored(self) -> Above:
+        """The norms of what is stored."""
+        return self.length(size(self.value))
+
+    def length(self, x: Above) -> Above:
+        return x.norm(self.axes)
+
+    def mapped(self, W: Array, norm2: Above) -> Vector:
+        """W x for an exact matrix W, ||W||_2 <= norm2: |fl(W x) - W x| <= gamma_n |W||x|, whose 2-norm is at most
+        gamma_n ||W||_F ||x||."""
+        made = norm(W, (0, 1)) * self.size.ulps(W.shape[1])
+        return Vector(W @ self.value, norm2 * self.error + made)
+
+    def beside(self, W: Array) -> Vector:
+        """These vectors, and then exact ones."""
+        return Vector(np.concatenate([self.value, W], 1), self.error.beside(Above(np.zeros(W.shape[1]))))
+
+    def times(self, k: Near) -> Vector:
+        """Entry by entry products with numbers k."""
+        made = size(k.value).max() * (self.error + self.size.ulps(1)) + k.error.max() * self.size
+        return Vector(self.value * k.value[:, None], made)
+
+
+class Square(Vector):
+    """Matrices along the first two axes, each within its error in the Frobenius norm."""
+
+    axes = (0, 1)
+
+    @property
+    def majorant(self) -> Array:
+        """Matrices M with d'X d <= d'M d for all X within the error: its identity is added on the diagonal."""
+        M = self.value + 0.0 * self.error.v
+        i = np.arange(len(M))
+        M[i, i] = Near(M[i, i], self.error).ends[1]
+        return M
+
+
+class Tensor(Square):
+    """The same with any number of axes but the last."""
+
+    def __init__(self, value: Any, error: Above = ZERO) -> None:
+        super().__init__(value, error)
+        self.axes = tuple(range(np.ndim(value) - 1))
+
+
+class Cubic(Vector):
+    """Symmetric tensors with three indices, along the first axis as `triples` has them, within an error in the 2-norm of
+    the whole tensor."""
+
+    def length(self, x: Above) -> Above:
+        often = triples(order_of(len(x.v)))[-1].reshape(-1, *[1] * (np.ndim(x.v) - 1))
+        return (x * x * often).sum(0).root
+
+
+@cache
+def triples(k: int) -> tuple[Array, Array, Array, Array]:
+    """h <= i <= j, in the order in which the entries of a symmetric tensor K are stored, and how often each stands in
+    the whole tensor."""
+    kept = list(combinations_with_replacement(range(k), 3))
+    h, i, j = np.array(kept).T
+    return h, i, j, np.array([float(len(set(permutations(triple)))) for triple in kept])
+
+
+@cache
+def order_of(count: int) -> int:
+    """k for which there are so many triples."""
+    return next(k for k in range(1, count + 1) if k * (k + 1) * (k + 2) == 6 * count)
+
+
+def outer(x: Vector, y: Vector) -> Square:
+    """The symmetric part of x y', (k, k): the Frobenius norm of each half is at most that of x y'; three roundings."""
+    both = x.value[:, None] * y.value
+    value = (both + both.swapaxes(0, 1)) / 2
+    return Square(value, x.stored * (y.error + y.size.ulps(3)) + x.error * y.size)
+
+
+def symmetric(a: Vector, Q: Square) -> Cubic:
+    """The symmetric part of a_h Q_ij, Q symmetric; its norm is at most ||a|| ||Q||_F; five roundings."""
+    h, i, j, _ = triples(len(a.value))
+    x, M = a.value, Q.value
+    value = (x[h] * M[i, j] + x[i] * M[h, j] + x[j] * M[h, i]) / 3
+    return Cubic(value, a.stored * (Q.error + Q.size.ulps(5)) + a.error * Q.size)
+
+
+def mixed(x: Near, weights: Near) -> Any:
+    """`sum_q w_q x_q` of the same kind: q runs along the last axis of x, and along the first of the weights, (q,) or
+    (q, rows). Of N terms gamma_N bounds what is rounded."""
+    rows = (slice(None), *[None] * (np.ndim(weights.value) - 1))
+    wrong = (weights.error + weights.size.ulps(len(weights.value))) * x.size[rows] + size(weights.value) * x.error[rows]
+    return type(x)(x.value @ weights.value, wrong.sum())
+
+
+def gram(X: Near) -> Square:
+    """X X' of numbers (k, N) with an error each, e in the whole: X X' - Y Y' is at most e (2 ||X|| + e), and gamma_N
+    ||X||^2 bounds what is rounded, in the Frobenius norm."""
+    whole, e = norm(X.value, (0, 1)), X.error.norm((0, 1))
+    return Square(X.value @ X.value.T, (whole * whole).ulps(X.value.shape[1]) + e * (whole * 2 + e))
+
+
+def near_one(x: Any) -> tuple[Any, int]:
+    """(y, e): x is y 2^e, and nothing in y exceeds 1 in magnitude; exact but for underflow, at most 2^-1075 a number."""
+    most = max(np.max(np.abs(x.value), initial=0.0), np.max(x.error.top, initial=0.0))
+    by = int(np.frexp(most)[1])
+    return type(x)(np.ldexp(x.value, -by), Above(np.ldexp(x.error.top, -by)) + np.size(x.value) * LEAST), by
+
+
+def symmetrised(N: Tensor) -> Tensor:
+    """The part of N_l[h, i, j], (k, k, k, l), symmetric in all indices, N being so in the first three: a projection, so
+    that the distance of the whole does not grow, and four roundings."""
+    X = N.value
+    value = (X + X.transpose(3, 1, 2, 0) + X.transpose(0, 3, 2, 1) + X.transpose(0, 1, 3, 2)) / 4
+    wrong = (N.error + N.size.ulps(4)).norm()
+    return Tensor(value, wrong * np.ones(len(X)))
+
+
 def where(condition: Any, x: Near, y: Near) -> Near:
     """x where the condition holds, else y."""
     return Near(np.where(condition, x.value, y.value), x.error.where(condition, y.error))
@@ -315,7 +445,8 @@ def near(q: Fraction) -> Near:
 
 def stacked(numbers: Sequence[Near]) -> Near:
     """Single numbers as an array."""
-    return Near(np.array([x.value for x in numbers]), Above(np.array([0 * x.value if x.error is ZERO else x.error.top for x in numbers])))
+    errors = [0.0 if x.error is ZERO else x.error.top for x in numbers]
+    return Near(np.array([x.value for x in numbers], dtype=np.float64), Above(np.array(errors, dtype=np.float64)))
 
 
 def all_near(numbers: Iterable[Fraction]) -> Near:
@@ -339,6 +470,11 @@ def within(bounds: tuple[Fraction, Fraction], x: Near) -> Any:
     (_, least), (most, _) = (near(q).ends for q in bounds)
     lo, hi = x.ends
     return (lo >= least) & (hi <= most)
+
+
+def at_least_0(x: Near) -> Above:
+    """Upper bounds of numbers that are not negative."""
+    return Above(np.maximum(x.ends[1], 0.0))
 
 
 def lower(x: Near) -> Any:

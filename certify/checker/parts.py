@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, NoReturn
 
-from .float64 import Array
+from .near import Array
 
 Batch = tuple[int, Array, Array]  # the number of the first leaf, and their corners (n, B)
 

@@ -21,7 +21,7 @@ from .document import Certificate, Partition
 from .errors import Rejected
 from .exact import Exact, Undecided, policy_at_origin
 from .expression import evaluate
-from .float64 import self_test
+from .near import self_test
 from .network import reaches
 from .parts import Part, in_processes
 

@@ -16,7 +16,7 @@ from typing import Protocol, Self, TypeVar
 import numpy as np
 
 from certify.loop.expressions import Algebra
-from certify.provers.bounds.arrays import Array, Index, product
+from certify.provers.bounds.arrays import Array, Index, chosen, product
 
 EPS = 2.0**-50
 TINY = 2.0**-900
@@ -174,8 +174,8 @@ class Models(ConstantsLast[Taylor]):
 def upper_bound(model: Taylor) -> tuple[Array, Array]:
     """(bound (B,), excess (N, B)): an upper bound over the box, and what each symbol adds to it.
 
-    The separable part `g t + q t^2` is maximised exactly over |t| <= 1; cross terms are bounded by magnitude, half to
-    each of the two symbols.
+    The lesser of two: in one the separable part `g t + q t^2` is maximised exactly over |t| <= 1, and cross terms are
+    bounded by magnitude, half to each of the two symbols; the other is `at_a_corner`.
     """
     g = np.abs(model.g)
     q = np.einsum("iib->ib", model.Q)
@@ -185,4 +185,21 @@ def upper_bound(model: Taylor) -> tuple[Array, Array]:
     cross = symmetric.sum(1) - np.abs(q)
     size = np.abs(model.c) + g.sum(0) + np.abs(axes).sum(0) + cross.sum(0) + model.r
     bound = model.c + axes.sum(0) + cross.sum(0) + model.r + 1e-11 * size + TINY
+    left = chosen(~(bound < 0))
+    if len(left):
+        bound[left] = np.fmin(bound[left], at_a_corner(model.at(left)))
     return bound, axes + cross
+
+
+def at_a_corner(model: Taylor) -> Array:
+    """Upper bounds (B,) from the corner s to which the gradient points, d_i = s_i (1 - w_i) with 0 <= w_i <= 2.
+
+    With R_ij = s_i s_j Q_ij the model is `c + sum |g_i| + s'Q s - sum_i w_i (|g_i| + 2 sum_j R_ij) + w'R w`, and
+    `w'R w <= 2 sum_i w_i sum_j max(R_ij, 0)`, since `w_i w_j <= w_i + w_j`.
+    """
+    g, s = np.abs(model.g), np.where(model.g < 0, -1.0, 1.0)
+    R = (model.Q + model.Q.swapaxes(0, 1)) * (s[:, None] * s)
+    more = np.maximum(np.maximum(-R, 0.0).sum(1) - g, 0.0).sum(0)
+    size = np.abs(model.c) + g.sum(0) + np.abs(R).sum((0, 1)) + model.r
+    bound: Array = model.c + g.sum(0) + R.sum((0, 1)) / 2 + 2 * more + model.r + 1e-11 * size + TINY
+    return bound
