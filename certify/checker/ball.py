@@ -204,7 +204,9 @@ def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
     """
     k = len(states[0].a.value)
     y = stacked([x.c for x in states])
-    X = Vector(np.array([x.a.value for x in states]), stacked([Near(0.0, x.a.error) for x in states]).error.norm() * np.ones(k))
+    X = Vector(
+        np.array([x.a.value for x in states]), stacked([Near(0.0, x.a.error) for x in states]).error.norm() * np.ones(k)
+    )
     H, C, R = np.zeros((k, k, 0)), np.zeros((len(triples(k)[0]), 0)), np.zeros((k, k, 0))
     lips = Above(np.zeros(0))
     for number, layer in enumerate(net.layers):

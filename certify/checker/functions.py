@@ -41,8 +41,12 @@ class Expansion:
 
     @cached_property
     def stored(self) -> Three:
-        """phi, phi' and phi''/2 at the stored numbers."""
-        return self.phi.at(Near(self.v0.value))
+        """phi, phi' and phi''/2 at the stored numbers; NaN where phi may be undefined around v0."""
+        f0, f1, f2 = self.phi.at(Near(self.v0.value))
+        if not self.phi.partial:
+            return f0, f1, f2
+        defined = Above(0 * self.third.v)
+        return Near(f0.value, f0.error + defined), Near(f1.value, f1.error + defined), Near(f2.value, f2.error + defined)
 
     @cached_property
     def f(self) -> Four:
@@ -51,7 +55,12 @@ class Expansion:
         if self.v0.error is ZERO:
             return f0, f1, f2, f3
         e0, e1, e2, e3 = (self.v0.error * steep for steep in self.phi.slopes(self.v0))
-        return Near(f0.value, f0.error + e0), Near(f1.value, f1.error + e1), Near(f2.value, f2.error + e2), Near(f3.value, f3.error + e3)
+        return (
+            Near(f0.value, f0.error + e0),
+            Near(f1.value, f1.error + e1),
+            Near(f2.value, f2.error + e2),
+            Near(f3.value, f3.error + e3),
+        )
 
     @property
     def derivative(self) -> Derivative:
@@ -88,6 +97,7 @@ class Function(ABC):
     """A row of the table: phi, and its first derivatives, f = (phi, phi', phi''/2, phi^(3)/6)."""
 
     name: str
+    partial = False  # true if phi is not defined for all numbers
 
     def exact(self, q: Fraction) -> Fraction | None:
         """phi(q), None where rationals do not know it: they know it at 0. Raises `Undecided` where there is none."""
@@ -160,7 +170,7 @@ class _Tanh(Function):
 
 
 class _Inverse(Function):
-    name = "inv"
+    name, partial = "inv", True
 
     def exact(self, q: Fraction) -> Fraction | None:
         if q == 0:
@@ -268,7 +278,7 @@ class _Atan(Function):
 class _Sqrt(Function):
     """With s^2 = v0 and w^2 = v."""
 
-    name = "sqrt"
+    name, partial = "sqrt", True
 
     def exact(self, q: Fraction) -> Fraction | None:
         if q <= 0:
@@ -376,6 +386,5 @@ def _step(v: list[Any], w: list[Any], k: int, constant: Constant) -> Any:
 
 
 FUNCTIONS: dict[str, Function] = {
-    row.name: row
-    for row in (_Inverse(), _Tanh(), _Exp(), _Atan(), _Sqrt(), _Sine("sin", "cos"), _Sine("cos", "sin"))
+    row.name: row for row in (_Inverse(), _Tanh(), _Exp(), _Atan(), _Sqrt(), _Sine("sin", "cos"), _Sine("cos", "sin"))
 }

@@ -95,8 +95,10 @@ class Jet:
     @cached_property
     def remainder(self) -> Array:
         """A matrix M with |v(d) - v(0) - a.d - d'Q d - K[d] - sum_j B_j e_j(d)| <= d'M d for the stored Q, K and B."""
-        of_B = mixed(Square(self.U), Near(self.B.error.top + 0 * self.B.value))
-        return (self.E + of_B + identity(self.E, self.Q.error + self.K.error)).majorant
+        E = self.E
+        if self.B.error is not ZERO:
+            E = E + mixed(Square(self.U), Near(self.B.error.top + 0 * self.B.value))
+        return Square(E.value, E.error + (self.Q.error + self.K.error)).majorant
 
     @property
     def lipschitz(self) -> Above:
@@ -198,7 +200,9 @@ class Jet:
         _, _, half, sixth = phi.f
         a, s, curve = self.gradient, self.gradient.size, self.curve
         quartic, straight = phi.fourth * (self.radius * self.radius), half.size * s * 2  # 2 half (a.d) (z - d'Q d)
-        square = half.size * curve + sixth.size * (s * s * 3 + s * curve * 3 + curve * curve) + quartic * (s * 2 + curve)
+        square = (
+            half.size * curve + sixth.size * (s * s * 3 + s * curve * 3 + curve * curve) + quartic * (s * 2 + curve)
+        )
         aa = outer(a, a)
         C = symmetric(a, self.Q) * (half * 2) + symmetric(a, aa) * sixth
         plain = straight * self.twist + square * (self.bend + self.twist)
@@ -248,7 +252,9 @@ def constant(q: Fraction, U: Array, count: int) -> Jet:
 def uncertain(lo: Fraction, hi: Fraction, U: Array, number: int, count: int) -> Jet:
     """A number of [lo, hi], lo + hi + (hi - lo) y over 2, y being the one of this number of `count`."""
     reach, here = near((hi - lo) / 2), np.arange(count) == number
-    c_y = Near(np.where(here, reach.value, 0.0), reach.error * np.where(here, 1.0, 0.0) if reach.error is not ZERO else ZERO)
+    c_y = Near(
+        np.where(here, reach.value, 0.0), reach.error * np.where(here, 1.0, 0.0) if reach.error is not ZERO else ZERO
+    )
     return replace(constant((lo + hi) / 2, U, count), c_y=c_y)
 
 

@@ -75,7 +75,10 @@ class Local(Ball):
     def during(self, way: Way) -> list[Jet]:
         """The states within a way of the ball's."""
         moved = zip(self.states, *way, strict=True)
-        return [replace(x, c=Near(x.c.value, x.c.error + far), a=Vector(x.a.value, x.a.error + along)) for x, far, along in moved]
+        return [
+            replace(x, c=Near(x.c.value, x.c.error + far), a=Vector(x.a.value, x.a.error + along))
+            for x, far, along in moved
+        ]
 
     def settled(self, v: Jet) -> Jet:
         """Set the value at d = 0 to exactly 0 at rest, where it is 0 in truth."""

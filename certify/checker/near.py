@@ -65,8 +65,8 @@ class Above:
 
     @property
     def top(self) -> Any:
-        """The bounds as binary64 numbers, rounded up."""
-        return self.v * _MORE + LEAST
+        """The bounds as binary64 numbers, rounded up: 1 + 4u (k + 2) is exact, and times 1 - u at least (1 + 2u)^k."""
+        return self.v * (1 + 4 * U * (self.k + 2)) + LEAST if self.k else self.v
 
     def __add__(self, other: Above | float) -> Above:
         if not isinstance(other, Above):
@@ -95,7 +95,7 @@ class Above:
     @property
     def root(self) -> Above:
         """Square roots."""
-        return Above(np.sqrt(self.v), self.k + 1)
+        return self if self is ZERO else Above(np.sqrt(self.v), self.k + 1)
 
     def ulps(self, roundings: int) -> Above:
         """2 u times the numbers, so many times: what that many roundings in a row, of numbers that are not larger, come
@@ -116,13 +116,15 @@ class Above:
 
     def sum(self, axis: int | tuple[int, ...] = 0) -> Above:
         """Sums along axes, in any order: of n numbers they lose a factor 1 - n u, and 4 n u makes up for it."""
+        if self is ZERO:
+            return self
         added = np.sum(self.v, axis=axis)
         n = np.size(self.v) // max(np.size(added), 1)
         return Above(added * (1 + 4 * n * U), self.k + 2)
 
     def max(self, axis: int = 0) -> Above:
         """The largest along an axis."""
-        return Above(np.max(self.v, axis=axis, initial=0.0), self.k)
+        return self if self is ZERO else Above(np.max(self.v, axis=axis, initial=0.0), self.k)
 
     def norm(self, axis: int | tuple[int, ...] = 0) -> Above:
         """2-norms along axes."""
@@ -131,7 +133,7 @@ class Above:
     def through(self, W: Array) -> Above:
         """|W| x for an exact matrix W, the numbers x along the first axis."""
         n = W.shape[1]
-        return Above(np.tensordot(np.abs(W), self.v, 1) * (1 + 4 * n * U) + n * LEAST, self.k + 3)
+        return self if self is ZERO else Above(np.tensordot(np.abs(W), self.v, 1) * (1 + 4 * n * U) + n * LEAST, self.k + 3)
 
     def __getitem__(self, index: Any) -> Above:
         return self if self is ZERO else Above(self.v[index], self.k)
@@ -175,8 +177,8 @@ class Near:
 
     axes: tuple[int, ...] = ()
 
-    def __init__(self, value: Any, error: Above = ZERO) -> None:
-        self.value, self.error = value, error
+    def __init__(self, value: Any, error: Above = ZERO, rough: Above | None = None) -> None:
+        self.value, self.error, self.rough = value, error, rough
 
     def length(self, x: Above) -> Above:
         """The norm of magnitudes x."""
@@ -186,6 +188,11 @@ class Near:
     def size(self) -> Above:
         """Upper bound of the norm of the numbers."""
         return self.length(size(self.value)) + self.error
+
+    @property
+    def roughly(self) -> Above:
+        """Upper bound of the norm of what is stored: of sums and products by those of their parts."""
+        return self.rough or self.size
 
     @property
     def ends(self) -> tuple[Any, Any]:
@@ -202,11 +209,11 @@ class Near:
     def __add__(self, other: Near) -> Self:
         """The norm of a sum's roundings is at most u times that of the terms."""
         value = self.value + other.value
-        made = self.size + other.size if self.axes else size(value)
-        return type(self)(value, self.error + other.error + made.ulps(1))
+        made = self.roughly + other.roughly if self.axes else size(value)
+        return type(self)(value, self.error + other.error + made.ulps(1), made)
 
     def __neg__(self) -> Self:
-        return type(self)(-self.value, self.error)
+        return type(self)(-self.value, self.error, self.rough)
 
     def __sub__(self, other: Near) -> Self:
         return self + -other
@@ -214,9 +221,10 @@ class Near:
     def __mul__(self, other: Near | float) -> Self:
         """Products with one number for all that share an error. |xy - XY| <= |x||y - Y| + |x - X||Y|."""
         x, y = other if isinstance(other, Near) else Near(other), self
-        of_x = size(x.value)
-        made = of_x * (y.error + y.size.ulps(1))
-        return type(self)(x.value * y.value, made if x.error is ZERO else made + x.error * y.size)
+        of_x, rough = size(x.value), y.roughly
+        made = of_x * (y.error + rough.ulps(1))
+        made = made if x.error is ZERO else made + x.error * (rough + y.error)
+        return type(self)(x.value * y.value, made, of_x * rough)
 
     __rmul__ = __mul__
 
@@ -316,6 +324,8 @@ class Square(Vector):
     @property
     def majorant(self) -> Array:
         """Matrices M with d'X d <= d'M d for all X within the error: its identity is added on the diagonal."""
+        if self.error is ZERO:
+            return self.value
         M = self.value + 0.0 * self.error.v
         i = np.arange(len(M))
         M[i, i] = Near(M[i, i], self.error).ends[1]
@@ -325,8 +335,8 @@ class Square(Vector):
 class Tensor(Square):
     """The same with any number of axes but the last."""
 
-    def __init__(self, value: Any, error: Above = ZERO) -> None:
-        super().__init__(value, error)
+    def __init__(self, value: Any, error: Above = ZERO, rough: Above | None = None) -> None:
+        super().__init__(value, error, rough)
         self.axes = tuple(range(np.ndim(value) - 1))
 
 
@@ -356,9 +366,10 @@ def order_of(count: int) -> int:
 
 def outer(x: Vector, y: Vector) -> Square:
     """The symmetric part of x y', (k, k): the Frobenius norm of each half is at most that of x y'; three roundings."""
-    both = x.value[:, None] * y.value
-    value = (both + both.swapaxes(0, 1)) / 2
-    return Square(value, x.stored * (y.error + y.size.ulps(3)) + x.error * y.size)
+    whole = x.value[:, None] * y.value
+    value = (whole + whole.swapaxes(0, 1)) / 2
+    both = x.stored * y.stored
+    return Square(value, x.stored * y.error + both.ulps(3) + x.error * y.size, both)
 
 
 def symmetric(a: Vector, Q: Square) -> Cubic:
@@ -366,7 +377,8 @@ def symmetric(a: Vector, Q: Square) -> Cubic:
     h, i, j, _ = triples(len(a.value))
     x, M = a.value, Q.value
     value = (x[h] * M[i, j] + x[i] * M[h, j] + x[j] * M[h, i]) / 3
-    return Cubic(value, a.stored * (Q.error + Q.size.ulps(5)) + a.error * Q.size)
+    both = a.stored * Q.roughly
+    return Cubic(value, a.stored * Q.error + both.ulps(5) + a.error * (Q.roughly + Q.error), both)
 
 
 def mixed(x: Near, weights: Near) -> Any:

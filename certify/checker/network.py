@@ -27,7 +27,6 @@ from .near import (
     size,
     spectral_norm,
     stacked,
-    where,
 )
 
 

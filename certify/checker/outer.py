@@ -20,9 +20,9 @@ from .case import Case, Failures
 from .document import Network
 from .exact import exactly, inverse
 from .expression import Tape, evaluate
+from .flow import Series
 from .functions import FUNCTIONS
 from .near import ZERO, Above, Array, Form, Near, near
-from .flow import Series
 from .network import Folded, enclose_on_boxes, layer
 from .parts import Batch
 from .taylor import Taylor, affine, constant, upper_bound

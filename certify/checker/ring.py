@@ -14,8 +14,8 @@ from flint import fmpq
 from .boxes import Boxes, Leaves, batches, is_whole, middle, multipliers, on_box
 from .case import Case, Failures
 from .exact import fraction, root_above
-from .near import Above, Array, Near, near, size
 from .flow import later
+from .near import Above, Array, Near, near, size
 from .network import enclose_on_boxes
 from .parts import Batch
 from .taylor import Taylor, affine, combination, pairs, upper_bound

@@ -22,6 +22,7 @@ import pytest
 from certify.checker import local
 from certify.checker.decrease import Models
 from certify.checker.jets import Jet
+from certify.checker.near import ZERO
 from certify.checker.ring import Ring
 from certify.checker.taylor import upper_bound
 from tests.support.certificates import Document, edited, encode, verdict
@@ -251,13 +252,13 @@ def test_without_lipschitz_constants_trajectories_part(name: str, monkeypatch: p
     """What is left of x^4 is left by products, of the others by functions."""
     product = Jet.__mul__
     monkeypatch.setattr(Jet, "__mul__", lambda x, y: forgetful(product(x, y)))
-    monkeypatch.setattr(Jet, "lip_beyond_tangent", lambda jet, phi: 0.0)
+    monkeypatch.setattr(Jet, "lip_beyond_tangent", lambda jet, phi: ZERO)
     drive = closer(name, 1)
     assert drive.last() > drive.truth
 
 
 def forgetful(jet: Jet) -> Jet:
-    object.__setattr__(jet, "lip", 0 * jet.lip)
+    object.__setattr__(jet, "lip", ZERO)
     return jet
 
 

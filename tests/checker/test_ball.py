@@ -5,7 +5,6 @@ A model is asked at rational points of the ball, in Arb, and nothing that is not
 
 from __future__ import annotations
 
-from dataclasses import replace
 from fractions import Fraction
 from functools import cache, partial
 from typing import Any
@@ -18,10 +17,10 @@ from certify.checker import ball, local, rules, tube
 from certify.checker.ball import Ball
 from certify.checker.case import Case
 from certify.checker.errors import Rejected
-from certify.checker.jets import Jet
 from tests.checker.test_rules import honest
 from tests.support.balls import with_ball
 from tests.support.certificates import Document, decode, edited, encode, make, parse, rehash
+from tests.support.jets import Jet, changed, seen
 from tests.support.jets import curved as beyond_linear
 from tests.support.marks import slow_after
 from tests.support.oracle import policy_in_arb, quadratic, value_of
@@ -102,9 +101,9 @@ def test_the_ball_encloses_F_and_the_inputs(name: str, size: float) -> None:
             for d in points(generator, n):
                 x = states(J, d)
                 u = policy_in_arb(c.policy, c.u_eq, x)
-                assert all(contains(v, *pair, d) for v, *pair in zip(found.inputs, u, zero, strict=True))
+                assert all(contains(v, *pair, d) for v, *pair in zip(seen(found.inputs), u, zero, strict=True))
                 names = dict(zip(plant["states"] + plant["inputs"], x + u, strict=True))
-                for equation, f in zip(plant["dynamics"], found.F(), strict=True):
+                for equation, f in zip(plant["dynamics"], seen(found.F()), strict=True):
                     assert contains(f, value_of(equation, names), arb(0), d), (d, equation)
 
 
@@ -113,7 +112,7 @@ def test_what_is_left_is_of_fourth_order(name: str) -> None:
     """On a ball half as large a is half, Q a quarter, K an eighth and what is left a sixteenth."""
     data, sizes = document_of(name), (2.0**-9, 2.0**-10, 2.0**-11)
     found = [
-        [[np.linalg.norm(part) for part in (f.a, f.Q, f.K, f.whole)] for f in on_ball(data, s * np.eye(2)).F()]
+        [[np.linalg.norm(part) for part in (f.a, f.Q, f.K, f.whole)] for f in seen(on_ball(data, s * np.eye(2)).F())]
         for s in sizes
     ]
     with np.errstate(all="ignore"):  # a component that is a state has no Q
@@ -132,7 +131,7 @@ def test_the_models_know_directions() -> None:
         [["sin", "x"], "y"], [(np.zeros((1, 2)), [0.0])], np.eye(2), (0.01, 0.01), states="xy",
         domain=[("-3", "3")] * 2,
     )  # fmt: skip
-    f = on_ball(data, 0.5 * np.eye(2)).F()[0]
+    f = seen(on_ball(data, 0.5 * np.eye(2)).F())[0]
     assert f.E[0, 0] > 0.001 > 1e-12 > f.E[1, 1] >= 0
 
 
@@ -151,7 +150,7 @@ def reach(data: Document) -> tuple[float, float]:
     """u_eq and the radius of the first input on the local ball."""
     c = parse(data)
     assert c.evidence.local is not None
-    u = on_ball(data, c.evidence.local.J).inputs[0]
+    u = seen(on_ball(data, c.evidence.local.J).inputs)[0]
     return float(c.u_eq[0]), float(u.radius)
 
 
@@ -198,10 +197,10 @@ def test_what_is_not_finite_keeps_no_input_and_is_clipped(bad: float, part: str)
     found = on_ball(data, c.evidence.local.J)
     with np.errstate(all="ignore"):
         assert first(ball.keeps_inputs(found)) is None and first(ball.is_not_clipped(found)) is None
-        u = found.inputs[0]
+        u = seen(found.inputs)[0]
         spoilt = np.array(getattr(u, part), float)
         spoilt[(0,) * spoilt.ndim] = bad
-        found.__dict__["inputs"] = [replace(u, **{part: spoilt})]
+        found.__dict__["inputs"] = [changed(u, **{part: spoilt}).model]
         assert first(ball.keeps_inputs(found)) == ("ball", "u may leave its bounds")
         assert first(ball.is_not_clipped(found)) == ("ball", "u may be clipped: policy.clip")
 
@@ -221,9 +220,9 @@ def test_what_is_not_finite_does_not_decrease(part: str) -> None:
         for subject, decreases in pieces:
             assert first(decreases(subject)) is None
             F = subject.F()
-            spoilt = np.array(getattr(F[0], part), float)
+            spoilt = np.array(getattr(Jet.of(F[0]), part), float)
             spoilt[(0,) * spoilt.ndim] = np.nan
-            subject.__dict__["F"] = partial(given, [replace(F[0], **{part: spoilt}), *F[1:]])
+            subject.__dict__["F"] = partial(given, [changed(Jet.of(F[0]), **{part: spoilt}).model, *F[1:]])
             subject.__dict__.pop("sides", None)  # what it found before
             found = first(decreases(subject))
             assert found is not None and "no finite model" in found[1]

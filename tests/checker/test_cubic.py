@@ -17,24 +17,38 @@ import pytest
 from flint import arb, ctx, fmpq, fmpq_mat
 
 from certify.checker import decrease, local, tube
-from certify.checker.ball import Ball, Units, too_large
+from certify.checker.ball import Ball, too_large
 from certify.checker.case import Case
 from certify.checker.decrease import Models
 from certify.checker.document import Certificate, Multipliers
-from certify.checker.elementary import Expansion, elementary
 from certify.checker.exact import exactly
-from certify.checker.jets import Jet, constant, symmetric, tensor_norm, unpacked, widen
+from certify.checker.jets import Jet as Batch
+from certify.checker.jets import unpacked
+from certify.checker.near import Above, Cubic, Near, Square, Vector, symmetric
 from certify.checker.network import fold
-from certify.checker.pairs import bound_of_pairs, in_binary64
+from certify.checker.pairs import in_binary64
 from tests.checker.test_ball import curved as every_function
 from tests.checker.test_path import linear as along
 from tests.checker.test_path import placed
 from tests.checker.test_rules import honest
 from tests.support.balls import with_ball
 from tests.support.certificates import Document, edited, encode, make, parse, verdict
-from tests.support.jets import curved, plain
+from tests.support.jets import (
+    Jet,
+    beyond_tangent,
+    bound_of_pairs,
+    changed,
+    constant,
+    curved,
+    models_of,
+    plain,
+    remainders,
+    seen,
+    units_of,
+)
 from tests.support.marks import slow_after
 from tests.support.oracle import policy_in_arb, quadratic, value_of
+from tests.support.plain import elementary
 
 Generator = np.random.Generator
 JUST = 1 - 2.0**-40
@@ -139,15 +153,21 @@ def random_jet(generator: Generator, k: int, U: np.ndarray, size: float = 1.0) -
         np.float64(generator.choice([-1, 1]) * number()), number() * 2.0**-8 * generator.choice([0, 1]),
         generator.standard_normal(k) * number(), number() * 2.0**-8 * generator.choice([0, 1]),
         (half + half.T) * number(), generator.standard_normal(k * (k + 1) * (k + 2) // 6) * number(),
-        widen((E + E.T) / 2, 0.0, 2.0**-40), generator.standard_normal(len(U)) * number(), U,
+        semidefinite((E + E.T) / 2), generator.standard_normal(len(U)) * number(), U,
         np.zeros(0), np.zeros((0, k)), 0.0,
     )  # fmt: skip
+
+
+def semidefinite(E: np.ndarray) -> np.ndarray:
+    """Matrices that are semidefinite in spite of rounding."""
+    trace = np.trace(E, axis1=-2, axis2=-1)
+    return np.asarray(E + (2.0**-39 * trace)[..., None, None] * np.eye(E.shape[-1]))
 
 
 def shares(generator: Generator, m: int, k: int) -> np.ndarray:
     """U of the errors of a family, semidefinite."""
     root = generator.standard_normal((m, k, k)) * 2.0 ** generator.integers(-12, 0, (m, 1, 1))
-    return np.asarray(widen(root @ root.swapaxes(1, 2), 0.0, 2.0**-40))
+    return semidefinite(root @ root.swapaxes(1, 2))
 
 
 class Member:
@@ -204,7 +224,7 @@ def test_operations_know_the_errors_that_their_operands_share(size: float) -> No
             closeness(-x, common, lambda d, v=v: -v(d), [-p for p in v.a], where)
             used = max(used, closeness(x * y, common, lambda d, v=v, w=w: v(d) * w(d), products, where))
             for name in FUNCTIONS:
-                jet = replace(x, c=np.float64(abs(x.c) + 12 * size)) if name in ("inv", "sqrt") else x
+                jet = changed(x, c=np.float64(abs(x.c) + 12 * size)) if name in ("inv", "sqrt") else x
                 f, u = jet.function(name), Member(jet, v.own, common)
                 if not np.isfinite(f.E).all():
                     assert name in ("inv", "sqrt")
@@ -222,7 +242,7 @@ def alone(part: str, generator: Generator, U: np.ndarray) -> Jet:
     half, root = generator.standard_normal((2, k, k))
     only = {"a": generator.standard_normal(k), "Q": half + half.T, "E": root @ root.T, "B": np.ones(len(U)),
             "K": generator.standard_normal(k * (k + 1) * (k + 2) // 6)}  # fmt: skip
-    return replace(nothing, **{part: only[part]})
+    return changed(nothing, **{part: only[part]})
 
 
 @pytest.mark.parametrize(("left", "right"), list(itertools.product("aQKEB", repeat=2)))
@@ -241,15 +261,14 @@ def test_every_pair_of_parts_has_its_place_in_a_product(left: str, right: str) -
 def test_every_power_has_its_place_in_what_a_function_adds(order: int, left: str, right: str) -> None:
     """D^2, D^3 or D^4 itself, of two parts of a jet: |D^order - d'H d - C[d]| <= d'R d."""
     generator, used = np.random.default_rng(order), 0.0
-    f = tuple(np.float64(j == order) for j in range(4))
-    phi = Expansion(f, (0.0, 0.0, 0.0, 0.0), np.float64(1), np.float64(order == 4), 0.0)  # type: ignore[arg-type]
+    f = [float(j == order) for j in range(4)]
     with ctx.workprec(2500):
         for size in (0.01, 0.3, 1.0, 1.0, 3.0):
             U = shares(generator, 1, 2)
             x, y = alone(left, generator, U), alone(right, generator, U)
-            jet = x if left == right else replace(x, **{right: size * getattr(y, right)})
+            jet = x if left == right else changed(x, **{right: size * getattr(y, right)})
             member = Member(jet, JUST, [JUST])
-            H, C, R = jet.beyond_tangent(phi)
+            H, C, R = beyond_tangent(jet, f, 1.0, float(order == 4))
             for d in points(generator, 2):
                 bound = quadratic(R.tolist(), d)
                 off = abs(member(d) ** order - curved(plain(0.0, 0.0, jet.a, 0.0, H, R, C), d))
@@ -297,11 +316,12 @@ def test_a_tensor_is_stored_once() -> None:
     for k in (1, 2, 3, 5):
         a, Q = generator.standard_normal(k), generator.standard_normal((k, k))
         Q = Q + Q.T
-        whole = unpacked(symmetric(a, Q), k)
+        found = symmetric(Vector(a), Square(Q))
+        whole = unpacked(found.value, k)
         truth = sum(np.transpose(np.multiply.outer(a, Q), order) for order in itertools.permutations(range(3))) / 6
         assert np.allclose(whole, truth, rtol=0, atol=1e-14) and whole.shape == (k, k, k)
         size = float(np.linalg.norm(whole))
-        assert size <= tensor_norm(symmetric(a, Q), k) <= size * (1 + 1e-9)
+        assert size <= Cubic(found.value).size.top <= size * (1 + 1e-9)
 
 
 # --------------------------------------------------------------------------------------------------- networks and loops
@@ -391,14 +411,15 @@ def test_units_carry_all_that_their_inputs_leave_out(
             (found,) = tube.pieces(Case(parse(placed(data, ends[0].tolist(), ends.sum(0).tolist(), 0.5, J))))
         layers = spied(found, monkeypatch)
         with np.errstate(all="ignore"):
-            units, inputs, F = found.units, found.inputs, found.F()
-        hidden = len(units.R) - len(inputs)
+            units, inputs, F = found.units, seen(found.inputs), seen(found.F())
+        R = remainders(units)
+        hidden = len(R) - len(inputs)
         for d in points(generator, n + moving):
             with ctx.workprec(500):
                 x, u, errors = at_point(found, layers, d)
                 m, u_0, _ = at_point(found, layers, [0.0] * len(d))
                 length = sum((arb(v) ** 2 for v in d), arb(0)).sqrt()
-                bounds = [quadratic(R.tolist(), d) for R in units.R]
+                bounds = [quadratic(own.tolist(), d) for own in R]
                 assert all(abs(e) <= bound for e, bound in zip(errors[:hidden], bounds, strict=False))
                 of_units = max(
                     [of_units, *(share(e, bound) for e, bound in zip(errors[:hidden], bounds, strict=False))]
@@ -458,11 +479,13 @@ def test_a_subnormal_scale_of_an_input_that_bends_much_contains(scale: float) ->
     net = found.case.net
     found.case.__dict__["net"] = replace(net, scale=np.array([scale, 1.0]))
     Q, flat = np.full((2, 2, 2), 2.0**500 / 3), np.zeros((2, 2, 2))
-    found.__dict__["outputs"] = Jet(np.zeros(2), np.zeros(2), np.zeros((2, 2)), np.zeros(2), Q, np.zeros((2, 4)), flat,
-                                    np.full((2, 1), 2.0**-20), np.full((1, 2, 2), 2.0**400), np.zeros((2, 0)),
-                                    np.zeros((2, 0, 2)), np.zeros(2))  # fmt: skip
+    no_y = Near(np.zeros((0, 2))), Vector(np.zeros((2, 0, 2)))
+    found.__dict__["outputs"] = Batch(
+        Near(np.zeros(2)), Vector(np.zeros((2, 2))), Square(Q), Cubic(np.zeros((4, 2))), Square(flat),
+        Near(np.full((1, 2), 2.0**-20)), np.full((2, 2, 1), 2.0**400), *no_y, Above(np.zeros(2)),
+    )  # fmt: skip
     with np.errstate(all="ignore"):
-        u = found.inputs[0]
+        u = seen(found.inputs)[0]
     least = abs(quotient(scale)) * (quotient(2.0**-53) * quotient(Q[0, 0, 0]))
     assert quotient(u.E[0, 0]) >= least
     assert quotient(u.E[0, 0]) >= abs(quotient(found.units.L[0, 0]) - quotient(scale) * quotient(2.0**-20)) * quotient(
@@ -542,10 +565,11 @@ def test_one_pair_is_bounded_as_well_as_can_be() -> None:
 def test_rationals_in_binary64(by: int) -> None:
     entries = [fmpq(1, 3), fmpq(-7, 5), fmpq(0), fmpq(1, 2**80)]
     a, e = in_binary64(fmpq_mat(2, 2, [v * fmpq(2) ** by for v in entries]))
-    assert np.max(np.abs(a)) <= 1
-    for found, v in zip(a.ravel(), entries, strict=True):
-        assert abs(quotient(found) * fmpq(2) ** (e - by) - v) <= abs(v) * fmpq(1, 2**53)
-    assert in_binary64(fmpq_mat(1, 2))[0].tolist() == [[0.0, 0.0]]
+    assert np.max(np.abs(a.value)) <= 1
+    for found, error, v in zip(a.value.ravel(), a.error.top.ravel(), entries, strict=True):
+        off = abs(quotient(found) * fmpq(2) ** (e - by) - v)
+        assert off <= abs(v) * fmpq(1, 2**53) and off <= quotient(error) * fmpq(2) ** (e - by)
+    assert in_binary64(fmpq_mat(1, 2))[0].value.tolist() == [[0.0, 0.0]]
 
 
 # ----------------------------------------------------------------------------------------------------------- inequality
@@ -554,9 +578,10 @@ def test_rationals_in_binary64(by: int) -> None:
 def random_models(generator: Generator, n: int, k: int, units: int) -> Models:
     m = 2
     U = np.zeros((m, k, k))
-    F = [replace(random_jet(generator, k, U), B=generator.standard_normal(m)) for _ in range(n)]
-    R = np.asarray(shares(generator, units, k))
-    return Models(generator.standard_normal((n, n)), F, Units(generator.standard_normal((m, units)), R), True)
+    F = [changed(random_jet(generator, k, U), B=generator.standard_normal(m)) for _ in range(n)]
+    R = shares(generator, units, k)
+    known = units_of(generator.standard_normal((m, units)), R)
+    return models_of(generator.standard_normal((n, n)), F, known, True)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
@@ -572,9 +597,9 @@ def test_the_two_new_sums_bound_what_they_stand_for(n: int, kind: str) -> None:
         with np.errstate(all="ignore"):
             by = Multipliers(apart, apart, apart, weight)
             sums = decrease.cubic(models, b, by), decrease.of_units(models, b, weight)
-        L, R = exactly(models.units.L), [exactly(part) for part in models.units.R]
+        L, R = exactly(models.units.L), [exactly(part) for part in remainders(models.units)]
         p = b.transpose() * models.B * L
-        whole = [unpacked(K, k) for K in models.K]
+        whole = [unpacked(K, k) for K in models.K.T]
         for d in points(generator, k):
             q = [quotient(v) for v in d]
             along = [sum((b[i, j] * q[j] for j in range(k)), fmpq(0)) for i in range(n)]

@@ -24,10 +24,9 @@ from certify.checker.case import Case
 from certify.checker.decrease import Models, are_finite, sides
 from certify.checker.document import Certificate, Multipliers, Path, Slab
 from certify.checker.exact import exactly
-from certify.checker.jets import Jet
 from tests.support.balls import with_ball
 from tests.support.certificates import Document, decode, edited, encode, make, parse, verdict
-from tests.support.jets import curved
+from tests.support.jets import Jet, curved, seen
 from tests.support.marks import slow_after
 from tests.support.oracle import ball, policies_in_arb, quadratic
 from tests.support.reached import dot, field_in_arb
@@ -191,7 +190,7 @@ def test_no_point_of_a_ball_leaves_its_models(count: int) -> None:
         generator = np.random.default_rng(seed)
         _, found = random_loop(generator)
         truth = Truth(found)
-        jets = [*found.inputs, *found.F()]
+        jets = seen([*found.inputs, *found.F()])
         at_0 = [ball(q) for q in found.case.c.u_eq] if found.motion is None else truth.centre[: len(found.inputs)]
         at_0 += truth.centre[len(found.inputs) :]
         asked = [i for i, jet in enumerate(jets) if is_known(jet)]
@@ -241,7 +240,7 @@ def test_polynomials_up_to_the_third_degree_leave_roundings_alone(span: int) -> 
         with ctx.workprec(1500):
             truth = Truth(found)
             for d in scattered(generator, 4, 3):
-                for jet, value, at_0 in zip(found.F(), truth.at(d)[1:], truth.centre[1:], strict=True):
+                for jet, value, at_0 in zip(seen(found.F()), truth.at(d)[1:], truth.centre[1:], strict=True):
                     assert is_known(jet)
                     closest = max(closest, part_used(jet, value, at_0, d))
     assert 1e-6 < closest <= 1
@@ -292,7 +291,7 @@ def test_no_point_of_a_ball_crosses_the_inequality(count: int) -> None:
         known += 1
         truth, A, B = Truth(found), generator.standard_normal((n, n)), generator.standard_normal((n, n))
         P, R = A + A.T if seed % 2 else A @ A.T, 10.0 ** generator.uniform(-3, 3) * (B + B.T)
-        by, path = random_hints(generator, found.J, P, found.F(), n + moving)
+        by, path = random_hints(generator, found.J, P, seen(found.F()), n + moving)
         v = [fmpq(int(q), 7) for q in generator.integers(-9, 10, n)]
         models = Models(found.J, found.F(), found.units, not moving, v if moving else ())
         decay, rest = sides(models, exactly(P), exactly(R), by, path if moving else None)
@@ -435,7 +434,7 @@ GRID = np.geomspace(0.1, 10, 5).tolist()
 
 def attempts(case: Case, piece: tube.Piece) -> Iterator[tube.Piece]:
     """The slab with multipliers that balance the sums, edge and motion on a grid around the rate of the flow."""
-    F = piece.F()
+    F = seen(piece.F())
     b = abs(float(piece.J[0, 0] * piece.slab.middle[0, 0]))
     rest, apart = ((quotient(max(float(np.linalg.norm(getattr(F[0], part))) / b, 1e-30)),) for part in ("E", "Q"))
     by = Multipliers(rest, apart, (fmpq(1),), piece.slab.multipliers.weight)

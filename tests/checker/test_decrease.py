@@ -15,14 +15,13 @@ import numpy as np
 import pytest
 from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
-from certify.checker.decrease import Models, are_finite, are_usable, shows, sides
+from certify.checker.decrease import are_finite, are_usable, shows, sides
 from certify.checker.document import Multipliers
 from certify.checker.exact import exactly
-from certify.checker.jets import Jet
 from certify.reference import decrease as reference
 from certify.reference.evidence import Ball
 from certify.reference.model import Model
-from tests.support.jets import no_units, plain
+from tests.support.jets import Jet, models_of, no_units, plain
 
 Generator = np.random.Generator
 Rows = tuple[list[float], list[float], list[float]]
@@ -107,7 +106,7 @@ def test_the_sides_bound_what_they_stand_for(n: int, kind: str) -> None:
         J, P, R = generator.standard_normal((n, n)), symmetric(generator, n), symmetric(generator, n)
         J, P, R = exactly(J), exactly(P), exactly(R)
         exact = np.array([[float(int(v.p)) / int(v.q) for v in row] for row in J.tolist()])
-        decay, rest = sides(Models(exact, F, no_units(n), True), P, R, random_multipliers(generator, n, kind))
+        decay, rest = sides(models_of(exact, F, no_units(n), True), P, R, random_multipliers(generator, n, kind))
         assert decay == decay.transpose() and rest == rest.transpose()
         for _ in range(12):
             d, unit = inside(generator, n), [quotient(v) for v in UNITS[generator.integers(len(UNITS))][:n]]
@@ -132,7 +131,7 @@ def test_what_is_shown_is_so(n: int) -> None:
         hints = by(
             *([float(v) for v in size / 4 * generator.choice([0, 1, 1], n)] for _ in range(2)), [n * size / 4] * n
         )
-        answers.append(shows(Models(J, F, no_units(n), True), P, R, hints))
+        answers.append(shows(models_of(J, F, no_units(n), True), P, R, hints))
         for _ in range(20 if answers[-1] else 0):
             d, unit = inside(generator, n), [quotient(v) for v in UNITS[generator.integers(len(UNITS))][:n]]
             assert worst(exactly(J), P, R, F, d, unit) < 0
@@ -147,7 +146,7 @@ def test_the_sums_are_those_of_the_reference(n: int, kind: str) -> None:
     for _ in range(20):
         F, hints = random_jets(generator, n, 1.0), random_multipliers(generator, n, kind)
         J, P, R = generator.standard_normal((n, n)), symmetric(generator, n), symmetric(generator, n)
-        decay, rest = sides(Models(J, F, no_units(n), True), exactly(P), exactly(R), hints)
+        decay, rest = sides(models_of(J, F, no_units(n), True), exactly(P), exactly(R), hints)
         with ctx.workprec(300):
             rows = [array("d", [float(int(v.p)) / int(v.q) for v in row]) for row in
                     (hints.rest, hints.apart, hints.joint)]  # fmt: skip
@@ -179,7 +178,10 @@ def scalar(
 ) -> bool:
     one = [jet([a], slack, [[Q]], [[E]])]
     return shows(
-        Models(np.array([[J]]), one, no_units(1), True), exactly(np.array([[P]])), exactly(np.array([[R]])), by(*rows)
+        models_of(np.array([[J]]), one, no_units(1), True),
+        exactly(np.array([[P]])),
+        exactly(np.array([[R]])),
+        by(*rows),
     )
 
 
@@ -220,7 +222,7 @@ def test_errors_of_two_components_cancel_jointly_alone() -> None:
     """F = -x + k x_1^2 (1, -1), and P for which (1, -1) is short: x'PF sees a tenth of the square."""
     P, zero, flat = exactly(np.array([[1.0, 0.9], [0.9, 1.0]])), fmpq_mat(2, 2), np.zeros((2, 2))
     F = [jet([-1, 0], 0.0, [[0.75, 0], [0, 0]], flat), jet([0, -1], 0.0, [[-0.75, 0], [0, 0]], flat)]
-    models, each = Models(np.eye(2), F, no_units(2), True), np.exp(np.arange(-6, 3, 0.25)).tolist()
+    models, each = models_of(np.eye(2), F, no_units(2), True), np.exp(np.arange(-6, 3, 0.25)).tolist()
     assert shows(models, P, zero, by([0, 0], [0, 0], [0.125, 2.0**-60]))
     assert not any(shows(models, P, zero, by([0, 0], [v, w], [0, 0])) for v in each for w in each)
 
@@ -247,7 +249,7 @@ def test_no_multiplier_is_negative(row: int, value: float) -> None:
 
 def test_a_negative_multiplier_would_show_what_is_false(monkeypatch: pytest.MonkeyPatch) -> None:
     """x' = x/2: a beta of -9 with Q = 1, or g = -9, takes from the rest what the decay lacks."""
-    growing = Models(np.eye(1), [jet([0.5], 0.0, [[1.0]], [[0.0]])], no_units(1), True)
+    growing = models_of(np.eye(1), [jet([0.5], 0.0, [[1.0]], [[0.0]])], no_units(1), True)
     one, zero = fmpq_mat([[1]]), fmpq_mat(1, 1)
     for rows in (([0.0], [0.0], [-9.0]), ([-9.0], [0.0], [-9.0])):
         assert shows(growing, one, zero, by(*rows)) and not are_usable(by(*rows))
@@ -257,7 +259,7 @@ def test_a_negative_multiplier_would_show_what_is_false(monkeypatch: pytest.Monk
 @pytest.mark.parametrize("part", ["a", "slack", "Q", "E"])
 def test_what_is_not_finite_is_no_model(bad: float, part: str) -> None:
     parts: dict[str, Any] = {"a": [1.0, 2.0], "slack": 0.0, "Q": np.eye(2), "E": np.eye(2)}
-    assert are_finite([jet(**parts)], no_units(2))
+    assert are_finite([jet(**parts).model], no_units(2))
     spoilt = np.array(parts[part], float)
     spoilt[(-1,) * spoilt.ndim] = bad
-    assert not are_finite([jet(**parts), jet(**parts | {part: spoilt})], no_units(2))
+    assert not are_finite([jet(**parts).model, jet(**parts | {part: spoilt}).model], no_units(2))

@@ -17,21 +17,33 @@ from numpy.random import Generator
 
 from certify.checker.ball import Units
 from certify.checker.case import Case
-from certify.checker.decrease import Level, Models, sides, size_beyond
+from certify.checker.decrease import Level, sides, size_beyond
 from certify.checker.document import Multipliers
 from certify.checker.exact import exactly
 from certify.checker.flow import Series
-from certify.checker.jets import Jet, between, uncertain
 from certify.checker.local import Local
 from certify.checker.ring import Ring
 from tests.checker.test_ball import points
 from tests.checker.test_cubic import FUNCTIONS, JUST, Member, closeness, derivatives, random_jet, shares, value
 from tests.checker.test_uncertain import holds
 from tests.support.certificates import Document, edited, make, parse
-from tests.support.jets import curved, given, no_units, plain
+from tests.support.jets import (
+    Jet,
+    between,
+    changed,
+    curved,
+    given,
+    models_of,
+    no_units,
+    plain,
+    remainders,
+    seen,
+    uncertain,
+    units_of,
+)
 from tests.support.leaves import on_boxes
-from tests.support.plain import Taylor
 from tests.support.marks import slow_after
+from tests.support.plain import Taylor
 from tests.support.stepped_loops import fitted
 
 # ------------------------------------------------------------------------------------------ jets with what is uncertain
@@ -41,7 +53,7 @@ def swaying(generator: Generator, k: int, U: np.ndarray, count: int, size: float
     jet = random_jet(generator, k, U, size)
     by = size * 2.0 ** generator.integers(-8, 0, 2)
     c_y, a_y = by[0] * generator.standard_normal(count), by[1] * generator.standard_normal((count, k))
-    return replace(jet, c_y=c_y, a_y=a_y)
+    return changed(jet, c_y=c_y, a_y=a_y)
 
 
 class At(Member):
@@ -74,7 +86,7 @@ def test_jets_that_are_affine_in_y_contain_what_they_stand_for(size: float) -> N
                 truth: Any = lambda d, v=v, w=w: v(d) * w(d)  # noqa: E731
                 used = max(used, closeness(given(x * y, at), common, truth, products, where))
                 for name in FUNCTIONS:
-                    jet = replace(x, c=np.float64(abs(x.c) + 14 * size)) if name in ("inv", "sqrt") else x
+                    jet = changed(x, c=np.float64(abs(x.c) + 14 * size)) if name in ("inv", "sqrt") else x
                     f, u = jet.function(name), At(jet, v.own, common, at)
                     if not np.isfinite(f.E).all():
                         assert name in ("inv", "sqrt")
@@ -198,7 +210,7 @@ def test_the_ball_holds_the_mean_over_a_period_in_which_what_is_uncertain_switch
         with np.errstate(all="ignore"):
             local = Local(Case(parse(data)))
             [cell] = local.case.cells
-            G, way = local.G(cell), local.way
+            G, way = seen(local.G(cell)), local.way
         assert way is not None and all(np.isfinite(g.E).all() for g in G)
         ends = np.array([[float(q) for q in pair] for pair in cell]).T
         widest = 0.0
@@ -266,7 +278,7 @@ def test_a_symbol_in_the_place_of_the_mean_is_not_enough_for_its_square() -> Non
     case = Case(parse(idle([["**", "q", 2]], "q", "1/8")))
     [g] = map(Taylor.of, on_boxes(Ring(case), np.zeros((1, 1)), np.full((1, 1), 0.1))[1])
     assert float(g.c[0] + g.r[0]) >= 1.0
-    [jet] = Local(case).G(next(iter(case.cells)))
+    [jet] = seen(Local(case).G(next(iter(case.cells))))
     assert jet.c + jet.error >= 1.0
 
 
@@ -274,7 +286,7 @@ def test_a_symbol_in_the_place_of_the_mean_is_not_enough_for_its_square() -> Non
 def test_the_order_of_values_within_a_period_counts(order: int) -> None:
     """x' = q, y' = x: the same, and linear in q."""
     h, case = 0.25, Case(parse(idle(["q", "x"], "q", "1/4", order)))
-    for jet, each in zip(Local(case).G(next(iter(case.cells))), (0.0, h / 4), strict=True):
+    for jet, each in zip(seen(Local(case).G(next(iter(case.cells)))), (0.0, h / 4), strict=True):
         assert within_jet(jet, [0.0], np.zeros(2), each, 1e-12)
     for model, each in zip(on_boxes(Ring(case), np.zeros((2, 1)), np.full((2, 1), 0.01))[1], (0.0, h / 4), strict=True):
         assert holds(replace_slack(Taylor.of(model)), 0, 2, 1, [0.0, 0.0, 0.0], arb(each))
@@ -287,7 +299,7 @@ def test_what_switches_within_a_period_may_do_what_no_constant_does(order: int) 
     path = travelled(np.zeros(2), lambda at, w: np.array([w, at[0]]), [(h / 2, 1.0), (h / 2, -1.0)])
     true = path[-1] / h
     assert true == pytest.approx([0, h / 4], abs=1e-12)
-    for jet, each in zip(Local(case).G(next(iter(case.cells))), true, strict=True):
+    for jet, each in zip(seen(Local(case).G(next(iter(case.cells)))), true, strict=True):
         assert within_jet(jet, [0.0, 1.0], np.zeros(2), each, 1e-12)
     for model, each in zip(on_boxes(Ring(case), np.zeros((2, 1)), np.full((2, 1), 0.01))[1], true, strict=True):
         assert holds(replace_slack(Taylor.of(model)), 0, 2, 2, [0.0, 0.0, 0.0, 1.0], arb(each))
@@ -333,19 +345,19 @@ def stepped(generator: Generator, n: int, units: int, count: int) -> tuple[list[
     m = 2
     U = np.zeros((m, n, n))
     jets = [
-        replace(
+        changed(
             swaying(generator, n, U, count, 0.4),
             B=generator.standard_normal(m),
             c=np.float64(0.2 * generator.standard_normal()),
         )
         for _ in range(n)
     ]
-    return jets, Units(generator.standard_normal((m, units)), np.asarray(shares(generator, units, n)))
+    return jets, units_of(generator.standard_normal((m, units)), shares(generator, units, n))
 
 
 def beyond(jets: list[Jet], units: Units, generator: Generator, d: np.ndarray) -> np.ndarray:
     """What some member of the models has beyond f and a.d; all errors are at an end of what they may be."""
-    errors = np.array([generator.choice([-1, 1]) * (d @ R @ d) for R in units.R])
+    errors = np.array([generator.choice([-1, 1]) * (d @ R @ d) for R in remainders(units)])
     own = np.array([generator.choice([-1, 1]) * (d @ jet.E @ d) for jet in jets])
     with ctx.workprec(120):
         curves = np.array([float(curved(jet, d.tolist()).mid()) for jet in jets])
@@ -359,7 +371,7 @@ def test_gamma_bounds_what_models_have_beyond_their_first_order(n: int) -> None:
         jets, units = stepped(generator, n, 3, 0)
         root = generator.standard_normal((n, n))
         P = root @ root.T + 0.1 * np.eye(n)
-        most = size_beyond(Models(np.eye(n), jets, units, True), P)
+        most = size_beyond(models_of(np.eye(n), jets, units, True), P)
         for _ in range(40):
             d = generator.standard_normal(n)
             d /= np.linalg.norm(d) * (1 + 2.0**-40)
@@ -380,13 +392,13 @@ def test_the_sides_of_a_step_bound_what_they_stand_for(n: int, level: bool, h: f
     for _ in range(12):
         count = int(generator.integers(0, 3))
         jets, units = stepped(generator, n, 2, count)
-        jets = [replace(jet, error=0.05 * generator.random(), slack=0.05 * generator.random()) for jet in jets]
+        jets = [changed(jet, error=0.05 * generator.random(), slack=0.05 * generator.random()) for jet in jets]
         root, J = generator.standard_normal((2, n, n))
         P = root @ root.T + 0.1 * np.eye(n)
         rate, c0, k = 0.3, 0.5, float(generator.choice([0.0, 0.7, 2.0]))
         rows = np.exp(generator.uniform(-3, 1, (3, n))).tolist()
         by = Multipliers(*(tuple(map(q, row)) for row in rows), np.eye(n))
-        models = Models(J, jets, units, not level)
+        models = models_of(J, jets, units, not level)
         most, around = size_beyond(models, P), Level(q(c0), q(k)) if level else None
         for corner, signs in zip(models.corners(), itertools.product((1, -1), repeat=count), strict=True):
             R = 2 * q(rate) * exactly(P)
@@ -396,7 +408,7 @@ def test_the_sides_of_a_step_bound_what_they_stand_for(n: int, level: bool, h: f
                 d = generator.standard_normal(n)
                 d /= np.linalg.norm(d) * (1 + 2.0**-40)
                 d *= generator.choice([1.0, 1.0, 0.5, 0.01])
-                at = [given(replace(jet, error=0.0, slack=0.0), list(signs)) for jet in jets]
+                at = [given(changed(jet, error=0.0, slack=0.0), list(signs)) for jet in jets]
                 f = np.array([jet.c for jet in at]) + np.array([jet.error for jet in jets]) * generator.choice(
                     [-1, 1], n
                 )
@@ -418,7 +430,7 @@ def test_what_is_left_counts_twice_with_the_value_that_it_is_added_to() -> None:
     """Next to x = 0 the increment f + c d^2 has the square f^2 + 2 f c d^2 + c^2 d^4."""
     f, c, small = 1.0, 0.5, 2.0**-30
     jet = plain(np.float64(f), 0.0, np.zeros(1), 0.0, np.full((1, 1), c), np.zeros((1, 1)))
-    models, one = Models(np.full((1, 1), small), [jet], no_units(1), False), np.eye(1)
+    models, one = models_of(np.full((1, 1), small), [jet], no_units(1), False), np.eye(1)
     by, around = Multipliers((fmpq(1),), (fmpq(1),), (fmpq(1),), one), Level(q(1.0), q(0.0))
     decay, rest = sides(models, exactly(one), exactly(0 * one), by, None, q(1.0), q(size_beyond(models, one)), around)
     left = numbers(decay - rest)

@@ -26,7 +26,6 @@ from certify.checker.case import Case
 from certify.checker.decrease import Models, are_finite, are_usable, shows, sides
 from certify.checker.document import Certificate, Multipliers, Path
 from certify.checker.exact import exactly
-from certify.checker.jets import Jet
 from tests.checker.test_rules import (
     array,
     at,
@@ -52,7 +51,7 @@ from tests.checker.test_tube import (
 )
 from tests.support.balls import enlarged_from, reached_from
 from tests.support.certificates import ASYMPTOTIC, Document, decode, edited, encode, make, parse, rehash, verdict
-from tests.support.jets import curved, no_units, plain
+from tests.support.jets import Jet, curved, models_of, no_units, plain, seen
 from tests.support.marks import slow_after
 from tests.support.oracle import ball as exact
 from tests.support.oracle import policy_in_arb, quadratic
@@ -757,7 +756,7 @@ def test_the_models_along_a_path_enclose_the_field(name: str, where: str) -> Non
         c = parse(data)
         (piece,) = tube.pieces(Case(c))
         with np.errstate(all="ignore"):
-            jets = [*piece.F(), *piece.inputs]
+            jets = seen([*piece.F(), *piece.inputs])
         if not all(np.isfinite(part).all() for jet in jets for part in (jet.c, jet.error, jet.a, jet.Q, jet.E)):
             continue
         met += 1
@@ -794,8 +793,8 @@ def test_models_of_random_loops_hold_along_random_paths(seed: int) -> None:
         share = float(random.choice([random.uniform(0.01, 0.99), 2.0**-40, 1 - 2.0**-40]))
         (piece,) = tube.pieces(Case(parse(placed(base, first.tolist(), (first + step).tolist(), share, J))))
         with np.errstate(all="ignore"):
-            jets = [*piece.F(), *piece.inputs]
-            finite = are_finite(jets, piece.units)
+            jets = seen([*piece.F(), *piece.inputs])
+            finite = are_finite([*piece.F(), *piece.inputs], piece.units)
         if not finite:
             continue
         met += 1
@@ -837,7 +836,7 @@ def random_models(generator: np.random.Generator, n: int) -> tuple[Models, list[
         jets.append(plain(np.float64(generator.standard_normal()), error, generator.standard_normal(k), slack, Q, E))
     velocity = [quotient(v) for v in generator.standard_normal(n)]
     J = generator.standard_normal((n, n))
-    return Models(J, jets, no_units(k), False, velocity), jets, velocity, J
+    return models_of(J, jets, no_units(k), False, velocity), jets, velocity, J
 
 
 def multipliers_of(generator: np.random.Generator, n: int, kind: str) -> tuple[Multipliers, Path]:
@@ -914,7 +913,7 @@ def test_the_homogenised_matrix_is_refused_at_its_edges() -> None:
         widest = np.zeros((2, 2))
         widest[0, 0] = E
         jet = plain(np.float64(alpha), error, np.array([-1.0, 0.0]), slack, np.zeros((2, 2)), widest)
-        models = Models(np.array([[1.0]]), [jet], no_units(2), False, [fmpq(0)])
+        models = models_of(np.array([[1.0]]), [jet], no_units(2), False, [fmpq(0)])
         rows = Multipliers((fmpq(0),), (quotient(NONE),), (fmpq(0),), np.eye(2))
         path = Path(np.zeros(1), 0.5, edge, 2 * (error + slack) + 2.0**-20, 0.0)
         return shows(models, exactly(np.eye(1)), fmpq_mat(1, 1), rows, path)

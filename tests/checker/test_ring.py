@@ -19,8 +19,8 @@ from certify.checker.ring import Ring
 from tests.checker.test_rules import honest, scalar_claim
 from tests.support.certificates import grow, parse, verdict
 from tests.support.leaves import on_boxes
-from tests.support.plain import Taylor, upper_bound
 from tests.support.oracle import policies_in_arb, value_of
+from tests.support.plain import Taylor, upper_bound
 
 Array = np.ndarray
 CASES = ("scalar", "linear", "rotor", "rotor, preactivation")

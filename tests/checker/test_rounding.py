@@ -29,9 +29,9 @@ from numpy.typing import NDArray
 
 from certify.checker import near
 from certify.checker import network as checker
+from certify.checker.boxes import middle
 from certify.checker.case import Case
 from certify.checker.document import Certificate, Policy
-from certify.checker.boxes import middle
 from certify.checker.ring import Ring
 from certify.checker.taylor import upper_bound
 from certify.loop.closed_loop import ClosedLoop

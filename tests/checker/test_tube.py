@@ -28,7 +28,7 @@ from hypothesis import strategies as st
 from certify.checker import tube, words
 from certify.checker.ball import Ball
 from certify.checker.case import Case
-from certify.checker.decrease import Models, are_finite, are_usable, shows, sides
+from certify.checker.decrease import are_finite, are_usable, shows, sides
 from certify.checker.document import Multipliers
 from certify.checker.exact import MAX_MATRIX_BITS, exactly, is_definite, root_above
 from certify.reference import rules as second
@@ -46,7 +46,7 @@ from tests.support.certificates import (
     verdict,
     write,
 )
-from tests.support.jets import curved, no_units, plain
+from tests.support.jets import curved, models_of, no_units, plain, seen
 from tests.support.marks import slow_after
 from tests.support.oracle import policy_in_arb, quadratic, value_of
 
@@ -582,9 +582,10 @@ def test_models_hold_on_their_balls(seed: int) -> None:
         c = parse(data)
         with np.errstate(all="ignore"):
             on = Ball(Case(c), J, "a ball")
-            jets = [*on.F(), *on.inputs]
-        if not are_finite(jets, on.units):
+            known_there = [*on.F(), *on.inputs]
+        if not are_finite(known_there, on.units):
             continue
+        jets = seen(known_there)
         met += 1
         n = len(J)
         points = random.standard_normal((3, n))
@@ -633,7 +634,9 @@ def test_what_is_just_shown_is_true_of_the_worst_remainder(seed: int) -> None:
         E = np.einsum("iab,icb->iac", E, E) * 10.0 ** random.uniform(-3, 0) * (random.random() < 0.7)
         Q = Q * 10.0 ** random.uniform(-2, 1) * (random.random() < 0.7)
         slack = 10.0 ** random.uniform(-6, 0, n) * (random.random() < 0.5)
-        models = Models(J, [plain(np.float64(0), 0.0, a[i], slack[i], Q[i], E[i]) for i in range(n)], no_units(n), True)
+        models = models_of(
+            J, [plain(np.float64(0), 0.0, a[i], slack[i], Q[i], E[i]) for i in range(n)], no_units(n), True
+        )
         by = random_multipliers(random, P @ J, Q, E)
         assert are_usable(by)
         decay_of, rest = sides(models, exactly(P), exactly(R), by)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from fractions import Fraction
 from functools import cache
 from itertools import pairwise
@@ -21,16 +20,15 @@ from flint import arb, ctx
 
 from certify.checker.ball import Ball
 from certify.checker.case import Case
-from certify.checker.jets import Jet, constant, uncertain
 from certify.checker.ring import Ring
 from tests.checker.test_ball import BITS, contains, points, states
 from tests.support.balls import enlarged_from, reached_from, with_ball
 from tests.support.certificates import Document, edited, encode, grow, make, parse, rehash, verdict
-from tests.support.jets import given
+from tests.support.jets import Jet, changed, constant, given, seen, uncertain
 from tests.support.leaves import on_boxes
-from tests.support.plain import Taylor
 from tests.support.marks import slow_after
 from tests.support.oracle import ball, policy_in_arb, value_of
+from tests.support.plain import Taylor
 from tests.support.uncertain import FACTORS, drawn, largest, random_plant, ranges_of, refutation
 
 Edit = Callable[[Document], Document]
@@ -488,7 +486,7 @@ def test_jets_of_a_function_of_a_quantity_enclose_it(factor: str, width: str) ->
     J = 0.1 * generator.standard_normal((2, 2))
     with np.errstate(all="ignore"):
         [cell] = cells_of(data)
-        found = Ball(Case(parse(data)), J, "ball").F(cell)[0]
+        found = seen(Ball(Case(parse(data)), J, "ball").F(cell))[0]
     if factor == "q^-3" and width != "1/1000000":  # q q^2 as a wide number may be 0, and its inverse anything
         assert not np.isfinite(found.E).any()
         return
@@ -533,7 +531,7 @@ def test_products_of_wide_jets_enclose_what_they_stand_for() -> None:
         lo = [Fraction(float(v)) for v in generator.uniform(-2, 2, 2)]
         hi = [v + Fraction(float(w)) for v, w in zip(lo, 10.0 ** generator.uniform(-6, 0.5, 2), strict=True)]
         p, q = (uncertain(*ends, no_errors, j, 2) for j, ends in enumerate(zip(lo, hi, strict=True)))
-        x, y = (replace(constant(Fraction(0), no_errors, 2), a=v) for v in (a, b))
+        x, y = (changed(constant(Fraction(0), no_errors, 2), a=v) for v in (a, b))
         with np.errstate(all="ignore"):
             jets = [(p + x) * (q + y)]
             jets += [jets[0].function(name) for name in ("sin", "tanh", "atan")]

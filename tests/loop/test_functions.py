@@ -22,7 +22,6 @@ from certify.certificates.claims import Asymptotic, conditions
 from certify.certificates.claims.queries import query
 from certify.certificates.verdict import Verdict
 from certify.checker import expression as checker_expression
-from certify.checker import jets as checker_jets
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import (
@@ -52,6 +51,7 @@ from tests.support import plain as plain_models
 from tests.support.balls import with_ball
 from tests.support.cases import case_of
 from tests.support.certificates import Document, edited, grow, make, verdict
+from tests.support.jets import constant as jet_of
 from tests.support.jets import curved, plain
 from tests.support.loops import box, tank, valve
 from tests.support.oracle import value_of
@@ -215,7 +215,7 @@ def test_models_of_random_equations_contain_them(tree: Any, seed: int, size: flo
         # balls
         n = np.zeros((2, 2))
         jets = [plain(np.float64(c), 0.0, a, 0.0, n, n) for c, a in zip(at_0, slopes, strict=True)]
-        [jet] = checker_expression.evaluate(tape, lambda q: checker_jets.constant(q, np.zeros((1, 2, 2)), 0), jets)
+        [jet] = checker_expression.evaluate(tape, lambda q: jet_of(q, np.zeros((1, 2, 2)), 0), jets)
         models = {
             name: reference_model.Model.affine(arb(float(c)), [arb(float(v)) for v in a])
             for name, c, a in zip("xy", at_0, slopes, strict=True)

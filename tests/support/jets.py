@@ -1,25 +1,151 @@
-"""Jets for the checker's tests: models that somebody writes down, and what they say at a point, in ball arithmetic."""
+"""Jets for the checker's tests: models that somebody writes down, as plain numbers, and what they say at a point, in
+ball arithmetic."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from fractions import Fraction
 from itertools import combinations_with_replacement
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from flint import arb
 
+from certify.checker import jets, pairs
 from certify.checker.ball import Units
-from certify.checker.jets import Jet
+from certify.checker.decrease import Models
+from certify.checker.near import ZERO, Above, Cubic, Near, Square, Tensor, Vector
 from tests.support.oracle import quadratic
+from tests.support.plain import top
+
+
+def bound(x: Any) -> Above:
+    """An upper bound, exact where it is 0."""
+    return ZERO if np.all(np.asarray(x) == 0) else Above(np.asarray(x, dtype=np.float64))
+
+
+class Jet:
+    """A jet of the checker as numbers: `c` +- `error`, `a` (k,) +- `slack`, `Q` (k, k), `K` as triples, remainder `E`
+    (k, k), `B` (m,) of the errors within `U` (m, k, k), `c_y` (N,) and `a_y` (N, k), and `lip`."""
+
+    def __init__(
+        self, c: Any, error: Any, a: Any, slack: Any, Q: Any, K: Any, E: Any, B: Any, U: Any, c_y: Any, a_y: Any,
+        lip: Any = 0.0,
+    ) -> None:  # fmt: skip
+        Q, E, U, a_y = (np.asarray(v, dtype=np.float64) for v in (Q, E, U, a_y))
+        self.model = jets.Jet(
+            Near(np.float64(c), bound(error)), Vector(np.asarray(a, dtype=np.float64), bound(slack)), Square(Q),
+            Cubic(np.asarray(K, dtype=np.float64)), Square(E), Near(np.asarray(B, dtype=np.float64)),
+            np.moveaxis(U, 0, -1), Near(np.asarray(c_y, dtype=np.float64)), Vector(a_y.T), bound(lip),
+        )  # fmt: skip
+
+    @classmethod
+    def of(cls, model: jets.Jet) -> Jet:
+        made = cls.__new__(cls)
+        made.model = model
+        return made
+
+    def __getattr__(self, name: str) -> Any:
+        """`error`, `slack`, `lip`, `radius`, `curve`, `twist`, `bend`, `sway`, `tilt` as numbers."""
+        if name == "model":
+            raise AttributeError(name)
+        return top(getattr(self.model, "lipschitz" if name == "lip" else name))
+
+    @property
+    def c(self) -> Any:
+        return self.model.c.value
+
+    @property
+    def a(self) -> Any:
+        return self.model.a.value
+
+    @property
+    def Q(self) -> Any:
+        return self.model.Q.value
+
+    @property
+    def K(self) -> Any:
+        return self.model.K.value
+
+    @property
+    def B(self) -> Any:
+        return self.model.B.value
+
+    @property
+    def U(self) -> Any:
+        return np.moveaxis(self.model.U, -1, 0)
+
+    @property
+    def c_y(self) -> Any:
+        return self.model.c_y.value
+
+    @property
+    def a_y(self) -> Any:
+        return self.model.a_y.value.T
+
+    @property
+    def E(self) -> Any:
+        return self.model.remainder
+
+    @property
+    def whole(self) -> Any:
+        """A bound of the remainder and of sum_j B_j e_j, as a matrix."""
+        kept = jets.identity(self.model.E, self.model.Q.error + self.model.K.error)
+        return (self.model.whole + kept).majorant
+
+    @property
+    def size(self) -> Any:
+        return top(self.model.v0.size)
+
+    def __add__(self, other: Jet) -> Jet:
+        return Jet.of(self.model + other.model)
+
+    def __neg__(self) -> Jet:
+        return Jet.of(-self.model)
+
+    def __mul__(self, other: Jet) -> Jet:
+        return Jet.of(self.model * other.model)
+
+    def function(self, name: str) -> Jet:
+        return Jet.of(self.model.function(name))
+
+
+def seen(models: Iterable[jets.Jet]) -> list[Jet]:
+    """Jets of the checker as numbers."""
+    return [Jet.of(model) for model in models]
+
+
+def members(batch: jets.Jet) -> list[Jet]:
+    """The jets of a batch as numbers."""
+    count = len(batch.c.value)
+    parts = (batch.c, batch.a, batch.Q, batch.K, batch.E, batch.B)
+    y = [(batch.c_y[:, j], Vector(batch.a_y.value[..., j])) for j in range(count)]
+    return [
+        Jet.of(
+            jets.Jet(*(part[..., j] if part is batch.B else part[j] for part in parts), batch.U, *y[j], batch.lip[j])
+        )
+        for j in range(count)
+    ]
+
+
+def constant(q: Fraction, U: Any, count: int) -> Jet:
+    return Jet.of(jets.constant(q, np.moveaxis(U, 0, -1), count))
+
+
+def uncertain(lo: Fraction, hi: Fraction, U: Any, number: int, count: int) -> Jet:
+    return Jet.of(jets.uncertain(lo, hi, np.moveaxis(U, 0, -1), number, count))
+
+
+def between(lo: Fraction, hi: Fraction, U: Any, count: int) -> Jet:
+    return Jet.of(jets.between(lo, hi, np.moveaxis(U, 0, -1), count))
 
 
 def plain(c: Any, error: Any, a: Any, slack: Any, Q: Any, E: Any, K: Any = None) -> Jet:
     """A model without the errors of inputs, and, if no K is given, without one."""
     k = len(a)
     thirds = np.zeros(k * (k + 1) * (k + 2) // 6) if K is None else np.array(K, float)
-    return Jet(c, error, a, slack, Q, thirds, E, np.zeros(1), np.zeros((1, k, k)), np.zeros(0), np.zeros((0, k)), 0.0)
+    return Jet(c, error, a, slack, Q, thirds, E, np.zeros(1), np.zeros((1, k, k)), np.zeros(0), np.zeros((0, k)))
 
 
 def given(jet: Jet, y: Sequence[Any]) -> Jet:
@@ -29,12 +155,17 @@ def given(jet: Jet, y: Sequence[Any]) -> Jet:
     lost = (len(y) + 4) * 2.0**-50
     error = jet.error + lost * (abs(jet.c) + np.abs(jet.c_y).sum())
     slack = jet.slack + lost * (np.linalg.norm(jet.a) + np.linalg.norm(jet.a_y))
-    return replace(jet, c=c, a=a, error=error, slack=slack, c_y=np.zeros(0), a_y=np.zeros((0, len(a))))
+    return Jet(c, error, a, slack, jet.Q, jet.K, jet.E, jet.B, jet.U, np.zeros(0), np.zeros((0, len(a))), jet.lip)
+
+
+def units_of(L: Any, R: Any) -> Units:
+    """Remainders R (N, k, k), and how they reach the inputs."""
+    return Units(np.asarray(L), np.moveaxis(np.asarray(R), 0, -1))
 
 
 def no_units(k: int) -> Units:
     """Of one input that no tanh reaches."""
-    return Units(np.zeros((1, 0)), np.zeros((0, k, k)))
+    return units_of(np.zeros((1, 0)), np.zeros((0, k, k)))
 
 
 def curved(jet: Jet, d: Sequence[Any]) -> arb:
@@ -44,3 +175,32 @@ def curved(jet: Jet, d: Sequence[Any]) -> arb:
     for (h, i, j), entry in zip(kept, jet.K.tolist(), strict=True):
         value += times[len({h, i, j})] * arb(entry) * arb(d[h]) * arb(d[i]) * arb(d[j])
     return value
+
+
+def changed(jet: Jet, **parts: Any) -> Jet:
+    """The same jet but for these parts."""
+    names = ("c", "error", "a", "slack", "Q", "K", "E", "B", "U", "c_y", "a_y", "lip")
+    return Jet(*(parts.get(name, getattr(jet, name)) for name in names))
+
+
+def models_of(J: Any, F: Iterable[Jet], units: Units, rest: bool, velocity: Sequence[Any] = ()) -> Models:
+    """The models of these jets in the inequality."""
+    return Models(J, [f.model for f in F], units, rest, velocity)
+
+
+def remainders(units: Units) -> Any:
+    """R (N, k, k) of the units."""
+    return np.moveaxis(units.R, -1, 0)
+
+
+def bound_of_pairs(p: Any, wrong: Any, T: Any, wrong_T: Any, weight: Any) -> Any:
+    """S for p (N, k) and T (N, r, k), each within its error."""
+    return pairs.bound_of_pairs(Vector(p.T, Above(wrong)), Tensor(T.transpose(2, 1, 0), Above(wrong_T)), weight)
+
+
+def beyond_tangent(jet: Jet, f: Sequence[float], third: float, fourth: float) -> tuple[Any, Any, Any]:
+    """H, C and R (a matrix) of a function whose expansion is given."""
+    phi = SimpleNamespace(f=[Near(np.float64(v)) for v in f], third=Above(third), fourth=Above(fourth), last=Above(0.0))
+    H, C, R = jet.model.beyond_tangent(phi)
+    kept = jets.identity(R, H.error + C.error)
+    return H.value, C.value, (R + kept).majorant

@@ -25,7 +25,7 @@ def top(bound: Above) -> Any:
 
 def parts(x: Near) -> Pair:
     """The value and the bound of its error, of one shape."""
-    return x.value, top(x.error) + 0 * np.asarray(x.value)
+    return x.value, np.broadcast_to(top(x.error), np.shape(x.value))
 
 
 def tanh(y: Array) -> Pair:
@@ -112,7 +112,7 @@ class Taylor:
 
     @property
     def r(self) -> Array:
-        return np.asarray(top(self.model.r) + 0 * self.model.c)
+        return np.array(np.broadcast_to(top(self.model.r), np.shape(self.model.c)))
 
     @property
     def size(self) -> Array:
@@ -165,7 +165,7 @@ def form(x: Array, error: Array) -> Form:
 
 def shown(u: Form) -> tuple[Array, Array, Array]:
     """Its centre (m, B), slopes (m, n, B) and error (m, B)."""
-    return u.value[0], np.moveaxis(u.value[1:], 0, 1), top(u.error) + 0 * u.value[0]
+    return u.value[0], np.moveaxis(u.value[1:], 0, 1), np.broadcast_to(top(u.error), u.value[0].shape)
 
 
 def enclose_on_boxes(net: network.Folded, x: Array, x_error: Array) -> tuple[Array, Array, Array]:
