@@ -145,7 +145,7 @@ def clipped(u: Form, least: Array, most: Array) -> Form:
     inside = (lo >= least[:, None]) & (hi <= most[:, None])
     slope, shift, gap = clip_of(v, least[:, None], most[:, None])
     cut = (u * Near(slope)).raised(Near(shift))
-    return Form(np.where(inside, u.value, cut.value), u.error.where(inside, cut.error + gap))
+    return Form(np.where(inside, u.value, cut.value), Above(np.where(inside, u.error.top, (cut.error + gap).top)))
 
 
 def _error_backwards(scale: Array, passed: list[tuple[Array, Array | None, Above]], of_x: Above) -> Above:

@@ -152,10 +152,10 @@ def test_what_is_known_of_a_box_is_so_exactly(count: int) -> None:
             for corner in (True, True, False):
                 d = exactly(symbols(generator, n, corner))
                 z = [c + r * s for c, r, s in zip(exactly(centre[:, k]), exactly(radius[:, k]), d, strict=True)]
-                for form, wrong, value in zip(x[:, :, k], error[:, k], states(z), strict=True):
-                    if is_finite(form, wrong):
+                for own, wrong, value in zip(x[:, :, k], error[:, k], states(z), strict=True):
+                    if is_finite(own, wrong):
                         met["form"] += 1
-                        first, *slopes = exactly(form)
+                        first, *slopes = exactly(own)
                         said = first + sum((g * s for g, s in zip(slopes, d, strict=True)), Fraction(0))
                         assert abs(value - said) <= Fraction(float(wrong)), seed
                 if below[k]:

@@ -348,18 +348,18 @@ def by_hand(squash: str, centre: str, widths: list[int], seed: int, scale: float
     )  # fmt: skip
 
 
-def spied(found: Ball, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Jet, Any]]:
-    """The values of the layers, each with what its tanh was said to add."""
-    seen: list[tuple[Jet, Any]] = []
-    before = Jet.beyond_tangent
+def spied(found: Ball, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any, Any]]:
+    """The gradients of the layers' values, each with H and C of what its tanh was said to add."""
+    seen: list[tuple[Any, Any, Any]] = []
+    before = Batch.beyond_tangent
 
-    def spy(jet: Jet, phi: Any) -> Any:
-        added = before(jet, phi)
-        seen.append((jet, added))
-        return added
+    def spy(jet: Batch, phi: Any) -> Any:
+        H, C, R = before(jet, phi)
+        seen.append((jet.a.value.T, np.moveaxis(H.value, -1, 0), C.value.T))
+        return H, C, R
 
     with monkeypatch.context() as patch, np.errstate(all="ignore"):
-        patch.setattr(Jet, "beyond_tangent", spy)
+        patch.setattr(Batch, "beyond_tangent", spy)
         assert found.outputs
     return seen
 
@@ -444,7 +444,7 @@ def test_units_carry_all_that_their_inputs_leave_out(
     assert used > 0.05 and (of_units > 0.1 or len(widths) == 2)
 
 
-def at_point(found: Ball, layers: list[tuple[Jet, Any]], d: list[float]) -> tuple[list[arb], list[arb], list[arb]]:
+def at_point(found: Ball, layers: list[tuple[Any, Any, Any]], d: list[float]) -> tuple[list[arb], list[arb], list[arb]]:
     """x and pi(x) at a point of the ball, and what each tanh adds there to its tangent beyond its model."""
     c, n = found.case.c, len(found.J)
     m, w = ([Fraction(0)] * n, [Fraction(0)] * n) if found.motion is None else found.motion
@@ -452,9 +452,9 @@ def at_point(found: Ball, layers: list[tuple[Jet, Any]], d: list[float]) -> tupl
     x = [p + q * arb(d[-1]) + sum((arb(a) * arb(v) for a, v in zip(row, d, strict=False)), arb(0))
          for p, q, row in zip(middle, step, found.J.tolist(), strict=True)]  # fmt: skip
     errors = []
-    for (jet, (H, C, _)), values, at_0 in zip(layers, layers_in_arb(c, x), layers_in_arb(c, middle), strict=False):
+    for (a, H, C), values, at_0 in zip(layers, layers_in_arb(c, x), layers_in_arb(c, middle), strict=False):
         for q, (v, p) in enumerate(zip(values, at_0, strict=True)):
-            model = curved(plain(0.0, 0.0, jet.a[q], 0.0, H[q], H[q], C[q]), d)
+            model = curved(plain(0.0, 0.0, a[q], 0.0, H[q], H[q], C[q]), d)
             errors.append(v.tanh() - p.tanh() - (1 - p.tanh() ** 2) * (v - p) - model)
     return x, policy_in_arb(c.policy, c.u_eq, x), errors
 
@@ -738,4 +738,4 @@ def test_along_a_path_a_weight_has_a_row_for_the_motion() -> None:
 
 def test_constants_have_no_part_in_the_errors() -> None:
     q = constant(Fraction(2, 3), np.ones((2, 3, 3)), 0)
-    assert not q.B.any() and np.trace(q.whole) < 1e-200 and q.K.shape == (10,)
+    assert not q.B.any() and np.trace(q.whole) < 1e-150 and q.K.shape == (10,)

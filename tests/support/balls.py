@@ -17,8 +17,8 @@ from flint import fmpq, fmpq_mat
 from certify.checker.ball import Ball
 from certify.checker.case import Case
 from certify.checker.errors import Rejected
-from tests.support.jets import seen
 from tests.support.certificates import ASYMPTOTIC, Document, decode, edited, encode, parse
+from tests.support.jets import seen
 
 MARGIN, TINY = 1e-6, 2.0**-60
 AT_REST: Document = {"edge": (0.0).hex(), "order": 1}  # what the ball of the section `local` has besides

@@ -50,7 +50,8 @@ class Jet:
         """`error`, `slack`, `lip`, `radius`, `curve`, `twist`, `bend`, `sway`, `tilt` as numbers."""
         if name == "model":
             raise AttributeError(name)
-        return top(getattr(self.model, "lipschitz" if name == "lip" else name))
+        found = top(getattr(self.model, "lipschitz" if name == "lip" else name))
+        return found if np.ndim(found) else float(found)
 
     @property
     def c(self) -> Any:

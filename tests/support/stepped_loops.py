@@ -19,6 +19,7 @@ from certify.checker.errors import Rejected
 from certify.checker.local import Local
 from tests.support.balls import centred, ones
 from tests.support.certificates import Document, decode, edited, encode, grow, make, parse
+from tests.support.jets import seen
 
 TINY = 2.0**-40
 WIDE = [("-99", "99")]
@@ -35,7 +36,7 @@ def fitted(data: Document, edge: float = 0.0, order: int = 1, wider: float = 1e-
     try:
         with np.errstate(all="ignore"):
             local = Local(Case(parse(data)))
-            G = local.G(next(iter(local.case.cells)))
+            G = seen(local.G(next(iter(local.case.cells))))
             A, Q, E = (np.array([getattr(g, part) for g in G]) for part in ("a", "Q", "E"))
             sizes = np.linalg.norm((J + float(local.case.c.step) * A).T @ P, axis=0)
             for row, parts in ((0, E), (1, Q)):
