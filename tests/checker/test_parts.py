@@ -5,7 +5,6 @@ Batches are made small, so that the leaves of a small certificate are those of m
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shlex
@@ -14,14 +13,13 @@ import subprocess
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from copy import deepcopy
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from certify.certificates import checking, join_parts, joining, run_checker, run_part
+from certify.certificates import checking, run_checker
 from certify.checker import outer, rules
 from certify.checker.__main__ import main
 from certify.checker.errors import Rejected
@@ -29,7 +27,7 @@ from certify.checker.parts import Part, in_processes
 from certify.checker.ring import Ring
 from certify.errors import BackendError, InputError
 from tests.checker.test_rules import HONEST, honest, scalar_claim
-from tests.support.certificates import Document, dump, edited, grow, parse, with_tree, write
+from tests.support.certificates import Document, edited, grow, parse, with_tree, write
 from tests.support.marks import slow_after
 from tests.support.mutants import family
 from tests.support.outer import uniform
@@ -263,239 +261,32 @@ def test_other_shares_are_usage_errors(arguments: list[str], tmp_path: Path) -> 
     assert main([str(write(honest("scalar"), tmp_path)), *arguments]) == 2
 
 
-# --------------------------------------------------------------------------------------------- the answers of all parts
-
-
-@cache
-def answers(name: str, of: int) -> tuple[bytes, tuple[dict[str, Any], ...]]:
-    """The certificate, and what the checker says of each part, in processes of its own and in batches of its own."""
-    raw = dump(with_tree(honest(name), uniform([0], 14)) if name == "scalar" else honest(name))
-    path = Path(os.environ["PYTEST_PARTS"]) / f"{hashlib.sha256(raw).hexdigest()}.json"
-    path.write_bytes(raw)
-    return raw, tuple(run_part(path, number, of) for number in range(1, of + 1))
-
-
-@pytest.fixture(autouse=True, scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTEST_PARTS", str(tmp_path_factory.mktemp("parts")))
-        yield
-
-
-def parts_of(name: str, of: int) -> tuple[bytes, list[dict[str, Any]]]:
-    raw, found = answers(name, of)
-    return raw, deepcopy(list(found))
-
-
-@pytest.mark.parametrize(
-    "name", slow_after(3, ["scalar", "sampled", "outer, a network", "enlarged", "practical, clipped"])
-)
-def test_all_parts_together_are_the_answer_of_one(name: str, tmp_path: Path) -> None:
-    raw, parts = parts_of(name, 3)
-    whole = run_checker(write(raw, tmp_path))
-    for order in (parts, parts[::-1]):
-        joined = join_parts(raw, order)
-        assert joined["result"] == "ACCEPTED" and joined["parts"] == 3
-        apart = ("seconds", "text", "parts")
-        assert {k: v for k, v in joined.items() if k not in apart} == {k: v for k, v in whole.items() if k not in apart}
-        json.dumps(joined)
-
-
-def test_one_part_of_one_is_joined_too() -> None:
-    raw, parts = parts_of("scalar", 1)
-    assert join_parts(raw, parts)["result"] == "ACCEPTED"
-
-
-JOINS: dict[str, Callable[[list[Any]], list[Any]]] = {
-    "none": lambda parts: [],
-    "one is missing": lambda parts: parts[:2],
-    "one is there twice": lambda parts: [parts[0], parts[1], parts[1]],
-    "one more": lambda parts: [*parts, parts[0]],
-    "one of another N": lambda parts: [*parts[:2], parts_of("scalar", 4)[1][2]],
-    "all but one of another N": lambda parts: parts_of("scalar", 4)[1][:3],
-    "of another file": lambda parts: [*parts[:2], parts_of("sampled", 3)[1][2]],
-    "all of another file": lambda parts: parts_of("sampled", 3)[1],
-    "no part but an acceptance": lambda parts: [*parts[:2], parts[2] | {"result": "ACCEPTED"}],
-    "a solver's word": lambda parts: [*parts[:2], parts[2] | {"result": "TRUSTED"}],
-    "a refusal": lambda parts: [*parts[:2], {"result": "REJECTED", "rule": "ring", "at": "leaf 1", "detail": ""}],
-    "an error": lambda parts: [*parts[:2], {"error": "internal error"}],
-    "an empty object": lambda parts: [*parts[:2], {}],
-    "null": lambda parts: [*parts[:2], None],
-    "a word": lambda parts: [*parts[:2], "PART"],
-    "a number": lambda parts: [*parts[:2], 3],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("what", JOINS)
-def test_other_answers_are_not_joined(what: str) -> None:
-    raw, parts = parts_of("scalar", 3)
-    with pytest.raises(BackendError):
-        join_parts(raw, JOINS[what](parts))
-
-
-EDITS: dict[str, tuple[str, Any]] = {
-    "part, as truth": ("part", [True, 3]),
-    "part, as floats": ("part", [1.0, 3.0]),
-    "part, as words": ("part", "1/3"),
-    "part, too long": ("part", [1, 3, 3]),
-    "part, null": ("part", None),
-    "sha256": ("certificate_sha256", "0" * 64),
-    "sha256, null": ("certificate_sha256", None),
-    "policy": ("policy_sha256", "0" * 64),
-    "claim": ("claim", "practical"),
-    "rate": ("rate", 0.1),
-    "rate, an integer": ("rate", 0),
-    "discrete": ("discrete", True),
-    "discrete, as a number": ("discrete", 0),
-    "sample": ("sample", ["0", "1"]),
-    "c2": ("levels.roa", lambda c: c * 0.5),
-    "c2, the next number": ("levels.roa", lambda c: c * (1 + 2.0**-52)),
-    "c2, as words": ("levels.roa", str),
-    "one more level": ("levels.floor", 0.1),
-    "levels, null": ("levels", None),
-    "leaves": ("leaves", lambda n: n - 1),
-    "leaves in all": ("leaves_in_all", lambda n: n - 1),
-    "no spans": ("spans", []),
-    "a span more": ("spans", lambda spans: [*spans, [0, 1]]),
-    "spans, the other way": ("spans", lambda spans: [span[::-1] for span in spans]),
-    "spans, not so far": ("spans", lambda spans: [[first, beyond - 1] for first, beyond in spans]),
-    "spans, as truth": ("spans", [[False, True]]),
-    "a margin beyond binary64": ("margins.ring", 10**400),
-    "fewer examined": ("examined", lambda n: n - 1),
-    "more examined": ("examined", lambda n: n + 1),
-    "less than none": ("examined", lambda n: -n),
-    "examined, as truth": ("examined", True),
-    "examined, as a float": ("examined", float),
-    "tree": ("rules.tree", lambda n: n + 1),
-    "a rule on leaves": ("rules.ring", lambda n: n + 1),
-    "a rule on leaves, by leaf": ("by_leaf.ring", lambda n: n + 1),
-    "a rule on the whole": ("rules.local", 2),
-    "a rule that is none": ("rules.ours", 1),
-    "a rule that is none, by leaf": ("by_leaf.ours", 0),
-    "by leaf, a list": ("by_leaf", []),
-    "by leaf, negative": ("by_leaf.ring", -1),
-    "by leaf, nan": ("by_leaf.ring", float("nan")),
-    "rules, null": ("rules", None),
-    "an outer set": ("outer", {"level": 1.0, "leaves": 1, "face_leaves": 1}),
-    "margins, null": ("margins", None),
-    "margins, words": ("margins.ring", "large"),
-    "seconds, words": ("seconds.check", "few"),
-    "centre": ("centre", [0.0]),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("which", [0, 2])
-@pytest.mark.parametrize("what", EDITS)
-def test_answers_that_are_altered_are_not_joined(what: str, which: int) -> None:
-    raw, parts = parts_of("scalar", 3)
-    assert json.dumps(parts[which]) != json.dumps(edited(parts[which], *EDITS[what]))
-    parts[which] = edited(parts[which], *EDITS[what])
-    with pytest.raises(BackendError):
-        join_parts(raw, parts)
-
-
-NEEDED = ("part", "certificate_sha256", "policy_sha256", "claim", "rate", "discrete", "levels", "leaves", "rules",
-          "by_leaf", "examined", "leaves_in_all", "spans", "margins", "seconds", "result")  # fmt: skip
-
-
-@pytest.mark.parametrize("key", NEEDED)
-def test_answers_with_something_missing_are_not_joined(key: str) -> None:
-    raw, parts = parts_of("scalar", 3)
-    del parts[1][key]
-    with pytest.raises(BackendError):
-        join_parts(raw, parts)
-
-
-@pytest.mark.parametrize("what", ["certificate_sha256", "levels.roa", "leaves", "leaves_in_all"])
-def test_what_all_parts_say_alike_is_compared_with_the_file(what: str) -> None:
-    raw, parts = parts_of("scalar", 3)
-    lied = [edited(part, what, {"certificate_sha256": "0" * 64, "levels.roa": 9.0}.get(what, 1)) for part in parts]
-    with pytest.raises(BackendError):
-        join_parts(raw, lied)
-
-
-def test_fewer_leaves_than_the_file_has_are_not_enough() -> None:
-    """Also where all parts agree about how many there are."""
-    raw, parts = parts_of("scalar", 3)
-    fewer = sum(part["examined"] for part in parts) - parts[0]["examined"]
-    lied = [edited(part, "leaves_in_all", fewer) for part in parts]
-    lied[0]["examined"] = 0
-    with pytest.raises(BackendError):
-        join_parts(raw, lied)
-
-
-@pytest.mark.parametrize("sizes", [(4, 3), (3, 4), (1, 5)])
-def test_parts_that_were_dealt_differently_are_not_joined(
-    sizes: tuple[int, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two versions of the checker may differ in the size of a batch: each is honest, and between them lie leaves that
-    nobody has looked at, while others are looked at twice."""
-    raw = dump(with_tree(honest("scalar"), uniform([0], 5)))
-    certificate, met = parse(json.loads(raw)), []
-    for number, size in enumerate(sizes, 1):
-        monkeypatch.setattr(Ring, "batch", property(lambda _, size=size: size))
-        part = Part(number, 2)
-        tally = rules.check(certificate, part)
-        met.append((part, tally))
-    spans = [span for part, _ in met for span in part.spans]
-    assert sorted(spans) != [[k, k + 1] for k in range(32)]
-    with pytest.raises(BackendError, match=r"each once|have done"):
-        joining._require_all([{"spans": part.spans, "examined": part.leaves} for part, _ in met], met[0][0].all_leaves)
-
-
-def test_what_is_not_of_the_file_is_not_handed_on() -> None:
-    for name, what, value in (
-        ("enlarged", "start", [[1e-4]]),
-        ("outer, a network", "outer.level", 1e9),
-        ("outer, a network", "outer.leaves", 1),
-        ("outer, a network", "by_leaf.faces", 1),
-    ):
-        raw, parts = parts_of(name, 2)
-        with pytest.raises(BackendError):
-            join_parts(raw, [edited(part, what, value) for part in parts])
-    raw, parts = parts_of("scalar", 2)
-    joined = join_parts(raw, [part | {"solver": "ours", "error": "none", "text": ["PROVED"]} for part in parts])
-    assert not {"solver", "error"} & set(joined) and joined["text"][0].startswith("ACCEPTED by 2 parts")
-
-
-def test_another_file_with_the_same_claim_is_another_file() -> None:
-    raw, parts = parts_of("scalar", 3)
-    assert all(part["examined"] > 0 for part in parts)
-    for other in (raw + b"\n", dump(edited(json.loads(raw), "provenance", {"by": "another"}))):
-        with pytest.raises(BackendError, match="sha256"):
-            join_parts(other, parts)
-
-
 # --------------------------------------------------------------------------------------------------- the child process
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_the_checker_as_a_child_takes_jobs(jobs: int, tmp_path: Path) -> None:
     assert run_checker(write(honest("rotor"), tmp_path), jobs=jobs)["result"] == "ACCEPTED"
-    path = write(with_tree(honest("linear"), b"\xff"), tmp_path)
-    for answer in (run_checker(path, jobs=jobs), run_part(path, 1, 1, jobs)):
-        assert (answer["result"], answer["rule"], answer["at"]) == ("REJECTED", "ring", "leaf 0")
+    answer = run_checker(write(with_tree(honest("linear"), b"\xff"), tmp_path), jobs=jobs)
+    assert (answer["result"], answer["rule"], answer["at"]) == ("REJECTED", "ring", "leaf 0")
 
 
-def test_the_reference_knows_of_no_shares(tmp_path: Path) -> None:
-    path = write(honest("scalar"), tmp_path)
+def test_the_reference_has_one_process(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="one process"):
-        run_checker(path, "reference", jobs=2)
-    with pytest.raises(InputError, match="one process"):
-        checking.ask(path, "reference", part=(1, 2))
+        run_checker(write(honest("scalar"), tmp_path), "reference", jobs=2)
 
 
-@pytest.mark.parametrize(("said", "status", "part"), [
-    ("PART", 4, None), ("ACCEPTED", 0, (1, 2)), ("PART", 0, (1, 2)), ("PART", 0, None), ("ACCEPTED", 4, None),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("said", "status"), [("PART", 4), ("PART", 0), ("ACCEPTED", 4), ("ACCEPTED", 1), ("REJECTED", 0)]
+)
 def test_an_answer_of_another_kind_is_no_verdict(
-    said: str, status: int, part: tuple[int, int] | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    said: str, status: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A part is never an acceptance, nor is an acceptance one of a part."""
+    """A status without its answer accepts nothing, nor does an answer without its status."""
     program = f"import json, sys; print(json.dumps({{'result': {said!r}}})); sys.exit({status})"
     monkeypatch.setattr(checking, "command", lambda program_, arguments: ["python3", "-c", program])
     with pytest.raises(BackendError, match=said):
-        checking.ask(tmp_path, part=part)
+        checking.ask(tmp_path)
 
 
 def test_no_process_outlives_an_examination_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
