@@ -15,7 +15,7 @@ from .case import Case, Failures
 from .exact import fraction
 from .expression import evaluate
 from .float64 import EPS, Array, float_with_error, gamma, norm, total, up, within
-from .parts import Batch
+from .processes import Batch
 from .taylor import Taylor, affine, constant, upper_bound
 
 LEAF = 255
