@@ -74,7 +74,6 @@ class Keywords(TypedDict, total=False):
     dreal_precision: float | None
     jobs: int | None
     cluster: str | None
-    cluster_checks: bool | None
     resume: bool | None
     ranges: Mapping[str, Sequence[Exact]] | None
     disturbances: Mapping[str, Exact | Sequence[Exact]] | None

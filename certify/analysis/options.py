@@ -106,8 +106,6 @@ class RoaOptions:
     cluster: str | None = option(None, "effort", "word", metavar="ADDRESS", varies=False, help=(
         "Have the workers of a Dask cluster split boxes: local:N for N processes of this machine, or a scheduler's "
         "address, such as tcp://host:8786. By default the threads of this process do."))
-    cluster_checks: bool = option(False, "effort", "flag", varies=False, help=(
-        "Have the cluster's workers run the checker as well, each on a part of the leaves, and believe them."))
     resume: bool = option(False, "effort", "flag", varies=False, help=(
         "Resume the search that an earlier run saved in the folder."))
     # fmt: on
@@ -166,7 +164,6 @@ def _choices() -> Mapping[str, tuple[Any, ...]]:
 
 _Rule = tuple[Callable[[RoaOptions], bool], str]
 _RULES: tuple[_Rule, ...] = (
-    (lambda o: o.cluster_checks and o.cluster is None, "`cluster_checks` must have a `cluster`; found none."),
     (lambda o: o.cluster is not None and o.engine != "bounds", "`cluster` needs the engine bounds."),
     (
         lambda o: o.resume and (o.engine != "bounds" or o.P is not None or o.only is not None),

@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from certify.certificates.checking import run_checker, run_part
+    from certify.certificates.checking import run_checker
     from certify.certificates.encoding import decode, encode
     from certify.certificates.evidence import (
         Contraction,
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
         TrustedSolver,
         Waypoint,
     )
-    from certify.certificates.joining import join_parts
     from certify.certificates.limits import require_short, require_within_limits
     from certify.certificates.model import Certificate, loop_sections
     from certify.certificates.reading import parse_certificate, read_certificate, read_raw
@@ -28,10 +27,9 @@ if TYPE_CHECKING:
     from certify.certificates.writing import SEARCH, remove, set_aside, sole_writer, write_atomically, write_beside
 
 _NAMES = {
-    "checking": ("run_checker", "run_part"),
+    "checking": ("run_checker",),
     "encoding": ("decode", "encode"),
     "evidence": ("Contraction", "LocalBall", "OuterTree", "PartitionTree", "Slab", "TrustedSolver", "Waypoint"),
-    "joining": ("join_parts",),
     "limits": ("require_short", "require_within_limits"),
     "model": ("Certificate", "loop_sections"),
     "reading": ("parse_certificate", "read_certificate", "read_raw"),
@@ -52,7 +50,6 @@ __all__ = [
     "Waypoint",
     "decode",
     "encode",
-    "join_parts",
     "leaves",
     "loop_sections",
     "parse_certificate",
@@ -62,7 +59,6 @@ __all__ = [
     "require_short",
     "require_within_limits",
     "run_checker",
-    "run_part",
     "set_aside",
     "sole_writer",
     "write_atomically",

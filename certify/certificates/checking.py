@@ -15,7 +15,7 @@ from typing import Any, Literal
 from certify.errors import BackendError, InputError
 
 Program = Literal["checker", "reference"]
-_STATUS = {"REJECTED": 1, "TRUSTED": 3}
+_STATUS = {"ACCEPTED": 0, "REJECTED": 1, "TRUSTED": 3}
 _LAUNCH = """
 import importlib, importlib.util, sys
 name, folder = sys.argv[1:3]
@@ -36,7 +36,6 @@ def ask(
     path: Path,
     program: Program = "checker",
     jobs: int = 1,
-    part: tuple[int, int] | None = None,
     patient: bool = False,
 ) -> tuple[int, dict[str, Any]]:
     """Run a checker on a file in a separate process; return its exit status and its JSON answer.
@@ -46,28 +45,25 @@ def ask(
     path : the certificate.
     program : the checker or the reference.
     jobs : number of processes that examine the leaves; the reference has only one.
-    part : K and N, for the answer of part K of N instead of an acceptance; for the checker only.
     patient : True to accept a file that needs hours, which its rule `limits` refuses otherwise.
 
     Raises
     ------
-    InputError : the reference is asked for more than one process, or for a part.
+    InputError : the reference is asked for more than one process.
     BackendError : it printed no JSON object, or its status is not the answer's.
     """
-    if program == "reference" and (jobs != 1 or part is not None):
-        raise InputError("the reference must be asked for the whole in one process; leave out `jobs` and parts.")
-    shares = [] if jobs == 1 else ["--jobs", str(jobs)]
-    shares += [] if part is None else ["--part", "/".join(map(str, part))]
-    shares += ["--patient"] if patient else []
-    line = command(program, ["--json", *shares, "--", str(path)])
+    if program == "reference" and jobs != 1:
+        raise InputError("the reference must be asked for one process; leave out `jobs`.")
+    options = [] if jobs == 1 else ["--jobs", str(jobs)]
+    options += ["--patient"] if patient else []
+    line = command(program, ["--json", *options, "--", str(path)])
     done = subprocess.run(line, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
     try:
         answer = dict(json.loads(done.stdout))
     except (ValueError, TypeError) as error:
         said = done.stderr.strip()[-300:]
         raise BackendError(f"the {program} ended with status {done.returncode} and no verdict: {said}") from error
-    stated = _STATUS | ({"ACCEPTED": 0} if part is None else {"PART": 4})
-    if done.returncode != stated.get(answer.get("result", ""), done.returncode if "error" in answer else -1):
+    if done.returncode != _STATUS.get(answer.get("result", ""), done.returncode if "error" in answer else -1):
         raise BackendError(f"the {program} ended with status {done.returncode} and says {answer}.")
     return done.returncode, answer
 
@@ -80,21 +76,7 @@ def run_checker(path: Path, program: Program = "checker", jobs: int = 1, patient
     ------
     BackendError : it ended with neither ACCEPTED, nor TRUSTED, nor REJECTED.
     """
-    return _verdict(program, *ask(path, program, jobs, patient=patient))
-
-
-def run_part(path: Path, number: int, of: int, jobs: int = 1) -> dict[str, Any]:
-    """The checker's JSON answer about one part of the leaves and all rules without leaves; `join_parts` joins the
-    answers of all parts.
-
-    Raises
-    ------
-    BackendError : it ended with neither PART, nor TRUSTED, nor REJECTED.
-    """
-    return _verdict("checker", *ask(path, "checker", jobs, (number, of)))
-
-
-def _verdict(program: Program, status: int, answer: dict[str, Any]) -> dict[str, Any]:
+    status, answer = ask(path, program, jobs, patient)
     if "error" in answer:
         raise BackendError(f"the {program} ended with status {status} and no verdict: {answer['error']}")
     return answer

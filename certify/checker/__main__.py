@@ -1,7 +1,7 @@
-"""`python -I -m certify.checker FILE [--json] [--jobs N] [--part K/N] [--patient]`: check one certificate.
+"""`python -I -m certify.checker FILE [--json] [--jobs N] [--patient]`: check one certificate.
 
 Exit status: 0 accepted, 1 rejected, 2 usage or unreadable file, 3 trusted (the evidence is a solver's answer, which
-cannot be checked; all else was), 4 one part held, which is no acceptance, 70 internal error.
+cannot be checked; all else was), 70 internal error.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 from .errors import Rejected, Unreadable
 
-_MOST_PARTS, _MOST_JOBS = 2**16, 2**8
+_MOST_JOBS = 2**8
 
 
 def main(arguments: list[str]) -> int:
@@ -25,7 +25,6 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("file", metavar="FILE", help="the certificate to check")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--jobs", metavar="N", type=_jobs, default=1, help="examine the leaves in N processes")
-    parser.add_argument("--part", metavar="K/N", type=_part, help="of the leaves, only those of part K of N")
     parser.add_argument("--patient", action="store_true", help="take a file that may need hours")
     try:
         options = parser.parse_args(arguments)
@@ -34,7 +33,7 @@ def main(arguments: list[str]) -> int:
     # Threads of several processes would wait for each other. numpy reads this when it is first imported: below.
     os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     try:
-        status, answer = _examine(options.file, options.part, options.jobs, options.patient)
+        status, answer = _examine(options.file, options.jobs, options.patient)
     except Rejected as no:
         status, answer = 1, {"result": "REJECTED", "rule": no.rule, "at": no.at, "detail": no.detail, "text": [str(no)]}
     except Unreadable as error:
@@ -58,14 +57,7 @@ def _jobs(text: str) -> int:
     return jobs
 
 
-def _part(text: str) -> tuple[int, int]:
-    number, of = map(int, text.split("/"))
-    if not 1 <= number <= of <= _MOST_PARTS:
-        raise ValueError
-    return number, of
-
-
-def _examine(path: str, share: tuple[int, int] | None, jobs: int, patient: bool) -> tuple[int, dict[str, Any]]:
+def _examine(path: str, jobs: int, patient: bool) -> tuple[int, dict[str, Any]]:
     """Status and answer of a certificate that no rule rejects."""
     from . import document, words
 
@@ -73,10 +65,9 @@ def _examine(path: str, share: tuple[int, int] | None, jobs: int, patient: bool)
     start = time.perf_counter()
     from . import rules  # after parsing: a malformed file needs no tables
     from .boxes import LEAF
-    from .parts import Part
 
-    ready, part = time.perf_counter(), Part(*share or (1, 1))
-    tally = rules.check(c, part, jobs, patient)
+    ready = time.perf_counter()
+    tally = rules.check(c, jobs, patient)
     seconds = {"start": ready - start, "check": time.perf_counter() - ready}
     answer: dict[str, Any] = {"certificate_sha256": c.sha256, "policy_sha256": c.policy.sha256(), "claim": c.claim}
     sample = None if c.sample is None else [str(h) for h in c.sample]
@@ -95,14 +86,7 @@ def _examine(path: str, share: tuple[int, int] | None, jobs: int, patient: bool)
     if c.start is not None:
         centre, longest = None if c.centre is None else c.centre.tolist(), words.duration(c)
         answer |= {"start": c.start.tolist(), "centre": centre, "time": longest if math.isfinite(longest) else None}
-    if "solver" in answer:
-        status, result = 3, "TRUSTED"
-    elif share is not None:
-        status, result = 4, "PART"
-        answer |= {"part": list(share), "by_leaf": tally.by_leaf}
-        answer |= {"examined": part.leaves, "leaves_in_all": part.all_leaves, "spans": part.spans}
-    else:
-        status, result = 0, "ACCEPTED"
+    status, result = (3, "TRUSTED") if "solver" in answer else (0, "ACCEPTED")
     answer = {"result": result, **answer}
     return status, answer | {"text": words.report(c, answer)}
 

@@ -15,7 +15,7 @@ from .case import Case, Failures
 from .exact import fraction
 from .expression import evaluate
 from .near import Above, Array, Form, Near, all_near, near, size, within
-from .parts import Batch
+from .processes import Batch
 from .taylor import Taylor, affine, combination, constant, pairs, upper_bound
 
 LEAF = 255

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from itertools import product
@@ -14,7 +14,6 @@ from .document import Array, Certificate, Intervals, LocalBall, Outer, OuterTree
 from .exact import exactly, gershgorin_lower, inverse_diagonal
 from .near import near
 from .network import Folded, fold
-from .parts import Part
 
 Failures = Generator[tuple[str, str], None, int]  # a rule: each failure's (place, detail); the rule's count
 
@@ -24,7 +23,7 @@ class Case:
     """The empty list stands for the inverse of a matrix that is not positive definite: no rule can use it."""
 
     c: Certificate
-    part: Part = field(default_factory=Part)
+    jobs: int = 1  # processes that examine the leaves
     patient: bool = False  # True if the check may take hours
 
     @property

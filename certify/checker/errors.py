@@ -7,8 +7,11 @@ class Rejected(Exception):
     """The certificate was read and is not valid: a rule failed at a place, for a reason."""
 
     def __init__(self, rule: str, at: str, detail: str) -> None:
-        super().__init__(f"REJECTED rule={rule} at={at}: {detail}")
+        super().__init__(rule, at, detail)
         self.rule, self.at, self.detail = rule, at, detail
+
+    def __str__(self) -> str:
+        return f"REJECTED rule={self.rule} at={self.at}: {self.detail}"
 
 
 class Unreadable(Exception):

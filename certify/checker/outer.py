@@ -9,13 +9,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
-from functools import cached_property
+from functools import cached_property, partial
 from math import nextafter
 
 import numpy as np
 from flint import fmpq, fmpq_mat
 
-from .boxes import Boxes, Leaves, batches, is_whole, middle, on_box
+from .boxes import LEAF, Boxes, Leaves, batches, is_whole, middle, on_box
 from .case import Case, Failures
 from .document import Network
 from .exact import exactly, inverse
@@ -24,7 +24,7 @@ from .flow import Series
 from .functions import FUNCTIONS
 from .near import ZERO, Above, Array, Form, Near, near
 from .network import Folded, enclose_on_boxes, layer
-from .parts import Batch
+from .processes import Batch, in_order
 from .taylor import Taylor, affine, constant, upper_bound
 
 _BATCH_NUMBERS = 1_000_000  # in the largest array of a batch
@@ -127,15 +127,20 @@ def is_above_on_faces(case: Case) -> Failures:
             yield f"{where}root", "no binary64 numbers enclose the domain"
         end = near(case.c.domain[i][side])
         lo, hi = np.array([(end.value, end.value) if j == i else pair for j, pair in enumerate(widest)]).T
-        doubt = np.where(np.arange(n) == i, end.error.top if end.error is not ZERO else 0.0, 0.0)[:, None]
-        for first, lower, upper in case.part.own(batches(tree, lo, hi, _batch(n * n * function.values))):
-            centre, radius = middle(lower, upper)
-            x = np.concatenate([centre[None], np.eye(n)[:, :, None] * radius])
-            left = _below_level(function, Form(x, Above(doubt + np.zeros_like(centre))), claim.level)[0]
+        doubt = end.error * np.where(np.arange(n) == i, 1.0, 0.0)[:, None]
+        left_over, leaves = partial(_below_on_face, function, claim.level, doubt), tree.count(LEAF)
+        for left in in_order(left_over, batches(tree, lo, hi, _batch(n * n * function.values)), leaves, case.jobs):
             if len(left):
-                yield f"{where}leaf {first + left[0]}", "N must be above its level"
-            count += centre.shape[1]
+                yield f"{where}leaf {left[0]}", "N must be above its level"
+        count += leaves
     return count
+
+
+def _below_on_face(function: Layers | Formula, level: float, doubt: Above, first: int, lo: Array, hi: Array) -> Array:
+    """The leaves of a face, by their numbers, on which N is not certainly above the level."""
+    centre, radius = middle(lo, hi)
+    x = np.concatenate([centre[None], np.eye(len(lo))[:, :, None] * radius])
+    return first + _below_level(function, Form(x, doubt * np.ones_like(centre)), level)[0]
 
 
 def contains_domain(case: Case) -> Failures:
@@ -178,11 +183,11 @@ class Beyond(Boxes):
         self.least, self.largest = np.array(ends_of).T[:, :, None]  # at or beyond the domain's ends, (n, 1)
 
     def leaves(self) -> Iterator[Batch]:
-        """The tree's leaves in batches, those of this part."""
+        """The tree's leaves in batches."""
         width = max(max(layer.W.shape) for layer in self.net.layers)
         values = max(self.function.values, len(self.c.dynamics.operations))
         size = _batch(max(self.symbols**2 * values, (self.symbols + 4) * width))
-        return self.case.part.own(batches(self.evidence.tree, -self.evidence.root, self.evidence.root, size))
+        return batches(self.evidence.tree, -self.evidence.root, self.evidence.root, size)
 
     def examine(self, first: int, lo: Array, hi: Array) -> Leaves:
         """The leaves with these corners, numbered from `first`, of which N'F is asked."""

@@ -17,7 +17,7 @@ from .exact import fraction, root_above
 from .flow import later
 from .near import Above, Array, Near, near, size
 from .network import enclose_on_boxes
-from .parts import Batch
+from .processes import Batch
 from .taylor import Taylor, affine, combination, pairs, upper_bound
 
 _BATCH_NUMBERS = 800_000  # in the largest array of a batch: more would not stay in a cache
@@ -50,9 +50,9 @@ class Ring(Boxes):
         return int(max(1, min(4096, _BATCH_NUMBERS // numbers)))
 
     def leaves(self) -> Iterator[Batch]:
-        """The tree's leaves in batches, those of this part."""
+        """The tree's leaves in batches."""
         root = self.case.partition.root
-        return self.case.part.own(batches(self.case.partition.tree, -root, root, self.batch))
+        return batches(self.case.partition.tree, -root, root, self.batch)
 
     def examine(self, first: int, lo: Array, hi: Array) -> RingLeaves:
         """The leaves with these corners, numbered from `first`."""

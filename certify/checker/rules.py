@@ -21,9 +21,9 @@ from .document import Certificate, Partition
 from .errors import Rejected
 from .exact import Exact, Undecided, policy_at_origin
 from .expression import evaluate
-from .near import self_test
+from .near import Array, self_test
 from .network import reaches
-from .parts import Part, in_processes
+from .processes import in_order
 
 
 def levels(case: Case) -> Failures:
@@ -144,12 +144,11 @@ class Tally:
     """Each rule's count, and the margins, which are floats for people."""
 
     rules: Counter[str] = field(default_factory=lambda: Counter(dict.fromkeys(RULES, 0) | READ))
-    by_leaf: Counter[str] = field(default_factory=Counter)  # the part of these counts that is on leaves
     ring_margin: float | None = None  # smallest -Vdot bound over the ring's leaves
     outer_margin: float | None = None  # smallest -N'F bound over the leaves of which it is asked
     local_margin: float | None = None  # 1 - the remainder's largest part of the decay
 
-    def hold(self, table: Table[Subject], subject: Subject, by_leaf: bool = False) -> None:
+    def hold(self, table: Table[Subject], subject: Subject) -> None:
         """Raise `Rejected` at the first failure of the first rule that fails; count what the rules have looked at."""
         for name, rule in table:
             failures = rule(subject)
@@ -157,57 +156,58 @@ class Tally:
                 at, detail = next(failures)
             except StopIteration as done:
                 self.rules[name] += done.value
-                self.by_leaf[name] += done.value if by_leaf else 0
             else:
                 raise Rejected(name, at, detail)
 
-    def elsewhere(self) -> dict[str, int]:
-        """Each rule's count without the leaves."""
-        return {name: count - self.by_leaf.get(name, 0) for name, count in self.rules.items()}
+    def hold_on_leaves(
+        self, table: Table[Any], bounds: ring.Ring | outer.Beyond, tree: bytes, asked: Callable[[Any], Array]
+    ) -> float | None:
+        """Do so on the leaves of a tree; returns the margin of the bounds that must be negative, None if there are
+        none."""
+
+        def examine(first: int, lo: Array, hi: Array) -> tuple[Counter[str], float]:
+            own, leaves = Tally(Counter()), bounds.examine(first, lo, hi)
+            own.hold(table, leaves)
+            return own.rules, float(np.min(-asked(leaves), initial=np.inf))
+
+        least = np.inf
+        for counts, margin in in_order(examine, bounds.leaves(), tree.count(boxes.LEAF), bounds.case.jobs):
+            self.rules.update(counts)
+            least = min(least, margin)
+        return least if least < np.inf else None
 
 
-def check(c: Certificate, part: Part | None = None, jobs: int = 1, patient: bool = False) -> Tally:
-    """Check every rule; returns the tally, raises `Rejected` at the first rule that fails.
+def check(c: Certificate, jobs: int = 1, patient: bool = False) -> Tally:
+    """Check every rule, those for leaves in so many processes; returns the tally, raises `Rejected` at the first rule
+    that fails.
 
-    Of a part, the rules for leaves look at its leaves only: the caller must not say ACCEPTED. Nor where evidence cannot
-    be replayed, of which only the rules about what is stated are checked; the tally then has no leaves. From the first
-    leaf on, each of `jobs` processes does with a part of its own what one would do. Rule `limits` takes files that need
-    hours if the caller is `patient`.
+    Where evidence cannot be replayed, only the rules about what is stated are checked, and the caller must not say
+    ACCEPTED; the tally then has no leaves. Rule `limits` takes files that need hours if the caller is `patient`.
     """
     self_test()
     np.empty(_KEPT)  # given back at once: an allocator that adapts then keeps arrays, and need not ask for each anew
     replayed = isinstance(c.evidence, Partition)
     spared = {"equilibrium": c.practical, "coordinates": not replayed, "root": not replayed}
     with np.errstate(all="ignore"):  # overflow becomes infinity or NaN, and every test then fails
-        tally, case = Tally(), Case(c, part or Part(), patient)
+        tally, case = Tally(), Case(c, jobs, patient)
         tally.hold([(name, rule) for name, rule in STATED if not spared.get(name)], case)
-        if not replayed:
-            return tally
-        if case.covered:
-            origin = local.Local(case)
-            tally.hold(ON_THE_BALL, origin)
-            if np.isfinite(origin.margin):  # binary64 may not hold the sides of an inequality that rationals decide
-                tally.local_margin = origin.margin
-        tally.hold(OF_THE_TREE, case)
-        if jobs == 1:
+        if replayed:
             _examine(tally, case)
-        else:
-            _join(tally, case.part, in_processes(jobs, lambda index: _answer(tally, case, index, jobs)))
-        if case.part.of == 1 and case.part.leaves != case.part.all_leaves:
-            raise ArithmeticError("leaves have been passed over")
     return tally
 
 
 def _examine(tally: Tally, case: Case) -> None:
-    """The rules for leaves, and those that come after the first of them."""
-    c, margin = case.c, np.inf
+    """The rules about evidence."""
+    c = case.c
+    if case.covered:
+        origin = local.Local(case)
+        tally.hold(ON_THE_BALL, origin)
+        if np.isfinite(origin.margin):  # binary64 may not hold the sides of an inequality that rationals decide
+            tally.local_margin = origin.margin
+    tally.hold(OF_THE_TREE, case)
     if not case.covered or c.c1 != c.c2:
-        bounds = ring.Ring(case)
-        for batch in bounds.leaves():
-            leaves = bounds.examine(*batch)
-            tally.hold(ON_LEAVES, leaves, by_leaf=True)
-            margin = min(margin, float(np.min(-leaves.bound[leaves.meet], initial=np.inf)))
-        tally.ring_margin = margin if margin < np.inf else None
+        bounds, tree = ring.Ring(case), case.partition.tree
+        tally.ring_margin = tally.hold_on_leaves(ON_LEAVES, bounds, tree, lambda leaves: leaves.bound[leaves.meet])
     if c.start is not None:
         tally.hold(OF_THE_TUBE, case)
         for piece in tube.pieces(case):
@@ -215,52 +215,7 @@ def _examine(tally: Tally, case: Case) -> None:
     if case.partition.contraction is not None:
         tally.hold(OF_CONTRACTION, contraction.Contracted(case, case.partition.contraction))
     if c.outer is not None:
-        tally.hold(OF_OUTER, case)
-        tally.hold(ON_FACES, case, by_leaf=True)
-        tally.hold(OF_OUTER_TREE, case)
-        beyond, margin = outer.Beyond(case), np.inf
-        for batch in beyond.leaves():
-            few = beyond.examine(*batch)
-            tally.hold(ON_OUTER_LEAVES, few, by_leaf=True)
-            margin = min(margin, float(np.min(-few.bound, initial=np.inf)))
-        tally.outer_margin = margin if margin < np.inf else None
-
-
-def _answer(tally: Tally, case: Case, index: int, jobs: int) -> dict[str, Any]:
-    """The answer of one process: its part, and its refusal or tally."""
-    part, refusal = case.part, None
-    part.number, part.of = part.split(index, jobs)
-    try:
-        _examine(tally, case)
-    except Rejected as no:
-        refusal = [no.rule, no.at, no.detail]
-    return {"refusal": refusal, "part": vars(part), "tally": vars(tally)}
-
-
-def _join(tally: Tally, part: Part, answers: Sequence[dict[str, Any]]) -> None:
-    """One tally of those of all processes, or the refusal that comes first in the file.
-
-    Raises
-    ------
-    ArithmeticError : the answers are not each about its own part, or do not agree about what is common to all.
-    """
-    parts, tallies = [Part(**answer["part"]) for answer in answers], [Tally(**answer["tally"]) for answer in answers]
-    if [(own.number, own.of) for own in parts] != [part.split(k, len(answers)) for k in range(len(answers))]:
-        raise ArithmeticError("a process has answered about another part than its own")
-    refusals = [
-        (own.passed, answer["refusal"]) for own, answer in zip(parts, answers, strict=True) if answer["refusal"]
-    ]
-    if refusals:  # one on a leaf precedes, by the batches passed, what all processes refuse that comes after it
-        part.passed, first = min(refusals)
-        raise Rejected(*first)
-    common = [(own.passed, own.all_leaves, one.elsewhere()) for own, one in zip(parts, tallies, strict=True)]
-    if any(own != common[0] for own in common):
-        raise ArithmeticError("the processes do not agree about what is no part of any")
-    part.passed, part.all_leaves, part.leaves = *common[0][:2], sum(own.leaves for own in parts)
-    tally.rules = tally.by_leaf = Counter()
-    for one in tallies:
-        tally.by_leaf = tally.by_leaf + Counter(one.by_leaf)
-    tally.rules = Counter(common[0][2])
-    tally.rules.update(tally.by_leaf)
-    tally.ring_margin = min((v.ring_margin for v in tallies if v.ring_margin is not None), default=None)
-    tally.outer_margin = min((v.outer_margin for v in tallies if v.outer_margin is not None), default=None)
+        for table in (OF_OUTER, ON_FACES, OF_OUTER_TREE):
+            tally.hold(table, case)
+        beyond, tree = outer.Beyond(case), case.outer[1].tree
+        tally.outer_margin = tally.hold_on_leaves(ON_OUTER_LEAVES, beyond, tree, lambda leaves: leaves.bound)

@@ -98,10 +98,6 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         outer = None if c.outer is None else answer["margins"]["outer"]
         margins += [] if outer is None else [f"smallest bound of -N'F on a leaf of the outer set {outer:.3g}"]
         rest, verdict = f"margins: {'; '.join(margins)}", answer["result"]
-        if verdict == "PART":
-            number, of = answer["part"]
-            rest += f"; looked at {answer['examined']} of {answer['leaves_in_all']} leaves: this accepts nothing"
-            verdict += f" {number}/{of}"
     after = "+" if c.discrete else "'"
     left = "x+" if c.discrete else "xdot"
     return [

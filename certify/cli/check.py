@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from certify.cli.shared import Json, Patient
 from certify.cli.terminal import say, tell
-from certify.errors import InputError
-
-_MOST_PARTS = 2**16
 
 
 def check(
@@ -24,17 +21,6 @@ def check(
         bool, typer.Option("--reference", help="Use the second checker (fractions, Arb balls): slower, shares no code.")
     ] = False,
     jobs: Annotated[int, typer.Option(min=1, max=256, help="Processes that examine the leaves.")] = 1,
-    part: Annotated[
-        str | None,
-        typer.Option(metavar="K/N", help="Examine only part K of N of the leaves; status 4 if that part holds."),
-    ] = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(
-            help="Let the workers of a Dask cluster check the parts, and trust their answers: local:N, or a "
-            "scheduler's address."
-        ),
-    ] = None,
     patient: Patient = False,
     as_json: Json = False,
 ) -> None:
@@ -46,13 +32,7 @@ def check(
         from certify.loop.policies import load_policy
 
         wanted = load_policy(policy).network.sha256()
-    if cluster is not None and (reference or part is not None or jobs != 1):
-        raise InputError("--cluster must stand without --reference, --jobs and --part.")
-    if cluster is not None:
-        status, answer = _by_cluster(certificate, cluster, patient)
-    else:
-        share = None if part is None else _part(part)
-        status, answer = ask(certificate, "reference" if reference else "checker", jobs, share, patient)
+    status, answer = ask(certificate, "reference" if reference else "checker", jobs, patient)
     lines = answer.pop("text", [])
     if wanted is not None and "policy_sha256" in answer and answer["policy_sha256"] != wanted:
         detail = f"the certificate is about policy {answer['policy_sha256']}, not about {policy} ({wanted})"
@@ -70,18 +50,3 @@ def check(
             tell(f"certify: {old}")
     say(json.dumps(answer) if as_json else "\n".join(lines))
     raise typer.Exit(status)
-
-
-def _by_cluster(certificate: Path, address: str, patient: bool) -> tuple[int, dict[str, Any]]:
-    from certify.analysis.parts import check_in_parts
-    from certify.provers.execution.cluster import ClusterRunner, connect
-
-    with connect(address) as client:
-        return check_in_parts(certificate, ClusterRunner(client), patient)
-
-
-def _part(text: str) -> tuple[int, int]:
-    number, _, of = text.partition("/")
-    if not (number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of) <= _MOST_PARTS):
-        raise InputError(f"--part must be K/N with 1 <= K <= N <= {_MOST_PARTS}, as in 2/8; found {text[:40]!r}.")
-    return int(number), int(of)

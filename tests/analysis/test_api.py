@@ -147,7 +147,6 @@ def test_options_by_name_are_those_of_the_options() -> None:
         "max_boxes": 0,
         "rate": -1.0,
         "cluster": "nowhere",
-        "cluster_checks": True,  # without a cluster
         "resume": "yes",
         "enlarge": "yes",
         "box": {"theta": -1.0},

@@ -67,7 +67,7 @@ def test_python_is_made_of_the_declarations() -> None:
 
 
 def test_a_study_is_made_of_the_declarations() -> None:
-    fixed = {"candidate", "P", "reach_from", "jobs", "cluster", "cluster_checks", "resume"}
+    fixed = {"candidate", "P", "reach_from", "jobs", "cluster", "resume"}
     assert set(OPTIONS.values()) == declared(RoaOptions).keys() - fixed
     assert {*TABLES, *PLANT_OPTIONS} == declared(PlantChanges).keys()
     page = on_page_markdown((ROOT / "docs" / "how-to" / "sweeps.md").read_text("utf-8"))

@@ -263,7 +263,6 @@ def test_bad_options_exit_2(
         ("reach", ["--from", "theta=1", "--kind", "onnx"], "--kind must be left out: "),
         ("reach", ["--from", "theta=1", "--time-limit", "-1"], "--time-limit must be positive; found -1"),
         ("roa", ["--precision", "2"], "--precision must lie between 0 and 1; found 2"),
-        ("roa", ["--cluster-checks"], "--cluster-checks must have a --cluster"),
         ("roa", ["--lyapunov-level", "1"], "--lyapunov-level must be the level of a function; give one as --lyapunov."),
         ("roa", ["--box", "q=1"], "--box must name states of pendulum"),
         ("roa", ["--enlarge", "--claim", "practical"], "--enlarge looks for a tube"),

@@ -89,22 +89,8 @@ class _Desk:
 
     def _answered(self, path: Path, patient: bool) -> Mapping[str, Any]:
         """The checker's answer; where many leaves make a long file, several processes share them."""
-        options = self.state.options
-        if options.cluster_checks:
-            from certify.analysis.parts import check_in_parts
-
-            try:
-                _, answer = check_in_parts(path, self.tools.runner, patient)
-            except BackendError as error:
-                self.tools.remarks.append(f"checked here, and not by the cluster: {str(error).rstrip('.')}")
-            else:
-                if "parts" in answer:
-                    self.tools.remarks.append(
-                        f"checked in {answer['parts']} parts by the workers of {options.cluster}, whose word it is"
-                    )
-                return answer
         cores = len(os.sched_getaffinity(0)) if path.stat().st_size > _LONG else 1
-        return run_checker(path, jobs=options.jobs or min(cores, _MOST_JOBS), patient=patient)
+        return run_checker(path, jobs=self.state.options.jobs or min(cores, _MOST_JOBS), patient=patient)
 
 
 def _with_facts(state: State, accepted: Accepted) -> State:

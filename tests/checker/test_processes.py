@@ -1,0 +1,424 @@
+"""Leaves in several processes: the same answer as of one, and no acceptance where one is missing.
+
+Batches are made small, so that the leaves of a small certificate are those of many processes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import cache
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from certify.certificates import checking, run_checker
+from certify.checker import boxes, outer, processes, rules
+from certify.checker.__main__ import main
+from certify.checker.errors import Rejected
+from certify.checker.processes import Batch, in_order
+from certify.checker.ring import Ring
+from certify.errors import BackendError, InputError
+from tests.checker.test_rules import HONEST, honest, scalar_claim
+from tests.support.certificates import Document, edited, grow, parse, with_tree, write
+from tests.support.marks import slow_after
+from tests.support.mutants import family
+from tests.support.outer import uniform
+from tests.support.outer_forgeries import forgeries
+
+SIZE = 3  # of a batch
+Refusal = tuple[str, str, str]
+
+
+@pytest.fixture(autouse=True)
+def small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Ring, "batch", SIZE)
+    monkeypatch.setattr(outer, "_batch", lambda numbers: SIZE)
+
+
+def refusal(data: Document, jobs: int = 1) -> Refusal | None:
+    try:
+        rules.check(parse(data), jobs)
+    except Rejected as no:
+        return no.rule, no.at, no.detail
+    return None
+
+
+def divided() -> Document:
+    """A true certificate of 32 leaves: several batches for each of three processes."""
+    return with_tree(honest("scalar"), uniform([0], 5))
+
+
+def some(count: int, size: int = SIZE) -> Iterator[Batch]:
+    """Batches of leaves that are nowhere, the last of one leaf."""
+    for first in range(0, count, size):
+        corners = np.zeros((1, min(size, count - first)))
+        yield first, corners, corners
+
+
+# ----------------------------------------------------------------------------------------------- acceptance and refusal
+
+
+@pytest.mark.parametrize("jobs", slow_after(1, [3, 2, 7]))
+@pytest.mark.parametrize("name", slow_after(8, HONEST))
+def test_several_processes_find_what_one_finds(name: str, jobs: int) -> None:
+    one, several = (rules.check(parse(honest(name)), count) for count in (1, jobs))
+    assert several == one and list(several.rules) == list(one.rules)
+
+
+@cache
+def refused() -> dict[str, Document]:
+    """Certificates that are refused on leaves, by each rule for them, some on several leaves and by several rules."""
+    narrow = edited(honest("linear"), "plant.input_bounds", [["-2", "2"]])
+    trees = {mutant.name: json.loads(mutant.raw) for mutant in [*family("coarser_trees")][::10]}
+    trees = {name: data for name, data in trees.items() if refusal(data)}  # a few are true, and accepted
+    flow = edited(honest("sampled"), "plant.domain.0", [f"-{2**20 + 1}/{2**21}", "1"])
+    others = {what: data for rule, what, data in [*forgeries(8)][::3] if rule in ("faces", "outer", "inputs")}
+    return {
+        "the whole ring": with_tree(honest("rotor"), b"\xff"),
+        "beyond the region": grow(scalar_claim(c2=3.7)),
+        "inputs": narrow,
+        "inputs and ring": with_tree(narrow, uniform(range(2), 4)),
+        "flow": flow,
+    } | trees | others  # fmt: skip
+
+
+@pytest.mark.parametrize("each", slow_after(1, [1, 1000]), ids=["one of a rule", "all"])
+def test_the_first_refusal_of_the_file_is_that_of_several_processes(each: int) -> None:
+    seen = Counter[str]()
+    for what, data in refused().items():
+        alone = refusal(data)
+        assert alone is not None, what
+        if seen[alone[0]] < each:
+            for jobs in (2, 5) if each > 1 else (2,):
+                assert refusal(data, jobs) == alone, (what, jobs)
+        seen[alone[0]] += "leaf " in alone[1]
+    assert all(seen[rule] for rule in ("ring", "inputs", "flow", "faces", "outer")), seen
+
+
+@pytest.mark.parametrize("jobs", [1, 2, 3, 4, 5, 256])
+@pytest.mark.parametrize("leaves", [1, 3, 4, 12, 13])
+def test_results_come_in_the_order_of_the_leaves(leaves: int, jobs: int) -> None:
+    """Also if they are long, or the first to begin is the last to end."""
+
+    def work(first: int, lo: Any, hi: Any) -> tuple[int, str]:
+        time.sleep(0.05 * (first == 0))
+        return first, "x" * 200_000 * (first % 2)
+
+    before = _children()
+    found = list(in_order(work, some(leaves), leaves, jobs))
+    assert found == [(first, "x" * 200_000 * (first % 2)) for first in range(0, leaves, SIZE)]
+    assert _children() <= before  # a child that nobody has waited for is still listed
+
+
+def test_no_process_examines_what_another_does() -> None:
+    answers = list(in_order(lambda first, lo, hi: (os.getpid(), first), some(30), 30, 4))
+    by = {who: [first for other, first in answers if other == who] for who, _ in answers}
+    assert sorted(by.values()) == [[0, 12, 24], [3, 15, 27], [6, 18], [9, 21]] and os.getpid() not in by
+
+
+def test_one_batch_needs_no_process() -> None:
+    assert list(in_order(lambda first, lo, hi: os.getpid(), some(SIZE), SIZE, 8)) == [os.getpid()]
+    assert len(set(in_order(lambda first, lo, hi: os.getpid(), some(2 * SIZE), 2 * SIZE, 8))) == 2
+
+
+def test_a_refusal_is_the_same_after_a_pipe() -> None:
+    no = pickle.loads(pickle.dumps(Rejected("ring", "leaf 3", "the decrease is not shown: 0.1")))
+    assert (no.rule, no.at, no.detail) == ("ring", "leaf 3", "the decrease is not shown: 0.1")
+    assert str(no) == "REJECTED rule=ring at=leaf 3: the decrease is not shown: 0.1"
+
+
+# -------------------------------------------------------------------------------------------------- processes that fail
+
+
+def _dies() -> None:
+    os._exit(3)
+
+
+def _is_killed() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _leaves_quietly() -> None:
+    os._exit(0)
+
+
+def _raises() -> None:
+    raise MemoryError
+
+
+def _exits() -> None:
+    raise SystemExit(0)
+
+
+def _ends_its_answers() -> None:
+    raise EOFError
+
+
+def _stops() -> None:
+    raise StopIteration
+
+
+class Unsendable(Exception):
+    """An error that no pipe takes."""
+
+    def __reduce__(self) -> Any:
+        raise TypeError
+
+
+def _raises_what_is_lost() -> None:
+    raise Unsendable
+
+
+FAULTS = [_dies, _is_killed, _leaves_quietly, _raises, _exits, _ends_its_answers, _stops, _raises_what_is_lost]
+
+
+@pytest.mark.parametrize("batch", slow_after(1, [1, 0, 3]))
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("name", ["accepted", "refused"])
+def test_a_process_that_does_not_answer_is_an_internal_error(
+    name: str,
+    fault: Callable[[], None],
+    batch: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Unless what comes before in the file is refused."""
+    data = divided() if name == "accepted" else refused_in_the_second_batch()
+    alone, honestly, parent = refusal(data), Ring.examine, os.getpid()
+
+    def examine(self: Ring, first: int, lo: Any, hi: Any) -> Any:
+        if first == batch * SIZE:
+            assert os.getpid() != parent
+            fault()
+        return honestly(self, first, lo, hi)
+
+    monkeypatch.setattr(Ring, "examine", examine)
+    before = _children()
+    status = main([str(write(data, tmp_path)), "--json", "--jobs", "3"])
+    answered = json.loads(capsys.readouterr().out)
+    if alone is not None and int(alone[1].removeprefix("leaf ")) < batch * SIZE:
+        assert (status, answered["rule"], answered["at"], answered["detail"]) == (1, *alone)
+    else:
+        assert status == 70 and "internal error" in answered["error"] and "result" not in answered
+    assert _children() <= before
+
+
+def refused_in_the_second_batch() -> Document:
+    places = {f"leaf {leaf}" for leaf in range(SIZE, 2 * SIZE)}
+    return next(data for data in refused().values() if (refusal(data) or ("", "", ""))[1] in places)
+
+
+Lie = Callable[[Iterator[Any]], Iterator[Any]]
+
+
+def _altered(change: Callable[[int, int, Any], Any]) -> Lie:
+    """The second answer of each process is another."""
+    return lambda answers: (change(*answer) if k == 1 else answer for k, answer in enumerate(answers))
+
+
+LIES: dict[str, Lie] = {
+    "nothing": lambda answers: iter([]),
+    "only the first": lambda answers: islice(answers, 1),
+    "all but the first": lambda answers: islice(answers, 1, None),
+    "every other": lambda answers: islice(answers, 0, None, 2),
+    "each twice": lambda answers: (answer for answer in answers for _ in range(2)),
+    "backwards": lambda answers: iter([*answers][::-1]),
+    "none": _altered(lambda number, size, result: None),
+    "a word": _altered(lambda number, size, result: "ACCEPTED"),
+    "no result": _altered(lambda number, size, result: (number, size)),
+    "two results": _altered(lambda number, size, result: (number, size, result, result)),
+    "a result that is none": _altered(lambda number, size, result: (number, size, None)),
+    "a result that is a number": _altered(lambda number, size, result: (number, size, 7)),
+    "of the next leaf": _altered(lambda number, size, result: (number + 1, size, result)),
+    "of the next batch": _altered(lambda number, size, result: (number + SIZE, size, result)),
+    "of the first leaves": _altered(lambda number, size, result: (0, size, result)),
+    "of no number": _altered(lambda number, size, result: (float("nan"), size, result)),
+    "fewer leaves": _altered(lambda number, size, result: (number, size - 1, result)),
+    "more leaves": _altered(lambda number, size, result: (number, size + 1, result)),
+    "all other leaves": _altered(lambda number, size, result: (number, 10**6, result)),
+    "no leaves": _altered(lambda number, size, result: (number, 0, result)),
+    "an end": _altered(lambda number, size, result: EOFError()),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", LIES)
+def test_answers_that_cannot_be_are_an_internal_error(
+    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    honestly = processes._send
+    monkeypatch.setattr(processes, "_send", lambda answers, *ends: honestly(LIES[what](answers), *ends))
+    for data in (divided(), honest("outer, a network")):
+        assert main([str(write(data, tmp_path)), "--json", "--jobs", "3"]) == 70
+        assert "internal error" in json.loads(capsys.readouterr().out)["error"]
+
+
+def test_the_same_answers_of_all_processes_are_an_internal_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each examines the share of the first."""
+    shares = processes.islice
+    monkeypatch.setattr(processes, "islice", lambda over, *ends: shares(over, *(0 if e == 2 else e for e in ends)))
+    assert main([str(write(divided(), tmp_path)), "--jobs", "3"]) == 70
+    assert "passed over" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("name", slow_after(1, ["outer, a network", "scalar", "sampled"]))
+@pytest.mark.parametrize("leaf", [0, 1, -1])
+def test_a_leaf_that_is_passed_over_is_an_internal_error(
+    leaf: int,
+    name: str,
+    jobs: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    honestly = boxes._walk
+
+    def walk(tree: bytes, lo: Any, hi: Any) -> Iterator[Any]:
+        corners = [*honestly(tree, lo, hi)]
+        del corners[leaf]
+        yield from corners
+
+    monkeypatch.setattr(boxes, "_walk", walk)
+    assert main([str(write(honest(name), tmp_path)), "--jobs", str(jobs)]) == 70
+    assert "passed over" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("leaves", [0, 11, 13, 24])
+def test_other_leaves_than_the_tree_has_are_an_error(leaves: int, jobs: int) -> None:
+    with pytest.raises(ArithmeticError, match="passed over"):
+        list(in_order(lambda first, lo, hi: None, some(12), leaves, jobs))
+
+
+def _children() -> set[str]:
+    """The child processes of this one, by number."""
+    return {number for task in Path("/proc/self/task").glob("*/children") for number in task.read_text().split()}
+
+
+def test_no_process_outlives_an_examination_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    fork, started = os.fork, []
+
+    def scarce() -> int:
+        if len(started) == 2:
+            raise OSError("no more processes")
+        child = fork()
+        if child:
+            started.append(child)
+        return child
+
+    monkeypatch.setattr(os, "fork", scarce)
+    with pytest.raises(OSError, match="no more"):
+        list(in_order(lambda first, lo, hi: time.sleep(60), some(12), 12, 3))
+    assert len(started) == 2
+    for child in started:
+        with pytest.raises(ChildProcessError):
+            os.waitpid(child, os.WNOHANG)
+
+
+def test_no_process_outlives_one_that_stops_asking() -> None:
+    before = _children()
+    results = in_order(lambda first, lo, hi: time.sleep(60 * (first > 0)), some(12), 12, 3)
+    assert next(results) is None and len(_children() - before) == 3
+    results.close()
+    assert _children() <= before
+
+
+ENDLESS = """
+import os, sys
+import numpy as np
+sys.path.insert(0, sys.argv[1])
+from certify.checker.processes import in_order
+batches = ((first, np.zeros((1, 1)), np.zeros((1, 1))) for first in range(10**9))
+for who in in_order(lambda first, lo, hi: (os.getpid(), "x" * 1000), batches, 10**9, 3):
+    print(who[0], flush=True)
+"""
+
+
+def test_no_process_outlives_one_that_is_killed() -> None:
+    """What they send to nobody ends them, even if they wait for room in a pipe."""
+    root = Path(rules.__file__).parents[2]
+    with subprocess.Popen(
+        [sys.executable, "-c", ENDLESS, str(root)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as child:
+        assert child.stdout is not None
+        workers = {int(child.stdout.readline()) for _ in range(3)}
+        child.kill()
+        assert len(workers) == 3
+    until = time.monotonic() + 60
+    while any(_is_alive(worker) for worker in workers):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def _is_alive(pid: int) -> bool:
+    """False of one that is gone, or dead and not yet waited for."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def test_a_caller_that_ignores_its_children_changes_nothing() -> None:
+    before = signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    try:
+        assert list(in_order(lambda first, lo, hi: first, some(12), 12, 2)) == [0, 3, 6, 9]
+    finally:
+        signal.signal(signal.SIGCHLD, before)
+
+
+@pytest.mark.parametrize("arguments", [
+    ["--jobs", "0"], ["--jobs", "-1"], ["--jobs", "257"], ["--jobs", "two"], ["--jobs", ""], ["--part", "1/2"],
+])  # fmt: skip
+def test_other_options_are_usage_errors(arguments: list[str], tmp_path: Path) -> None:
+    assert main([str(write(honest("scalar"), tmp_path)), *arguments]) == 2
+
+
+# --------------------------------------------------------------------------------------------------- the child process
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_the_checker_as_a_child_takes_jobs(jobs: int, tmp_path: Path) -> None:
+    assert run_checker(write(honest("rotor"), tmp_path), jobs=jobs)["result"] == "ACCEPTED"
+    answer = run_checker(write(with_tree(honest("linear"), b"\xff"), tmp_path), jobs=jobs)
+    assert (answer["result"], answer["rule"], answer["at"]) == ("REJECTED", "ring", "leaf 0")
+
+
+def test_the_reference_has_one_process(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="one process"):
+        run_checker(write(honest("scalar"), tmp_path), "reference", jobs=2)
+
+
+@pytest.mark.parametrize(
+    ("said", "status"), [("PART", 4), ("PART", 0), ("ACCEPTED", 4), ("ACCEPTED", 1), ("REJECTED", 0)]
+)
+def test_an_answer_of_another_kind_is_no_verdict(
+    said: str, status: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A status without its answer accepts nothing, nor does an answer without its status."""
+    program = f"import json, sys; print(json.dumps({{'result': {said!r}}})); sys.exit({status})"
+    monkeypatch.setattr(checking, "command", lambda program_, arguments: ["python3", "-c", program])
+    with pytest.raises(BackendError, match=said):
+        checking.ask(tmp_path)
+
+
+def test_an_answer_that_nobody_hears_is_no_refusal(tmp_path: Path) -> None:
+    line = checking.command("checker", [str(write(honest("scalar"), tmp_path))])
+    with open("/dev/full", "wb") as full:
+        assert subprocess.run(line, stdout=full, stderr=subprocess.DEVNULL, check=False).returncode == 70
+    shell = f"exec {shlex.join(line)} >&-"
+    assert subprocess.run(["sh", "-c", shell], stderr=subprocess.DEVNULL, check=False).returncode == 70
