@@ -10,7 +10,7 @@ import pytest
 from flint import arb, ctx, fmpq
 
 from certify.reference.__main__ import in_words
-from certify.reference.balls import PRECISION, derivatives, spanning, third
+from certify.reference.balls import PRECISION, derivatives, third
 from certify.reference.document import Certificate
 from certify.reference.document import read as read_certificate
 from certify.reference.leaves import Box, Leaves
@@ -105,6 +105,11 @@ def test_models_in_a_cell_enclose_F_for_all_its_values(factor: str) -> None:
                 x = [sum((arb(p) * arb(e) for p, e in zip(row, d, strict=True)), arb(0)) for row in J.tolist()]
                 true = in_arb(data, x, {"q": q}, data["plant"]["dynamics"][0])
                 assert holds(F, true, d, 2 * share - 1), (q, d)
+
+
+def spanning(ends: tuple[fmpq, fmpq]) -> arb:
+    """A ball that contains every number between two rationals."""
+    return arb(ends[0]).union(arb(ends[1]))
 
 
 def holds(f: Model, true: arb, d: list[float], y: Fraction | int) -> bool:
