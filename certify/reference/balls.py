@@ -16,7 +16,8 @@ from .document import Certificate
 from .fields import exact
 from .layers import Layer
 
-PRECISION = 128  # bits; single operations of flint cost about the same with 64
+PRECISION = 128  # bits
+ON_LEAVES = 64  # the same on leaves, of which there are many
 ZERO, ONE = arb(0), arb(1)
 SPREAD = arb(0, 1)  # every number from -1 to 1
 
@@ -43,6 +44,14 @@ def norm(values: Sequence[arb]) -> arb:
     """The largest 2-norm of a vector of balls; no upper bound of a sum of squares is negative, so the root exists."""
     row = arb_mat(1, len(values), list(values))
     return arb((row * row.transpose())[0, 0].upper()).sqrt()
+
+
+def spectral_norm(W: arb_mat) -> arb:
+    """A bound of ||W||_2, whose 64th power is that of (W'W)^32 and at most its Frobenius norm."""
+    G = W if W.nrows() >= W.ncols() else W.transpose()
+    for _ in range(6):
+        G = G.transpose() * G
+    return norm(G.entries()).root(64)
 
 
 @cache

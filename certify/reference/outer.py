@@ -18,7 +18,7 @@ from .document import Certificate
 from .evidence import Covering, Tree
 from .fields import exact
 from .function import Models
-from .leaves import BATCH, Box, Leaf, Leaves, boxes, cut, is_negative, structure
+from .leaves import Box, Leaf, Leaves, boxes, cut, is_negative, structure
 from .refusal import Refused, require
 from .taylor import Taylor
 
@@ -144,7 +144,7 @@ class Region:
 def check_leaves(c: Certificate, models: Models, covering: Covering) -> None:
     """In each batch of leaves on which something is asked rule `inputs` comes first."""
     region, bounded = Region(c, models, covering), bounded_by_form(c)
-    size = max(1, BATCH // max(layer.rows for layer in c.policy.layers))
+    size = region.leaves.network.batch(c.n)
     asked = (box for box in boxes(covering) if not region.is_free(box))
     while batch := list(islice(asked, size)):
         enclosed = region.leaves.enclose(batch)

@@ -107,7 +107,16 @@ class Taylor:
         Q = mix(at[1], self.Q, half, square(self.g, self.g))
         return Taylor(at[0], mix(at[1], self.g, ZERO, None), Q, r)
 
+    def is_negative(self) -> bool:
+        """True if it certainly is, on all of the box."""
+        return bool(self.by_pairs() < 0) or bool(self.from_corner() < 0)
+
     def bound(self) -> arb:
+        """A bound from above: one of two, the lesser if that is certain."""
+        first, second = self.by_pairs(), self.from_corner()
+        return second if second < first else first
+
+    def by_pairs(self) -> arb:
         """c + r, a bound of each pair, and the exact maximum of g_i t + Q_ii t^2 over |t| <= 1 for each symbol."""
         result = self.c + self.r
         if self.g is None:
@@ -125,3 +134,28 @@ class Taylor:
             else:
                 result += g + q.max(ZERO)
         return result
+
+    def from_corner(self) -> arb:
+        """The value at the corner to which g points, and a bound of what a move away from it adds.
+
+        With M_ij = s_i s_j Q_ij for signs s_i, of which any will do, and d_i = s_i (1 - w_i), this is sum_i w_i (sum_j
+        -M_ij (2 - w_j) - s_i g_i), where w_i and 2 - w_j lie in [0, 2].
+        """
+        if self.g is None or self.Q is None:
+            return self.c + self.r + self.first
+        negative = [bool(v < 0) for v in self.g]
+        gains = [v if n else -v for v, n in zip(self.g, negative, strict=True)]  # -s_i g_i and what is added below
+        result = self.c + self.r - total(gains)
+        for (i, j), q in zip(pairs(len(self.g)), self.Q, strict=True):
+            M = -q if negative[i] != negative[j] else q  # 2 M_ij for i < j
+            result += M
+            if not M >= 0:
+                fall = positive_part(-M)
+                gains[i] += fall
+                gains[j] += fall
+        return result + 2 * total(map(positive_part, gains))
+
+
+def positive_part(v: arb) -> arb:
+    """A number at or above v and 0, and the greater of both if that is certain."""
+    return ZERO if v <= 0 else v if v >= 0 else abs(v)
