@@ -210,7 +210,7 @@ def within_both(x: arb, w: arb) -> arb:
 
 
 def widened(x: Taylor, far: arb) -> Taylor:
-    return replace(x, r=x.r + far)
+    return x.widened(far)
 
 
 def mean_on(

@@ -27,7 +27,6 @@ from .evidence import Covering, Tree
 from .flow import Moving, constant, mean_on, reached_from
 from .rational import inverse_diagonal
 from .refusal import Refused, require
-from .symmetric import pairs
 from .taylor import Taylor
 
 LEAF = 255
@@ -200,7 +199,7 @@ class Leaves:
 
     def affine(self, row: list[arb]) -> Taylor:
         """A list [constant, coefficients of d]."""
-        return Taylor(row[0], row[1:] + [ZERO] * (self.symbols - self.n))
+        return Taylor(row[0], arb_mat(1, self.symbols, row[1:] + [ZERO] * (self.symbols - self.n)))
 
     def F(self, leaf: Leaf) -> list[Taylor]:
         """Models of f(x, pi(x), q), all of them finite."""
@@ -238,7 +237,8 @@ class Leaves:
 
     def moving(self, mid: arb, slopes: list[arb], symbol: int, size: arb) -> Taylor:
         """mid + slopes.d + size times a symbol of its own."""
-        return Taylor(mid, slopes + [size if i == symbol else ZERO for i in range(self.n, self.symbols)])
+        own = [size if i == symbol else ZERO for i in range(self.n, self.symbols)]
+        return Taylor(mid, arb_mat(1, self.symbols, slopes + own))
 
     def D(self, leaf: Leaf, within: dict[str, Taylor] | None = None) -> Taylor:
         """(2 P x + h P G)'G: Vdot in continuous time. What V changes by over a step, by its length.
@@ -261,9 +261,10 @@ class Leaves:
         each = list(zip(self.S, leaf.centre, leaf.radius, strict=True))
         c = total(s * z * z for s, z, _ in each)
         g = [2 * s * z * r for s, z, r in each] + [ZERO] * (self.symbols - self.n)
-        diagonal = [s * r * r for s, _, r in each]
-        Q = [diagonal[i] if i == j and i < self.n else ZERO for i, j in pairs(self.symbols)]
-        return Taylor(c, g, Q, self.cross_part(leaf.box))
+        Q = arb_mat(self.symbols, self.symbols)
+        for i, (s, _, r) in enumerate(each):
+            Q[i, i] = s * r * r
+        return Taylor(c, arb_mat(1, self.symbols, g), Q, self.cross_part(leaf.box))
 
     def decreases(self, leaf: Leaf, within: dict[str, Taylor] | None = None) -> bool:
         """True if D', D' + k (c2 - V) or D' + k (V - c1), D' = D + 2 lambda V, is certainly negative for some k >= 0.
@@ -315,7 +316,10 @@ def is_negative(D: Taylor, slacks: Sequence[Taylor]) -> bool:
 
 def kinks(D: Taylor, slack: Taylor) -> list[arb]:
     """Each k at which a coefficient of the first order vanishes in D + k slack."""
-    return [-(g / w).mid() for g, w in zip(D.g or (), slack.g or (), strict=D.g is not None)]
+    if D.g is None or slack.g is None:
+        return []
+    each = zip(D.g.entries(), slack.g.entries(), strict=True)
+    return [-(g / w).mid() for g, w in each if not w.is_zero()]
 
 
 def check_leaves(leaves: Leaves, evidence: Tree) -> None:

@@ -55,7 +55,7 @@ def face(c: Certificate, models: Models, k: int, tree: bytes) -> None:
     for box in cut(least, most, tree):
         centre, radius = middles(box)
         x = [
-            Taylor(v, [r if j == i else ZERO for j in range(c.n)])
+            Taylor(v, arb_mat(1, c.n, [r if j == i else ZERO for j in range(c.n)]))
             for i, (v, r) in enumerate(zip(centre, radius, strict=True))
         ]
         x[axis] = fixed
@@ -127,7 +127,7 @@ class Region:
         return [
             Taylor(
                 total(t * v for t, v in zip(row, centre, strict=True)),
-                [t * r for t, r in zip(row, radius, strict=True)],
+                arb_mat([[t * r for t, r in zip(row, radius, strict=True)]]),
             )
             for row in self.T
         ]

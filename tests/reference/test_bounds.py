@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from flint import arb, ctx, fmpq, fmpq_mat
+from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from certify.reference.balls import ON_LEAVES
 from certify.reference.taylor import Taylor, positive_part
@@ -61,8 +61,7 @@ def drawn(generator: np.random.Generator, n: int, kind: str) -> tuple[list[Fract
 
 
 def model(g: list[Fraction], Q: Rows) -> Taylor:
-    each = [ball(Q[i][j] if i == j else 2 * Q[i][j]) for i, j in pairs(len(g))]
-    return Taylor(arb(0), [ball(v) for v in g], each)
+    return Taylor(arb(0), arb_mat([[ball(v) for v in g]]), arb_mat([[ball(v) for v in row] for row in Q]))
 
 
 @pytest.mark.parametrize("kind", ["steep", "level", "flat"])
@@ -90,23 +89,28 @@ def test_numbers_that_are_not_known_exactly(shift: int) -> None:
         for _ in range(60):
             g, Q = drawn(generator, 3, "level")
             wide = [arb(float(v) / 8 * abs(shift), 0.25) for v in g]
-            places = pairs(3)
-            each = [
-                arb(0, 0.5) if generator.random() < 0.3 else ball(2 * Q[i][j] if i < j else Q[i][j]) for i, j in places
-            ]
-            bound = Taylor(arb(0), wide, each).bound()
+            each = [[ball(v) for v in row] for row in Q]
+            for i, j in pairs(3):
+                if generator.random() < 0.3:
+                    each[i][j] = each[j][i] = arb(0, 0.5)
+            bound = Taylor(arb(0), arb_mat([wide]), arb_mat(each)).bound()
             for _ in range(6):
                 h = [Fraction(float(v.mid())) + Fraction(int(generator.integers(-1, 2)), 4) for v in wide]
                 R = [[Fraction(0)] * 3 for _ in range(3)]
-                for (i, j), q in zip(places, each, strict=True):
-                    any_of = Fraction(float(q.mid())) + Fraction(int(generator.integers(-1, 2)), 2) * (not q.is_exact())
-                    R[i][j] = R[j][i] = any_of if i == j else any_of / 2
+                for i, j in pairs(3):
+                    drawn_one = Fraction(int(generator.integers(-1, 2)), 2) * (not each[i][j].is_exact())
+                    R[i][j] = R[j][i] = Fraction(float(each[i][j].mid())) + drawn_one
                 assert not bound < ball(largest(h, R))
         unknown = [arb("nan"), arb("inf"), arb(0, float("inf"))]
         for v in unknown:
-            assert not Taylor(arb(-1), [v, arb(1)], [arb(0)] * 3).is_negative()
-            assert not Taylor(arb(-1), [arb(0)] * 2, [arb(0), v, arb(0)]).is_negative()
-            assert not Taylor(arb(-1), [arb(0)] * 2, [arb(0)] * 3, v).is_negative()
+            none, flat = arb_mat(1, 2), arb_mat(2, 2)
+            for model in (
+                Taylor(arb(-1), arb_mat([[v, 1]]), flat),
+                Taylor(arb(-1), none, arb_mat([[0, v], [v, 0]])),
+                Taylor(arb(-1), none, flat, v),
+                Taylor(v, none, flat),
+            ):
+                assert not model.is_negative() and not model.is_finite()
 
 
 def test_a_part_that_is_not_negative() -> None:

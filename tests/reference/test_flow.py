@@ -26,7 +26,7 @@ from certify.reference.local import cells
 from certify.reference.loop import Loop
 from certify.reference.model import Model
 from certify.reference.refusal import Refused
-from certify.reference.taylor import Taylor, pairs
+from certify.reference.taylor import Taylor
 from tests.support.balls import exactly
 from tests.support.certificates import Document, decode, dump, make
 from tests.support.marks import slow_after
@@ -227,9 +227,11 @@ def leaf_of(data: Document, box: Box) -> tuple[Leaves, Any]:
 
 
 def value_at(model: Taylor, d: Sequence[arb]) -> arb:
-    value = model.c + sum((g * e for g, e in zip(model.g or [], d, strict=model.g is not None)), arb(0))
-    for (i, j), q in zip(pairs(len(d)), model.Q or [], strict=model.Q is not None):
-        value += q * d[i] * d[j]
+    value, column = model.c, arb_mat(len(d), 1, list(d))
+    if model.g is not None:
+        value += (model.g * column)[0, 0]
+    if model.Q is not None:
+        value += (column.transpose() * model.Q * column)[0, 0]
     return value + model.r.union(-model.r)
 
 
