@@ -16,44 +16,9 @@ from functools import cached_property
 
 from flint import arb, arb_mat
 
-from . import lipschitz
-from .balls import SPREAD, ZERO, derivatives, finite, fourth, identity, largest_fourth, norm, total
-from .refusal import Refused
+from . import functions, lipschitz
+from .balls import ZERO, finite, identity, norm, total
 from .symmetric import linear_times_square, no_form, squared_norm
-
-Four = tuple[arb, arb, arb, arb]
-
-
-@dataclass(frozen=True)
-class Expansion:
-    """phi, phi', phi''/2 and phi'''/6 at v, and how far they have `moved` from there at any v(0).
-
-    On the ball phi is within fourth D^4 of its cubic at v(0), D = v - v(0), and the derivative of what it adds to that
-    is within last |D|^3.
-    """
-
-    at: Four
-    moved: Four
-    fourth: arb
-    last: arb
-
-    @cached_property
-    def steepest(self) -> arb:
-        return abs(self.at[1]) + self.moved[1]
-
-    @cached_property
-    def bent(self) -> arb:
-        return abs(self.at[2]) + self.moved[2]
-
-    @cached_property
-    def twisted(self) -> arb:
-        return abs(self.at[3]) + self.moved[3]
-
-
-def coefficients(name: str, y: arb) -> Four:
-    """phi, phi', phi''/2 and phi'''/6 on a ball."""
-    value, first, second, third = derivatives(name, y)
-    return value, first, second / 2, third / 6
 
 
 @dataclass(frozen=True)
@@ -240,60 +205,4 @@ class Model:
 
     def function(self, name: str) -> Model:
         """phi of v."""
-        phi = self.expansion(name)
-        H, C, R = self.beyond_tangent(phi)
-        (value, p, half, _), moved, steepest = phi.at, phi.moved, phi.steepest
-        wrong = moved[1] * self.spread
-        E = steepest * self.E + R + wrong * identity(self.a.nrows())
-        lip = lipschitz.of_function(self, phi, wrong)
-        B, dv = tuple(p * q for q in self.B), tuple(p * q for q in self.dv)
-        by_y = 2 * abs(half) * self.sway
-        da = tuple(p * a + (2 * half * q) * self.a for q, a in zip(self.dv, self.da, strict=True))
-        square = self.doubt * self.doubt
-        off = abs(p) * self.off + phi.bent * square
-        slack = (2 * phi.bent * self.off + 3 * phi.twisted * square) * self.slope
-        slack += (abs(p) + by_y) * self.slack + by_y * self.tilt
-        Q, K = p * self.Q + H, p * self.K + C
-        return Model(value, p * self.a, Q, K, E, B, self.errors, dv, da, lip, off, slack)
-
-    def expansion(self, name: str) -> Expansion:
-        """The function's series at v, or a refusal.
-
-        Whoever asked for the ball knows the rule and the place of a refusal, and puts them into it.
-        """
-        at = there = coefficients(name, self.v)
-        anywhere, moved = self.v, (ZERO, ZERO, ZERO, ZERO)
-        if not self.doubt.is_zero():
-            anywhere += self.doubt * SPREAD
-            there = coefficients(name, anywhere)
-            a, b, c, d = (arb((p - q).abs_upper()) for p, q in zip(there, at, strict=True))
-            moved = a, b, c, d
-        most, last = (bound(name, there[0], anywhere, self.radius) for bound in (fourth, largest_fourth))
-        if most is None or last is None:
-            what = "a root of what may not be positive" if name == "sqrt" else "a division by what may be 0"
-            raise Refused("local", "ball", what)
-        return Expansion(at, moved, most / 24, last / 6)
-
-    def beyond_tangent(self, phi: Expansion) -> tuple[arb_mat, arb_mat, arb_mat]:
-        """H, C and R: what phi adds to its tangent is d'Hd + C[d] within d'Rd.
-
-        With D = v - v(0), y = a.d and z = D - y, within curve and d'Wd: h D^2 is h y^2 and 2 h y d'Qd but for what is
-        left of z in 2 h y z and for h z^2; g D^3 is g y^3 but for g z (3 y^2 + 3 y z + z^2); and D^4 is at most
-        radius^2 (y^2 + (2 |y| + |z|) |z|). Here h, g and a are those at y = 0: by what they differ R is larger.
-        """
-        n, slope, curve, a = self.a.nrows(), self.slope, self.curve, self.a
-        _, _, h, g = phi.at
-        outer = a * a.transpose()
-        C = no_form(n) if slope.is_zero() else linear_times_square(a, 2 * h * self.Q + g * outer)
-        quartic = phi.fourth * self.radius * self.radius
-        rest = 2 * phi.bent * slope
-        turned = phi.bent * curve + phi.twisted * (3 * slope * (slope + curve) + curve * curve)
-        turned += quartic * (2 * slope + curve)
-        known = rest * self.twist + turned * (self.bend + self.twist) + self.mistaken(phi)
-        return h * outer, C, (rest + turned) * self.whole + quartic * outer + known * identity(n)
-
-    def mistaken(self, phi: Expansion) -> arb:
-        """A bound of what differs in H, C and quartic a a' for other y, on the ball."""
-        s, quartic = self.slope, phi.fourth * self.radius * self.radius
-        wrong = phi.moved[2] * (s * s + 2 * s * self.bend) + phi.moved[3] * s * s * s
-        return wrong + (2 * (phi.bent + quartic) * s + 2 * phi.bent * self.bend + 3 * phi.twisted * s * s) * self.turn
+        return functions.function_of(self, name)

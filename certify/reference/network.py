@@ -17,8 +17,8 @@ from flint import arb, arb_mat, fmpq_mat
 
 from .balls import ONE, ZERO, absolute, beta, biased, columns_scaled, finite, net_at_0, origin, tanhs, weights
 from .document import Certificate
-from .lipschitz import beyond_tangent, of_function
-from .model import Expansion, Model
+from .functions import Expansion, beyond_tangent, expansion, steepness, steepness_beyond_tangent
+from .model import Model
 from .symmetric import half, no_form, whole
 
 
@@ -36,11 +36,11 @@ class Bends:
 
     def append(self, y: Model, phi: Expansion) -> tuple[arb_mat, arb_mat]:
         """The tanh of y; H and C."""
-        H, C, R = y.beyond_tangent(phi)
+        H, C, R = beyond_tangent(y, phi)
         self.H.append(half(H))
         self.C.append(C.entries())
         self.R.append(half(R))
-        lip = beyond_tangent(y, phi)
+        lip = steepness_beyond_tangent(y, phi)
         if lip is not None:
             self.lip.append(lip)
         return H, C
@@ -139,7 +139,7 @@ class Network:
         bends = Bends([], [], [], [])
         for layer in layers[:-1]:
             for y in layer.on(ball, bends, steady):
-                bends.append(y, y.expansion("tanh"))
+                bends.append(y, expansion(y, "tanh"))
         squashed, inputs, reached = self.c.policy.squash == "tanh", list[Model](), list[list[arb]]()
         L, hidden = layers[-1].L, len(bends.R)
         for j, (s, net) in enumerate(
@@ -148,8 +148,8 @@ class Network:
             y, slope, H, C = replace(net, v=self.before_squash(j, net.v, centre)), ONE, arb_mat(n, n), no_form(n)
             value, own, lip = y.v, [ZERO] * m, y.lip
             if squashed:
-                phi = y.expansion("tanh")
-                (value, slope, _, _), lip = phi.at, of_function(y, phi, ZERO)
+                phi = expansion(y, "tanh")
+                (value, slope, _, _), lip = phi.at, steepness(y, phi, ZERO)
                 H, C = bends.append(y, phi)
                 own[j] = s
             ways = [s * slope * L[j, q] for q in range(hidden)] if L is not None else []
