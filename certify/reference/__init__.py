@@ -5,9 +5,8 @@ same mistake. So nothing here was taken from `certify.checker`, nothing of the p
 comes from a float: rational conditions are decided in flint's fractions, all others in balls whose comparisons count
 only when they are certain.
 
-The page leaves choices: the two lines around a tanh, the multiplier k, how the error of a tanh reaches the tanhs behind
-it, how tightly the models on a ball are bounded. They are made here independently, so on a leaf or a ball that is close
-to its limit the two verdicts may differ, either way.
+The page says every bound, so that on a leaf or a ball that is close to its limit both programs decide alike but for
+their roundings, which are far smaller here. What it leaves open can only make a bound here tighter than there.
 
 `python -I -m certify.reference FILE` prints the claim and the verdict.
 """

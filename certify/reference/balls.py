@@ -12,12 +12,14 @@ from functools import cache
 
 from flint import arb, arb_mat
 
-from .document import Certificate, Interval
+from .document import Certificate
 from .fields import exact
 from .layers import Layer
 
-PRECISION = 128  # bits; single operations of flint cost about the same with 64
+PRECISION = 128  # bits
+ON_LEAVES = 64  # the same on leaves, of which there are many
 ZERO, ONE = arb(0), arb(1)
+SPREAD = arb(0, 1)  # every number from -1 to 1
 
 
 def total(terms: Iterable[arb]) -> arb:
@@ -26,12 +28,6 @@ def total(terms: Iterable[arb]) -> arb:
 
 def absolute(A: arb_mat) -> arb_mat:
     return arb_mat(A.nrows(), A.ncols(), [abs(v) for v in A.entries()])
-
-
-def spanning(ends: Interval) -> arb:
-    """A ball that contains every number between two rationals."""
-    lo, hi = ends
-    return arb(lo).union(arb(hi))
 
 
 def columns_scaled(A: arb_mat, factors: Sequence[arb]) -> arb_mat:
@@ -48,6 +44,14 @@ def norm(values: Sequence[arb]) -> arb:
     """The largest 2-norm of a vector of balls; no upper bound of a sum of squares is negative, so the root exists."""
     row = arb_mat(1, len(values), list(values))
     return arb((row * row.transpose())[0, 0].upper()).sqrt()
+
+
+def spectral_norm(W: arb_mat) -> arb:
+    """A bound of ||W||_2, whose 64th power is that of (W'W)^32 and at most its Frobenius norm."""
+    G = W if W.nrows() >= W.ncols() else W.transpose()
+    for _ in range(6):
+        G = G.transpose() * G
+    return norm(G.entries()).root(64)
 
 
 @cache
@@ -167,15 +171,20 @@ def fourth(name: str, at: arb, y: arb, reach: arb) -> arb | None:
 
 
 def largest_fourth(name: str, at: arb, y: arb, reach: arb) -> arb | None:
-    """A bound of |phi''''| itself, phi being `at` at y; None where phi may be undefined.
+    """Six times the factor of |D|^3 in the derivative of what phi adds to its cubic at y; None as in `fourth`.
 
-    For 1/v and sqrt `fourth` bounds a remainder, not its derivative, which is larger.
+    A bound of |phi''''| is one. For 1/v and sqrt, where `fourth` is of the remainder, its derivative is
+    D^3 (3 v + y) / (y^4 v^2), and -D^3 (8 s^2 + 9 s w + 3 w^2) / (16 s^5 w (s + w)^3); both fall as v rises.
     """
     bound = fourth(name, at, y, reach)
     if bound is None or name not in ("1/", "sqrt"):
         return bound
     least = arb((abs(y) - reach).lower())
-    return 24 / least**5 if name == "1/" else 15 / (16 * least.sqrt() ** 7)
+    if name == "1/":
+        nearest, farthest = arb(abs(y).lower()), arb(abs(y).upper())
+        return 6 * (3 * least + farthest) / (nearest**4 * least * least)
+    s, w, far = arb(y.lower()).sqrt(), least.sqrt(), arb(y.upper()).sqrt()
+    return 6 * (8 * far * far + 9 * far * w + 3 * w * w) / (16 * s**5 * w * (s + w) ** 3)
 
 
 def weights(layers: Sequence[Layer]) -> list[arb_mat]:

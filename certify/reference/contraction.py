@@ -62,7 +62,8 @@ def contracts(c: Certificate, J: fmpq_mat, g: Sequence[arb], weight: arb_mat, F:
     left = -(linear + linear.transpose()) - turned / 2
     for column, f in zip(columns, F.components, strict=True):
         left -= 3 * with_cubic(column, f, weight)
-    rest = total(2 * norm(column.entries()) * lip_of(f) for column, f in zip(columns, F.components, strict=True))
+    each = zip(columns, F.components, strict=True)
+    rest = total(2 * norm(column.entries()) * (f.slack + lip_of(f)) for column, f in each)
     return certainly_positive(left - diagonal([rest] * n))
 
 

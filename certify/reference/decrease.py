@@ -68,10 +68,9 @@ def decreases(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq = NO_STEP)
     P, positive definite where h > 0, and R are symmetric, G are the models on the ball, without y.
     """
     known, A, columns = quadratic(ball, P, R, G, h)
-    left = -known - beyond_second(ball, columns, G)
-    if h > 0:
-        left -= arb(h) * step(P, G, A.nrows(), ZERO)
-    return certainly_positive(left)
+    gamma = length_beyond(P, G, A.nrows()) if h > 0 else ZERO
+    along = doubts(P, G, h, columns, gamma)[1] + arb(h) * gamma * gamma
+    return certainly_positive(-known - beyond_second(ball, columns, G) - along * identity(A.ncols()))
 
 
 def decreases_around(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq, level: fmpq) -> bool:
@@ -83,13 +82,36 @@ def decreases_around(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq, le
     known, A, columns = quadratic(ball, P, R + k * P, G, h)
     f, of_P = arb_mat(n, 1, [g.v for g in G.components]), arb_mat(P)
     length = (f.transpose() * of_P * f)[0, 0]
-    below = -known - beyond_second(ball, columns, G)
-    if h > 0:
-        below -= arb(h) * step(P, G, n, arb(length.upper()).sqrt())
+    gamma = length_beyond(P, G, n) if h > 0 else ZERO
+    at_centre, along = doubts(P, G, h, columns, gamma, arb(h) * (of_P * f))
+    along += arb(h) * (gamma * gamma + 2 * root(length) * gamma)
+    below = -known - beyond_second(ball, columns, G) - along * identity(n)
     linear = -((arb_mat(ball.J) + arb(h) * A).transpose() * of_P * f)
-    first = [arb(k * level) - arb(h) * length, *linear.entries()]
+    first = [arb(k * level) - arb(h) * length - at_centre, *linear.entries()]
     below = (below + below.transpose()) / 2
     return certainly_positive(arb_mat([first, *([v, *row] for v, row in zip(first[1:], below.tolist(), strict=True))]))
+
+
+def doubts(
+    P: fmpq_mat, G: Field, h: fmpq, columns: Sequence[arb_mat], gamma: arb, moved: arb_mat | None = None
+) -> tuple[arb, arb]:
+    """Parts of the form, those of 1 and of each entry of d, that cover what is not known of values and gradients.
+
+    An error eps_i within e_i + s_i ||d|| adds 2 sum_i (h (P f)_i + b_i.d) eps_i + 2 h eps'P g + h eps'P eps, and
+    2 ||d|| is at most share + ||d||^2 / share. `moved` is h P f; without it f is 0, exactly, and so is each e_i.
+    """
+    share, components = ONE / 4, G.components
+    turn = total(2 * norm(b.entries()) * g.slack for b, g in zip(columns, components, strict=True))
+    roots = [arb(P[i, i]).sqrt() for i in range(P.nrows())] if h > 0 else []
+    s = total(root * g.slack for root, g in zip(roots, components, strict=h > 0))
+    turn += arb(h) * (s * s + 2 * gamma * s)
+    if moved is None:
+        return ZERO, turn
+    e = total(root * g.off for root, g in zip(roots, components, strict=h > 0))
+    each = list(zip(columns, map(abs, moved.entries()), components, strict=True))
+    both = total(norm(b.entries()) * g.off + p * g.slack for b, p, g in each) + arb(h) * e * s
+    still = total(2 * p * g.off for _, p, g in each) + arb(h) * e * e
+    return still + share * both, turn + 2 * arb(h) * gamma * e + both / share
 
 
 def quadratic(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq) -> tuple[arb_mat, arb_mat, list[arb_mat]]:
@@ -104,11 +126,11 @@ def quadratic(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq) -> tuple[
     return known, A, [arb_mat(n, 1, column) for column in b.transpose().tolist()]
 
 
-def step(P: fmpq_mat, G: Field, size: int, at_centre: arb) -> arb_mat:
-    """S_step / h: the square of all that is beyond the second order, and its product with f, of length `at_centre`.
+def length_beyond(P: fmpq_mat, G: Field, size: int) -> arb:
+    """Gamma: with ||v|| = (v'Pv)^(1/2) all that is beyond the first order is within Gamma ||d||^2.
 
-    With ||v|| = (v'Pv)^(1/2) these parts are within Gamma ||d||^2: sum_i e_i d'Q_i d is the image of the matrix dd'
-    under a linear map, and so is that of K; each error counts with the length of what it moves.
+    sum_i e_i d'Q_i d is the image of the matrix dd' under a linear map, and so is that of K; each error counts with the
+    length of what it moves.
     """
     of_P, components = arb_mat(P), G.components
     bent = arb_mat([list(g.Q.entries()) for g in components])
@@ -121,7 +143,7 @@ def step(P: fmpq_mat, G: Field, size: int, at_centre: arb) -> arb_mat:
         lengths = row_products(moved * of_P, moved)
         sizes = [total(G.units.squares[q, i * (size + 1)] for i in range(size)) for q in range(len(lengths))]
         gamma += total(root(v) * root(w) for v, w in zip(lengths, sizes, strict=True))
-    return (gamma * gamma + 2 * at_centre * gamma) * identity(size)
+    return gamma
 
 
 def length_of(M: arb_mat, P: arb_mat) -> arb:

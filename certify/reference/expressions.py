@@ -10,6 +10,7 @@ import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from flint import fmpq
@@ -56,18 +57,26 @@ class Equations:
     steps: tuple[Step, ...]
     results: tuple[int, ...]
 
+    @cached_property
+    def used_up(self) -> list[list[int]]:
+        """For each step the earlier ones that no later step asks for, nor a result."""
+        last = {operand: k for k, step in enumerate(self.steps) for operand in operands_of(step)}
+        found: list[list[int]] = [[] for _ in self.steps]
+        for operand, k in last.items():
+            if operand not in self.results:
+                found[k].append(operand)
+        return found
+
     def evaluate(self, names: Mapping[str, Any], constant: Callable[[fmpq], Any]) -> list[Any]:
         """Over anything that has `+`, `*`, unary `-` and `function(name)`; `1/` is a function.
 
         A value is dropped after its last use: a model of many variables is large.
         """
-        last = {operand: k for k, step in enumerate(self.steps) for operand in operands_of(step)}
         values: dict[int, Any] = {}
-        for k, step in enumerate(self.steps):
+        for k, (step, used_up) in enumerate(zip(self.steps, self.used_up, strict=True)):
             values[k] = evaluated(step, values, names, constant)
-            for operand in operands_of(step):
-                if last[operand] == k and operand not in self.results:
-                    values.pop(operand, None)
+            for operand in used_up:
+                del values[operand]
         return [values[k] for k in self.results]
 
 

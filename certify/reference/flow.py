@@ -17,15 +17,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from flint import arb, arb_mat, fmpq
+from flint import arb, fmpq
 
-from .balls import ZERO
+from .balls import SPREAD, ZERO
 from .document import Certificate, Interval
 from .evidence import Ball
 from .expressions import Equations
 from .fields import exact
 from .loop import Field, Known, Loop
-from .model import SPREAD, Model
+from .model import Model
 from .rational import inverse_diagonal
 from .refusal import Refused, require
 from .series import Constant, added, coefficients
@@ -129,11 +129,11 @@ def reached_on(loop: Loop, known: Known, at: str) -> dict[str, Model]:
         within = dict(zip(c.plant.states, moved, strict=True))
         F = loop.field(replace(known, names={**known.names, **within}), uncertain, "flow", at).components
         F = [settled(c)(f) for f in F]
-        most = [arb((hi * abs(f.v)).upper()) for f in F], [arb((hi * f.radius).upper()) for f in F]
+        most = [arb((hi * f.size).upper()) for f in F], [arb((hi * f.radius).upper()) for f in F]
         rests = [c.ends_at_origin and v.is_zero() for v in most[0]]
         stays = all(rest or v < k for rest, v, k in zip(rests, most[0], far, strict=True))
         if stays and all(v < t for v, t in zip(most[1], turned, strict=True)):
-            ranges = [f.v + f.radius * SPREAD for f in F]
+            ranges = [f.v + f.reach * SPREAD for f in F]
             largest = (arb(exact(c.inner) * s).sqrt() for s in inverse_diagonal(c.P, "lyapunov"))
             sizes = [x.slope.min(size) for x, size in zip(states, largest, strict=True)]
             in_domain(c, [v * SPREAD for v in sizes], ranges, at)
@@ -145,8 +145,7 @@ def reached_on(loop: Loop, known: Known, at: str) -> dict[str, Model]:
 
 def beyond(x: Model, far: arb, turned: arb) -> Model:
     """x within far + turned ||d||."""
-    a = arb_mat(x.a.nrows(), 1, [v + turned * SPREAD for v in x.a.entries()])
-    return replace(x, v=x.v + far * SPREAD, a=a)
+    return replace(x, off=x.off + far, slack=x.slack + turned)
 
 
 def in_domain(c: Certificate, states: Sequence[arb], F: Sequence[arb], at: str) -> None:
@@ -211,7 +210,7 @@ def within_both(x: arb, w: arb) -> arb:
 
 
 def widened(x: Taylor, far: arb) -> Taylor:
-    return replace(x, r=x.r + far)
+    return x.widened(far)
 
 
 def mean_on(

@@ -17,7 +17,6 @@ from .document import Function
 from .flow import constant
 from .layers import Layer
 from .series import along
-from .symmetric import pairs
 from .taylor import Taylor
 
 
@@ -46,8 +45,8 @@ class Models:
 
     def is_above_by_lines(self, x: Sequence[Taylor]) -> bool:
         """The same of a network by the least value of its affine form."""
-        symbols = max(len(v.g or ()) for v in x)
-        forms = arb_mat([[v.c, *(v.g or [ZERO] * symbols)] for v in x])
+        symbols = max(v.symbols for v in x)
+        forms = arb_mat([[v.c, *entries(v.g, symbols)] for v in x])
         (((mid, slopes, error),),) = self.network.outputs(forms, 1)
         least = mid - total(abs(v) for v in slopes) - error
         return bool(least.is_finite()) and bool(least > self.level)
@@ -74,13 +73,20 @@ class Models:
 
 def mapped(W: arb_mat, magnitudes: arb_mat, x: Sequence[Taylor]) -> list[Taylor]:
     """W times a column of models."""
-    symbols = max(len(v.g or ()) for v in x)
-    bent = any(v.Q is not None for v in x)
-    none, flat = [ZERO] * symbols, [ZERO] * (len(pairs(symbols)) if bent else 0)
-    rows = (W * arb_mat([[v.c, *(v.g or none), *(v.Q or flat)] for v in x])).tolist()
-    rest = (magnitudes * arb_mat([[v.r] for v in x])).entries()
-    end = 1 + symbols
+    symbols = max(v.symbols for v in x)
+    square = symbols**2 if any(v.Q is not None for v in x) else 0
+    rows = (W * arb_mat([[v.c, *entries(v.g, symbols), *entries(v.Q, square)] for v in x])).tolist()
+    rest, end = (magnitudes * arb_mat([[v.r] for v in x])).entries(), 1 + symbols
     return [
-        Taylor(row[0], row[1:end] if symbols else None, row[end:] if bent else None, r)
+        Taylor(
+            row[0],
+            arb_mat(1, symbols, row[1:end]) if symbols else None,
+            arb_mat(symbols, symbols, row[end:]) if square else None,
+            r,
+        )
         for row, r in zip(rows, rest, strict=True)
     ]
+
+
+def entries(part: arb_mat | None, count: int) -> list[arb]:
+    return [ZERO] * count if part is None else list(part.entries())

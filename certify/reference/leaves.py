@@ -11,7 +11,7 @@ from itertools import islice
 
 from flint import arb, arb_mat, fmpq_mat
 
-from .affine import Affine, Network, clip, tanh
+from .affine import Affine, Network, clip
 from .balls import (
     ZERO,
     beta,
@@ -19,6 +19,7 @@ from .balls import (
     net_at_0,
     origin,
     total,
+    weights,
     within_bounds,
 )
 from .document import Certificate
@@ -26,12 +27,10 @@ from .evidence import Covering, Tree
 from .flow import Moving, constant, mean_on, reached_from
 from .rational import inverse_diagonal
 from .refusal import Refused, require
-from .symmetric import pairs
 from .taylor import Taylor
 
 LEAF = 255
 MAX_WAITING = 4096  # boxes of the tree beside the one in hand
-BATCH = 2**14  # tanhs of a layer, over all leaves of a batch
 
 
 def structure(tree: bytes, axes: Collection[int], rule: str = "tree", where: str = "") -> int:
@@ -118,9 +117,7 @@ class Leaves:
         self.S = [arb(S[i, i]) for i in range(c.n)]
         self.cross = [(i, j, arb(2 * abs(S[i, j]))) for j in range(c.n) for i in range(j) if S[i, j] != 0]
         self.inner, self.outer = arb(c.inner), arb(c.outer)
-        self.network = Network(c.policy.layers)
-        self.net_at_0 = net_at_0(c, self.network.weights)
-        self.beta = beta(c) if c.policy.centre == "preactivation" else []
+        self.network, self.offset = centred(c)
 
     # ------------------------------------------------------------------------------------------------- which leaves
 
@@ -176,18 +173,11 @@ class Leaves:
         read = x + arb_mat(self.n, x.ncols(), [v for row in at for v in (row, *further) * count])
         return [[self.output(j, net) for net in nets] for j, nets in enumerate(self.network.outputs(read, count))]
 
-    def output(self, j: int, net: Affine) -> Affine:
-        """Input j from its net output."""
-        policy, (mid, slopes, error), at_0 = self.c.policy, net, self.net_at_0[j]
-        if policy.centre == "preactivation":
-            mid += self.beta[j] - at_0
-        if policy.squash == "tanh":
-            (mid, slopes, error), _, _ = tanh((mid, slopes, error))
-            at_0 = at_0.tanh()
-        scale = arb(policy.scale[j])
-        shift = arb(self.c.plant.u_eq[j]) - scale * at_0 if policy.centre == "output" else arb(policy.offset[j])
-        u = scale * mid + shift, [scale * v for v in slopes], abs(scale) * error
-        limits = policy.limits(j)
+    def output(self, j: int, squashed: Affine) -> Affine:
+        """Input j from the network's output."""
+        policy, (mid, slopes, error) = self.c.policy, squashed
+        scale, limits = arb(policy.scale[j]), policy.limits(j)
+        u = scale * mid + self.offset[j], [scale * v for v in slopes], abs(scale) * error
         return u if limits is None else clip(u, arb(limits[0]), arb(limits[1]))
 
     # ----------------------------------------------------------------------------------------------------- the ring
@@ -209,7 +199,7 @@ class Leaves:
 
     def affine(self, row: list[arb]) -> Taylor:
         """A list [constant, coefficients of d]."""
-        return Taylor(row[0], row[1:] + [ZERO] * (self.symbols - self.n))
+        return Taylor(row[0], arb_mat(1, self.symbols, row[1:] + [ZERO] * (self.symbols - self.n)))
 
     def F(self, leaf: Leaf) -> list[Taylor]:
         """Models of f(x, pi(x), q), all of them finite."""
@@ -247,7 +237,8 @@ class Leaves:
 
     def moving(self, mid: arb, slopes: list[arb], symbol: int, size: arb) -> Taylor:
         """mid + slopes.d + size times a symbol of its own."""
-        return Taylor(mid, slopes + [size if i == symbol else ZERO for i in range(self.n, self.symbols)])
+        own = [size if i == symbol else ZERO for i in range(self.n, self.symbols)]
+        return Taylor(mid, arb_mat(1, self.symbols, slopes + own))
 
     def D(self, leaf: Leaf, within: dict[str, Taylor] | None = None) -> Taylor:
         """(2 P x + h P G)'G: Vdot in continuous time. What V changes by over a step, by its length.
@@ -270,9 +261,10 @@ class Leaves:
         each = list(zip(self.S, leaf.centre, leaf.radius, strict=True))
         c = total(s * z * z for s, z, _ in each)
         g = [2 * s * z * r for s, z, r in each] + [ZERO] * (self.symbols - self.n)
-        diagonal = [s * r * r for s, _, r in each]
-        Q = [diagonal[i] if i == j and i < self.n else ZERO for i, j in pairs(self.symbols)]
-        return Taylor(c, g, Q, self.cross_part(leaf.box))
+        Q = arb_mat(self.symbols, self.symbols)
+        for i, (s, _, r) in enumerate(each):
+            Q[i, i] = s * r * r
+        return Taylor(c, arb_mat(1, self.symbols, g), Q, self.cross_part(leaf.box))
 
     def decreases(self, leaf: Leaf, within: dict[str, Taylor] | None = None) -> bool:
         """True if D', D' + k (c2 - V) or D' + k (V - c1), D' = D + 2 lambda V, is certainly negative for some k >= 0.
@@ -293,23 +285,41 @@ class Leaves:
         A step from there then leads to V + h D < V + h k (c0 - V) <= c0, if no ball has shown it. From c0 on D' < 0.
         """
         tried = [ZERO, *(k for k in kinks(D, above) if k >= 0 and k * self.step <= 1), 1 / self.step]
-        return any((D + above.scaled(k)).bound() < 0 for k in tried)
+        return any((D + above.scaled(k)).is_negative() for k in tried)
 
     def is_beyond_floor(self, box: Box) -> bool:
         """True if V is certainly at least the inner level on all of the box."""
         return bool(self.diagonal_part(box.least()) - self.cross_part(box) >= self.inner)
 
 
+def centred(c: Certificate) -> tuple[Network, list[arb]]:
+    """The policy's layers and its offset, with the centring in the last bias or in the offset."""
+    policy, squashed = c.policy, c.policy.squash == "tanh"
+    last, offset = policy.layers[-1].bias, [arb(v) for v in policy.offset]
+    if policy.centre == "none":
+        return Network(policy.layers, squashed), offset
+    at_0 = net_at_0(c, weights(policy.layers))
+    if policy.centre == "preactivation":
+        bias = [arb(b) - v + at for b, v, at in zip(last, at_0, beta(c), strict=True)]
+        return Network(policy.layers, squashed, bias), offset
+    each = zip(policy.scale, at_0, c.plant.u_eq, strict=True)
+    offset = [arb(u_eq) - arb(s) * (v.tanh() if squashed else v) for s, v, u_eq in each]
+    return Network(policy.layers, squashed), offset
+
+
 def is_negative(D: Taylor, slacks: Sequence[Taylor]) -> bool:
     """True if D, or D + k times one of the others for some k > 0, is certainly negative."""
-    if D.bound() < 0:
+    if D.is_negative():
         return True
-    return any(k > 0 and (D + slack.scaled(k)).bound() < 0 for slack in slacks for k in kinks(D, slack))
+    return any(k > 0 and (D + slack.scaled(k)).is_negative() for slack in slacks for k in kinks(D, slack))
 
 
 def kinks(D: Taylor, slack: Taylor) -> list[arb]:
     """Each k at which a coefficient of the first order vanishes in D + k slack."""
-    return [-(g / w).mid() for g, w in zip(D.g or (), slack.g or (), strict=D.g is not None)]
+    if D.g is None or slack.g is None:
+        return []
+    each = zip(D.g.entries(), slack.g.entries(), strict=True)
+    return [-(g / w).mid() for g, w in each if not w.is_zero()]
 
 
 def check_leaves(leaves: Leaves, evidence: Tree) -> None:
@@ -319,7 +329,7 @@ def check_leaves(leaves: Leaves, evidence: Tree) -> None:
     asked, and in continuous time that F has a finite model, but where time has steps that V stays below c0.
     """
     c, bounded = leaves.c, bounded_by_form(leaves.c)
-    size = max(1, BATCH // max(layer.rows for layer in c.policy.layers))
+    size = leaves.network.batch(c.n)
     covered = not leaves.alone
     asked = (box for box in boxes(evidence) if not (leaves.is_outside(box) or (covered and leaves.is_inside(box))))
     while batch := list(islice(asked, size)):

@@ -10,9 +10,6 @@ from typing import TYPE_CHECKING
 
 from flint import arb
 
-from .balls import largest_fourth
-from .refusal import Refused
-
 if TYPE_CHECKING:
     from .model import Model
 
@@ -29,41 +26,24 @@ class Beyond:
         return self.size + self.steep
 
 
-def of_product(v: Model, w: Model) -> arb | None:
+def of_product(v: Model, w: Model, wrong: arb) -> arb | None:
     """The Lipschitz constant of v w beyond K: v(0) times w's, (a.d) times w beyond Q, and the product beyond a.d.
 
-    A product has the size of each times the other's constant.
+    A product has the size of each times the other's constant. `wrong` bounds what Q and K are wrong by.
     """
     if v.lip is None or w.lip is None:
         return None
-    result = abs(v.range) * w.lip + abs(w.range) * v.lip
-    result += v.slope * _beyond_square(w, w.lip).both + w.slope * _beyond_square(v, v.lip).both
-    of_v, of_w = _beyond_linear(v, v.lip), _beyond_linear(w, w.lip)
-    return result + of_v.size * of_w.steep + of_w.size * of_v.steep
+    result = v.size * w.lip + w.size * v.lip
+    result += v.slope * beyond_square(w, w.lip).both + w.slope * beyond_square(v, v.lip).both
+    of_v, of_w = beyond_linear(v, v.lip), beyond_linear(w, w.lip)
+    return result + of_v.size * of_w.steep + of_w.size * of_v.steep + 3 * wrong
 
 
-def beyond_tangent(v: Model, name: str, at: tuple[arb, arb, arb, arb]) -> arb | None:
-    """The Lipschitz constant of phi''/2 (D^2 - y^2 - 2 y d'Qd) + phi'''/6 (D^3 - y^3) and the rest of the series.
-
-    D = y + z, y = a.d. The derivative of the rest by D is at most |phi''''|/6 |D|^3.
-    """
-    if v.lip is None:
-        return None
-    most = largest_fourth(name, at[0], v.range, v.radius)
-    if most is None:
-        raise Refused("contraction", "ball", f"{name} may be undefined")
-    beyond, left = _beyond_linear(v, v.lip), _beyond_square(v, v.lip)
-    y, z, steep = v.slope, beyond.size, beyond.steep
-    second = abs(at[2]) * (y * left.both + z * steep)
-    third = abs(at[3]) / 2 * (y * y * (steep + 2 * z) + y * z * (2 * steep + z) + z * z * steep)
-    return second + third + most / 6 * v.radius**3 * (y + steep)
-
-
-def _beyond_linear(v: Model, lip: arb) -> Beyond:
+def beyond_linear(v: Model, lip: arb) -> Beyond:
     """Bounds of the terms beyond v(0) + a.d; the Lipschitz constants of d'Qd and K[d] are 2 bend and 3 twist."""
     return Beyond(v.bend + v.twist + lip, 2 * v.bend + 3 * v.twist + lip)
 
 
-def _beyond_square(v: Model, lip: arb) -> Beyond:
+def beyond_square(v: Model, lip: arb) -> Beyond:
     """Bounds of the terms beyond v(0) + a.d + d'Qd."""
     return Beyond(v.twist + lip, 3 * v.twist + lip)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
-from .balls import ZERO, bounded_by_form, spanning, within_bounds
+from .balls import ZERO, bounded_by_form, within_bounds
 from .document import Certificate, Interval
 from .model import Model
 from .network import Network, Units
@@ -39,13 +39,15 @@ class Known:
     names: Mapping[str, Model]
     units: Units
 
-    def still(self, value: arb) -> Model:
-        """The model of a value that does not depend on d."""
-        some = next(iter(self.names.values()))
-        return Model.affine(value, [ZERO] * some.a.nrows(), some.errors, None if some.lip is None else ZERO)
-
     def constant(self, value: fmpq) -> Model:
-        return self.still(arb(value))
+        """The model of a number that does not depend on d."""
+        some = next(iter(self.names.values()))
+        return Model.affine(arb(value), [ZERO] * some.a.nrows(), some.errors, None if some.lip is None else ZERO)
+
+    def anything(self, ends: Interval) -> Model:
+        """A number between two others, which may be another one at each place."""
+        lo, hi = ends
+        return replace(self.constant((lo + hi) / 2), off=arb((hi - lo) / 2))
 
     def moving(self, ends: Interval, symbol: int, symbols: int) -> Model:
         """A number between two others, with a symbol of its own."""
@@ -117,6 +119,6 @@ class Loop:
         }
 
     def anything(self, known: Known) -> dict[str, Model]:
-        """The uncertain quantities as balls that contain their ranges, without symbols."""
+        """The uncertain quantities by their ranges, without symbols."""
         plant = self.c.plant
-        return {q: known.still(spanning(ends)) for q, ends in zip(plant.uncertain, plant.ranges, strict=True)}
+        return {q: known.anything(ends) for q, ends in zip(plant.uncertain, plant.ranges, strict=True)}

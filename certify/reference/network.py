@@ -17,6 +17,7 @@ from flint import arb, arb_mat, fmpq_mat
 
 from .balls import ONE, ZERO, absolute, beta, biased, columns_scaled, finite, net_at_0, origin, tanhs, weights
 from .document import Certificate
+from .functions import Expansion, beyond_tangent, expansion, steepness, steepness_beyond_tangent
 from .model import Model
 from .symmetric import half, no_form, whole
 
@@ -33,12 +34,16 @@ class Bends:
     R: list[list[arb]]
     lip: list[arb]
 
-    def append(self, H: arb_mat, C: arb_mat, R: arb_mat, lip: arb | None) -> None:
+    def append(self, y: Model, phi: Expansion) -> tuple[arb_mat, arb_mat]:
+        """The tanh of y; H and C."""
+        H, C, R = beyond_tangent(y, phi)
         self.H.append(half(H))
         self.C.append(C.entries())
         self.R.append(half(R))
+        lip = steepness_beyond_tangent(y, phi)
         if lip is not None:
             self.lip.append(lip)
+        return H, C
 
 
 @dataclass(frozen=True)
@@ -134,7 +139,7 @@ class Network:
         bends = Bends([], [], [], [])
         for layer in layers[:-1]:
             for y in layer.on(ball, bends, steady):
-                bends.append(*y.expanded("tanh")[2:])
+                bends.append(y, expansion(y, "tanh"))
         squashed, inputs, reached = self.c.policy.squash == "tanh", list[Model](), list[list[arb]]()
         L, hidden = layers[-1].L, len(bends.R)
         for j, (s, net) in enumerate(
@@ -143,10 +148,10 @@ class Network:
             y, slope, H, C = replace(net, v=self.before_squash(j, net.v, centre)), ONE, arb_mat(n, n), no_form(n)
             value, own, lip = y.v, [ZERO] * m, y.lip
             if squashed:
-                value, slope, H, C, R, beyond = y.expanded("tanh")
-                bends.append(H, C, R, None)
+                phi = expansion(y, "tanh")
+                (value, slope, _, _), lip = phi.at, steepness(y, phi, ZERO)
+                H, C = bends.append(y, phi)
                 own[j] = s
-                lip = None if y.lip is None or beyond is None else abs(slope) * y.lip + beyond
             ways = [s * slope * L[j, q] for q in range(hidden)] if L is not None else []
             reached.append(ways + own if squashed else ways)
             Q, K = s * (slope * y.Q + H), s * (slope * y.K + C)

@@ -18,7 +18,7 @@ from .document import Certificate
 from .evidence import Covering, Tree
 from .fields import exact
 from .function import Models
-from .leaves import BATCH, Box, Leaf, Leaves, boxes, cut, is_negative, structure
+from .leaves import Box, Leaf, Leaves, boxes, cut, is_negative, structure
 from .refusal import Refused, require
 from .taylor import Taylor
 
@@ -55,7 +55,7 @@ def face(c: Certificate, models: Models, k: int, tree: bytes) -> None:
     for box in cut(least, most, tree):
         centre, radius = middles(box)
         x = [
-            Taylor(v, [r if j == i else ZERO for j in range(c.n)])
+            Taylor(v, arb_mat(1, c.n, [r if j == i else ZERO for j in range(c.n)]))
             for i, (v, r) in enumerate(zip(centre, radius, strict=True))
         ]
         x[axis] = fixed
@@ -127,7 +127,7 @@ class Region:
         return [
             Taylor(
                 total(t * v for t, v in zip(row, centre, strict=True)),
-                [t * r for t, r in zip(row, radius, strict=True)],
+                arb_mat([[t * r for t, r in zip(row, radius, strict=True)]]),
             )
             for row in self.T
         ]
@@ -144,7 +144,7 @@ class Region:
 def check_leaves(c: Certificate, models: Models, covering: Covering) -> None:
     """In each batch of leaves on which something is asked rule `inputs` comes first."""
     region, bounded = Region(c, models, covering), bounded_by_form(c)
-    size = max(1, BATCH // max(layer.rows for layer in c.policy.layers))
+    size = region.leaves.network.batch(c.n)
     asked = (box for box in boxes(covering) if not region.is_free(box))
     while batch := list(islice(asked, size)):
         enclosed = region.leaves.enclose(batch)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from flint import ctx
 
 from . import rational
-from .balls import PRECISION
+from .balls import ON_LEAVES, PRECISION
 from .contraction import contraction
 from .document import Certificate, read
 from .evidence import WITH_TUBE, Trusted
@@ -73,7 +73,8 @@ def check(c: Certificate) -> int | None:
         local(loop, evidence.ball, evidence.cells)
     leaves = structure(evidence.tree, range(c.n))
     if c.inner < c.outer or loop is None:  # no local ball stands in for the leaves
-        check_leaves(Leaves(c, evidence.T, S), evidence)
+        with ctx.workprec(ON_LEAVES):
+            check_leaves(Leaves(c, evidence.T, S), evidence)
     if c.claim in WITH_TUBE:
         if loop is None or c.start is None:
             raise Refused("format", "claim.start", "the claim needs a start")
@@ -81,5 +82,6 @@ def check(c: Certificate) -> int | None:
     if evidence.contraction is not None:
         contraction(loop or Loop(c), evidence.contraction, evidence.cells)
     if c.beyond is not None:
-        outer(c, evidence)
+        with ctx.workprec(ON_LEAVES):
+            outer(c, evidence)
     return leaves

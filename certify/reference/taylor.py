@@ -1,70 +1,97 @@
 """Second-order Taylor models on a leaf, in which every coefficient is a ball.
 
-The quadratic part is kept as one coefficient for each pair of symbols, i <= j in the order of `pairs`, so that what
-cancels between Q_ij and Q_ji is gone at once. None stands for coefficients that are all 0: constants have no g, and
-what is affine has no Q.
+The coefficients are matrices, so that one operation of flint meets all of them. None stands for coefficients that are
+all 0: constants have no g, and what is affine has no Q.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Collection
+from functools import cache
 
-from flint import arb
+from flint import arb, arb_mat
 
-from .balls import ZERO, derivatives, finite, third, total
+from .balls import ONE, SPREAD, ZERO, derivatives, third, total
 from .refusal import Refused
-from .symmetric import pairs
 
-Coefficients = list[arb] | None
+HALF = ONE / 2
 
 
-def mix(a: arb, x: Coefficients, b: arb, y: Coefficients) -> Coefficients:
+def mix(a: arb, x: arb_mat | None, b: arb, y: arb_mat | None) -> arb_mat | None:
     """a x + b y."""
     if x is None:
-        return None if y is None else [b * v for v in y]
-    return [a * v for v in x] if y is None else [a * v + b * w for v, w in zip(x, y, strict=True)]
+        return None if y is None else y * b
+    return x * a if y is None else x * a + y * b
 
 
-def plus(x: Coefficients, y: Coefficients) -> Coefficients:
+def plus(x: arb_mat | None, y: arb_mat | None) -> arb_mat | None:
     if x is None:
         return y
-    return x if y is None else [v + w for v, w in zip(x, y, strict=True)]
+    return x if y is None else x + y
 
 
-def square(x: Coefficients, y: Coefficients) -> Coefficients:
-    """(x.d)(y.d)."""
-    if x is None or y is None:
-        return None
-    return [x[i] * y[j] + x[j] * y[i] if i < j else x[i] * y[i] for i, j in pairs(len(x))]
+@cache
+def anywhere(symbols: int) -> arb_mat:
+    """Every d of the box at once, a column; callers must not change it."""
+    return arb_mat(symbols, 1, [SPREAD] * symbols)
 
 
-@dataclass(frozen=True)
+@cache
+def anywhere_row(symbols: int) -> arb_mat:
+    return anywhere(symbols).transpose()
+
+
+def largest(value: arb_mat) -> arb:
+    """The largest magnitude in a ball, which is the only entry."""
+    return arb(value[0, 0].abs_upper())
+
+
 class Taylor:
-    """c + g.d + d'Qd + [-r, r] for d in [-1, 1]^symbols."""
+    """c + g.d + d'Qd + [-r, r] for d in [-1, 1]^symbols; g is a row, Q symmetric. Nothing changes a model.
 
-    c: arb
-    g: Coefficients = None
-    Q: Coefficients = None
-    r: arb = ZERO
+    A plain class, for a leaf has dozens of models and a certificate many thousands of leaves.
+    """
 
-    @cached_property
+    __slots__ = ("Q", "c", "g", "r", "reached")
+
+    def __init__(self, c: arb, g: arb_mat | None = None, Q: arb_mat | None = None, r: arb = ZERO) -> None:
+        if g is None and Q is not None:
+            g = arb_mat(1, Q.ncols())
+        self.c, self.g, self.Q, self.r = c, g, Q, r
+        self.reached: tuple[arb, arb] | None = None
+
+    def reaches(self) -> tuple[arb, arb]:
+        """Bounds of |g.d| and of |d'Qd|: in balls the magnitudes of all coefficients add up."""
+        if self.reached is None:
+            first = second = ZERO
+            if self.g is not None:
+                d = anywhere(self.g.ncols())
+                first = largest(self.g * d)
+                if self.Q is not None:
+                    second = largest(anywhere_row(self.g.ncols()) * (self.Q * d))
+            self.reached = first, second
+        return self.reached
+
+    @property
     def first(self) -> arb:
-        """The largest |g.d|."""
-        return total(abs(v) for v in self.g or ())
+        return self.reaches()[0]
 
-    @cached_property
+    @property
     def second(self) -> arb:
-        """A bound of |d'Qd|."""
-        return total(abs(v) for v in self.Q or ())
+        return self.reaches()[1]
+
+    @property
+    def symbols(self) -> int:
+        return 0 if self.g is None else int(self.g.ncols())
 
     def is_finite(self) -> bool:
-        return finite([self.c, self.r, *(self.g or ()), *(self.Q or ())])
+        """True if all coefficients are, for the bounds of no others are."""
+        return bool((self.c + sum(self.reaches(), self.r)).is_finite())
 
     def __add__(self, other: Taylor) -> Taylor:
         return Taylor(self.c + other.c, plus(self.g, other.g), plus(self.Q, other.Q), self.r + other.r)
 
-    def averaged(self, symbols: range) -> Taylor:
+    def averaged(self, symbols: Collection[int]) -> Taylor:
         """The mean of such numbers for many values of these symbols, each of which then stands for its own mean.
 
         The mean of the product of two is another number than that of their means: it lies in [-1, 1], that of a square
@@ -72,29 +99,42 @@ class Taylor:
         """
         if self.Q is None or not symbols:
             return self
-        c, r, Q = self.c, self.r, list(self.Q)
-        for k, (i, j) in enumerate(pairs(len(self.g or ()))):
-            if i in symbols and j in symbols:
-                c, r, Q[k] = (c + Q[k] / 2, r + abs(Q[k]) / 2, ZERO) if i == j else (c, r + abs(Q[k]), ZERO)
-        return Taylor(c, self.g, Q, r)
+        c, r, rows = self.c, self.r, self.Q.tolist()
+        for i in symbols:
+            c += rows[i][i] / 2
+            r += abs(rows[i][i]) / 2 + total(abs(rows[i][j]) for j in symbols if j != i)
+            rows[i] = [ZERO if j in symbols else v for j, v in enumerate(rows[i])]
+        return Taylor(c, self.g, arb_mat(rows), r)
 
     def scaled(self, k: arb) -> Taylor:
         return Taylor(k * self.c, mix(k, self.g, ZERO, None), mix(k, self.Q, ZERO, None), abs(k) * self.r)
 
     def __neg__(self) -> Taylor:
-        return self.scaled(arb(-1))
+        return Taylor(-self.c, None if self.g is None else -self.g, None if self.Q is None else -self.Q, self.r)
+
+    def widened(self, more: arb) -> Taylor:
+        return Taylor(self.c, self.g, self.Q, self.r + more)
 
     def __mul__(self, other: Taylor) -> Taylor:
         p, q = self, other
-        r = p.first * q.second + p.second * q.first + p.second * q.second
-        r += p.r * (abs(q.c) + q.first + q.second + q.r) + q.r * (abs(p.c) + p.first + p.second)
-        Q = plus(mix(p.c, q.Q, q.c, p.Q), square(p.g, q.g))
-        return Taylor(p.c * q.c, mix(p.c, q.g, q.c, p.g), Q, r)
+        if p.g is None or q.g is None:
+            p, q = (p, q) if p.g is None else (q, p)
+            return q.scaled(p.c).widened(p.r * (abs(q.c) + q.first + q.second + q.r))
+        (p_first, p_second), (q_first, q_second) = p.reaches(), q.reaches()
+        r = p_first * q_second + p_second * (q_first + q_second)
+        if not q.r.is_zero():
+            r += q.r * (abs(p.c) + p_first + p_second)
+        if not p.r.is_zero():
+            r += p.r * (abs(q.c) + q_first + q_second + q.r)
+        outer = p.g.transpose() * (q.g * HALF)
+        Q = plus(mix(p.c, q.Q, q.c, p.Q), outer + outer.transpose())
+        return Taylor(p.c * q.c, q.g * p.c + p.g * q.c, Q, r)
 
     def function(self, name: str) -> Taylor:
         """phi(c) + phi'(c) e + phi''(c) e^2 / 2 + phi'''(.) e^3 / 6 with e the model less its constant c."""
-        rest = self.second + self.r
-        reach, at = self.first + rest, derivatives(name, self.c)
+        first, second = self.reaches()
+        rest = second + self.r
+        reach, at = first + rest, derivatives(name, self.c)
         most = third(name, at[3], self.c, reach)
         if most is None:
             raise Refused(
@@ -103,25 +143,61 @@ class Taylor:
                 "a root of what may not be positive" if name == "sqrt" else "a division by what may be 0",
             )
         half = at[2] / 2
-        r = abs(at[1]) * self.r + abs(half) * (2 * self.first * rest + rest * rest) + most * reach**3 / 6
-        Q = mix(at[1], self.Q, half, square(self.g, self.g))
+        r = abs(at[1]) * self.r + abs(half) * (2 * first * rest + rest * rest) + most * reach**3 / 6
+        Q = mix(at[1], self.Q, ZERO, None)
+        if self.g is not None:
+            Q = plus(Q, self.g.transpose() * (self.g * half))
         return Taylor(at[0], mix(at[1], self.g, ZERO, None), Q, r)
 
+    def is_negative(self) -> bool:
+        """True if it certainly is, on all of the box."""
+        return bool(self.by_pairs() < 0) or bool(self.from_corner() < 0)
+
     def bound(self) -> arb:
+        """A bound from above: one of two, the lesser if that is certain."""
+        first, second = self.by_pairs(), self.from_corner()
+        return second if second < first else first
+
+    def by_pairs(self) -> arb:
         """c + r, a bound of each pair, and the exact maximum of g_i t + Q_ii t^2 over |t| <= 1 for each symbol."""
         result = self.c + self.r
         if self.g is None:
             return result
         if self.Q is None:
             return result + self.first
-        for (i, j), q in zip(pairs(len(self.g)), self.Q, strict=True):
-            g = abs(self.g[i])
-            if i < j:
-                result += abs(q)
-            elif q < 0 and g <= -2 * q:
+        for i, (g, row) in enumerate(zip(map(abs, self.g.entries()), self.Q.tolist(), strict=True)):
+            q = row[i]
+            if q < 0 and g <= -2 * q:
                 result += g * g / (-4 * q)  # at t = -g / 2q
             elif q < 0 and g >= -2 * q:
                 result += g + q
             else:
                 result += g + q.max(ZERO)
+            result += 2 * sum(map(abs, row[i + 1 :]), ZERO)
         return result
+
+    def from_corner(self) -> arb:
+        """The value at the corner to which g points, and a bound of what a move away from it adds.
+
+        With M_ij = s_i s_j Q_ij for signs s_i, of which any will do, and d_i = s_i (1 - w_i), this is sum_i w_i (sum_j
+        -M_ij (2 - w_j) - s_i g_i), where w_i and 2 - w_j lie in [0, 2].
+        """
+        if self.g is None or self.Q is None:
+            return self.c + self.r + self.first
+        g, result = self.g.entries(), self.c + self.r
+        negative = [bool(v < 0) for v in g]
+        for v, s, row in zip(g, negative, self.Q.tolist(), strict=True):
+            lost = v if s else -v  # -s_i g_i, and what may be gained is added
+            result -= lost
+            for t, q in zip(negative, row, strict=True):
+                M = q if s == t else -q
+                result += M
+                if not M >= 0:
+                    lost += 2 * positive_part(-M)
+            result += 2 * positive_part(lost)
+        return result
+
+
+def positive_part(v: arb) -> arb:
+    """A number at or above v and 0, and the greater of both if that is certain."""
+    return ZERO if v <= 0 else v if v >= 0 else abs(v)

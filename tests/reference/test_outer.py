@@ -13,6 +13,7 @@ import struct
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -27,7 +28,6 @@ from certify.reference.function import Models
 from certify.reference.leaves import Box
 from certify.reference.outer import Region, binary64_above
 from certify.reference.refusal import Refused
-from certify.reference.symmetric import pairs
 from certify.reference.taylor import Taylor
 from tests.reference.test_contraction import honest as around_a_level
 from tests.reference.test_practical import practical
@@ -88,9 +88,9 @@ def split(lo: list[float], hi: list[float], axes: Sequence[int], passes: Pass, m
 
 
 def grown(data: Document, most: int = 4000) -> Document:
-    """Trees whose leaves pass, if they are not too large."""
+    """Trees whose leaves pass, if they are not too large, by the bound that both programs have."""
     result = edited(data, "evidence.outer.tree", "/w==")
-    with ctx.workprec(PRECISION):
+    with ctx.workprec(PRECISION), patch.object(Taylor, "from_corner", Taylor.by_pairs):
         c = read(dump(data))
         region, bounded = region_of(c), bounded_by_form(c)
         models, root = region.models, list(region_tree(c).root)
@@ -135,7 +135,7 @@ def affine(box: Box, T: np.ndarray, symbols: int = 0) -> list[Taylor]:
     return [
         Taylor(
             sum((arb(t) * v for t, v in zip(row, centre, strict=True)), arb(0)),
-            [arb(t) * v for t, v in zip(row, radius, strict=True)] + [arb(0)] * (max(symbols, n) - n),
+            arb_mat([[arb(t) * v for t, v in zip(row, radius, strict=True)] + [arb(0)] * (max(symbols, n) - n)]),
         )
         for row in T.tolist()
     ]
@@ -592,8 +592,8 @@ def test_models_enclose_N_and_its_rate(name: str, seed: int) -> None:
             F = [
                 Taylor(
                     arb(generator.standard_normal()),
-                    [arb(v) for v in generator.standard_normal(symbols)],
-                    [arb(v) for v in 0.1 * generator.standard_normal(len(pairs(symbols)))],
+                    arb_mat([[arb(v) for v in generator.standard_normal(symbols)]]),
+                    symmetric(0.1 * generator.standard_normal((symbols, symbols))),
                     arb(0.01),
                 ),
                 Taylor(arb(generator.standard_normal())),
@@ -602,9 +602,9 @@ def test_models_enclose_N_and_its_rate(name: str, seed: int) -> None:
                 value, rate = models.moving(x, F)
                 alone = models.value(affine(box, T))
                 if models.N.layers:
-                    forms = arb_mat([[v.c, *(v.g or [])] for v in affine(box, T)])
+                    forms = arb_mat([[v.c, *v.g.entries()] for v in affine(box, T)])
                     (((mid, slopes, error),),) = models.network.outputs(forms, 1)
-                    lined = Taylor(mid, slopes, None, error)
+                    lined = Taylor(mid, arb_mat([slopes]), None, error)
             except Refused:
                 assert name == "functions"
                 continue
@@ -653,16 +653,22 @@ def test_a_free_leaf_holds_no_point_of_which_something_is_said(name: str) -> Non
 
 def exactly_at(model: Taylor, d: Sequence[float]) -> arb:
     """c + g.d + d'Qd."""
-    value = model.c + sum((g * e for g, e in zip(model.g or [], d, strict=model.g is not None)), arb(0))
-    for (i, j), q in zip(pairs(len(d)), model.Q or [], strict=model.Q is not None):
-        value += q * arb(d[i]) * arb(d[j])
+    value, column = model.c, arb_mat(len(d), 1, list(map(arb, d)))
+    if model.g is not None:
+        value += (model.g * column)[0, 0]
+    if model.Q is not None:
+        value += (column.transpose() * model.Q * column)[0, 0]
     return value
+
+
+def symmetric(A: np.ndarray) -> arb_mat:
+    return arb_mat([[arb(v) for v in row] for row in (A + A.T).tolist()])
 
 
 @pytest.mark.parametrize("bad", ["inf", "-inf", "nan"])
 def test_what_is_not_finite_is_not_accepted(bad: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """+inf > n2 and -inf < 0 are certain, and say nothing."""
-    data, broken = honest("an affine network"), Taylor(arb(bad), [arb(0)])
+    data, broken = honest("an affine network"), Taylor(arb(bad), arb_mat([[0]]))
     with ctx.workprec(PRECISION):
         region = region_of(read(dump(data)))
         assert not region.models.is_above([broken])

@@ -7,10 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from flint import arb, ctx, fmpq
+from flint import arb, arb_mat, ctx, fmpq
 
 from certify.reference.__main__ import in_words
-from certify.reference.balls import PRECISION, derivatives, spanning, third
+from certify.reference.balls import PRECISION, derivatives, third
 from certify.reference.document import Certificate
 from certify.reference.document import read as read_certificate
 from certify.reference.leaves import Box, Leaves
@@ -20,7 +20,7 @@ from certify.reference.model import Model
 from certify.reference.rational import coordinates
 from certify.reference.refusal import Refused
 from certify.reference.rules import judge as whole_verdict
-from certify.reference.taylor import Taylor, pairs
+from certify.reference.taylor import Taylor
 from tests.checker.test_ball import points
 from tests.checker.test_uncertain import HONEST, Edit, forgeries, honest, in_arb, wider
 from tests.support.balls import exactly
@@ -107,6 +107,11 @@ def test_models_in_a_cell_enclose_F_for_all_its_values(factor: str) -> None:
                 assert holds(F, true, d, 2 * share - 1), (q, d)
 
 
+def spanning(ends: tuple[fmpq, fmpq]) -> arb:
+    """A ball that contains every number between two rationals."""
+    return arb(ends[0]).union(arb(ends[1]))
+
+
 def holds(f: Model, true: arb, d: list[float], y: Fraction | int) -> bool:
     return may_be(f.where([ball(Fraction(y))]), true, d)
 
@@ -178,9 +183,11 @@ def test_leaf_models_enclose_Vdot_at_every_value(seed: int) -> None:
 
 
 def value_at(model: Taylor, d: list[arb]) -> arb:
-    value = model.c + sum((g * e for g, e in zip(model.g or [], d, strict=True)), arb(0))
-    for (i, j), q in zip(pairs(len(d)), model.Q or [], strict=model.Q is not None):
-        value += q * d[i] * d[j]
+    value, column = model.c, arb_mat(len(d), 1, list(d))
+    if model.g is not None:
+        value += (model.g * column)[0, 0]
+    if model.Q is not None:
+        value += (column.transpose() * model.Q * column)[0, 0]
     return value + model.r.union(-model.r)
 
 

@@ -78,7 +78,8 @@ def beyond(value: arb, v: Model, d: Sequence[Any]) -> arb:
 
 def may_be(v: Model, true: arb, d: Sequence[Any]) -> bool:
     """Whether a value at d is not certainly outside; each number of the model is a ball, of which no more is known."""
-    rest = form(v.whole, d)
+    length = sum((arb(x) ** 2 for x in d), arb(0)).sqrt()
+    rest = form(v.whole, d) + v.doubt + v.turn * length
     return bool((true - linear(v, d) - curved(v, d)).overlaps(rest.union(-rest)))
 
 

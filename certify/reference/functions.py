@@ -1,0 +1,135 @@
+"""Functions of models on a ball: the series of phi at the value of v in the centre, and what it leaves out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from flint import arb, arb_mat
+
+from .balls import SPREAD, ZERO, derivatives, fourth, identity, largest_fourth
+from .lipschitz import beyond_linear, beyond_square
+from .refusal import Refused
+from .symmetric import linear_times_square, no_form
+
+if TYPE_CHECKING:
+    from .model import Model
+
+Four = tuple[arb, arb, arb, arb]
+
+
+@dataclass(frozen=True)
+class Expansion:
+    """phi, phi', phi''/2 and phi'''/6 at v, and how far they have `moved` from there at any v(0).
+
+    On the ball phi is within fourth D^4 of its cubic at v(0), D = v - v(0), and the derivative of what it adds to that
+    is within last |D|^3.
+    """
+
+    at: Four
+    moved: Four
+    fourth: arb
+    last: arb
+
+    @cached_property
+    def steepest(self) -> arb:
+        return abs(self.at[1]) + self.moved[1]
+
+    @cached_property
+    def bent(self) -> arb:
+        return abs(self.at[2]) + self.moved[2]
+
+    @cached_property
+    def twisted(self) -> arb:
+        return abs(self.at[3]) + self.moved[3]
+
+
+def coefficients(name: str, y: arb) -> Four:
+    """phi, phi', phi''/2 and phi'''/6 on a ball."""
+    value, first, second, third = derivatives(name, y)
+    return value, first, second / 2, third / 6
+
+
+def function_of(v: Model, name: str) -> Model:
+    """The model of phi of v."""
+    phi = expansion(v, name)
+    H, C, R = beyond_tangent(v, phi)
+    (value, p, half, _), moved, steepest = phi.at, phi.moved, phi.steepest
+    wrong = moved[1] * v.spread
+    E = steepest * v.E + R + wrong * identity(v.a.nrows())
+    lip = steepness(v, phi, wrong)
+    B, dv = tuple(p * q for q in v.B), tuple(p * q for q in v.dv)
+    by_y = 2 * abs(half) * v.sway
+    da = tuple(p * a + (2 * half * q) * v.a for q, a in zip(v.dv, v.da, strict=True))
+    square = v.doubt * v.doubt
+    off = abs(p) * v.off + phi.bent * square
+    slack = (2 * phi.bent * v.off + 3 * phi.twisted * square) * v.slope
+    slack += (abs(p) + by_y) * v.slack + by_y * v.tilt
+    Q, K = p * v.Q + H, p * v.K + C
+    return replace(v, v=value, a=p * v.a, Q=Q, K=K, E=E, B=B, dv=dv, da=da, lip=lip, off=off, slack=slack)
+
+
+def expansion(v: Model, name: str) -> Expansion:
+    """The function's series at v, or a refusal.
+
+    Whoever asked for the ball knows the rule and the place of a refusal, and puts them into it.
+    """
+    at = there = coefficients(name, v.v)
+    anywhere, moved = v.v, (ZERO, ZERO, ZERO, ZERO)
+    if not v.doubt.is_zero():
+        anywhere += v.doubt * SPREAD
+        there = coefficients(name, anywhere)
+        a, b, c, d = (arb((p - q).abs_upper()) for p, q in zip(there, at, strict=True))
+        moved = a, b, c, d
+    most, last = (bound(name, there[0], anywhere, v.radius) for bound in (fourth, largest_fourth))
+    if most is None or last is None:
+        what = "a root of what may not be positive" if name == "sqrt" else "a division by what may be 0"
+        raise Refused("local", "ball", what)
+    return Expansion(at, moved, most / 24, last / 6)
+
+
+def beyond_tangent(v: Model, phi: Expansion) -> tuple[arb_mat, arb_mat, arb_mat]:
+    """H, C and R: what phi adds to its tangent is d'Hd + C[d] within d'Rd.
+
+    With D = v - v(0), y = a.d and z = D - y, within curve and d'Wd: h D^2 is h y^2 and 2 h y d'Qd but for what is
+    left of z in 2 h y z and for h z^2; g D^3 is g y^3 but for g z (3 y^2 + 3 y z + z^2); and D^4 is at most
+    radius^2 (y^2 + (2 |y| + |z|) |z|). Here h, g and a are those at y = 0: by what they differ R is larger.
+    """
+    n, slope, curve, a = v.a.nrows(), v.slope, v.curve, v.a
+    _, _, h, g = phi.at
+    outer = a * a.transpose()
+    C = no_form(n) if slope.is_zero() else linear_times_square(a, 2 * h * v.Q + g * outer)
+    quartic = phi.fourth * v.radius * v.radius
+    rest = 2 * phi.bent * slope
+    turned = phi.bent * curve + phi.twisted * (3 * slope * (slope + curve) + curve * curve)
+    turned += quartic * (2 * slope + curve)
+    known = rest * v.twist + turned * (v.bend + v.twist) + mistaken(v, phi)
+    return h * outer, C, (rest + turned) * v.whole + quartic * outer + known * identity(n)
+
+
+def mistaken(v: Model, phi: Expansion) -> arb:
+    """A bound of what differs in H, C and quartic a a' for other y, on the ball."""
+    s, quartic = v.slope, phi.fourth * v.radius * v.radius
+    wrong = phi.moved[2] * (s * s + 2 * s * v.bend) + phi.moved[3] * s * s * s
+    return wrong + (2 * (phi.bent + quartic) * s + 2 * phi.bent * v.bend + 3 * phi.twisted * s * s) * v.turn
+
+
+def steepness(v: Model, phi: Expansion, wrong: arb) -> arb | None:
+    """The Lipschitz constant of phi(v) beyond its K; `wrong` bounds what phi' Q and phi' K are wrong by."""
+    beyond = steepness_beyond_tangent(v, phi)
+    return None if v.lip is None or beyond is None else phi.steepest * v.lip + beyond + 3 * wrong
+
+
+def steepness_beyond_tangent(v: Model, phi: Expansion) -> arb | None:
+    """The Lipschitz constant of phi''/2 (D^2 - y^2 - 2 y d'Qd) + phi'''/6 (D^3 - y^3) and the rest of the series.
+
+    D = y + z, y = a.d. The derivative of the rest by D is at most `last` |D|^3.
+    """
+    if v.lip is None:
+        return None
+    beyond, left = beyond_linear(v, v.lip), beyond_square(v, v.lip)
+    y, z, steep = v.slope, beyond.size, beyond.steep
+    second = 2 * phi.bent * (y * left.both + z * steep)
+    third = 3 * phi.twisted * (y * y * (steep + 2 * z) + y * z * (2 * steep + z) + z * z * steep)
+    return second + third + phi.last * v.radius**3 * (y + steep) + 3 * mistaken(v, phi)
