@@ -145,7 +145,7 @@ class BoundsEngine(Engine):
 
 
 def _cut_short(ring: RingProof) -> Stop | None:
-    """What ended the search of a ring before it knew; None if nothing did."""
+    """The stop that ended the search of a ring before its time; None if none did."""
     return ring.stop if ring.stop is Stop.CLUSTER or ring.stop.ran_out else None
 
 

@@ -130,12 +130,23 @@ def prove_inwards(
         stop = ring.advance(budget, report)
         if stop is not None:
             ring.settle()
-            ring.advance(replace(budget, effort=ring.closing(budget, budget.effort.spent - before)), report)
+            ring.advance(replace(budget, effort=_to_close(ring, budget, budget.effort.spent - before)), report)
         found = ring.proof(stop)
         # A step from below may end above a level to which the ring reaches: then there is none from which it does not.
         floor = _HIGHER * max(floor, found.inner)
         if found.covered or not rule.step or floor >= outer or budget.effort.over:
             return found
+
+
+def _to_close(ring: Pass, budget: Budget, took: float) -> Effort:
+    """The effort in which a settled pass may close its open boxes, of a budget that it took so much of.
+
+    Most need one look. Inside the inner level some need more, where inputs leave their bounds or steps lead far; for
+    these it may take as much again as it took, unless the clock ended it.
+    """
+    looks = _LOOKS * (len(ring.frontier) * ring.rule.operations + _BATCH)
+    more = looks if budget.effort.is_short_of_time else max(looks, took)
+    return budget.effort if budget.effort.left == math.inf else budget.effort.part(more, even_if_over=True)
 
 
 def _root(problem: Problem, T: Array, level: float) -> Array:
@@ -288,16 +299,6 @@ class Pass:
     def expected(self) -> float:
         """Boxes that the search may need before it gains anything, by the last batch."""
         return len(self.frontier) * math.exp2(min(1000.0, self.halvings))
-
-    def closing(self, budget: Budget, took: float) -> Effort:
-        """The effort in which a settled pass may close its open boxes, of a budget that it took so much of.
-
-        Most need one look. Inside the inner level some need more, where inputs leave their bounds or steps lead far;
-        for these it may take as much again as it took, unless the clock ended it.
-        """
-        looks = _LOOKS * (self._open() * self.rule.operations + _BATCH)
-        more = looks if budget.effort.is_short_of_time else max(looks, took)
-        return budget.effort if budget.effort.left == math.inf else budget.effort.part(more, even_if_over=True)
 
     def settle(self) -> None:
         """Take the levels that are proved for good: open boxes lie outside of them, and most need one look."""
