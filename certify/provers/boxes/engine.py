@@ -85,7 +85,9 @@ class BoundsEngine(Engine):
         if task.exactly:
             bands = [band for band in bands if band.top >= task.target]
         where = "near" if task.exactly else "around"
-        why = f"Vdot >= 0 or an input out of bounds was sampled {where} every level"
+        plain = not (task.problem.rate or task.problem.loop.system.in_steps)
+        what = "Vdot >= 0" if plain else "a V that does not fall enough"
+        why = f"{what} or an input out of bounds was sampled {where} every level"
         found = Proof(None, None, Stop.FLOOR, why)
         for k, band in enumerate(bands):
             share = budget.effort.share(1.0 if k == len(bands) - 1 else 0.5)
