@@ -316,7 +316,8 @@ def _longer(result: RoaResult, options: RoaOptions, proof: Proof | None, effort:
         more = options.effort + 2 * left / WHOLE  # the check grows with the tree
         seconds = _round(effort.seconds_for(left))
         return Step((("--effort", _round(more)),), f"the ring needs about {seconds} s more at this pace")
-    return Step((("--effort", _round(10 * options.effort)),), "the set still grew when the effort ended")
+    ended = "nothing was proved yet" if result.levels.roa is None else "the set still grew"
+    return Step((("--effort", _round(10 * options.effort)),), f"{ended} when the effort ended")
 
 
 def _wider_domain(result: RoaResult, name: str, effort: Effort) -> Step:

@@ -19,18 +19,21 @@ from typing import Any, Literal
 
 import numpy as np
 
+from certify.analysis.asked import require_one_that_knows
+from certify.analysis.facts import Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
 from certify.analysis.run import Report, certify_roa, effort_of
 from certify.certificates import set_aside, sole_writer, write_atomically
 from certify.certificates.claims import Problem
-from certify.certificates.verdict import Verdict
+from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, exact
 from certify.loop.policies import TanhNetwork
 from certify.lyapunov import diagonalising_coordinates
 from certify.lyapunov.function import Quadratic
+from certify.provers.execution.threads import one_thread
 from certify.provers.falsify import is_violated
 
 Quantity = Literal["period", "rate"]
@@ -68,20 +71,22 @@ def certify_largest(
 
     Raises
     ------
-    InputError, BackendError, SoundnessError : those of `certify_roa`.
+    InputError, BackendError, SoundnessError : those of `certify_roa`, also where the options allow no such quantity.
     """
     start = time.perf_counter() - load_seconds
     plain = system.with_sample(None) if quantity == "period" else system
+    _require_possible(quantity, plain, options)
     effort = effort_of(options, load_seconds)
-    certify = partial(certify_roa, provenance=provenance, progress=progress)
-    with sole_writer(out), TemporaryDirectory(dir=out, prefix="attempt-") as folder:
+    certify = partial(certify_roa, provenance=provenance, progress=progress, keep=False)
+    with one_thread(), sole_writer(out), TemporaryDirectory(dir=out, prefix="attempt-") as folder:
         set_aside(out)
         share = effort.share(_FOR_THE_SET)
         here = Path(folder) / "first"
         first = certify(plain, network, here, replace(options, rate=0.0), load_seconds=load_seconds, effort=share)
         best, proved = first, None
         if first.verdict is Verdict.PROVED and first.problem is not None and first.levels.roa is not None:
-            P, level = first.problem.V.P, _SET * first.levels.roa
+            P = first.problem.V.P
+            level = _SET * first.levels.roa if options.level is None else options.level
             plain, network = first.system, first.network  # as seen from where V is 0
 
             def attempt(value: Fraction) -> RoaResult | None:
@@ -89,12 +94,39 @@ def certify_largest(
                 held = plain.with_sample((value, value)) if quantity == "period" else plain
                 share = effort.part(max(UNIT, _EACH * effort.left))
                 found = certify(held, network, Path(folder) / "next", asked, effort=share)
-                return replace(found, rest=first.rest) if found.verdict is Verdict.PROVED else None
+                return _named(found, first, options) if found.verdict is Verdict.PROVED else None
 
             largest = _largest(attempt, _tried(quantity, plain, network, P, level), lambda: effort.over)
             if largest is not None:
                 best, proved = largest
-        return _in_place(best, out, _notice(quantity, proved, first), time.perf_counter() - start)
+        notice = _notice(quantity, proved, first, options)
+        return _in_place(best, out, notice, time.perf_counter() - start)
+
+
+def _require_possible(quantity: Quantity, plain: System, options: RoaOptions) -> None:
+    """Refuse at the beginning what no attempt could be asked.
+
+    Raises
+    ------
+    InputError : an option excludes a rate, or a period, or the plant cannot have one.
+    """
+    if quantity == "rate":
+        replace(options, rate=1.0)
+    else:
+        require_one_that_knows(plain.with_sample((Fraction(1), Fraction(1))), options)
+
+
+def _named(found: RoaResult, first: RoaResult, options: RoaOptions) -> RoaResult:
+    """An attempt's result, by the names of the first run: its candidate, where the loop rests, whose level it is."""
+    name = first.candidate or ""
+    tried = tuple(replace(one, candidate=name) for one in found.tried)
+    found = replace(found, rest=first.rest, candidate=first.candidate, tried=tried)
+    if options.level is not None or found.stop is not Stop.REQUESTED or found.diagnosis is None:
+        return found
+    detail = f"{_SET:g} of the level proved without it"
+    reason, why = found.stop.explain(detail), f"the set that is proved without it is limited by {first.reason}"
+    diagnosis = replace(found.diagnosis, binds=reason, next=Step((), why))
+    return replace(found, detail=detail, diagnosis=diagnosis)
 
 
 def _largest(
@@ -153,13 +185,14 @@ def _short(value: Fraction) -> Fraction:
     return Fraction(f"{float(value):.{_DIGITS}g}")
 
 
-def _notice(quantity: Quantity, proved: Fraction | None, first: RoaResult) -> str | None:
+def _notice(quantity: Quantity, proved: Fraction | None, first: RoaResult, options: RoaOptions) -> str | None:
     if first.verdict is not Verdict.PROVED:
         return first.notice
     if proved is None:
         return f"no {quantity} could be proved for this set; the claim is the one without it"
     what = f"the input is held over {float(proved):g}" if quantity == "period" else f"the rate is {float(proved):g}"
-    return f"{what}, the largest of those tried that could be proved for {_SET:g} of the level proved without it"
+    level = f"{_SET:g} of the level proved without it" if options.level is None else f"the level {options.level:g}"
+    return f"{what}, the largest of those tried that could be proved for {level}"
 
 
 def _in_place(result: RoaResult, out: Path, notice: str | None, seconds: float) -> RoaResult:

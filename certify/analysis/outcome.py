@@ -82,7 +82,7 @@ def with_witness(result: RoaResult, task: Task, witness: Witness | None) -> RoaR
     """REFUTED by a witness; as it is without one."""
     if witness is None:
         return result
-    detail = witness.describe(result.system)
+    detail = witness.describe(result.system, task.problem.rate)
     levels = replace(result.levels, sampled_limit=witness.level)
     return replace(result, verdict=Verdict.REFUTED, stop=Stop.WITNESS, detail=detail, witness=witness, levels=levels)
 

@@ -49,6 +49,7 @@ def certify_roa(
     progress: Report | None = None,
     show: Callable[[bytes], None] | None = None,
     effort: Effort | None = None,
+    keep: bool = True,
 ) -> RoaResult:
     """Certify a region of attraction of `system` under `network`.
 
@@ -63,6 +64,7 @@ def certify_roa(
         ("check", None).
     show : called with the bytes of a certificate that the run ends with if they are accepted, before they are checked.
     effort : counted work of the run; by default that of the options.
+    keep : False if the folder does not outlive the caller, so that no search is kept for `--resume`.
 
     Returns
     -------
@@ -81,7 +83,7 @@ def certify_roa(
     with one_thread(), sole_writer(out):
         set_aside(out, keep=options.resume)
         with _runner_for(options) as runner:
-            can_keep, named = options.engine == "bounds", options.P is not None or options.only is not None
+            can_keep, named = keep and options.engine == "bounds", options.P is not None or options.only is not None
             tools = Tools(
                 out,
                 runner,

@@ -121,8 +121,9 @@ class NothingYetError(InputError):
 
 
 def identity(system: System, network: TanhNetwork, rate: float) -> str:
-    """A hash of the loop and the rate, which a search is about."""
-    said = json.dumps([loop_sections(system, network), float(rate).hex()], sort_keys=True)
+    """A hash of the loop, its periods and the rate, which a search is about."""
+    sample = None if system.sample is None else [str(h) for h in system.sample]
+    said = json.dumps([loop_sections(system, network), sample, float(rate).hex()], sort_keys=True)
     return hashlib.sha256(said.encode()).hexdigest()
 
 
@@ -195,8 +196,8 @@ def load(path: Path, loop: ClosedLoop, rate: float) -> Unfinished:
             raise ValueError("it has another hash than when it was written")
         if data["about"] != identity(loop.system, loop.network, rate):
             raise _Unfit(
-                f"the search in {path} is about another policy, plant, domain or rate; run without --resume, or into "
-                "another folder."
+                f"the search in {path} is about another policy, plant, domain, period or rate; run without --resume, "
+                "or into another folder."
             )
         if data["candidate"] is None:
             raise NothingYetError(f"the run that left {path} was stopped before it had a candidate.")

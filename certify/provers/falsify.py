@@ -44,15 +44,18 @@ class Witness:
     values: Mapping[str, Fraction] = field(default_factory=dict)
     period: Fraction | None = None
 
-    def describe(self, system: System) -> str:
-        """The violation in words."""
+    def describe(self, system: System, rate: float = 0.0) -> str:
+        """The violation in words, of a claim with this rate."""
         names = ", ".join(f"{s} = {v:.6g}" for s, v in zip(system.states, self.x, strict=True))
         names += "".join(f", {name} = {float(q):.6g}" for name, q in self.values.items())
         names += ", in deviations from x_eq," if system.operating_point() else ""
         what = "the input leaves its bounds" if self.kind == "input" else "Vdot >= 0"
+        at_rate = f" at the rate {rate:g}" if rate else ""
+        if self.kind == "vdot" and rate:
+            what = f"V does not fall{at_rate}"
         if self.kind == "vdot" and (system.time == "discrete" or self.period):
             over = "a step" if self.period is None else f"a period of {float(self.period):.6g}"
-            what = f"V does not fall over {over}"
+            what = f"V does not fall{at_rate} over {over}"
         return f"{what} at {names} with V = {self.level:.12g} (shown in Arb)"
 
 

@@ -7,10 +7,12 @@ import random
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from certify.analysis.options import RoaOptions
+from certify.analysis.results import RoaResult
 from certify.analysis.run import certify_roa
 from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT, UNLIMITED, Effort
@@ -107,3 +109,33 @@ def test_a_limit_on_the_clock_is_said_and_kept(tmp_path: Path) -> None:
     found = certify_roa(system, policy.network, tmp_path, RoaOptions(effort=100.0, time_limit=1.0))
     assert found.stop is Stop.TIME and found.search is not None
     assert found.diagnosis is not None and "--time-limit" in dict(found.diagnosis.next.options)
+
+
+def pendulum(out: Path, **options: Any) -> RoaResult:
+    return certify_roa(get_system("pendulum"), pendulum_network(), out, RoaOptions(**options))
+
+
+@pytest.mark.parametrize("candidate", ["robust", "peak"])
+@pytest.mark.parametrize(("limit", "most"), [("effort", 1e-4), ("time_limit", 1e-3)])
+def test_a_candidate_that_was_not_found_in_time_is_no_error(
+    candidate: str, limit: str, most: float, tmp_path: Path
+) -> None:
+    result = pendulum(tmp_path, candidate=candidate, **{limit: most})
+    assert result.verdict is Verdict.UNKNOWN and result.stop is (Stop.EFFORT if limit == "effort" else Stop.TIME)
+    assert result.candidate == candidate and result.search is None and result.diagnosis is not None
+    assert f"--{limit}".replace("_", "-") in dict(result.diagnosis.next.options)
+
+
+@pytest.mark.parametrize("candidate", ["robust", "peak"])
+def test_a_candidate_that_does_not_exist_is_no_error(
+    candidate: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("certify.analysis.candidates.robust._all_scaled", lambda *_: [])
+    result = pendulum(tmp_path, candidate=candidate)
+    assert result.verdict is Verdict.UNKNOWN and result.stop is Stop.LOCAL
+    assert result.diagnosis is not None and result.diagnosis.next.options == (("--candidate", "auto"),)
+
+
+def test_nothing_is_said_to_have_grown_where_nothing_is_proved(tmp_path: Path) -> None:
+    result = pendulum(tmp_path, candidate="peak", effort=1e-4)
+    assert result.diagnosis is not None and "nothing was proved" in result.diagnosis.next.why

@@ -264,6 +264,8 @@ OTHERS: dict[str, Callable[[], tuple[ClosedLoop, float]]] = {
     "plant": lambda: (ClosedLoop(WIDE.with_parameters({"m": Fraction(1, 7)}), pendulum_network()), 0.0),
     "domain": lambda: (ClosedLoop(dataclasses.replace(WIDE, domain=box(7, 31)), pendulum_network()), 0.0),
     "range": lambda: (ClosedLoop(WIDE.with_ranges({"m": (Fraction(1, 7), Fraction(1, 6))}), pendulum_network()), 0.0),
+    "period": lambda: (ClosedLoop(WIDE.with_sample((Fraction(1, 50), Fraction(1, 50))), pendulum_network()), 0.0),
+    "periods": lambda: (ClosedLoop(WIDE.with_sample((Fraction(0), Fraction(1, 50))), pendulum_network()), 0.0),
     "rate": lambda: (LOOP, 0.25),
 }
 
@@ -271,7 +273,7 @@ OTHERS: dict[str, Callable[[], tuple[ClosedLoop, float]]] = {
 @pytest.mark.parametrize("what", OTHERS)
 def test_a_search_of_something_else_is_refused(what: str, kept: tuple[Unfinished, bytes], tmp_path: Path) -> None:
     (tmp_path / "search.json").write_bytes(kept[1])
-    with pytest.raises(InputError, match="about another policy, plant, domain or rate"):
+    with pytest.raises(InputError, match="about another policy, plant, domain, period or rate"):
         load(tmp_path / "search.json", *OTHERS[what]())
 
 

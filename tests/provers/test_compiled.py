@@ -10,29 +10,35 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numba
 import numpy as np
 import pytest
 
 from certify.certificates.claims import Problem
+from certify.certificates.tree import LEAF
+from certify.loop.expressions import Number, cos, sin, symbols
 from certify.loop.expressions.tree import FUNCTIONS
-from certify.loop.plants import get_system
-from certify.loop.policies import load_policy
+from certify.loop.plants import System, get_system
+from certify.loop.policies import TanhNetwork, load_policy
 from certify.provers.base import Budget
 from certify.provers.bounds import compiled, kernels, loop_models, tape, taylor, vectors
 from certify.provers.bounds import policy as policies
 from certify.provers.bounds.compiled import Compiled
 from certify.provers.bounds.loop import played
+from certify.provers.boxes.mend import cut_leaf
 from certify.provers.boxes.rule import BoxBounds, VdotBound
 from certify.provers.boxes.search import prove_outwards
+from certify.provers.boxes.sweep import RingGrowth, Sweep
 from certify.provers.execution import ThreadRunner
-from tests.provers.test_steps import alone, stepped, uncertain_pendulum
+from tests.provers.test_steps import Stepped, alone, stepped, uncertain_pendulum
 from tests.provers.test_vdot import CASES, cartpole_case
 from tests.support.cases import case_of
-from tests.support.loops import pendulum_network
+from tests.support.loops import box, pendulum_network
 from tests.support.marks import slow_after
 from tests.support.ways import WAYS, Way, bounded
 
@@ -102,6 +108,47 @@ def test_a_box_is_bounded_alike_whatever_boxes_it_comes_with(name: str, way: Way
             found = bound(lo.take(part, -1), hi.take(part, -1), 1e-3, 10.0)
         for a, b in zip(whole, found, strict=True):
             assert np.array_equal(a.take(part, -1), b)
+
+
+def curved() -> Stepped:
+    """One state in discrete time, and four uncertain quantities: a model has ten products of these, even at a point,
+    which numpy sums in blocks if it may."""
+    x, u, *uncertain = symbols(["x", "u", "a", "b", "c", "d"])
+    a, b, c, d = uncertain
+    row = x / 2 + u / 4 + x * (sin(a + 2 * b + 3 * c + 5 * d) + a * b / 3 - c * d / 7 + cos(a - b / 5 + c - d / 9) - 1)
+    ranges = {q.name: (Fraction(-1, n), Fraction(1, n)) for n, q in enumerate(uncertain, 3)}
+    plant = System(
+        "curved", (x,), (u,), {}, (row,), (Number(0),), box(2), box(9), time="discrete",
+        disturbances=tuple(uncertain), ranges=ranges,
+    )  # fmt: skip
+    return stepped(plant, TanhNetwork((np.array([[0.3]]),), (np.zeros(1),), np.ones(1), np.zeros(1)))
+
+
+def test_a_violation_s_level_is_the_same_whatever_others_there_are() -> None:
+    """The levels after a step, which move the ring's, are of the same bits for a violation alone."""
+    case = curved()
+    rule = VdotBound(case.problem, case.T, inside=True)
+    growth = RingGrowth(cast("Sweep", SimpleNamespace(inner=1e-3, outer=10.0)), rule, np.ones(1))
+    lo, hi = boxes(1, 400, 1e-3)
+    judgement = judged("numpy", rule, lo, hi)
+    centres, every = 0.5 * (lo + hi), np.ones(400, dtype=np.bool_)
+    whole = growth.levels_of(centres, judgement._replace(violated=every))
+    for way in WAYS:
+        with bounded(way):
+            alone = [growth.levels_of(centres, judgement._replace(violated=np.arange(400) == i))[i] for i in range(400)]
+        assert np.array_equal(whole, alone)
+
+
+def test_a_leaf_is_cut_by_scores_of_more_than_one_box() -> None:
+    """A box alone would be bounded by other sums than the search's, and differently where loops are compiled."""
+    asked = list[int]()
+
+    def score(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+        asked.append(lo.shape[1])
+        return hi - lo
+
+    tree = cut_leaf(bytes([LEAF]), 0, np.array([-1.0, -2.0]), np.array([1.0, 2.0]), score)
+    assert len(tree) == 15 and set(asked) == {2}
 
 
 @pytest.mark.parametrize("name", slow_after(1, ["cartpole", "pendulum"]))

@@ -191,6 +191,31 @@ def test_budgets_leave_a_floor_that_is_proved(tmp_path: Path) -> None:
     assert ring.inner >= 0.999 * best.floor
 
 
+def hump() -> Case:
+    """x' = -x + u/1000, whose input, 2 tanh(2) at x = 0, leaves its bounds there alone: no box there is closed."""
+    x, u = symbols(["x", "u"])
+    bounds = ((Fraction(-9), Fraction(19, 10)),)
+    system = System("hump", (x,), (u,), {}, (-x + u / 1000,), (Number(0),), box(9), bounds)
+    weights, biases = (np.ones((2, 1)), np.array([[1.0, -1.0]])), (np.array([2.0, -2.0]), np.zeros(1))
+    network = TanhNetwork(weights, biases, np.ones(1), np.zeros(1), "identity", "none")
+    return case_of(system, network)
+
+
+def test_boxes_that_are_never_closed_end_with_the_effort() -> None:
+    """After a pass inwards its open boxes are closed; that was counted nowhere, and ended with four million."""
+    case, effort = hump(), Effort(5e7)
+    ring = prove_inwards(case.problem, case.T, 1e-6, 16.0 * case.P[0, 0], Budget(effort), ThreadRunner())
+    assert ring.stop is Stop.EFFORT and not ring.covered
+    assert ring.boxes < 100_000 and effort.spent < 3 * effort.granted
+
+
+def test_a_ring_that_the_effort_cut_short_is_not_said_to_be_impossible(tmp_path: Path) -> None:
+    system = get_system("pendulum").with_sample((Fraction(1, 50), Fraction(1, 50)))
+    result = certify_roa(system, pendulum_network(), tmp_path, RoaOptions(claim="practical", effort=0.003))
+    assert result.verdict is Verdict.UNKNOWN and result.stop is Stop.EFFORT
+    assert result.diagnosis is not None and "--effort" in dict(result.diagnosis.next.options)
+
+
 def test_an_exact_level(tmp_path: Path) -> None:
     result = certify_roa(*uncentred(), tmp_path, RoaOptions(claim="practical", level=2.0))
     assert result.verdict is Verdict.PROVED and result.levels.roa == 2.0

@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from certify.analysis.run import RoaOptions, certify_roa
 from certify.certificates.claims import Problem
-from certify.certificates.verdict import Stop
+from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
@@ -412,3 +414,29 @@ def test_the_order_is_chosen_once_and_the_same_each_time() -> None:
     assert choose_order(case.problem, case.T, 1e-3, 1.0) == choose_order(case.problem, case.T, 1e-3, 1.0) >= 2
     ring = prove_outwards(case.problem, case.T, 1e-3, 0.1, Budget(boxes=20_000), ThreadRunner())
     assert ring.stop is Stop.REQUESTED and ring.order >= 2 and math.isclose(ring.outer, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("dynamics", "time", "rate", "words"),
+    [
+        ("-x", "continuous", 1.0, "V does not fall at the rate 1 at x"),
+        ("x/2", "discrete", 0.375, "V does not fall at the rate 0.375 over a step at x"),
+        ("3*x/2", "discrete", 0.0, "V does not fall over a step at x"),
+        ("x", "continuous", 0.0, "Vdot >= 0 at x"),
+    ],
+)
+def test_a_violation_of_a_rate_is_not_said_to_be_more(dynamics: str, time: str, rate: float, words: str) -> None:
+    """At the fastest rate there is V falls, exactly at it: a condition of the claim fails, and Vdot < 0."""
+    loop = ClosedLoop(*alone(dynamics, time))
+    problem = Problem(loop, Quadratic(np.eye(1)), rate)
+    found = falsify(problem, np.eye(1), 1.0)
+    assert found is not None and refutes(problem, found, 1.0)
+    assert found.describe(loop.system, problem.rate).startswith(words)
+
+
+def test_a_refuted_rate_is_told_as_such(tmp_path: Path) -> None:
+    options = RoaOptions(P=np.eye(1), level=1.0, rate=1.0, claim="asymptotic")
+    system, network = alone("-x + u", "continuous")
+    result = certify_roa(system, dataclasses.replace(network, centre="output"), tmp_path, options)
+    assert result.verdict is Verdict.REFUTED
+    assert "V does not fall at the rate 1 " in result.reason and "Vdot" not in result.reason

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.analysis.candidates.robust import CONE, PROGRAM, robust_candidate, solve
+from certify.analysis.candidates.robust import CONE, PROGRAM, NoCandidateError, robust_candidate, solve
 from certify.effort import UNLIMITED, Effort
 from certify.errors import BackendError
 from certify.loop.closed_loop import ClosedLoop
@@ -36,7 +36,8 @@ def peak_candidate(loop: ClosedLoop, effort: Effort = UNLIMITED) -> Array:
 
     Raises
     ------
-    BackendError : cvxpy is missing, or there is no such P.
+    BackendError : cvxpy is missing.
+    NoCandidateError : there is no such P.
     InputError : the network is larger than the checker's local rule allows.
     """
     try:
@@ -64,7 +65,7 @@ def peak_candidate(loop: ClosedLoop, effort: Effort = UNLIMITED) -> Array:
         if effort.over:
             break
     if best is None or not slowest > 0:
-        raise BackendError("no ellipsoid is found that keeps what pushes the loop small beside the set")
+        raise NoCandidateError("no ellipsoid is found that keeps what pushes the loop small beside the set", effort)
     return best
 
 

@@ -49,6 +49,14 @@ _INSIDE = 0.995  # share of the room of an input or a state
 _BELOW = 1 - 1e-9  # share of the domain's limit
 
 
+class NoCandidateError(BackendError):
+    """There is no such candidate; `ran_out` says that the effort ended before it was looked for everywhere."""
+
+    def __init__(self, message: str, effort: Effort) -> None:
+        super().__init__(message)
+        self.ran_out = effort.over
+
+
 def robust_candidate(loop: ClosedLoop, effort: Effort = UNLIMITED) -> Array:
     """P (n, n), scaled so that the local rule proves {x'Px <= 1}, for the largest such set that the effort finds.
 
@@ -58,7 +66,8 @@ def robust_candidate(loop: ClosedLoop, effort: Effort = UNLIMITED) -> Array:
 
     Raises
     ------
-    BackendError : cvxpy is missing, or the local rule proves nothing with any candidate to begin with.
+    BackendError : cvxpy is missing.
+    NoCandidateError : the local rule proves nothing with any candidate to begin with.
     InputError : the network is larger than the checker's local rule allows.
     """
     known, proved = paths(loop), list[Array]()
@@ -67,7 +76,9 @@ def robust_candidate(loop: ClosedLoop, effort: Effort = UNLIMITED) -> Array:
         proved = _all_scaled(known, [robust_candidate(at_once, effort.share(_AT_ONCE))], effort)
     proved = proved or _all_scaled(known, [choose_candidate(loop, name).P for name in SOLVED], effort)
     if not proved:
-        raise BackendError("the local rule proves nothing with the candidates that solve a Lyapunov equation")
+        raise NoCandidateError(
+            "the local rule proves nothing with the candidates that solve a Lyapunov equation", effort
+        )
     start = max(proved, key=_log_volume)
     return max((_climbed(known, start, effort, quick) for quick in (True, False)), key=_log_volume)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from certify.analysis.asked import ellipsoid_in
+from certify.analysis.candidates.robust import NoCandidateError
 from certify.analysis.candidates.trials import (
     FOR_PEAK,
     OPTIMISING,
@@ -28,6 +29,7 @@ from certify.analysis.outcome import refuted_at_once
 from certify.analysis.saved_search import NothingYetError, load
 from certify.analysis.selection import Contender, Race
 from certify.analysis.stages.state import State, Tools
+from certify.certificates.verdict import Stop
 from certify.effort import UNIT, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
@@ -69,8 +71,13 @@ class Candidate:
             _Choice(state, tools, effort, race).run()
             return state
         share = share_of_robust(state.loop) if options.only == "robust" else OPTIMISING
-        with tools.timing("candidate"):
-            one = named(state.loop, options, _granted(effort, tools.whole, share))
+        try:
+            with tools.timing("candidate"):
+                one = named(state.loop, options, _granted(effort, tools.whole, share))
+        except NoCandidateError as error:
+            ended = Budget(effort).ended_by if error.ran_out else Stop.LOCAL
+            none = replace(state.result, stop=ended, detail=str(error), candidate=options.only)
+            return state.finished(none)
         refuted = refuted_at_once(state.result, one)
         if refuted is not None:
             return state.finished(refuted)

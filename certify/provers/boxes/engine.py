@@ -85,7 +85,9 @@ class BoundsEngine(Engine):
         if task.exactly:
             bands = [band for band in bands if band.top >= task.target]
         where = "near" if task.exactly else "around"
-        why = f"Vdot >= 0 or an input out of bounds was sampled {where} every level"
+        plain = not (task.problem.rate or task.problem.loop.system.in_steps)
+        what = "Vdot >= 0" if plain else "a V that does not fall enough"
+        why = f"{what} or an input out of bounds was sampled {where} every level"
         found = Proof(None, None, Stop.FLOOR, why)
         for k, band in enumerate(bands):
             share = budget.effort.share(1.0 if k == len(bands) - 1 else 0.5)
@@ -104,11 +106,11 @@ class BoundsEngine(Engine):
             )
         ring = prove_inwards(task.problem, self.T, band.below, outer, budget, self.runner, report)
         if not ring.inner < ring.outer:
-            stop = Stop.CLUSTER if ring.stop is Stop.CLUSTER else Stop.FLOOR
-            return Proof(None, None, stop, f"no ring below V = {outer:.6g} is proved", boxes=ring.boxes)
+            why = f"no ring below V = {outer:.6g} is proved"
+            return Proof(None, None, _cut_short(ring) or Stop.FLOOR, why, boxes=ring.boxes)
         if not ring.covered:
             why = f"F and its inputs are not enclosed on all of V <= {ring.inner:.6g}"
-            return Proof(None, None, Stop.SMOOTH, why, boxes=ring.boxes)
+            return Proof(None, None, _cut_short(ring) or Stop.SMOOTH, why, boxes=ring.boxes)
         claim = Practical(roa=ring.outer, local=ring.inner, floor=ring.inner, rate=task.problem.rate)
         stop = Stop.CLUSTER if ring.stop is Stop.CLUSTER else stop
         return replace(self.stated(task.problem, ring, claim, {}), stop=stop, witness=witness)
@@ -142,6 +144,11 @@ class BoundsEngine(Engine):
             direction=ring.direction,
             left=ring.left,
         )
+
+
+def _cut_short(ring: RingProof) -> Stop | None:
+    """The stop that ended the search of a ring before its time; None if none did."""
+    return ring.stop if ring.stop is Stop.CLUSTER or ring.stop.ran_out else None
 
 
 def _is_better(one: Proof, other: Proof) -> bool:

@@ -32,14 +32,15 @@ def split_again(problem: Problem, evidence: PartitionTree, claim: Claim, leaf: i
 
 
 def cut_leaf(tree: bytes, leaf: int, lo: Array, hi: Array, score: Callable[[Array, Array], Array]) -> bytes:
-    """The tree with this leaf, of corners (n,), cut into eight, along the axes of the highest score (n, 1)."""
+    """The tree with this leaf, of corners (n,), cut into eight, along the axes of the highest score (n, B)."""
     at = int(np.flatnonzero(np.frombuffer(tree, dtype=np.uint8) == LEAF)[leaf])
     return tree[:at] + _cut(score, lo[:, None], hi[:, None], _DEPTH) + tree[at + 1 :]
 
 
 def _cut(score: Callable[[Array, Array], Array], lo: Array, hi: Array, depth: int) -> bytes:
     """A box (n, 1) as a subtree of this depth."""
-    axis = int(score(lo, hi)[:, 0].argmax())
+    twice = (np.repeat(v, 2, axis=1) for v in (lo, hi))  # sums over one box alone go another way
+    axis = int(score(*twice)[:, 0].argmax())
     middle = 0.5 * lo[axis] + 0.5 * hi[axis]
     if depth == 0 or not bool(lo[axis] < middle) or not bool(middle < hi[axis]):
         return bytes([LEAF])

@@ -17,7 +17,7 @@ import numpy as np
 
 from certify.certificates.claims import Problem
 from certify.certificates.verdict import Stop
-from certify.effort import UNLIMITED
+from certify.effort import Effort
 from certify.errors import BackendError, CertificateFormatError, InputError
 from certify.provers.base import Budget, Report, SearchState
 from certify.provers.bounds.arrays import Array, Index
@@ -33,6 +33,7 @@ from certify.provers.execution import Bound, Runner
 from certify.provers.falsify import Witness
 
 _BATCH = 4e6  # operations of a batch, however small
+_LOOKS = 2.0  # operations to look at open boxes, relative to one look at each
 _HIGHER = 8.0  # an inner level over one from below which a step may lead out
 
 
@@ -124,16 +125,28 @@ def prove_inwards(
     order = choose_order(problem, T, max(floor, 1e-3 * outer), outer)
     rule = VdotBound(problem, T, inside=True, order=order)
     while True:
+        before = budget.effort.spent
         ring = Pass(Inwards(problem, T, floor, outer), _root(problem, T, outer), runner, rule)
         stop = ring.advance(budget, report)
         if stop is not None:
             ring.settle()
-            ring.advance(replace(budget, effort=UNLIMITED), report)
+            ring.advance(replace(budget, effort=_to_close(ring, budget, budget.effort.spent - before)), report)
         found = ring.proof(stop)
         # A step from below may end above a level to which the ring reaches: then there is none from which it does not.
         floor = _HIGHER * max(floor, found.inner)
         if found.covered or not rule.step or floor >= outer or budget.effort.over:
             return found
+
+
+def _to_close(ring: Pass, budget: Budget, took: float) -> Effort:
+    """The effort in which a settled pass may close its open boxes, of a budget that it took so much of.
+
+    Most need one look. Inside the inner level some need more, where inputs leave their bounds or steps lead far; for
+    these it may take as much again as it took, unless the clock ended it.
+    """
+    looks = _LOOKS * (len(ring.frontier) * ring.rule.operations + _BATCH)
+    more = looks if budget.effort.is_short_of_time else max(looks, took)
+    return budget.effort if budget.effort.left == math.inf else budget.effort.part(more, even_if_over=True)
 
 
 def _root(problem: Problem, T: Array, level: float) -> Array:
@@ -288,7 +301,7 @@ class Pass:
         return len(self.frontier) * math.exp2(min(1000.0, self.halvings))
 
     def settle(self) -> None:
-        """Take the levels that are proved for good: open boxes lie outside of them, and need at most one look."""
+        """Take the levels that are proved for good: open boxes lie outside of them, and most need one look."""
         self.sweep.inner, self.sweep.outer = self.sweep.reached(self._least())
 
     def state(self) -> SearchState:

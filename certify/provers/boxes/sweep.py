@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 import numpy as np
 
 from certify.certificates.claims import Problem
-from certify.provers.bounds.arrays import Array, Mask
+from certify.provers.bounds.arrays import Array, Mask, chosen
 from certify.provers.boxes.halving import Halves
 from certify.provers.boxes.rule import BoxBounds, VdotBound
 from certify.provers.boxes.subtrees import Growth
@@ -177,7 +177,7 @@ class RingGrowth(Growth):
         """V at violations, infinite elsewhere; where a step leads from within the outer level to a higher V, that, but
         no more than just above the outer level."""
         levels = np.where(found.violated, self.rule.levels_at(centres), math.inf)
-        index = np.flatnonzero(levels <= self.sweep.outer)
+        index = chosen(levels <= self.sweep.outer)
         if not (self.rule.inside and self.rule.step) or not len(index):
             return levels
         after = np.minimum(self.rule.levels_after(centres.take(index, -1), self.sweep.outer), self.sweep.outer)
