@@ -67,7 +67,7 @@ _STOPPED = "interrupted; nothing was left half-written."
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: turn every error into one sentence and the right exit status."""
-    gc.set_threshold(100_000)  # most objects of a run are modules, which live to its end
+    gc.set_threshold(500_000)  # most objects of a run are modules, which live to its end
     # Waiting threads must not spin: on a busy machine spinning costs a factor of ten. OpenBLAS has no such setting, and
     # the checker's matrices are small; the engine shares out boxes among threads of its own.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
