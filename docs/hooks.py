@@ -9,11 +9,9 @@ from __future__ import annotations
 import inspect
 from typing import Any
 
-import typer
-
 import certify
 from certify.analysis.studies.study import KNOWN
-from certify.cli.main import app
+from certify.cli.main import command_line
 
 COMMANDS, NAMES = "<!-- every command -->", "<!-- every public name -->"
 OPTIONS = "<!-- every option of a study -->"
@@ -30,7 +28,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 def commands() -> str:
     """A section for each command of `certify`: its summary, arguments and options with their defaults."""
-    group = typer.main.get_command(app)
+    group = command_line()
     sections = []
     for name, command in getattr(group, "commands", {}).items():
         lines = [

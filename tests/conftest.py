@@ -1,4 +1,4 @@
-"""One thread a process and its children, hypothesis profiles, reports drawn in the process of the test, a fixture."""
+"""One thread a process and its children, hypothesis profiles, a fixture."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import pytest
 from hypothesis import settings
 
 from certify.loop.plants import System, get_system
-from certify.report.drawing import Drawing
 
 # The suite runs one process a core: threads that wait for each other's cores take several times as long.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -16,12 +15,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 settings.register_profile("ci", deadline=None, derandomize=True, max_examples=50)
 settings.register_profile("fuzz", deadline=None, max_examples=5000)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
-
-
-@pytest.fixture(autouse=True)
-def drawn_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports are drawn where everything is loaded already; of the process for it tests/report/test_drawing.py."""
-    monkeypatch.setattr(Drawing, "__enter__", lambda self: self)
 
 
 @pytest.fixture

@@ -108,10 +108,10 @@ def test_every_block_says_whether_it_is_run(page: Path) -> None:
 
 @pytest.mark.parametrize("page", READ, ids=named)
 def test_commands_exist_with_their_options(page: Path) -> None:
-    from certify.cli.main import app as certify
+    from certify.cli.main import command_line
     from controllers.cli import app as controllers
 
-    programs = {"certify": typer.main.get_command(certify), "controllers": typer.main.get_command(controllers)}
+    programs = {"certify": command_line(), "controllers": typer.main.get_command(controllers)}
     for block in blocks(page):
         if block.language != "sh":
             continue
@@ -245,10 +245,10 @@ def test_formulas_have_room_beside_functions(formula: str, text: str) -> None:
 
 def test_the_reference_has_every_command_and_public_name(site: Path) -> None:
     import certify
-    from certify.cli.main import app
+    from certify.cli.main import command_line
 
     commands = (site / "reference" / "commands.html").read_text("utf-8")
-    for name in getattr(typer.main.get_command(app), "commands"):  # noqa: B009
+    for name in getattr(command_line(), "commands"):  # noqa: B009
         assert f">certify {name}<" in commands, name
     python = (site / "reference" / "python.html").read_text("utf-8")
     for name in certify.__all__:

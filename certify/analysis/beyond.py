@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from typing import TYPE_CHECKING
 
 from certify.analysis.facts import OuterFacts
 from certify.analysis.options import RoaOptions
 from certify.certificates.claims import Claim, Outer, Problem
 from certify.lyapunov import sampled_volume
 from certify.lyapunov.rigorous import evaluate_rise
-from certify.provers.outer import OuterProof
+
+if TYPE_CHECKING:
+    from certify.provers.outer import OuterProof
 
 
 def outer_facts(problem: Problem, claim: Claim, outer: Outer, found: OuterProof) -> OuterFacts:

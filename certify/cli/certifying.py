@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import fields
@@ -20,7 +19,7 @@ from certify.cli.contains import stated, text
 from certify.cli.ending import Interrupted
 from certify.cli.options import as_typed, options_of
 from certify.cli.shared import given_words, noting, write
-from certify.cli.terminal import ProgressLine, load_tables, say, show
+from certify.cli.terminal import ProgressLine, say, show
 
 if TYPE_CHECKING:
     from certify.analysis.maximise import Quantity
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from certify.analysis.results import RoaResult
     from certify.loop.plants import System
     from certify.loop.policies import Policy
-    from certify.report.drawing import Drawing
 
 CONTAINS = "--contains"
 _OF_SEARCH = ("candidate", "Q", "R", "level")
@@ -42,7 +40,6 @@ def certified(
     options: RoaOptions,
     out: Path | None,
     start: float,
-    drawing: Drawing,
     quiet: bool,
     as_json: bool,
     asked: str | None = None,
@@ -55,20 +52,18 @@ def certified(
     stored, plant : the policy in the file `policy`, and the plant that it is certified on.
     out : folder for the results.
     start : when the command began, by `time.perf_counter`.
-    drawing : draws the report.
     asked : a state or a box, as people write it; the result says if the proved set contains it.
     largest : the quantity that is to be as large as can be proved for the set.
     """
     from certify.report import summary
+    from certify.report.drawing import Drawing
 
-    note = noting(quiet)
+    note, drawing = noting(quiet), Drawing()
     note(_plant_line(stored, plant, context.params["system"] is not None))
     folder = out if out is not None else Path("out") / policy.stem
 
     def draw(raw: bytes) -> None:
         drawing.begin(raw, folder / "certificate.json", time.perf_counter() - start)
-        if not as_json:  # this process waits for the checker's
-            threading.Thread(target=load_tables, daemon=True).start()
 
     run = _run_for(largest, draw)
     progress = None if quiet else ProgressLine()

@@ -14,7 +14,6 @@ from certify.cli.certifying import certified
 from certify.cli.importing import import_options, kind_called
 from certify.cli.options import changes_of_a_plant, options_of_a_run, takes
 from certify.cli.shared import Json, PlantName, PolicyArgument, PolicyFile, Quiet, Results, noting, the_policy
-from certify.report.drawing import Drawing
 
 if TYPE_CHECKING:
     from certify.loop.policies.importers import ImportOptions
@@ -41,9 +40,8 @@ def reach(
     importing: ImportOptions,
 ) -> None:
     """Prove that a state, with what lies around it, converges: a tube around its trajectory into a certified set."""
-    start, drawing = time.perf_counter(), context.with_resource(Drawing())
-    note, path = noting(quiet), the_policy(context, file, policy)
+    start, note, path = time.perf_counter(), noting(quiet), the_policy(context, file, policy)
     with kind_called(_KIND):
         stored = policy_in(path, importing, system, changes, note)
     plant = plant_of(stored, system, changes, note)
-    certified(context, path, stored, plant, options_of(typed, plant, note), out, start, drawing, quiet, as_json)
+    certified(context, path, stored, plant, options_of(typed, plant, note), out, start, quiet, as_json)

@@ -17,7 +17,6 @@ from certify.cli.options import FIRST, Bundle, changes_of_a_plant, options_of_a_
 from certify.cli.shared import Json, PlantName, PolicyArgument, PolicyFile, Quiet, Results, noting, the_policy
 from certify.cli.terminal import tell
 from certify.errors import BackendError, InputError
-from certify.report.drawing import Drawing
 
 if TYPE_CHECKING:
     from certify.analysis.maximise import Quantity
@@ -54,8 +53,7 @@ def roa(
     importing: ImportOptions,
 ) -> None:
     """Certify a region of attraction: prove, write a certificate, have it checked, report."""
-    start, drawing = time.perf_counter(), context.with_resource(Drawing())
-    note, path = noting(quiet), the_policy(context, file, policy)
+    start, note, path = time.perf_counter(), noting(quiet), the_policy(context, file, policy)
     largest = _largest(changed.get("sample_time"), typed.get("rate"), "resume" in typed)
     if largest is not None:
         (changed if largest == "period" else typed).pop("sample_time" if largest == "period" else "rate")
@@ -65,7 +63,7 @@ def roa(
     options = options_of(typed | {"engine": _engine(context, typed.get("engine", "bounds"))}, plant, note)
     if contains is not None:
         region(contains, plant, CONTAINS)  # an error in it is reported before the run
-    certified(context, path, stored, plant, options, out, start, drawing, quiet, as_json, contains, largest)
+    certified(context, path, stored, plant, options, out, start, quiet, as_json, contains, largest)
 
 
 def _largest(period: str | None, rate: str | None, resume: bool) -> Quantity | None:

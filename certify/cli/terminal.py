@@ -6,7 +6,6 @@ import math
 import shutil
 import sys
 import time
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
@@ -38,12 +37,6 @@ def show(renderable: Any) -> None:
     with console.capture() as captured:
         console.print(renderable)
     say(captured.get().rstrip("\n"))
-
-
-def load_tables() -> None:
-    """Import the modules that print tables, while there is time."""
-    for module in ("rich.box", "rich.console", "rich.table", "rich.text"):
-        import_module(module)
 
 
 def tell(line: str) -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 
 from certify import InputError, RoaOptions, certify_roa, get_system
 from certify.analysis.api import Keywords, in_python
@@ -20,7 +19,7 @@ from certify.analysis.declaration import Option, declared
 from certify.analysis.studies.case import OPTIONS, PLANT_OPTIONS, TABLES
 from certify.analysis.studies.study import KNOWN, read_study
 from certify.analysis.values import changes_in
-from certify.cli.main import _run, app
+from certify.cli.main import _run, command_line
 from certify.cli.options import FIRST
 from docs.hooks import on_page_markdown
 
@@ -32,7 +31,7 @@ BY_NAME = pytest.mark.parametrize("option", DECLARED.values(), ids=DECLARED)
 
 def parameters(command: str) -> dict[str, Any]:
     """The parameters of a command by their names."""
-    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    commands = command_line().commands
     return {one.name: one for one in commands[command].params}
 
 

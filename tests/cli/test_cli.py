@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import typer
 
 from certify.analysis.arguments import changes_of
 from certify.analysis.options import RoaOptions
 from certify.certificates import checking, reading
-from certify.cli.main import _run, app
+from certify.cli.main import _run, command_line
 from certify.cli.options import options_of
 from certify.cli.terminal import ring_line
 from certify.loop.plants import get_system
@@ -286,7 +285,7 @@ def test_an_option_is_named_as_it_is_typed(
 
 def test_each_option_that_python_refuses_by_name_is_an_option_of_the_command_line() -> None:
     """Whoever adds a field to the options and a message about it need not think of how it is typed."""
-    command = typer.main.get_command(app)
+    command = command_line()
     options = {name: options_of(command.commands[name]) for name in ("roa", "reach")}  # type: ignore[attr-defined]
     only_in_python = {"P"}
     for one in dataclasses.fields(RoaOptions):

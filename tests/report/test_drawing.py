@@ -1,31 +1,23 @@
-"""A report drawn by a process of its own: the same page, whatever happens to the process, and nothing left running."""
+"""Figures drawn while the checker works: the same page, whatever happens to them, and no word before it answers."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from certify.analysis.results import RoaResult
 from certify.analysis.run import certify_roa
 from certify.errors import SoundnessError
 from certify.loop.plants import get_system
-from certify.report import drawing, drawn
+from certify.report import drawing, drawn, page
 from certify.report.drawing import Drawing
+from certify.report.sampling import _smoothed
 from tests.support.loops import pendulum_network
-from tests.support.marks import slow_after
 
 Asked = tuple[bytes, Path, dict[str, Any], dict[str, Any]]
-
-
-@pytest.fixture(autouse=True)
-def drawn_here() -> None:
-    """Here reports are drawn as they are for users."""
 
 
 @pytest.fixture(scope="module")
@@ -39,136 +31,89 @@ def asked(result: RoaResult) -> Asked:
     return result.raw, result.certificate, dict(result.checker), result.to_dict()
 
 
+@pytest.fixture(scope="module")
+def expected(result: RoaResult) -> str:
+    assert result.raw is not None and result.certificate is not None and result.checker is not None
+    return drawn.page_of(result.raw, result.certificate, dict(result.checker), result.to_dict())
+
+
 @pytest.fixture
-def here(asked: Asked, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The page as it is drawn in this process; afterwards each page that is drawn here is noted in the list."""
-    found, page_of = [drawn.page_of(*asked)], drawn.page_of
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Grows whenever figures are drawn."""
+    found, figures_of = list[bool](), page.figures_of
 
-    def noted(*given: Any) -> str:
-        found.append(page_of(*given))
-        return found[-1]
+    def noted(*given: Any) -> Any:
+        found.append(True)
+        return figures_of(*given)
 
-    monkeypatch.setattr(drawn, "page_of", noted)
+    monkeypatch.setattr(page, "figures_of", noted)
     return found
 
 
-def process_of(one: Drawing) -> subprocess.Popen[bytes]:
-    assert one._process is not None
-    return one._process
-
-
-def is_gone(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return True
-    return False
-
-
-@pytest.mark.parametrize("begun", slow_after(1, [True, False]))
-def test_the_page_is_the_same_and_the_process_ends(begun: bool, asked: Asked, here: list[str]) -> None:
-    with Drawing() as one:
-        pid = process_of(one).pid
-        if begun:
-            one.begin(asked[0], asked[1], 1.0)
-        assert one.page_of(*asked) == here[0]
-    assert len(here) == 1 and is_gone(pid)
-
-
-@pytest.mark.slow
-def test_a_certificate_that_came_later_is_the_one_that_is_drawn(asked: Asked, here: list[str]) -> None:
-    with Drawing() as one:
-        first = process_of(one).pid
-        one.begin(asked[0].replace(b"provenance", b"provisions"), asked[1], 1.0)
+@pytest.mark.parametrize("begun", [True, False])
+def test_the_page_is_the_same_and_drawn_once(begun: bool, asked: Asked, expected: str, figures: list[bool]) -> None:
+    one = Drawing()
+    if begun:
         one.begin(asked[0], asked[1], 1.0)
-        assert is_gone(first) and process_of(one).pid != first
-        assert one.page_of(*asked) == here[0] and len(here) == 1
-    with Drawing() as one:
-        first = process_of(one).pid
-        one.begin(asked[0].replace(b"provenance", b"provisions"), asked[1], 1.0)
-        assert one.page_of(*asked) == here[0] and len(here) == 2  # what was begun is of no use
-        assert is_gone(first)
+    assert one.page_of(*asked) == expected and len(figures) == 1
+
+
+def test_a_certificate_that_came_later_is_drawn_with_the_page(asked: Asked, expected: str, figures: list[bool]) -> None:
+    one = Drawing()
+    one.begin(asked[0].replace(b"provenance", b"provisions"), asked[1], 1.0)
+    one.begin(asked[0], asked[1], 1.0)
+    assert one.page_of(*asked) == expected and len(figures) == 1  # the first is no certificate, and has no figures
 
 
 def test_figures_begun_early_say_nothing_before_the_checker_does(asked: Asked) -> None:
     """A refusal after figures were drawn: the page is the one that a refusal has, drawn anew."""
     raw, path, _answer, data = asked
     refused = {"result": "REJECTED", "rule": "ring", "at": "leaf 3", "detail": "positive"}
-    with Drawing() as one:
-        one.begin(raw, path, 1.0)
-        page = one.page_of(raw, path, refused, data)
+    one = Drawing()
+    one.begin(raw, path, 1.0)
+    page = one.page_of(raw, path, refused, data)
     assert page == drawn.page_of(raw, path, refused, data)
     assert "Nothing here is proved" in page and "The independent checker accepted" not in page
 
 
 def test_an_answer_about_other_bytes_is_an_error_and_no_page(asked: Asked) -> None:
     raw, path, answer, data = asked
-    with Drawing() as one, pytest.raises(SoundnessError, match="must be about the certificate"):
-        one.begin(raw, path, 1.0)
+    one = Drawing()
+    one.begin(raw, path, 1.0)
+    with pytest.raises(SoundnessError, match="must be about the certificate"):
         one.page_of(raw, path, {**answer, "certificate_sha256": "0" * 64}, data)
 
 
-@pytest.mark.parametrize("when", ["before", "begun", "never"])
-def test_without_its_process_the_page_is_drawn_here(
-    when: str, asked: Asked, here: list[str], monkeypatch: pytest.MonkeyPatch
+def test_figures_that_fail_are_drawn_again_with_the_page(
+    asked: Asked,
+    expected: str,
+    figures: list[bool],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    if when == "never":
+    def fail(*_: object) -> None:
+        raise MemoryError
 
-        def refuse(*_: object, **__: object) -> None:
-            raise OSError("no more processes")
-
-        monkeypatch.setattr(subprocess, "Popen", refuse)
-    with Drawing() as one:
-        if when == "before":
-            process_of(one).kill()
-            process_of(one).wait()
+    one = Drawing()
+    with monkeypatch.context() as patched:
+        patched.setattr(drawn, "figures_if_accepted", fail)
         one.begin(asked[0], asked[1], 1.0)
-        if when == "begun":
-            process_of(one).kill()
-        assert one.page_of(*asked) == here[0] and len(here) == 2
+        assert one._thread is not None
+        one._thread.join()
+    assert one.page_of(*asked) == expected and len(figures) == 1
+    assert capsys.readouterr() == ("", "")
 
 
-def test_a_process_that_fails_is_no_page(asked: Asked, here: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """It says something, and then ends as processes do that failed."""
-    monkeypatch.setattr(drawing, "_LAUNCH", "import sys; print('<!DOCTYPE html>half a page'); sys.exit(1)")
-    with Drawing() as one:
-        assert one.page_of(*asked) == here[0] and len(here) == 2
+def test_nothing_is_drawn_early_of_a_large_certificate(asked: Asked) -> None:
+    one = Drawing()
+    one.begin(asked[0] + b" " * drawing._MOST, asked[1], 1.0)
+    assert one._thread is None
 
 
-def test_nothing_waits_for_a_large_certificate(asked: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The process never reads; a pipe that is full would hold the command up."""
-    monkeypatch.setattr(drawing, "_LAUNCH", "import time; time.sleep(600)")
-    with Drawing() as one:
-        pid = process_of(one).pid
-        one.begin(asked[0] + b" " * 2**20, asked[1], 1.0)
-        one.begin(asked[0] + b" " * (drawing._FITS - len(asked[0])), asked[1], 1.0)
-        start = time.monotonic()
-    assert is_gone(pid) and time.monotonic() - start < 60
+@pytest.mark.parametrize("shape", [(1, 1), (2, 9), (5, 3), (60, 41)])
+def test_an_edge_is_smoothed_as_scipy_does_it(shape: tuple[int, int]) -> None:
+    from scipy.ndimage import gaussian_filter
 
-
-@pytest.mark.slow
-def test_the_process_has_the_import_path_of_this_one(tmp_path: Path, asked: Asked, here: list[str]) -> None:
-    """A module of the current folder that bears the name of one that is needed is not imported."""
-    (tmp_path / "json.py").write_text("raise SystemExit(1)")
-    (tmp_path / "matplotlib.py").write_text("raise SystemExit(1)")
-    before = os.getcwd()
-    os.chdir(tmp_path)
-    try:
-        with Drawing() as one:
-            assert one.page_of(*asked) == here[0] and len(here) == 1
-    finally:
-        os.chdir(before)
-
-
-def test_a_parent_that_dies_takes_the_process_along(tmp_path: Path) -> None:
-    code = (
-        "import os, signal\nfrom certify.report.drawing import Drawing\none = Drawing().__enter__()\n"
-        "print(one._process.pid, flush=True)\nos.kill(os.getpid(), signal.SIGKILL)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    pid = int(done.stdout)
-    for _ in range(600):
-        if is_gone(pid):
-            break
-        time.sleep(0.1)
-    assert is_gone(pid)
+    values = (np.random.default_rng(0).random(shape) < 0.4).astype(np.float64)
+    expected = gaussian_filter(values, 1.0, mode="nearest")
+    np.testing.assert_allclose(_smoothed(_smoothed(values).T).T, expected, rtol=0, atol=1e-15)

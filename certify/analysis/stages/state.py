@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from certify.analysis.acceptance import Accepted
 from certify.analysis.options import RoaOptions
@@ -22,7 +22,9 @@ from certify.effort import Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.provers.base import Progress, Proof
 from certify.provers.execution import Runner
-from certify.provers.outer import OuterProof
+
+if TYPE_CHECKING:
+    from certify.provers.outer import OuterProof
 
 StageName = Literal["candidate", "ring", "tube", "learn", "outer", "check"]
 Report = Callable[[StageName, Progress | None], None]
