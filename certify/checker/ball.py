@@ -105,12 +105,14 @@ class Ball:
         """pi(x) on the ball before the clip, each input with its own error."""
         h, scale, m = self.outputs, Near(self.case.net.scale), len(self.case.c.inputs)
         c = all_near(self.case.c.u_eq) if self.starts_at_u_eq else h.c * scale + self.case.net.offset
-        batch = h.a * scale, Square(h.Q.value) * scale, Cubic(h.K.value) * scale
+        a, Q, K = h.a * scale, Square(h.Q.value) * scale, Cubic(h.K.value) * scale
         E, lip = mixed(Square(h.U), Near(self.reach.error.top)), h.lipschitz * size(scale.value)
         return [
             Jet(
                 c[j],
-                *(part[j] for part in batch),
+                a[j],
+                Q[j],
+                K[j],
                 E[j],
                 Near(np.eye(m)[j]),
                 self.units.shares,

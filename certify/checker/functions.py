@@ -18,7 +18,8 @@ import numpy as np
 
 from .near import ZERO, Above, Near, atan, exp, inverse, lower, near, sin_cos, sqrt, tanh
 
-Three, Four = tuple[Near, Near, Near], tuple[Near, Near, Near, Near]
+Three = tuple[Near, Near, Near]
+Four = tuple[Near, Near, Near, Near]
 Constant = Callable[[Fraction], Any]
 FourBounds = tuple[Above, Above, Above, Above]
 _ONE, _TWO, _THIRD, _UNIT = Near(np.float64(1)), Near(np.float64(2)), near(Fraction(1, 3)), Above(1.0)
@@ -46,7 +47,11 @@ class Expansion:
         if not self.phi.partial:
             return f0, f1, f2
         defined = Above(0 * self.third.v)
-        return Near(f0.value, f0.error + defined), Near(f1.value, f1.error + defined), Near(f2.value, f2.error + defined)
+        return (
+            Near(f0.value, f0.error + defined),
+            Near(f1.value, f1.error + defined),
+            Near(f2.value, f2.error + defined),
+        )
 
     @cached_property
     def f(self) -> Four:
@@ -124,7 +129,7 @@ class Function(ABC):
         """`fourth` of an expansion."""
 
     def last(self, e: Expansion) -> Above:
-        """`last` of an expansion: a supremum of |phi^(4)|/6, four times that of `fourth`, unless a row says otherwise."""
+        """`last` of an expansion: sup |phi^(4)|/6, four times that of `fourth`, unless a row says otherwise."""
         return e.fourth * 4
 
     @abstractmethod

@@ -98,7 +98,8 @@ class Jet:
         E = self.E
         if self.B.error is not ZERO:
             E = E + mixed(Square(self.U), Near(self.B.error.top + 0 * self.B.value))
-        return Square(E.value, E.error + (self.Q.error + self.K.error)).majorant
+        found: Array = Square(E.value, E.error + (self.Q.error + self.K.error)).majorant
+        return found
 
     @property
     def lipschitz(self) -> Above:
@@ -118,7 +119,8 @@ class Jet:
     @cached_property
     def shares(self) -> Square:
         """Bound of sum_j B_j e_j as a matrix."""
-        return mixed(Square(self.U), Near(self.B.size.top))
+        found: Square = mixed(Square(self.U), Near(self.B.size.top))
+        return found
 
     @cached_property
     def whole(self) -> Square:
@@ -144,8 +146,8 @@ class Jet:
 
     def __add__(self, other: Jet) -> Jet:
         x, y = self, other
-        parts = (getattr(x, name) + getattr(y, name) for name in ("c", "a", "Q", "K", "E", "B"))
-        return Jet(*parts, x.U, x.c_y + y.c_y, x.a_y + y.a_y, x.lip + y.lip)
+        Q, K, E, B = x.Q + y.Q, x.K + y.K, x.E + y.E, x.B + y.B
+        return Jet(x.c + y.c, x.a + y.a, Q, K, E, B, x.U, x.c_y + y.c_y, x.a_y + y.a_y, x.lip + y.lip)
 
     def __neg__(self) -> Jet:
         x = self
@@ -216,7 +218,8 @@ class Jet:
         _, _, half, sixth = phi.f
         squares = half.size * 2 * (s * (w + M) + z * L)
         cubes = sixth.size * 3 * (s * s * (L + z * 2) + s * z * (L * 2 + z) + z * z * L)
-        return squares + cubes + phi.last * (self.radius * self.radius * self.radius) * (s + L)
+        found: Above = squares + cubes + phi.last * (self.radius * self.radius * self.radius) * (s + L)
+        return found
 
     def _by_y(self, name: str, phi: Expansion) -> tuple[Near, Vector, Near, Vector]:
         """c, a, c_y and a_y of phi(v).

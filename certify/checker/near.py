@@ -8,8 +8,9 @@ for underflow: sums and roots have none, a product or quotient loses at most 2^-
 
     the exact number is at most v (1 + 2u)^k,
 
-v being computed from non-negative numbers in k or fewer roundings, each of which takes at most 1/(1 - u) <= 1 + 2u away;
-products and quotients add LEAST = 2^-1022 to v. k stays below 2^11, where (1 + 2u)^k < 1 + 2^-41.
+v being computed from non-negative numbers in k or fewer roundings, each of which takes at most a factor
+1/(1 - u) <= 1 + 2u away; products and quotients add LEAST = 2^-1022 to v. k stays below 2^11, where
+(1 + 2u)^k < 1 + 2^-41.
 
 Sums and matrix products are bounded for any order of summation and with or without fused multiply-add:
 |fl(AB) - AB| <= gamma_n |A||B| with gamma_n = n u / (1 - n u) <= 2 n u (Higham 2002, section 3.5).
@@ -45,7 +46,7 @@ _ANGLE_END = 64.0  # beyond, sin and cos are only known to lie in [-1, 1]
 _EXP_END = 64.0  # beyond, nothing is known of exp; below -64 it lies between 0 and 2^-92
 
 
-# ----------------------------------------------------------------------------------------------------------- upper bounds
+# -------------------------------------------------------------------------------------------------------- upper bounds
 
 
 class Above:
@@ -68,15 +69,17 @@ class Above:
         """The bounds as binary64 numbers, rounded up: 1 + 4u (k + 2) is exact, and times 1 - u at least (1 + 2u)^k."""
         return self.v * (1 + 4 * U * (self.k + 2)) + LEAST if self.k else self.v
 
-    def __add__(self, other: Above | float) -> Above:
+    def __add__(self, other: Any) -> Above:
+        """The sum with bounds, or with exact numbers that are not negative."""
         if not isinstance(other, Above):
             return Above(self.v + other, self.k + 1)
         if self is ZERO or other is ZERO:
             return other if self is ZERO else self
         return Above(self.v + other.v, (self.k if self.k > other.k else other.k) + 1)
 
-    def __mul__(self, other: Above | float) -> Above:
-        """What is bounded by ZERO is 0, and so is its product with any number, whatever bounds that."""
+    def __mul__(self, other: Any) -> Above:
+        """The product with bounds, or with exact numbers that are not negative. What is bounded by ZERO is 0,
+        and so is its product with any number, whatever bounds that."""
         if not isinstance(other, Above):
             return Above(self.v * other + LEAST, self.k + 2)
         if self is ZERO or other is ZERO:
@@ -133,7 +136,11 @@ class Above:
     def through(self, W: Array) -> Above:
         """|W| x for an exact matrix W, the numbers x along the first axis."""
         n = W.shape[1]
-        return self if self is ZERO else Above(np.tensordot(np.abs(W), self.v, 1) * (1 + 4 * n * U) + n * LEAST, self.k + 3)
+        return (
+            self
+            if self is ZERO
+            else Above(np.tensordot(np.abs(W), self.v, 1) * (1 + 4 * n * U) + n * LEAST, self.k + 3)
+        )
 
     def __getitem__(self, index: Any) -> Above:
         return self if self is ZERO else Above(self.v[index], self.k)
@@ -164,7 +171,7 @@ def norm(x: Any, axis: int | tuple[int, ...] = 0) -> Above:
     return size(x).norm(axis)
 
 
-# ------------------------------------------------------------------------------------------------------- numbers near others
+# -------------------------------------------------------------------------------------------------- numbers near others
 
 
 class Near:
@@ -228,8 +235,8 @@ class Near:
 
     __rmul__ = __mul__
 
-    def over(self, k: float) -> Self:
-        """Quotients by an exact positive number."""
+    def over(self, k: Any) -> Self:
+        """Quotients by exact positive numbers."""
         return type(self)(self.value / k, (self.error + self.size.ulps(1)).over(k))
 
     def sum(self) -> Near:
@@ -244,8 +251,7 @@ class Near:
         return type(self)(self.value[place], self.error[index])
 
     def through(self, W: Array) -> Self:
-        """W x for an exact matrix W, the numbers x along the first axis of `error`, which is the last or last but one of
-        `value`.
+        """W x for an exact matrix W, x along the first axis of `error`, the last or last but one of `value`.
 
         A row's roundings are at most gamma_n sum_l |W_il| times the norms of the x_l, and so is what underflows.
         """
@@ -319,7 +325,7 @@ class Vector(Near):
 class Square(Vector):
     """Matrices along the first two axes, each within its error in the Frobenius norm."""
 
-    axes = (0, 1)
+    axes: tuple[int, ...] = (0, 1)
 
     @property
     def majorant(self) -> Array:
@@ -341,12 +347,13 @@ class Tensor(Square):
 
 
 class Cubic(Vector):
-    """Symmetric tensors with three indices, along the first axis as `triples` has them, within an error in the 2-norm of
-    the whole tensor."""
+    """Symmetric tensors with three indices, along the first axis as `triples` has them, within an error in the 2-norm
+    of the whole tensor."""
 
     def length(self, x: Above) -> Above:
         often = triples(order_of(len(x.v)))[-1].reshape(-1, *[1] * (np.ndim(x.v) - 1))
-        return (x * x * often).sum(0).root
+        found: Above = (x * x * often).sum(0).root
+        return found
 
 
 @cache
@@ -397,7 +404,7 @@ def gram(X: Near) -> Square:
 
 
 def near_one(x: Any) -> tuple[Any, int]:
-    """(y, e): x is y 2^e, and nothing in y exceeds 1 in magnitude; exact but for underflow, at most 2^-1075 a number."""
+    """(y, e): x is y 2^e, and nothing in y exceeds 1; exact but for underflow, at most 2^-1075 a number."""
     most = max(np.max(np.abs(x.value), initial=0.0), np.max(x.error.top, initial=0.0))
     by = int(np.frexp(most)[1])
     return type(x)(np.ldexp(x.value, -by), Above(np.ldexp(x.error.top, -by)) + np.size(x.value) * LEAST), by
@@ -495,7 +502,7 @@ def lower(x: Near) -> Any:
     return np.where((least > 0) & (least < np.inf), least, np.nan)
 
 
-# -------------------------------------------------------------------------------------------------------------- functions
+# ----------------------------------------------------------------------------------------------------------- functions
 
 
 def _table(values: Iterable[arb]) -> Array:
@@ -640,7 +647,7 @@ def exp(x: Near) -> Near:
 
 
 def sqrt(x: Near) -> Near:
-    """Square roots; NaN unless x is certainly positive. |s - w| = |s^2 - w^2| / (s + w), s + w at least the root of s^2."""
+    """Square roots; NaN unless x is certainly positive. |s - w| = |s^2 - w^2| / (s + w), and s + w is at least s."""
     least = lower(x)
     root = np.sqrt(np.where(x.value > 0, x.value, np.nan))
     return Near(root, size(root).ulps(1) + x.error.over(lower(Near(np.sqrt(least), size(np.sqrt(least)).ulps(1)))))
@@ -652,7 +659,7 @@ def inverse(x: Near) -> Near:
     return Near(value, size(value).ulps(1) + x.error.over(least).over(least))
 
 
-# ------------------------------------------------------------------------------------------------------- fused operations
+# ----------------------------------------------------------------------------------------------------- fused operations
 
 
 def lines_around_tanh(centre: Array, radius: Above) -> tuple[Array, Array, Above]:

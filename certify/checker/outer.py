@@ -22,7 +22,7 @@ from .exact import exactly, inverse
 from .expression import Tape, evaluate
 from .flow import Series
 from .functions import FUNCTIONS
-from .near import ZERO, Above, Array, Form, Near, near
+from .near import Above, Array, Form, Near, near
 from .network import Folded, enclose_on_boxes, layer
 from .processes import Batch, in_order
 from .taylor import Taylor, affine, constant, upper_bound

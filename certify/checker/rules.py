@@ -19,8 +19,9 @@ from . import ball, boxes, contraction, limits, local, outer, ring, tube
 from .case import Case, Failures
 from .document import Certificate, Partition
 from .errors import Rejected
-from .exact import Exact, Undecided, policy_at_origin
+from .exact import Exact, policy_at_origin
 from .expression import evaluate
+from .functions import Undecided
 from .near import Array, self_test
 from .network import reaches
 from .processes import in_order

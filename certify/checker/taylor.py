@@ -103,7 +103,7 @@ class Taylor:
         return combination((k, self))
 
     def __mul__(self, other: Taylor) -> Taylor:
-        """r bounds the constants times the remainders, all of third and fourth order, and a remainder times the rest."""
+        """r bounds constants times remainders, all of third and fourth order, and remainders times the rest."""
         a, b = self, other
         c, ca, cb = a.c * b.c, size(a.c), size(b.c)
         r = ca * b.r + cb * a.r + a.linear * b.quadratic + a.quadratic * b.beyond.size
