@@ -73,7 +73,7 @@ def _examine(path: str, jobs: int, patient: bool) -> tuple[int, dict[str, Any]]:
     sample = None if c.sample is None else [str(h) for h in c.sample]
     answer |= {"rate": c.rate, "sample": sample, "discrete": c.discrete}
     answer["origin"] = None if c.policy.origin is None else c.policy.origin.tolist()  # the hash does not tell
-    answer |= {"levels": c.levels, "rules": tally.rules, "seconds": seconds}
+    answer |= {"levels": c.levels, "rules": tally.rules, "modules": _modules(), "seconds": seconds}
     if isinstance(c.evidence, document.Trusted):
         answers = [": ".join(pair) for pair in c.evidence.queries]
         answer |= {"solver": c.evidence.solver, "version": c.evidence.version, "answers": answers}
@@ -89,6 +89,11 @@ def _examine(path: str, jobs: int, patient: bool) -> tuple[int, dict[str, Any]]:
     status, result = (3, "TRUSTED") if "solver" in answer else (0, "ACCEPTED")
     answer = {"result": result, **answer}
     return status, answer | {"text": words.report(c, answer)}
+
+
+def _modules() -> list[str]:
+    """The files of this program that were loaded, which the answer rests on."""
+    return sorted(name.rpartition(".")[2] for name in sys.modules if name.startswith(f"{__package__}."))
 
 
 if __name__ == "__main__":

@@ -48,6 +48,14 @@ class Boxes:
         wrong = Above(np.array([row.error.v for row in rows]), max(row.error.k for row in rows))
         self.S_rest = wrong + size(np.where(axes, 0.0, whole))  # bounds what S is beside it
 
+    def leaves(self) -> Iterator[Batch]:
+        """The tree's leaves in batches."""
+        raise NotImplementedError
+
+    def examine(self, first: int, lo: Array, hi: Array) -> Leaves:
+        """The leaves with these corners, numbered from `first`, of which anything is asked."""
+        raise NotImplementedError
+
     def levels(self, lo: Array, hi: Array) -> tuple[Array, Array]:
         """Bounds of V from below and above on the boxes; NaN where they overflow."""
         far = np.maximum(np.abs(lo), np.abs(hi))

@@ -60,6 +60,9 @@ def contracts(ball_: Contracted) -> Failures:
     return count
 
 
+OF_CONTRACTION = (("contraction", fits), ("contraction", ball.is_not_clipped), ("contraction", contracts))
+
+
 def _turning(models: Models, b: fmpq_mat, weights: list[float]) -> fmpq_mat:
     """(diag(g) + sum_j N_j diag(1/g) N_j)/2, N_j = 2 sum_i (b_i (Q_i)_j:' + (Q_i)_j: b_i')."""
     k, g = b.ncols(), [rational(w) for w in weights]

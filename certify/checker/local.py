@@ -18,7 +18,6 @@ from .case import Case, Failures
 from .decrease import Level, Models, are_finite, are_usable, rational, sides, size_beyond
 from .document import Intervals
 from .exact import contains_ball, exactly, fraction, is_definite, root_above
-from .flow import later
 from .jets import Jet, uncertain
 from .near import Array, Near, Vector, norm
 
@@ -95,6 +94,8 @@ class Local(Ball):
         """The terms of G beyond x_1, divided by h; uncertain quantities enter them with their whole range alone."""
         if self.way is None or self.order == 1:
             return []
+        from .flow import later
+
         start, during = self.shared(self.states), self.shared(self.during(self.way))
         held, dynamics = [*self.inputs, *self.ranges], self.case.c.dynamics
         return later(dynamics, self.constant, start, during, held, self.period, self.order, self.settled)

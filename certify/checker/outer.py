@@ -15,7 +15,7 @@ from math import nextafter
 import numpy as np
 from flint import fmpq, fmpq_mat
 
-from .boxes import LEAF, Boxes, Leaves, batches, is_whole, middle, on_box
+from .boxes import LEAF, Boxes, Leaves, batches, is_whole, keeps_inputs, middle, on_box
 from .case import Case, Failures
 from .document import Network
 from .exact import exactly, inverse
@@ -213,6 +213,12 @@ class Beyond(Boxes):
         lo, hi = on_box(x).ends
         outside: Array = np.any((lo > self.largest) | (hi < self.least), axis=0)
         return outside
+
+
+OF_OUTER = (("outer", is_small),)
+ON_FACES = (("faces", is_above_on_faces),)
+OF_OUTER_TREE = (("outer", contains_domain), ("outer", is_partition))
+ON_OUTER_LEAVES = (("inputs", keeps_inputs), ("outer", falls))
 
 
 def _function(case: Case) -> Layers | Formula:

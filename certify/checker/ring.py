@@ -14,7 +14,6 @@ from flint import fmpq
 from .boxes import Boxes, Leaves, batches, is_whole, middle, multipliers, on_box
 from .case import Case, Failures
 from .exact import fraction, root_above
-from .flow import later
 from .near import Above, Array, Near, near, size
 from .network import enclose_on_boxes
 from .processes import Batch
@@ -94,6 +93,8 @@ class Ring(Boxes):
         order, h = self.case.partition.order, self.number(self.c.sample, self.symbols - 1, batch)
         G = [self.of_mean(f) for f in self.f(during if order == 1 else states, [*inputs, *ranges])]
         if order > 1:
+            from .flow import later
+
             rising = later(self.c.dynamics, self.constant(batch), states, during, loose, h, order, _itself)
             G = [x + h * more for x, more in zip(G, rising, strict=True)]
         return G, self.hull(states, F)

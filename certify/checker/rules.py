@@ -2,7 +2,8 @@
 
 A rule is a function that yields its failures as (place, detail) and returns how many things it has looked at; the
 first failure of all ends the examination. Together the rules imply the claim (FORMAT.md gives the inequalities and
-why they suffice).
+why they suffice). What only some certificates need is a module that is loaded for these alone: steps of time (flow.py),
+tubes, contraction, sets of another function. An answer names the modules that it rests on.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from . import ball, boxes, contraction, limits, local, outer, ring, tube
+from . import ball, boxes, limits, local, ring
 from .case import Case, Failures
 from .document import Certificate, Partition
 from .errors import Rejected
@@ -112,31 +113,12 @@ ON_THE_BALL: Table[local.Local] = (
 )
 OF_THE_TREE: Table[Case] = (("tree", ring.is_partition),)
 ON_LEAVES: Table[ring.RingLeaves] = (("inputs", boxes.keeps_inputs), ("flow", ring.stays), ("ring", ring.decreases))
-OF_THE_TUBE: Table[Case] = (("tube", tube.nodes_are_sound),)
-ON_SLABS: Table[tube.Piece] = (
-    ("tube", tube.fits),
-    ("inputs", ball.keeps_inputs),
-    ("tube", ball.is_not_clipped),
-    ("tube", tube.decreases),
-)
-OF_CONTRACTION: Table[contraction.Contracted] = (
-    ("contraction", contraction.fits),
-    ("contraction", ball.is_not_clipped),
-    ("contraction", contraction.contracts),
-)
-OF_OUTER: Table[Case] = (("outer", outer.is_small),)
-ON_FACES: Table[Case] = (("faces", outer.is_above_on_faces),)
-OF_OUTER_TREE: Table[Case] = (("outer", outer.contains_domain), ("outer", outer.is_partition))
-ON_OUTER_LEAVES: Table[boxes.Leaves] = (("inputs", boxes.keeps_inputs), ("outer", outer.falls))
 _KEPT = 4_000_000  # numbers, just below the 2^25 bytes up to which glibc adapts
 READ = {"format": 1, "hash": 1}  # rules of document.py, which have held
 RULES = (
     *READ,
-    *dict.fromkeys(
-        name
-        for table in (STATED, ON_THE_BALL, OF_THE_TREE, ON_LEAVES, OF_THE_TUBE, OF_CONTRACTION, OF_OUTER, ON_FACES)
-        for name, _ in table
-    ),
+    *dict.fromkeys(name for table in (STATED, ON_THE_BALL, OF_THE_TREE, ON_LEAVES) for name, _ in table),
+    *("tube", "contraction", "outer", "faces"),  # of features: their modules have the tables
 )
 
 
@@ -161,7 +143,7 @@ class Tally:
                 raise Rejected(name, at, detail)
 
     def hold_on_leaves(
-        self, table: Table[Any], bounds: ring.Ring | outer.Beyond, tree: bytes, asked: Callable[[Any], Array]
+        self, table: Table[Any], bounds: boxes.Boxes, tree: bytes, asked: Callable[[Any], Array]
     ) -> float | None:
         """Do so on the leaves of a tree; returns the margin of the bounds that must be negative, None if there are
         none."""
@@ -210,13 +192,19 @@ def _examine(tally: Tally, case: Case) -> None:
         bounds, tree = ring.Ring(case), case.partition.tree
         tally.ring_margin = tally.hold_on_leaves(ON_LEAVES, bounds, tree, lambda leaves: leaves.bound[leaves.meet])
     if c.start is not None:
-        tally.hold(OF_THE_TUBE, case)
+        from . import tube
+
+        tally.hold(tube.OF_THE_TUBE, case)
         for piece in tube.pieces(case):
-            tally.hold(ON_SLABS, piece)
+            tally.hold(tube.ON_SLABS, piece)
     if case.partition.contraction is not None:
-        tally.hold(OF_CONTRACTION, contraction.Contracted(case, case.partition.contraction))
+        from . import contraction
+
+        tally.hold(contraction.OF_CONTRACTION, contraction.Contracted(case, case.partition.contraction))
     if c.outer is not None:
-        for table in (OF_OUTER, ON_FACES, OF_OUTER_TREE):
+        from . import outer
+
+        for table in (outer.OF_OUTER, outer.ON_FACES, outer.OF_OUTER_TREE):
             tally.hold(table, case)
         beyond, tree = outer.Beyond(case), case.outer[1].tree
-        tally.outer_margin = tally.hold_on_leaves(ON_OUTER_LEAVES, beyond, tree, lambda leaves: leaves.bound)
+        tally.outer_margin = tally.hold_on_leaves(outer.ON_OUTER_LEAVES, beyond, tree, lambda leaves: leaves.bound)

@@ -139,3 +139,7 @@ def decreases(piece: Piece) -> Failures:
         if not shows(models, P, rate, piece.slab.multipliers, piece.slab.path):
             yield piece.at, "the decrease of x'P(t)x is not shown"
     return 1
+
+
+OF_THE_TUBE = (("tube", nodes_are_sound),)
+ON_SLABS = (("tube", fits), ("inputs", ball.keeps_inputs), ("tube", ball.is_not_clipped), ("tube", decreases))

@@ -119,6 +119,7 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         *([] if c.outer is None else [_function(c.outer.function)]),
         *claim(c),
         "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items()),
+        "modules that were used: " + ", ".join(answer["modules"]),
         rest,
         f"{verdict} {f'c0={c.c0!r} ' if c.practical else ''}c1={c.c1!r} c2={c.c2!r}"
         f"{'' if c.outer is None else f' n2={c.outer.level!r}'} sha256={c.sha256}",

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from certify.checker import local
+from certify.checker import flow, local
 from certify.checker.decrease import Models
 from certify.checker.jets import Jet
 from certify.checker.near import ZERO
@@ -171,7 +171,7 @@ def from_any_level(ring: Ring, rise: Any, centre: Any, radius: Any) -> Any:
 
 SIDES = local.sides
 BROKEN: dict[str, tuple[str, Any, str, Any]] = {
-    "Euler's steps": ("a period", local, "later", in_steps_of_euler),
+    "Euler's steps": ("a period", flow, "later", in_steps_of_euler),
     "no square of the step": ("a rate of steps", local, "sides", without_the_square),
     "no rate": ("a rate of samples", local, "sides", without_the_rate),
     "one corner": ("a range that moves all", Models, "corners", lambda models: iter([models])),

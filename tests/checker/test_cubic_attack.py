@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from flint import arb, ctx, fmpq, fmpq_mat
 
-from certify.checker import rules, tube
+from certify.checker import tube
 from certify.checker.ball import Ball
 from certify.checker.case import Case
 from certify.checker.decrease import Models, are_finite, sides
@@ -404,7 +404,7 @@ def test_a_cubic_in_skewed_coordinates_is_not_proved_to_its_limit(shear: int, po
 
 def refused_by(piece: tube.Piece) -> str | None:
     """The rule of slabs that fails."""
-    return next((name for name, rule in rules.ON_SLABS if next(rule(piece), None) is not None), None)
+    return next((name for name, rule in tube.ON_SLABS if next(rule(piece), None) is not None), None)
 
 
 def flow(field: Callable[[float], float], x: float, seconds: float) -> float:

@@ -422,3 +422,24 @@ def test_an_answer_that_nobody_hears_is_no_refusal(tmp_path: Path) -> None:
         assert subprocess.run(line, stdout=full, stderr=subprocess.DEVNULL, check=False).returncode == 70
     shell = f"exec {shlex.join(line)} >&-"
     assert subprocess.run(["sh", "-c", shell], stderr=subprocess.DEVNULL, check=False).returncode == 70
+
+
+FEATURES = {"flow", "tube", "contraction", "outer"}
+
+
+@pytest.mark.parametrize(
+    ("name", "used"),
+    [("rotor", set()), ("enlarged", {"tube"}), ("sampled", {"flow"}), ("outer, a network", {"flow", "outer"})],
+)
+def test_an_answer_rests_on_the_modules_that_it_needs(name: str, used: set[str], tmp_path: Path) -> None:
+    answer = run_checker(write(honest(name), tmp_path), "checker")
+    assert answer["result"] == "ACCEPTED"
+    modules = set(json.loads(run_alone(write(honest(name), tmp_path)))["modules"])
+    assert modules & FEATURES == used
+    package = Path(boxes.__file__).parent
+    assert modules - FEATURES == {path.stem for path in package.glob("[a-z]*.py")} - FEATURES
+
+
+def run_alone(path: Path) -> str:
+    command = [sys.executable, "-I", "-m", "certify.checker", "--json", str(path)]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout

@@ -12,6 +12,13 @@ from types import ModuleType
 
 import certify.checker
 
+TABLES = {
+    "rules": ("STATED", "ON_THE_BALL", "OF_THE_TREE", "ON_LEAVES"),
+    "tube": ("OF_THE_TUBE", "ON_SLABS"),
+    "contraction": ("OF_CONTRACTION",),
+    "outer": ("OF_OUTER", "ON_FACES", "OF_OUTER_TREE", "ON_OUTER_LEAVES"),
+}
+
 
 @contextmanager
 def checker_without(rule: str, folder: Path) -> Iterator[ModuleType]:
@@ -34,14 +41,13 @@ def checker_without(rule: str, folder: Path) -> Iterator[ModuleType]:
         for module in ("case", "document", "exact", "rules", "strict"):
             importlib.import_module(f"{name}.{module}")
         removed = 0
-        for table in (
-            "STATED", "ON_THE_BALL", "OF_THE_TREE", "ON_LEAVES", "OF_THE_TUBE", "ON_SLABS", "OF_CONTRACTION",
-            "OF_OUTER", "ON_FACES", "OF_OUTER_TREE", "ON_OUTER_LEAVES",
-        ):  # fmt: skip
-            rows = getattr(package.rules, table)
-            kept = tuple(row for row in rows if row[0] != rule)
-            setattr(package.rules, table, kept)
-            removed += len(rows) - len(kept)
+        for module, tables in TABLES.items():
+            place = importlib.import_module(f"{name}.{module}")
+            for table in tables:
+                rows = getattr(place, table)
+                kept = tuple(row for row in rows if row[0] != rule)
+                setattr(place, table, kept)
+                removed += len(rows) - len(kept)
         if rule == "format":
             package.strict.fail = lambda at, detail: None
         elif rule == "hash":
