@@ -1,4 +1,4 @@
-"""Prove the gallery's plants, draw their certificates, and write the page's table: `make gallery`, a quarter of an hour.
+"""Prove the gallery's plants, draw their certificates, and write its table: `make gallery`, a quarter of an hour.
 
 The pictures and `proved.txt` are kept in the repository, so that building the site stays quick; what they show is read
 from certificates that the checker has accepted in this run. A certificate that `out/gallery` already has is checked
