@@ -33,29 +33,26 @@ SAMPLES = 200_000
 
 @dataclass(frozen=True)
 class Entry:
-    """A plant; the efforts for its largest set and for a tube from its box, 0 for no tube."""
+    """A plant; the effort for a tube from its box, 0 for no tube."""
 
     name: str
-    effort: float = 1.0
     tube_effort: float = 0.0
 
     @property
     def own(self) -> list[str]:
         """The command that proves the largest set."""
-        limit = [] if self.effort == 1 else ["--effort", f"{self.effort:g}"]
-        return ["certify", "roa", "--policy", f"examples/policies/{self.name}.pt", *limit]
+        return ["certify", "roa", "--policy", f"examples/policies/{self.name}.pt"]
 
     @property
     def box(self) -> list[str]:
         """The command that proves the largest multiple of the box' ellipsoid."""
-        limit = ["--effort", f"{self.tube_effort:g}"]
-        return [*self.own[:4], *limit, "--box", _text(self.name)]
+        return [*self.own, "--effort", f"{self.tube_effort:g}", "--box", _text(self.name)]
 
 
 ENTRIES = (
     Entry("pendulum"),
     Entry("cartpole"),
-    Entry("quadrotor2d", effort=2.0),
+    Entry("quadrotor2d"),
     Entry("quadrotor3d", tube_effort=12.0),
 )
 
