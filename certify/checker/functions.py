@@ -196,12 +196,12 @@ class _Inverse(Function):
         return pp, p * pp * 2, pp * pp * 3, pp * p * pp * 4
 
     def third(self, e: Expansion) -> Above:
-        """What three terms leave is exactly -D^3 / (v0^3 v)."""
+        """Three terms leave exactly -D^3 / (v0^3 v)."""
         p = _UNIT.over(lower(e.v0))
         return (p * p * p).over(lower(e.v))
 
     def fourth(self, e: Expansion) -> Above:
-        """What four leave is exactly D^4 / (v0^4 v)."""
+        """Four leave exactly D^4 / (v0^4 v)."""
         return e.third.over(lower(e.v0))
 
     def last(self, e: Expansion) -> Above:
@@ -307,14 +307,14 @@ class _Sqrt(Function):
         return p * 0.5, cube * 0.25, fifth * 0.1875, fifth * p * p * 0.15625
 
     def third(self, e: Expansion) -> Above:
-        """What three terms leave is exactly D^3 (3 s + w) / (8 s^3 (s + w)^3), which falls as v rises; and 3 s + w is
+        """Three terms leave exactly D^3 (3 s + w) / (8 s^3 (s + w)^3), which falls as v rises; and 3 s + w is
         2 s + (s + w)."""
         p, q, _ = self._inverses(e)
         pq = p * q
         return (pq * pq * (q * 2 + p)).over(8.0)
 
     def fourth(self, e: Expansion) -> Above:
-        """What four leave is exactly -D^4 (5 s^2 + 4 s w + w^2) / (16 s^5 (s + w)^4), which falls in magnitude as v
+        """Four leave exactly -D^4 (5 s^2 + 4 s w + w^2) / (16 s^5 (s + w)^4), which falls in magnitude as v
         rises; and 5 s^2 + 4 s w + w^2 is 2 s^2 + 2 s (s + w) + (s + w)^2."""
         p, q, _ = self._inverses(e)
         pq = p * q

@@ -453,11 +453,11 @@ def products(x: Array, y: Array, both: Above, first: Array, second: Array) -> Fo
 
 
 def near(q: Fraction) -> Near:
-    """The binary64 number nearest to a rational; infinitely far if it is too large."""
+    """The binary64 number nearest to a rational; 0, and infinitely far, if it is too large."""
     try:
         value = float(q)
     except OverflowError:
-        return Near(np.float64(np.inf), Above(np.float64(np.inf)))
+        return Near(np.float64(0), Above(np.float64(np.inf)))
     left = abs(Fraction(value) - q)
     return Near(np.float64(value), Above(np.float64(left) + LEAST, 2) if left else ZERO)
 

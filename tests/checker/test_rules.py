@@ -959,7 +959,7 @@ def test_without_centring_the_equilibrium_is_decided_exactly(
     case = Case(replace(parse(scalar_claim()), policy=policy, u_eq=(u_eq,)))
     failures = list(dict(rules.STATED)["centring"](case))
     if known:
-        assert not failures and network.fold(policy, (u_eq,)).offset is policy.offset
+        assert not failures and network.fold(policy, (u_eq,)).offset.value is policy.offset
     else:
         assert [at for at, _ in failures] == ["policy.centre"] and raw_at_origin(policy) != [u_eq]
 

@@ -50,7 +50,8 @@ class Jet:
         """`error`, `slack`, `lip`, `radius`, `curve`, `twist`, `bend`, `sway`, `tilt` as numbers."""
         if name == "model":
             raise AttributeError(name)
-        found = top(getattr(self.model, "lipschitz" if name == "lip" else name))
+        with np.errstate(all="ignore"):
+            found = top(getattr(self.model, "lipschitz" if name == "lip" else name))
         return found if np.ndim(found) else float(found)
 
     @property
@@ -87,13 +88,15 @@ class Jet:
 
     @property
     def E(self) -> Any:
-        return self.model.remainder
+        with np.errstate(all="ignore"):
+            return self.model.remainder
 
     @property
     def whole(self) -> Any:
         """A bound of the remainder and of sum_j B_j e_j, as a matrix."""
-        kept = jets.identity(self.model.E, self.model.Q.error + self.model.K.error)
-        return (self.model.whole + kept).majorant
+        with np.errstate(all="ignore"):
+            kept = jets.identity(self.model.E, self.model.Q.error + self.model.K.error)
+            return (self.model.whole + kept).majorant
 
     @property
     def size(self) -> Any:
