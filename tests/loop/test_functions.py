@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flint import arb, ctx, fmpq
+from flint import arb, arb_mat, ctx, fmpq
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -198,7 +198,7 @@ def test_models_of_random_equations_contain_them(tree: Any, seed: int, size: flo
                 )
                 assert off <= arb(float(v.r[0]))
         names = {
-            name: reference_taylor.Taylor(arb(float(c)), [arb(float(a)) for a in g])
+            name: reference_taylor.Taylor(arb(float(c)), arb_mat([[arb(float(a)) for a in g]]))
             for name, c, g in zip("xy", centre, slopes, strict=True)
         }
         try:
@@ -206,11 +206,10 @@ def test_models_of_random_equations_contain_them(tree: Any, seed: int, size: flo
         except Refused:
             w = None
         if w is not None and w.is_finite():
-            Q = [[arb(0)] * 2 for _ in range(2)]
-            for (i, j), q in zip(reference_taylor.pairs(2), w.Q or [], strict=w.Q is not None):
-                Q[i][j] = q
+            g = arb_mat(1, 2) if w.g is None else w.g
+            Q = arb_mat(2, 2) if w.Q is None else w.Q
             for d in points:
-                off = abs(_at(tree, centre, slopes, d) - w.c - _form(w.g or [arb(0)] * 2, Q, d))
+                off = abs(_at(tree, centre, slopes, d) - w.c - _form(g.entries(), Q.tolist(), d))
                 assert off <= w.r + arb(2) ** -100 * (1 + w.r + abs(w.c))
         # balls
         n = np.zeros((2, 2))
