@@ -20,7 +20,7 @@ from certify.analysis.candidates.trials import trial
 from certify.analysis.facts import Diagnosis, Share, Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
-from certify.certificates.verdict import Stop
+from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT, UNLIMITED, WHOLE, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
@@ -167,7 +167,10 @@ def _next(
     effort: Effort,
 ) -> Step:
     if result.stop is Stop.UNSTABLE:
-        return Step((), "no Lyapunov equation has a solution; the policy has to stabilise the plant first")
+        other = "another policy, which stabilises the plant"
+        if result.verdict is Verdict.REFUTED:
+            return Step((), f"{other}: no V can prove the claim for this one")
+        return Step((), f"{other}; for this one no Lyapunov equation has a solution, so that you must give P yourself")
     if result.claim in ("practical", "nearby") and (centre := _centring(*asked)) is not None:
         return Step(
             (("--centre", centre),),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -91,3 +92,14 @@ def test_no_wider_domain_is_suggested_where_samples_allow_no_more(
         "samples allow hardly more to this V, and to one that is stretched along with the domain, where the domain is "
         "wider in θ̇ or θ"
     )
+
+
+@pytest.mark.parametrize("claim, said", [("asymptotic", "no V can prove"), ("practical", "you must give P yourself")])
+def test_an_unstable_loop_needs_another_policy(
+    tmp_path: Path, claim: Literal["asymptotic", "practical"], said: str
+) -> None:
+    """The practical claim may still hold beyond a floor, and a P that is given may show it."""
+    system, network = chain(1, [0.5])
+    result = certify_roa(system, network, tmp_path, RoaOptions(claim=claim))
+    assert result.diagnosis is not None and result.diagnosis.next.options == ()
+    assert result.diagnosis.next.why.startswith("another policy") and said in result.diagnosis.next.why

@@ -136,6 +136,7 @@ def test_unstable_loops_exit_1_and_name_the_eigenvalues(
 ) -> None:
     status, out, _ = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path, "--param", "m=5")
     assert status == 1 and "REFUTED" in out and "eigenvalues" in out
+    assert "no V can prove" in out and "another V" not in out and "hardest along" not in out
 
 
 def test_a_plant_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
