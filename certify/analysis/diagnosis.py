@@ -16,25 +16,26 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.analysis.candidates.trials import trial
 from certify.analysis.facts import Diagnosis, Share, Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
-from certify.certificates.verdict import Stop
+from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT, UNLIMITED, WHOLE, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System
 from certify.loop.policies import Centre, TanhNetwork
-from certify.lyapunov import diagonalising_coordinates, domain_limit, extents, volume
+from certify.lyapunov import extents, volume
 from certify.provers.ball.models import paths
-from certify.provers.base import Proof
-from certify.provers.falsify import falsify
+from certify.provers.base import FEW, Proof
 from certify.provers.tube.tube import find_tube
 from certify.report.timing import TimingInWords
 from certify.report.words import number, quantity, symbol
 
 Array = NDArray[np.float64]
-_WIDER = Fraction(3, 2)  # factor of the side of the domain that binds
+_WIDER, _SLIGHTLY_WIDER = Fraction(3, 2), Fraction(5, 4)  # factors of the side of the domain that binds
+_BINDS = 0.99  # of the largest share of a side of the domain: another side that binds as well
 _WORTH = 1.1  # growth of the volume that makes a wider domain worth a word
 _MOST = 1000.0  # an effort that may be suggested
 _LONGER, _LOOK = 1.1, 2 * UNIT  # a tube's start relative to the proved set; operations for looking
@@ -99,8 +100,7 @@ def _binding(result: RoaResult) -> tuple[str, str, str | None, str | None, Array
     limit = result.levels.domain_limit
     if result.stop in (Stop.DOMAIN, Stop.MARGIN) and P is not None and limit is not None:
         columns = np.asarray(np.linalg.inv(P), dtype=np.float64)
-        share = [columns[i, i] / min(-float(lo), float(hi)) ** 2 for i, (lo, hi) in enumerate(system.domain)]
-        i = int(np.argmax(share))
+        i = int(np.argmax(_shares(system, P)))
         lo, hi = system.domain[i]
         side = "lower" if -lo < hi else "upper"
         sign = -1.0 if side == "lower" else 1.0
@@ -167,14 +167,17 @@ def _next(
     effort: Effort,
 ) -> Step:
     if result.stop is Stop.UNSTABLE:
-        return Step((), "no Lyapunov equation has a solution; the policy has to stabilise the plant first")
+        other = "another policy, which stabilises the plant"
+        if result.verdict is Verdict.REFUTED:
+            return Step((), f"{other}: no V can prove the claim for this one")
+        return Step((), f"{other}; for this one no Lyapunov equation has a solution, so that you must give P yourself")
     if result.claim in ("practical", "nearby") and (centre := _centring(*asked)) is not None:
         return Step(
             (("--centre", centre),),
             "shifted so that pi(0) = u_eq the loop rests where it should, and the stronger claim can be tried",
         )
-    if result.stop is Stop.DOMAIN and name is not None and options.level is None:
-        return _wider_domain(result, name, effort)
+    if result.stop is Stop.DOMAIN and options.level is None:
+        return _wider_domain(result, options, effort)
     if result.stop is Stop.PATH:
         why = "the set that the tube has to reach grows with the effort, and so do the widths that are tried"
         return Step((("--effort", _round(4 * options.effort)),), why)
@@ -320,28 +323,67 @@ def _longer(result: RoaResult, options: RoaOptions, proof: Proof | None, effort:
     return Step((("--effort", _round(10 * options.effort)),), f"{ended} when the effort ended")
 
 
-def _wider_domain(result: RoaResult, name: str, effort: Effort) -> Step:
-    """A wider domain, where the same V reaches further in a domain that is wider in the state that binds."""
+def _wider_domain(result: RoaResult, options: RoaOptions, effort: Effort) -> Step:
+    """A domain that is wider in a state that binds, where samples show that a V reaches further in it.
+
+    This V is tried there, and one that is stretched along with the domain, unless V is given.
+    """
     system, problem, level = result.system, result.problem, result.levels.roa
-    i = [s.name for s in system.states].index(name)
-    lo, hi = (_WIDER * side for side in system.domain[i])
-    wider = system.with_domain({name: (lo, hi)})
     if problem is None or level is None:
         return Step((), result.reason)
-    P = problem.V.P
-    loop = ClosedLoop(wider, result.network)
-    limit = domain_limit(P, wider.domain)
-    T = diagonalising_coordinates(P, loop.mean_rate(), loop.step)
-    witness = falsify(replace(problem, loop=loop), T, limit, samples=4000, effort=effort.part(_LOOK, even_if_over=True))
-    reach = volume(P, limit if witness is None else min(limit, witness.level))
-    grown = reach / volume(P, level)
-    if grown < _WORTH:
-        return Step(
-            (), f"no option helps: in a domain that is wider in {symbol(name)} something else soon limits this V"
-        )
-    at = system.operating_point().get(name, Fraction(0))  # the command takes an interval as values
-    side = f"{name}={float(hi):g}" if lo == -hi else f"{name}={float(lo + at):g}..{float(hi + at):g}"
-    return Step((("--domain", side),), f"if the equations hold there, this V reaches {grown:.3g} times the volume")
+    free = options.P is None and options.engine != "dreal"
+    kinds = [(_WIDER, False)] + [(factor, True) for factor in (_WIDER, _SLIGHTLY_WIDER) if free]
+    share, look = _shares(system, problem.V.P), effort.part(_LOOK, even_if_over=True)
+    binding = [int(i) for i in np.argsort(-share, kind="stable") if share[i] >= _BINDS * np.max(share)]
+    for i in binding:
+        found = list[tuple[float, Fraction, bool]]()
+        for factor, stretched in kinds:
+            reach = _reach(result, options, i, factor, stretched, look)
+            if reach is not None:
+                found.append((reach / volume(problem.V.P, level), factor, stretched))
+        grown, factor, stretched = max(found, key=lambda one: one[0], default=(0.0, _WIDER, False))
+        if grown >= _WORTH:
+            which = "a V that is stretched along with the domain" if stretched else "this V"
+            why = f"if the equations hold there, samples allow {grown:.3g} times the volume to {which}"
+            other = (("--candidate", "auto"),) if stretched and options.only not in (None, "optimised") else ()
+            return Step((("--domain", _side(system, i, factor)), *other), why)
+        if len(found) < len(kinds):  # samples cannot tell, or the operations for them have ended
+            why = "if the equations hold there, the set may be larger"
+            return Step((("--domain", _side(system, i, _WIDER)),), why)
+    which = ", and to one that is stretched along with the domain," if free else ""
+    where = " or ".join(symbol(system.states[i].name) for i in binding)
+    return Step((), f"samples allow hardly more to this V{which} where the domain is wider in {where}")
+
+
+def _shares(system: System, P: Array) -> Array:
+    """The shares (n,) of the domain that an ellipsoid {x'Px <= const} extends to, in proportion to each other."""
+    least = np.array([min(-float(lo), float(hi)) for lo, hi in system.domain])
+    return np.asarray(np.sqrt(np.diag(np.linalg.inv(P))) / least)
+
+
+def _reach(
+    result: RoaResult, options: RoaOptions, i: int, factor: Fraction, stretched: bool, effort: Effort
+) -> float | None:
+    """The volume that V reaches in samples where state i has a domain wider by this factor; None if that is unknown."""
+    system, problem = result.system, result.problem
+    if problem is None or (result.claim in ("practical", "nearby") and system.n > FEW):
+        return None
+    lo, hi = system.domain[i]
+    wider = system.with_domain({system.states[i].name: (factor * lo, factor * hi)})
+    scale = np.ones(system.n)
+    scale[i] = 1 / float(factor) if stretched else 1.0
+    try:
+        found = trial(ClosedLoop(wider, result.network), scale[:, None] * problem.V.P * scale, "", options, effort)
+    except InputError:
+        return 0.0
+    return None if effort.over else found.volume
+
+
+def _side(system: System, i: int, factor: Fraction) -> str:
+    """The option's value for a state's side of the domain that is wider by this factor: values, not deviations."""
+    name, (lo, hi) = system.states[i].name, (factor * side for side in system.domain[i])
+    at = system.operating_point().get(name, Fraction(0))
+    return f"{name}={float(hi):g}" if lo == -hi else f"{name}={float(lo + at):g}..{float(hi + at):g}"
 
 
 def _round(value: float) -> str:

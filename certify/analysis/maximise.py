@@ -24,7 +24,7 @@ from certify.analysis.facts import Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
 from certify.analysis.run import Report, certify_roa, effort_of
-from certify.certificates import set_aside, sole_writer, write_atomically
+from certify.certificates import earlier_aside, sole_writer, write_atomically
 from certify.certificates.claims import Problem
 from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT
@@ -56,6 +56,7 @@ def certify_largest(
     load_seconds: float = 0.0,
     provenance: Mapping[str, Any] | None = None,
     progress: Report | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> RoaResult:
     """Certify the set that is proved with an input that follows at once and no rate, but for a few hundredths of its
     level, with as long a period, or as large a rate, as can be proved for it.
@@ -63,7 +64,7 @@ def certify_largest(
     Parameters
     ----------
     quantity : `period`, for exactly which the input is held, or `rate`; with a rate the plant keeps its sample time.
-    system, network, out, options, load_seconds, provenance, progress : those of `certify_roa`.
+    system, network, out, options, load_seconds, provenance, progress, tell : those of `certify_roa`.
 
     Returns
     -------
@@ -78,8 +79,11 @@ def certify_largest(
     _require_possible(quantity, plain, options)
     effort = effort_of(options, load_seconds)
     certify = partial(certify_roa, provenance=provenance, progress=progress, keep=False)
-    with one_thread(), sole_writer(out), TemporaryDirectory(dir=out, prefix="attempt-") as folder:
-        set_aside(out)
+    with (
+        sole_writer(out),
+        earlier_aside(out, tell or (lambda _: None)),
+        TemporaryDirectory(dir=out, prefix="attempt-") as folder,
+    ):
         share = effort.share(_FOR_THE_SET)
         here = Path(folder) / "first"
         first = certify(plain, network, here, replace(options, rate=0.0), load_seconds=load_seconds, effort=share)

@@ -22,7 +22,7 @@ from certify.analysis.stages.further import Beyond, Equilibrium, Route, Tube
 from certify.analysis.stages.ring import Ring
 from certify.analysis.stages.setting import Setting, setting_of
 from certify.analysis.stages.state import Report, Stage, State, Tools
-from certify.certificates import PartitionTree, set_aside, sole_writer
+from certify.certificates import PartitionTree, earlier_aside, sole_writer
 from certify.certificates.verdict import Stop
 from certify.effort import WHOLE, Effort
 from certify.errors import InputError, SoundnessError
@@ -50,6 +50,7 @@ def certify_roa(
     show: Callable[[bytes], None] | None = None,
     effort: Effort | None = None,
     keep: bool = True,
+    tell: Callable[[str], None] | None = None,
 ) -> RoaResult:
     """Certify a region of attraction of `system` under `network`.
 
@@ -65,6 +66,7 @@ def certify_roa(
     show : called with the bytes of a certificate that the run ends with if they are accepted, before they are checked.
     effort : counted work of the run; by default that of the options.
     keep : False if the folder does not outlive the caller, so that no search is kept for `--resume`.
+    tell : told where an earlier run's certificate is kept, if this run ends without one.
 
     Returns
     -------
@@ -80,21 +82,21 @@ def certify_roa(
     from certify.provers.execution.threads import one_thread
 
     options = options or RoaOptions()
-    with one_thread(), sole_writer(out):
-        set_aside(out, keep=options.resume)
-        with _runner_for(options) as runner:
-            can_keep, named = keep and options.engine == "bounds", options.P is not None or options.only is not None
-            tools = Tools(
-                out,
-                runner,
-                effort or effort_of(options, load_seconds),
-                Keeper(out, can_keep, named),
-                provenance or {},
-                progress,
-                show or (lambda _: None),
-                load_seconds,
-            )
-            return _result(setting_of(ClosedLoop(system, network), options), tools)
+    begin = setting_of(ClosedLoop(system, network), options)
+    aside = earlier_aside(out, tell or (lambda _: None), keep=options.resume)
+    with one_thread(), sole_writer(out), aside, _runner_for(options) as runner:
+        can_keep, named = keep and options.engine == "bounds", options.P is not None or options.only is not None
+        tools = Tools(
+            out,
+            runner,
+            effort or effort_of(options, load_seconds),
+            Keeper(out, can_keep, named),
+            provenance or {},
+            progress,
+            show or (lambda _: None),
+            load_seconds,
+        )
+        return _result(begin, tools)
 
 
 def effort_of(options: RoaOptions, load_seconds: float = 0.0) -> Effort:

@@ -24,7 +24,15 @@ if TYPE_CHECKING:
     from certify.certificates.model import Certificate, loop_sections
     from certify.certificates.reading import parse_certificate, read_certificate, read_raw
     from certify.certificates.tree import leaves
-    from certify.certificates.writing import SEARCH, remove, set_aside, sole_writer, write_atomically, write_beside
+    from certify.certificates.writing import (
+        SEARCH,
+        earlier_aside,
+        remove,
+        set_aside,
+        sole_writer,
+        write_atomically,
+        write_beside,
+    )
 
 _NAMES = {
     "checking": ("run_checker",),
@@ -34,7 +42,7 @@ _NAMES = {
     "model": ("Certificate", "loop_sections"),
     "reading": ("parse_certificate", "read_certificate", "read_raw"),
     "tree": ("leaves",),
-    "writing": ("SEARCH", "remove", "set_aside", "sole_writer", "write_atomically", "write_beside"),
+    "writing": ("SEARCH", "earlier_aside", "remove", "set_aside", "sole_writer", "write_atomically", "write_beside"),
 }
 _PLACES = {name: module for module, names in _NAMES.items() for name in names}
 
@@ -49,6 +57,7 @@ __all__ = [
     "TrustedSolver",
     "Waypoint",
     "decode",
+    "earlier_aside",
     "encode",
     "leaves",
     "loop_sections",

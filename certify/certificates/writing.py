@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -48,11 +48,39 @@ def write_beside(path: Path, data: bytes, suffix: str) -> Path:
 
 
 SEARCH = "search.json"
-_OURS = {"certificate.json": b"certify-certificate/", "report.html": b"-m certify.checker", SEARCH: b"certify-search/"}
+_CERTIFICATE = "certificate.json"
+_OURS = {_CERTIFICATE: b"certify-certificate/", "report.html": b"-m certify.checker", SEARCH: b"certify-search/"}
 """The files that a run writes, by names, each with words that its text holds."""
 
 
-def set_aside(folder: Path, *, keep: bool = False) -> None:
+@contextmanager
+def earlier_aside(folder: Path, tell: Callable[[str], None], *, keep: bool = False) -> Iterator[None]:
+    """Set an earlier run's files aside during a run; a run that cannot begin, by an `InputError`, leaves them in place.
+
+    Parameters
+    ----------
+    tell : told where the earlier certificate lies, if the run ends without one of its own.
+    keep : True to leave the saved search in place, to be resumed.
+
+    Raises
+    ------
+    InputError : a file cannot be renamed, or somebody's own file has the other name.
+    """
+    renamed = set_aside(folder, keep=keep)
+    try:
+        yield
+    except InputError:
+        for path, other in renamed.items():
+            if not path.exists():
+                other.replace(path)
+        raise
+    finally:
+        path = folder / _CERTIFICATE
+        if path in renamed and not path.exists():
+            tell(f"no certificate is written; that of an earlier run is kept as {renamed[path]}")
+
+
+def set_aside(folder: Path, *, keep: bool = False) -> dict[Path, Path]:
     """Rename an earlier run's files in a folder, `certificate.json` to `certificate.earlier.json` and so on.
 
     A run's folder must not show another run's results, and hours of work must not be lost to a slip.
@@ -63,10 +91,15 @@ def set_aside(folder: Path, *, keep: bool = False) -> None:
     ----------
     keep : True to leave the saved search in place, to be resumed.
 
+    Returns
+    -------
+    dict : the new path of each file that was renamed.
+
     Raises
     ------
     InputError : a file cannot be renamed, or somebody's own file has the other name.
     """
+    renamed = dict[Path, Path]()
     for name, text in _OURS.items():
         path = folder / name
         if (keep and name == SEARCH) or not _holds(path, text):
@@ -78,6 +111,8 @@ def set_aside(folder: Path, *, keep: bool = False) -> None:
             path.replace(other)
         except OSError as error:
             raise InputError(f"{path} cannot be renamed: {error.strerror}.") from error
+        renamed[path] = other
+    return renamed
 
 
 def remove(path: Path) -> None:

@@ -66,10 +66,10 @@ def certified(
         drawing.begin(raw, folder / "certificate.json", time.perf_counter() - start)
 
     run = _run_for(largest, draw)
-    progress = None if quiet else ProgressLine()
+    progress, later = None if quiet else ProgressLine(), list[str]()
     try:
         about = {"load_seconds": time.perf_counter() - start, "provenance": _provenance(policy)}
-        result = run(plant, stored.network, folder, options, progress=progress, **about)
+        result = run(plant, stored.network, folder, options, progress=progress, tell=later.append, **about)
     except KeyboardInterrupt:
         search = folder / SEARCH
         if largest is not None or not search.exists():
@@ -81,6 +81,8 @@ def certified(
     finally:
         if progress is not None:
             progress.close()
+        for line in later:
+            note(line)
     if result.notice is not None:
         note(as_typed(result.notice, options_of(context.command)))
     data = _with_next_command(result.to_dict(), context, policy)

@@ -232,7 +232,7 @@ def _diagnosis_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
         held = " (at the nominal values)" if result.get("uncertain") else ""
         at_once = "" if timing.sample is None else ", if the input followed at once"
         rows.append(("modes", modes(found["fastest"], found["slowest"]) + held + at_once))
-    if found["hurts"] and found.get("kind") not in AT_A_POINT:
+    if found["hurts"] and found.get("kind") not in (*AT_A_POINT, "unstable"):  # an unstable loop has no proof
         rows.append(("hardest along", hardest(found["hurts"])))
     step = found["next"]
     command = f"{step['command']}  ({step['why']})" if step.get("command") else step["why"]

@@ -91,9 +91,10 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
             constant="where what is uncertain is constant in time, " if result.get("uncertain") else "",
         )
         word = ", if the solver is right: nothing checked its answers" if verdict == "TRUSTED" else ""
-        if any(map(Fraction, (result.get("operating_point") or {}).values())):
-            stated = stated.replace("the origin", "the operating point")
+        stated = stated.replace("the origin", _where_v_is_0(result))
         return f"{name}: {_whatever(result)}{stated}{word}"
+    if verdict == "REFUTED" and result.get("stop") == "unstable":
+        return f"{name}: the closed loop is unstable at {_where_v_is_0(result)}, so that no V can prove the claim"
     if verdict == "REFUTED":
         return f"{name}: a condition of the claim fails for this V and level; another V may show what this one cannot"
     if is_missed(result) and result.get("stop") == "beyond":
@@ -103,6 +104,12 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
     if is_missed(result):
         return f"{name}: the state is NOT shown to converge; what is proved is {{V <= {below(level)}}}, without it"
     return f"{name}: nothing was proved"
+
+
+def _where_v_is_0(result: Mapping[str, Any]) -> str:
+    """The name of the origin for people who read values: the operating point, if that is not 0."""
+    moved = any(map(Fraction, (result.get("operating_point") or {}).values()))
+    return "the operating point" if moved else "the origin"
 
 
 _FEW = 3  # uncertain quantities that a headline names

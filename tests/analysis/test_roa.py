@@ -418,7 +418,10 @@ def test_a_pass_says_in_which_direction_it_goes(tmp_path: Path) -> None:
 def test_an_earlier_run_s_files_do_not_lie_where_the_result_is_looked_for(
     ends: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They are set aside under a name that says so; what is somebody's own stays."""
+    """They are set aside under a name that says so, and people are told; what is somebody's own stays.
+
+    A run that cannot begin has no result, and leaves them in place.
+    """
     system, network = scalar_tanh()
     proved = certify_roa(system, network, tmp_path, RoaOptions(level=0.5))
     assert proved.verdict is Verdict.PROVED and proved.raw is not None
@@ -435,16 +438,29 @@ def test_an_earlier_run_s_files_do_not_lie_where_the_result_is_looked_for(
         )
     if ends == "unknown":
         monkeypatch.setattr("certify.provers.boxes.engine.prove_local", lambda *_: None)
-    given = options.get(ends, RoaOptions(level=0.5))
+    given, told = options.get(ends, RoaOptions(level=0.5)), list[str]()
     if ends in options:
-        assert certify_roa(system, network, tmp_path, given).verdict.value == ends.upper()
+        assert certify_roa(system, network, tmp_path, given, tell=told.append).verdict.value == ends.upper()
     else:
         with pytest.raises((InputError, KeyboardInterrupt)):
-            certify_roa(system, network, tmp_path, given)
+            certify_roa(system, network, tmp_path, given, tell=told.append)
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"certificate.earlier.json", "report.earlier.html", "search.json"}
-    assert (tmp_path / "certificate.earlier.json").read_bytes() == proved.raw
+    if ends == "with an error":
+        kept = tmp_path / "certificate.json"
+        assert names == {kept.name, "report.html", "search.json"} and not told
+    else:
+        kept = tmp_path / "certificate.earlier.json"
+        assert names == {kept.name, "report.earlier.html", "search.json"}
+        assert told == [f"no certificate is written; that of an earlier run is kept as {kept}"]
+    assert kept.read_bytes() == proved.raw
     assert (tmp_path / "search.json").read_text() == "my own notes"
+
+
+def test_a_run_that_writes_a_certificate_says_nothing_of_the_earlier_one(tmp_path: Path) -> None:
+    told = list[str]()
+    for _ in range(2):
+        certify_roa(*scalar_tanh(), tmp_path, RoaOptions(level=0.5), tell=told.append)
+    assert not told and (tmp_path / "certificate.earlier.json").exists()
 
 
 def test_a_run_that_finds_the_folder_taken_leaves_what_lies_there(tmp_path: Path) -> None:

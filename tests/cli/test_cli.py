@@ -135,6 +135,20 @@ def test_unstable_loops_exit_1_and_name_the_eigenvalues(
 ) -> None:
     status, out, _ = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path, "--param", "m=5")
     assert status == 1 and "REFUTED" in out and "eigenvalues" in out
+    assert "no V can prove" in out and "another V" not in out and "hardest along" not in out
+
+
+def test_a_run_without_a_certificate_says_where_the_earlier_one_is(
+    tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An option that cannot be used leaves it in place."""
+    asked = ("roa", policy_file, "--out", tmp_path)
+    run(capsys, *asked, "--level", "0.1")
+    assert run(capsys, *asked, "--Q", "1,2,3")[0] == 2 and (tmp_path / "certificate.json").exists()
+    status, _, err = run(capsys, *asked, "--param", "m=5")
+    kept = tmp_path / "certificate.earlier.json"
+    assert status == 1 and kept.exists() and not (tmp_path / "certificate.json").exists()
+    assert f"that of an earlier run is kept as {kept}" in err
 
 
 def test_a_plant_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -961,7 +961,12 @@ def test_summary_without_a_proof() -> None:
     }  # fmt: skip
     text = rendered(refuted)
     assert text.startswith("REFUTED") and "3.1, -5.8" in text and "not reached" in text
-    assert "invariant" not in text
+    assert "invariant" not in text and "another V may show" in text
+    unstable = rendered({**refuted, "stop": "unstable"})
+    assert "the closed loop is unstable at the origin, so that no V can prove the claim" in unstable
+    assert "another V" not in unstable
+    elsewhere = rendered({**refuted, "stop": "unstable", "operating_point": {"theta": "1/2"}})
+    assert "unstable at the operating point" in elsewhere
     unknown = rendered({**refuted, "verdict": "UNKNOWN", "reason": "[bold]time[/bold]", "system": "[red]x[/red]"})
     assert "nothing was proved" in unknown and "[bold]time[/bold]" in unknown and "[red]x[/red]" in unknown
 

@@ -1,0 +1,105 @@
+"""A suggestion is true: whoever follows it gets what it promises."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from certify.analysis.diagnosis import diagnose
+from certify.analysis.facts import Step
+from certify.analysis.options import RoaOptions
+from certify.analysis.results import RoaResult
+from certify.analysis.run import certify_roa
+from certify.loop.plants import System, get_system
+from certify.loop.policies import load_policy
+from tests.support.loops import chain
+
+PENDULUM = Path(__file__).parents[2] / "examples" / "policies" / "pendulum.pt"
+LITTLE = RoaOptions(effort=0.2)
+
+
+def step_of(result: RoaResult, options: RoaOptions) -> Step:
+    found = diagnose(result, options, None).next
+    assert found is not None
+    return found
+
+
+def widened(system: System, step: Step) -> System:
+    """The plant with the domain that a step suggests, whose sides are symmetric."""
+    name, _, end = dict(step.options)["--domain"].partition("=")
+    return system.with_domain({name: (-Fraction(end), Fraction(end))})
+
+
+@pytest.fixture(scope="module")
+def pendulum_result(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
+    network = load_policy(PENDULUM).network
+    return certify_roa(get_system("pendulum"), network, tmp_path_factory.mktemp("pendulum"), LITTLE)
+
+
+def test_a_wider_domain_that_is_suggested_gives_a_larger_set(pendulum_result: RoaResult, tmp_path: Path) -> None:
+    """Both sides of the domain bind, so this very V reaches no further: another one does, and the run finds it."""
+    assert pendulum_result.diagnosis is not None
+    step = pendulum_result.diagnosis.next
+    assert dict(step.options) == {"--domain": "theta_dot=25"} and "a V that is stretched" in step.why
+    wider = certify_roa(widened(pendulum_result.system, step), pendulum_result.network, tmp_path, LITTLE)
+    assert wider.volume is not None and pendulum_result.volume is not None
+    assert wider.volume > 1.2 * pendulum_result.volume
+
+
+def test_a_wider_domain_is_suggested_for_this_v_where_it_alone_reaches_further(tmp_path: Path) -> None:
+    system, network = chain(2, [-1.0, -2.0])
+    options = replace(LITTLE, P=np.array([[1.0, 0.2], [0.2, 0.3]]))
+    result = certify_roa(system, network, tmp_path, options)
+    assert result.reason == "domain" and result.volume is not None
+    step = step_of(result, options)
+    assert "to this V" in step.why
+    wider = certify_roa(widened(system, step), network, tmp_path / "wider", options)
+    promised = float(step.why.partition("samples allow ")[2].split()[0])
+    assert wider.volume == pytest.approx(promised * result.volume, rel=0.02)
+
+
+def test_a_v_that_is_given_is_not_stretched(pendulum_result: RoaResult) -> None:
+    assert pendulum_result.P is not None
+    step = step_of(pendulum_result, replace(LITTLE, P=pendulum_result.P))
+    assert step.options == () and step.why.startswith("samples allow hardly more to this V where the domain is wider")
+
+
+def test_another_candidate_is_suggested_with_the_domain_that_needs_it(pendulum_result: RoaResult) -> None:
+    step = step_of(pendulum_result, replace(LITTLE, candidate="lqr"))
+    assert dict(step.options) == {"--domain": "theta_dot=25", "--candidate": "auto"}
+
+
+def test_a_domain_that_no_sample_tells_of_is_suggested_without_a_number(
+    pendulum_result: RoaResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("certify.analysis.diagnosis._LOOK", 1.0)
+    step = step_of(pendulum_result, LITTLE)
+    assert dict(step.options) == {"--domain": "theta_dot=30"} and step.why.endswith("the set may be larger")
+
+
+def test_no_wider_domain_is_suggested_where_samples_allow_no_more(
+    pendulum_result: RoaResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("certify.analysis.diagnosis._WORTH", 2.0)
+    step = step_of(pendulum_result, LITTLE)
+    assert step.options == ()
+    assert step.why == (
+        "samples allow hardly more to this V, and to one that is stretched along with the domain, where the domain is "
+        "wider in θ̇ or θ"
+    )
+
+
+@pytest.mark.parametrize("claim, said", [("asymptotic", "no V can prove"), ("practical", "you must give P yourself")])
+def test_an_unstable_loop_needs_another_policy(
+    tmp_path: Path, claim: Literal["asymptotic", "practical"], said: str
+) -> None:
+    """The practical claim may still hold beyond a floor, and a P that is given may show it."""
+    system, network = chain(1, [0.5])
+    result = certify_roa(system, network, tmp_path, RoaOptions(claim=claim))
+    assert result.diagnosis is not None and result.diagnosis.next.options == ()
+    assert result.diagnosis.next.why.startswith("another policy") and said in result.diagnosis.next.why
