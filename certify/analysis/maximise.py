@@ -33,7 +33,6 @@ from certify.loop.plants import System, exact
 from certify.loop.policies import TanhNetwork
 from certify.lyapunov import diagonalising_coordinates
 from certify.lyapunov.function import Quadratic
-from certify.provers.execution.threads import one_thread
 from certify.provers.falsify import is_violated
 
 Quantity = Literal["period", "rate"]
