@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from flint import arb, arb_mat
 
-from .balls import SPREAD, ZERO, derivatives, fourth, identity, largest_fourth
+from .balls import SPREAD, ZERO, derivatives, fourth, identity, largest_fourth, total
 from .lipschitz import beyond_linear, beyond_square
 from .refusal import Refused
 from .symmetric import linear_times_square, no_form
@@ -56,15 +56,14 @@ def function_of(v: Model, name: str) -> Model:
     phi = expansion(v, name)
     H, C, R = beyond_tangent(v, phi)
     (value, p, half, _), moved, steepest = phi.at, phi.moved, phi.steepest
-    wrong = moved[1] * v.spread
-    E = steepest * v.E + R + wrong * identity(v.a.nrows())
-    lip = steepness(v, phi, wrong)
+    E = steepest * v.E + R + moved[1] * (v.shares + (v.bend + v.twist) * identity(v.a.nrows()))
+    lip = steepness(v, phi, moved[1] * (2 * v.bend + 3 * v.twist))
     B, dv = tuple(p * q for q in v.B), tuple(p * q for q in v.dv)
     by_y = 2 * abs(half) * v.sway
     da = tuple(p * a + (2 * half * q) * v.a for q, a in zip(v.dv, v.da, strict=True))
     square = v.doubt * v.doubt
     off = abs(p) * v.off + phi.bent * square
-    slack = (2 * phi.bent * v.off + 3 * phi.twisted * square) * v.slope
+    slack = (2 * abs(half) * v.off + 3 * phi.twisted * square) * v.slope
     slack += (abs(p) + by_y) * v.slack + by_y * v.tilt
     Q, K = p * v.Q + H, p * v.K + C
     return replace(v, v=value, a=p * v.a, Q=Q, K=K, E=E, B=B, dv=dv, da=da, lip=lip, off=off, slack=slack)
@@ -104,21 +103,24 @@ def beyond_tangent(v: Model, phi: Expansion) -> tuple[arb_mat, arb_mat, arb_mat]
     rest = 2 * phi.bent * slope
     turned = phi.bent * curve + phi.twisted * (3 * slope * (slope + curve) + curve * curve)
     turned += quartic * (2 * slope + curve)
-    known = rest * v.twist + turned * (v.bend + v.twist) + mistaken(v, phi)
+    known = rest * v.twist + turned * (v.bend + v.twist) + total(mistaken(v, phi))
     return h * outer, C, (rest + turned) * v.whole + quartic * outer + known * identity(n)
 
 
-def mistaken(v: Model, phi: Expansion) -> arb:
-    """A bound of what differs in H, C and quartic a a' for other y, on the ball."""
-    s, quartic = v.slope, phi.fourth * v.radius * v.radius
-    wrong = phi.moved[2] * (s * s + 2 * s * v.bend) + phi.moved[3] * s * s * s
-    return wrong + (2 * (phi.bent + quartic) * s + 2 * phi.bent * v.bend + 3 * phi.twisted * s * s) * v.turn
+def mistaken(v: Model, phi: Expansion) -> tuple[arb, arb, arb]:
+    """Bounds of what differs in H, in C and in quartic a a' for other y, on the ball."""
+    s, a, quartic = v.slope, v.slope - v.turn, phi.fourth * v.radius * v.radius
+    square, cube = s * s - a * a, s * s * s - a * a * a
+    of_H = phi.moved[2] * s * s + (phi.bent - phi.moved[2]) * square
+    of_C = 2 * (phi.moved[2] * s + (phi.bent - phi.moved[2]) * v.turn) * v.bend
+    of_C += phi.moved[3] * s * s * s + (phi.twisted - phi.moved[3]) * cube
+    return of_H, of_C, quartic * square
 
 
 def steepness(v: Model, phi: Expansion, wrong: arb) -> arb | None:
-    """The Lipschitz constant of phi(v) beyond its K; `wrong` bounds what phi' Q and phi' K are wrong by."""
+    """The Lipschitz constant of phi(v) beyond its K; `wrong` is twice what phi' Q is off by, and thrice what phi' K is."""
     beyond = steepness_beyond_tangent(v, phi)
-    return None if v.lip is None or beyond is None else phi.steepest * v.lip + beyond + 3 * wrong
+    return None if v.lip is None or beyond is None else phi.steepest * v.lip + beyond + wrong
 
 
 def steepness_beyond_tangent(v: Model, phi: Expansion) -> arb | None:
@@ -132,4 +134,5 @@ def steepness_beyond_tangent(v: Model, phi: Expansion) -> arb | None:
     y, z, steep = v.slope, beyond.size, beyond.steep
     second = 2 * phi.bent * (y * left.both + z * steep)
     third = 3 * phi.twisted * (y * y * (steep + 2 * z) + y * z * (2 * steep + z) + z * z * steep)
-    return second + third + phi.last * v.radius**3 * (y + steep) + 3 * mistaken(v, phi)
+    of_H, of_C, _ = mistaken(v, phi)
+    return second + third + phi.last * v.radius**3 * (y + steep) + 2 * of_H + 3 * of_C

@@ -29,14 +29,14 @@ class Beyond:
 def of_product(v: Model, w: Model, wrong: arb) -> arb | None:
     """The Lipschitz constant of v w beyond K: v(0) times w's, (a.d) times w beyond Q, and the product beyond a.d.
 
-    A product has the size of each times the other's constant. `wrong` bounds what Q and K are wrong by.
+    A product has the size of each times the other's constant. `wrong` is twice what Q and three times what K is off by.
     """
     if v.lip is None or w.lip is None:
         return None
     result = v.size * w.lip + w.size * v.lip
     result += v.slope * beyond_square(w, w.lip).both + w.slope * beyond_square(v, v.lip).both
     of_v, of_w = beyond_linear(v, v.lip), beyond_linear(w, w.lip)
-    return result + of_v.size * of_w.steep + of_w.size * of_v.steep + 3 * wrong
+    return result + of_v.size * of_w.steep + of_w.size * of_v.steep + wrong
 
 
 def beyond_linear(v: Model, lip: arb) -> Beyond:

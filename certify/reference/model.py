@@ -104,11 +104,6 @@ class Model:
         return self.E + self.shares
 
     @cached_property
-    def spread(self) -> arb:
-        """A bound of all that Q, K and B come to."""
-        return self.bend + self.twist + norm(self.shares.entries())
-
-    @cached_property
     def curve(self) -> arb:
         return self.bend + self.twist + norm(self.whole.entries())
 
@@ -185,8 +180,10 @@ class Model:
         K = v.v * w.K + w.v * v.K + v.times_square(w) + w.times_square(v)
         B = tuple(v.v * q + w.v * p for p, q in zip(v.B, w.B, strict=True))
         known = v.slope * w.twist + w.slope * v.twist + (v.bend + v.twist) * (w.bend + w.twist)
-        wrong = v.doubt * w.spread + w.doubt * v.spread + v.turn * (w.slope + w.bend) + w.turn * (v.slope + v.bend)
-        E = v.size * w.E + w.size * v.E + (known + wrong) * identity(n)
+        of_Q = v.doubt * w.bend + w.doubt * v.bend + v.turn * w.slope + w.turn * (v.slope - v.turn)
+        of_K = v.doubt * w.twist + w.doubt * v.twist + v.turn * w.bend + w.turn * v.bend
+        E = v.size * w.E + w.size * v.E + v.doubt * w.shares + w.doubt * v.shares
+        E += (known + of_Q + of_K) * identity(n)
         E += v.radius * w.whole + (w.slope + w.bend + w.twist) * v.whole
         off = v.size * w.off + w.size * v.off + v.sway * w.sway
         slack = v.size * w.slack + v.off * w.slope + w.size * v.slack + w.off * v.slope
@@ -195,7 +192,7 @@ class Model:
         each = list(zip(v.of_y(symbols), w.of_y(symbols), strict=True))
         dv = tuple(v.v * q + w.v * p for (p, _), (q, _) in each)
         da = tuple(v.v * b + w.v * a + p * w.a + q * v.a for (p, a), (q, b) in each)
-        lip = lipschitz.of_product(v, w, wrong)
+        lip = lipschitz.of_product(v, w, 2 * of_Q + 3 * of_K)
         return Model(v.v * w.v, v.v * w.a + w.v * v.a, Q, K, E, B, v.errors, dv, da, lip, off, slack)
 
     def times_square(self, other: Model) -> arb_mat:

@@ -107,6 +107,9 @@ def test_a_state_by_name(tmp_path: Path) -> None:
     assert result.contains([Fraction(13, 10)]) is True and result.contains([-1.3]) is False
 
 
+FOR_PROGRAMS = {"network", "show", "tell", "keep"}  # what draws meanwhile, prints, or runs many
+
+
 def test_what_the_core_takes_is_taken(tmp_path: Path) -> None:
     seen: list[str] = []
     result = certify_roa(
@@ -121,9 +124,7 @@ def test_what_the_core_takes_is_taken(tmp_path: Path) -> None:
     assert json.loads((result.raw or b"").decode())["provenance"] == {"mine": "yes"}
     core = inspect.signature(__import__("certify.analysis.run", fromlist=["certify_roa"]).certify_roa).parameters
     ours = list(inspect.signature(certify_roa).parameters)
-    assert ours[:4] == ["system", "policy", "out", "options"] and set(core) - {"network", "show"} <= set(
-        ours
-    )  # `show` is for whoever draws meanwhile
+    assert ours[:4] == ["system", "policy", "out", "options"] and set(core) - FOR_PROGRAMS <= set(ours)
 
 
 def test_options_by_name_are_those_of_the_options() -> None:

@@ -13,7 +13,6 @@ import struct
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -88,9 +87,9 @@ def split(lo: list[float], hi: list[float], axes: Sequence[int], passes: Pass, m
 
 
 def grown(data: Document, most: int = 4000) -> Document:
-    """Trees whose leaves pass, if they are not too large, by the bound that both programs have."""
+    """Trees whose leaves pass, if they are not too large."""
     result = edited(data, "evidence.outer.tree", "/w==")
-    with ctx.workprec(PRECISION), patch.object(Taylor, "from_corner", Taylor.by_pairs):
+    with ctx.workprec(PRECISION):
         c = read(dump(data))
         region, bounded = region_of(c), bounded_by_form(c)
         models, root = region.models, list(region_tree(c).root)

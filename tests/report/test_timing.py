@@ -454,7 +454,7 @@ def test_what_limits_names_the_step() -> None:
 def printed_by_checker(timing: TimingInWords, claim: Claim, *, push: bool = False) -> list[str]:
     raw = claimed(timing, claim, push=push).to_json().encode()
     read = document.certificate(json.loads(raw), hashlib.sha256(raw).hexdigest())
-    answer = {"result": "ACCEPTED", "rules": {"tree": 1}, "margins": {"local": 0.5, "ring": 0.25}}
+    answer = {"result": "ACCEPTED", "rules": {"tree": 1}, "modules": ["ring"], "margins": {"local": 0.5, "ring": 0.25}}
     return checker_words.report(read, answer)
 
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import scipy.linalg
 import torch
+from click.testing import CliRunner as ClickRunner
 from typer.testing import CliRunner
 
-from certify.cli.main import app as certify_app
+from certify.cli.main import command_line
 from certify.errors import InputError
 from certify.loop.plants import get_system
 from certify.loop.policies import Policy, TanhNetwork, load_policy, require_centred, save_policy
@@ -466,8 +467,8 @@ def test_an_imported_policy(tmp_path):
     state = {f"{2 * k}.weight": torch.tensor(W).float() for k, W in enumerate(network.weights)}
     state |= {f"{2 * k}.bias": torch.tensor(b).float() for k, b in enumerate(network.biases)}
     torch.save(state, tmp_path / "agent.pth")
-    imported = runner.invoke(
-        certify_app,
+    imported = ClickRunner().invoke(
+        command_line(),
         [
             *("import", str(tmp_path / "agent.pth"), "--system", "pendulum", "--states", "theta,theta_dot"),
             *("--activation", "tanh", "--squash", "tanh", "--normaliser", "none", "--action-scale", "12"),
