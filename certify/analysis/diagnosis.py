@@ -24,7 +24,7 @@ from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT, UNLIMITED, WHOLE, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.plants import System
+from certify.loop.plants import System, require_equilibrium
 from certify.loop.policies import Centre, TanhNetwork
 from certify.lyapunov import extents, volume
 from certify.provers.ball.models import paths
@@ -176,6 +176,10 @@ def _next(
             (("--centre", centre),),
             "shifted so that pi(0) = u_eq the loop rests where it should, and the stronger claim can be tried",
         )
+    if result.levels.roa is None and (off := _off_equilibrium(asked[0])) is not None:
+        return Step((), off)
+    if options.level is not None and result.verdict is Verdict.REFUTED:
+        return Step((), "leave --level out for the largest level that can be proved")
     if result.stop is Stop.DOMAIN and options.level is None:
         return _wider_domain(result, options, effort)
     if result.stop is Stop.PATH:
@@ -282,6 +286,15 @@ def _has_tube(result: RoaResult, effort: Effort) -> bool:
         )
         is not None
     )
+
+
+def _off_equilibrium(system: System) -> str | None:
+    """The correction of a plant whose operating point is no equilibrium; None if it is one."""
+    try:
+        require_equilibrium(system, rounded=True)
+    except InputError as error:
+        return str(error)
+    return None
 
 
 def _centring(system: System, network: TanhNetwork) -> str | None:

@@ -12,7 +12,8 @@ import typer
 from certify.analysis.changes import PlantChanges
 from certify.cli.options import changes_of_a_plant, takes
 from certify.cli.shared import Json, describe
-from certify.cli.terminal import say, show
+from certify.cli.terminal import say, show, tell
+from certify.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -27,8 +28,11 @@ def plant(
     changes: PlantChanges,
     as_json: Json = False,
 ) -> None:
-    """Show a plant: equations, operating point, linearisation, controllability, disturbances, bounds and units."""
-    from certify.loop.plants import chosen_system, controllability, linearise
+    """Show a plant: equations, operating point, linearisation, controllability, disturbances, bounds and units.
+
+    The exit status is 2 if the operating point is no equilibrium.
+    """
+    from certify.loop.plants import chosen_system, controllability, linearise, require_equilibrium
 
     found = changes.of(chosen_system(system))
     A, B = linearise(found)
@@ -37,6 +41,11 @@ def plant(
         say(json.dumps(_data(found, A, B, eigenvalues, reach)))
     else:
         show(_page(found, A, B, eigenvalues, reach))
+    try:
+        require_equilibrium(found, rounded=True)
+    except InputError as error:
+        tell(f"certify: {error}")
+        raise typer.Exit(2) from None
 
 
 def _data(s: System, A: Matrix, B: Matrix, eigenvalues: Sequence[complex], reach: Controllability) -> dict[str, Any]:

@@ -79,10 +79,11 @@ def optimise_candidate(
     return _optimise(loop, start, decays, seed, effort, known)[0]
 
 
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")
 def _optimise(
     loop: ClosedLoop, start: Array, decays: tuple[float, ...], seed: int, effort: Effort, known: Array | None
 ) -> tuple[Array, float]:
-    """P, and the ratio of its sampled volume and the start's."""
+    """P, and the ratio of its sampled volume and the start's; levels that sink to 0 overflow and are refused."""
     A, h = loop.mean_rate(), loop.step
     slowest = slowest_decay(A, h)
     found = given = 0.0
@@ -129,6 +130,7 @@ def optimise_repeatedly(
     return P
 
 
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")
 def largest_sampled(loop: ClosedLoop, candidates: Sequence[Array], seed: int = 0, effort: Effort = UNLIMITED) -> Array:
     """The P, (n, n), of those given whose set inside the domain without a sampled violation has the largest volume;
     where the effort ends, fewer samples tell."""
@@ -219,6 +221,8 @@ class _Samples:
             self.search(P, alpha)
             level = self.known(P, alpha)
             P = P / min(level, domain_limit(P, self.loop.system.domain), float(_RADII[-1]) ** 2)
+            if not np.all(np.isfinite(P)):  # as where the loop does not rest at the origin
+                raise BackendError("V falls on no sampled set around the origin. Use the candidate 'lyapunov'.")
             if k + 1 >= searches and level > 0.5:  # a lower level leaves the set too coarsely sampled
                 break
             if self.effort.over:

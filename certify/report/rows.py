@@ -235,6 +235,8 @@ def _diagnosis_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     if found["hurts"] and found.get("kind") not in (*AT_A_POINT, "unstable"):  # an unstable loop has no proof
         rows.append(("hardest along", hardest(found["hurts"])))
     step = found["next"]
+    if not step.get("command") and step["why"] == result.get("reason"):  # which is said already
+        return rows
     command = f"{step['command']}  ({step['why']})" if step.get("command") else step["why"]
     return [*rows, ("try next", command)]
 

@@ -62,11 +62,13 @@ def train(
 
         system, plant_options = chosen_plant(plant)
         options = overridden(plant_options.named(preset), _given(chosen))
+        from certify.loop.plants import require_equilibrium
         from certify.loop.policies import save_policy
         from controllers.history.policies import PolicyWriter
         from controllers.training.device import find_device
         from controllers.training.trainer import Trainer
 
+        require_equilibrium(system, rounded=True)
         if checkpoint_every < 1:
             raise OptionError(f"`checkpoint_every` must be positive; found {checkpoint_every}.")
         if evaluate_every < 0:

@@ -15,6 +15,7 @@ from certify.analysis.facts import Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
 from certify.analysis.run import certify_roa
+from certify.certificates.verdict import Verdict
 from certify.loop.plants import System, get_system
 from certify.loop.policies import load_policy
 from tests.support.loops import chain
@@ -103,3 +104,22 @@ def test_an_unstable_loop_needs_another_policy(
     result = certify_roa(system, network, tmp_path, RoaOptions(claim=claim))
     assert result.diagnosis is not None and result.diagnosis.next.options == ()
     assert result.diagnosis.next.why.startswith("another policy") and said in result.diagnosis.next.why
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_plant_that_rests_elsewhere_is_to_be_corrected(tmp_path: Path) -> None:
+    """No warning of floats on the way: levels sink to 0 around a point at which nothing rests."""
+    system, network = chain(2, [-1.0, -2.0])
+    law = replace(network, biases=(np.zeros(1),), centre="output")
+    x, v = system.states
+    pushed = replace(system, dynamics=(v, system.inputs[0] - 2 + 0 * x), input_bounds=((Fraction(-1), Fraction(1)),))
+    result = certify_roa(pushed, law, tmp_path, LITTLE)
+    assert result.verdict is Verdict.UNKNOWN and result.diagnosis is not None
+    assert "x2' = -2" in result.diagnosis.next.why and "Correct x_eq or u_eq" in result.diagnosis.next.why
+
+
+def test_a_level_that_is_refuted_is_to_be_left_out(pendulum_result: RoaResult, tmp_path: Path) -> None:
+    options = replace(LITTLE, level=20.0)
+    refuted = certify_roa(pendulum_result.system, pendulum_result.network, tmp_path, options)
+    assert refuted.verdict is Verdict.REFUTED and refuted.diagnosis is not None
+    assert refuted.diagnosis.next.why.startswith("leave --level out")

@@ -553,9 +553,10 @@ def test_plant_says_what_cannot_be_controlled_and_what_does_not_rest(
         TANK[TANK.index("[x_eq]") : TANK.index("[u_eq]")], ""
     )
     text = text.replace("level = [0, 1]", "level = [-1, 1]")
-    status, out, _ = plant_command(capsys, str(write(tmp_path, text)))
+    status, out, err = plant_command(capsys, str(write(tmp_path, text)))
     words = " ".join(out.split())
-    assert status == 0 and "1 of 2 directions: NOT controllable" in words and "policy reads" not in words
+    assert status == 2 and "Correct x_eq or u_eq" in err  # a command that follows must not take it for usable
+    assert "1 of 2 directions: NOT controllable" in words and "policy reads" not in words
     assert "no equilibrium: level' = 0.2, flow' = 0.0185185 at (x_eq, u_eq)" in words
     text = text.replace('"1/5 - level"', '"sin(level + 1)*flow - u"')
     words = " ".join(plant_command(capsys, str(write(tmp_path, text)))[1].split())

@@ -965,6 +965,8 @@ def test_summary_without_a_proof() -> None:
     unstable = rendered({**refuted, "stop": "unstable"})
     assert "the closed loop is unstable at the origin, so that no V can prove the claim" in unstable
     assert "another V" not in unstable
+    again = {"stiffness": None, "hurts": {}, "kind": "unstable", "next": {"options": {}, "why": refuted["reason"]}}
+    assert "try next" not in rendered({**refuted, "diagnosis": again})  # it would only repeat the reason
     elsewhere = rendered({**refuted, "stop": "unstable", "operating_point": {"theta": "1/2"}})
     assert "unstable at the operating point" in elsewhere
     unknown = rendered({**refuted, "verdict": "UNKNOWN", "reason": "[bold]time[/bold]", "system": "[red]x[/red]"})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from certify.loop.plants.deviations import domain_of_values, dynamics_of_values, in_deviations, with_origin
 from certify.loop.plants.floating_point import mean_rate
 from certify.loop.plants.linear import Controllability, Matrix, controllability, in_floats, linearise
-from certify.loop.plants.operating_point import residuals, rests_where
+from certify.loop.plants.operating_point import require_equilibrium, residuals, rests_where
 from certify.loop.plants.registry import available_systems, chosen_system, get_system, shipped_system
 from certify.loop.plants.system import System, exact
 from certify.loop.plants.toml import load_system
@@ -31,6 +31,7 @@ __all__ = [
     "linearise",
     "load_system",
     "mean_rate",
+    "require_equilibrium",
     "residuals",
     "rests_where",
     "shipped_system",

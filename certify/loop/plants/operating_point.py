@@ -35,14 +35,18 @@ def rests_where(system: System) -> str:
     return "0" if system.time == "continuous" else "x_eq"
 
 
-def require_equilibrium(system: System, refuse: Callable[[str], InputError] = InputError) -> None:
+def require_equilibrium(
+    system: System, refuse: Callable[[str], InputError] = InputError, *, rounded: bool = False
+) -> None:
     """Reject a plant whose operating point is no equilibrium; `refuse` makes the error of a message.
+
+    With `rounded` an exact residual of 1e-12 is 0 as well, as where u_eq is a rounded number.
 
     Raises
     ------
     InputError : f(x_eq, u_eq) is not 0; the message has the residual of each state by its name.
     """
-    off = {name: r for name, r in residuals(system).items() if _is_off(r)}
+    off = {name: r for name, r in residuals(system).items() if _is_off(float(r) if rounded else r)}
     if off:
         shown = ", ".join(_residual(system, name, r) for name, r in off.items())
         raise refuse(

@@ -51,6 +51,13 @@ def test_train_writes_policy_log_and_checkpoint_and_resumes(tmp_path):
     assert again.read_bytes() == out.read_bytes()
 
 
+def test_a_plant_whose_operating_point_is_no_equilibrium_is_not_trained_for(tmp_path):
+    plant, example = tmp_path / "off.toml", Path(__file__).parents[3] / "examples" / "van_der_pol.toml"
+    plant.write_text(example.read_text().replace('u = "0"', 'u = "1"').replace("van_der_pol", "pushed"))
+    done = _train(plant, "--out", tmp_path / "p.pt", *SHORT)
+    assert done.exit_code == 2 and "must be an equilibrium" in done.stderr and not (tmp_path / "p.pt").exists()
+
+
 @pytest.mark.parametrize(
     "arguments, message",
     [
