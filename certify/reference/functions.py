@@ -118,7 +118,7 @@ def mistaken(v: Model, phi: Expansion) -> tuple[arb, arb, arb]:
 
 
 def steepness(v: Model, phi: Expansion, wrong: arb) -> arb | None:
-    """The Lipschitz constant of phi(v) beyond its K; `wrong` is twice what phi' Q is off by, and thrice what phi' K is."""
+    """The Lipschitz constant of phi(v) beyond its K; `wrong` is for what phi' Q and phi' K are off by."""
     beyond = steepness_beyond_tangent(v, phi)
     return None if v.lip is None or beyond is None else phi.steepest * v.lip + beyond + wrong
 
