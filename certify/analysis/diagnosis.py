@@ -210,17 +210,22 @@ def _next(
         why = f"the bounds are too wide beyond the local set, most of all along {worst}; "
         return Step((), why + "a policy that bends less there helps", flattens=_can_be_flattened(result))
     if result.stop in (Stop.WITNESS, Stop.INPUTS):
-        tried = max((t.volume for t in result.tried), default=0.0)
-        reached = max((t.proved_volume or 0.0 for t in result.tried), default=0.0)
-        if reached and tried > _WORTH * reached:
-            return Step((("--effort", _round(4 * options.effort)),), "another candidate reaches further")
-        if _may_go_beyond(result, options):
-            why = "what this V can show is proved; a function of higher degree may show more, beyond the ellipsoid"
-            return Step((("--candidate", "polynomial"),), why)
-        return Step((), "what this V can show is proved; a larger set needs another policy or another kind of V")
+        return _another_candidate(result, options)
     if result.stop is Stop.REQUESTED and result.levels.roa is not None:
         return Step((), "the level that was asked for is proved; leave --level out for the largest")
     return Step((), result.reason)
+
+
+def _another_candidate(result: RoaResult, options: RoaOptions) -> Step:
+    """The step where this V shows no more: another candidate, a function of higher degree, or another policy."""
+    tried = max((t.volume for t in result.tried), default=0.0)
+    reached = max((t.proved_volume or 0.0 for t in result.tried), default=0.0)
+    if reached and tried > _WORTH * reached:
+        return Step((("--effort", _round(4 * options.effort)),), "another candidate reaches further")
+    if _may_go_beyond(result, options):
+        why = "what this V can show is proved; a function of higher degree may show more, beyond the ellipsoid"
+        return Step((("--candidate", "polynomial"),), why)
+    return Step((), "what this V can show is proved; a larger set needs another policy or another kind of V")
 
 
 def _may_go_beyond(result: RoaResult, options: RoaOptions) -> bool:
