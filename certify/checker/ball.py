@@ -17,7 +17,7 @@ from .case import Case, Failures
 from .document import Intervals
 from .expression import evaluate
 from .functions import FUNCTIONS
-from .jets import Jet, between, constant, identity, uncertain
+from .jets import Jet, between, constant, uncertain
 from .near import Above, Array, Cubic, Near, Square, Vector, all_near, mixed, near, size, stacked, triples, within
 from .network import Folded
 
@@ -217,14 +217,15 @@ def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
             X = X.beside(layer.W)
         B, rows = Near(X.value[:, k:].T, X.error[k:, None]), np.ones(len(y.value))
         a, Q, K = Vector(X.value[:, :k].T, X.error[:k].norm() * rows), mixed(Square(H), B), mixed(Cubic(C), B)
-        E, lip = identity(Q, (B.error * Square(R).size[:, None]).sum() * rows), (B.size * lips[:, None]).sum()
+        E = Square(np.zeros_like(Q.value), (B.error * Square(R).size[:, None]).sum() * rows)
+        lip = (B.size * lips[:, None]).sum()
         of_y = Near(np.zeros((0, len(rows)))), Vector(np.zeros((k, 0, len(rows))))  # a policy knows nothing of y
         value = Jet(y, a, Q, K, E, Near(B.value), R, *of_y, lip)
         if number == len(net.layers) - 1:
             break
         phi = FUNCTIONS["tanh"].expansion(value.v0, value.radius)
         bent, twisted, rest = value.beyond_tangent(phi)
-        rest = rest + identity(rest, bent.error + twisted.error)
+        rest = rest.wider(bent.error + twisted.error)
         H, C, R = (np.concatenate(pair, -1) for pair in ((H, bent.value), (C, twisted.value), (R, rest.majorant)))
         lips = lips.beside(value.lip_beyond_tangent(phi) + bent.error * 2 + twisted.error * 3)
         y, X = phi.f[0], X.times(phi.f[1])

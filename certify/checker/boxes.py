@@ -3,6 +3,7 @@ leaves themselves."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -34,7 +35,7 @@ class Leaves:
     hold: Array  # where what is asked holds
 
 
-class Boxes:
+class Boxes(ABC):
     """Boxes with corners lo and hi (n, B) in z, batched; S = T'PT."""
 
     def __init__(self, case: Case, T: Array, S: fmpq_mat, more: int = 0) -> None:
@@ -48,13 +49,13 @@ class Boxes:
         wrong = Above(np.array([row.error.v for row in rows]), max(row.error.k for row in rows))
         self.S_rest = wrong + size(np.where(axes, 0.0, whole))  # bounds what S is beside it
 
+    @abstractmethod
     def leaves(self) -> Iterator[Batch]:
         """The tree's leaves in batches."""
-        raise NotImplementedError
 
+    @abstractmethod
     def examine(self, first: int, lo: Array, hi: Array) -> Leaves:
         """The leaves with these corners, numbered from `first`, of which anything is asked."""
-        raise NotImplementedError
 
     def levels(self, lo: Array, hi: Array) -> tuple[Array, Array]:
         """Bounds of V from below and above on the boxes; NaN where they overflow."""
@@ -154,11 +155,6 @@ def middle(lo: Array, hi: Array) -> tuple[Array, Array]:
     centre = 0.5 * lo + 0.5 * hi
     ends = (Near(hi) - Near(centre)).ends[1], (Near(centre) - Near(lo)).ends[1]
     return centre, np.maximum(*ends)
-
-
-def on_box(u: Form) -> Near:
-    """Forms as numbers."""
-    return Near(u.value[0], size(u.value[1:]).sum() + u.error)
 
 
 def keeps_inputs(leaves: Leaves) -> Failures:

@@ -47,11 +47,7 @@ class Expansion:
         if not self.phi.partial:
             return f0, f1, f2
         defined = Above(0 * self.third.v)
-        return (
-            Near(f0.value, f0.error + defined),
-            Near(f1.value, f1.error + defined),
-            Near(f2.value, f2.error + defined),
-        )
+        return f0.wider(defined), f1.wider(defined), f2.wider(defined)
 
     @cached_property
     def f(self) -> Four:
@@ -60,12 +56,7 @@ class Expansion:
         if self.v0.error is ZERO:
             return f0, f1, f2, f3
         e0, e1, e2, e3 = (self.v0.error * steep for steep in self.phi.slopes(self.v0))
-        return (
-            Near(f0.value, f0.error + e0),
-            Near(f1.value, f1.error + e1),
-            Near(f2.value, f2.error + e2),
-            Near(f3.value, f3.error + e3),
-        )
+        return f0.wider(e0), f1.wider(e1), f2.wider(e2), f3.wider(e3)
 
     @property
     def derivative(self) -> Derivative:
@@ -75,7 +66,7 @@ class Expansion:
     @property
     def v(self) -> Near:
         """All that v may be."""
-        return Near(self.v0.value, self.v0.error + self.radius)
+        return self.v0.wider(self.radius)
 
     @cached_property
     def third(self) -> Above:

@@ -30,11 +30,6 @@ def unpacked(K: Array, k: int) -> Array:
     return K[..., place]
 
 
-def identity(like: Square, extra: Above) -> Square:
-    """The matrix whose form is at most `extra` ||d||^2: zeros, within that in the norm."""
-    return Square(np.zeros_like(like.value), extra)
-
-
 def times(E: Square, k: Above) -> Square:
     """E k for an upper bound k."""
     return E * Near(k.top)
@@ -70,17 +65,17 @@ class Jet:
     @cached_property
     def v0(self) -> Near:
         """v(0), whatever y is."""
-        return Near(self.c.value, self.c.error + self.sway)
+        return self.c.wider(self.sway)
 
     @cached_property
     def gradient(self) -> Vector:
         """The gradient, whatever y is."""
-        return Vector(self.a.value, self.a.error + self.tilt)
+        return self.a.wider(self.tilt)
 
     @property
     def range(self) -> Near:
         """v on the ball, whatever y is."""
-        return Near(self.c.value, self.v0.error + self.radius)
+        return self.v0.wider(self.radius)
 
     @property
     def error(self) -> Above:
@@ -98,7 +93,7 @@ class Jet:
         E = self.E
         if self.B.error is not ZERO:
             E = E + mixed(Square(self.U), Near(self.B.error.top + 0 * self.B.value))
-        found: Array = Square(E.value, E.error + (self.Q.error + self.K.error)).majorant
+        found: Array = E.wider(self.Q.error + self.K.error).majorant
         return found
 
     @property
@@ -158,14 +153,13 @@ class Jet:
         c = x.c * y.c
         a, a_y = x.a * y.c + y.a * x.c, x.a_y * y.c + y.a_y * x.c
         if x.c_y.value.size:  # second order in y is lost
-            c = Near(c.value, c.error + x.sway * y.sway)
-            a = Vector(a.value, a.error + x.sway * y.tilt + y.sway * x.tilt)
+            c, a = c.wider(x.sway * y.sway), a.wider(x.sway * y.tilt + y.sway * x.tilt)
             a_y = a_y + _each(x.c_y, y.a) + _each(y.c_y, x.a)
         (s, t), (zx, lx, _, tx), (zy, ly, _, ty) = (x.gradient.size, y.gradient.size), x.beyond, y.beyond
         # all products of what v and w have beyond v(0) and w(0), but those that are in Q and K
         known = s * y.twist + t * x.twist + (x.bend + x.twist) * (y.bend + y.twist)
-        E = times(y.E, x.v0.size) + times(x.E, y.v0.size) + identity(x.E, known)
-        E = E + times(y.whole, x.radius) + times(x.whole, t + y.bend + y.twist)
+        E = times(y.E, x.v0.size) + times(x.E, y.v0.size)
+        E = (E + times(y.whole, x.radius) + times(x.whole, t + y.bend + y.twist)).wider(known)
         lip = x.v0.size * y.lip + y.v0.size * x.lip + zx * ly + zy * lx
         lip = lip + s * (ty + y.beyond[2]) + t * (tx + x.beyond[2])
         return Jet(
@@ -209,7 +203,7 @@ class Jet:
         C = symmetric(a, self.Q) * (half * 2) + symmetric(a, aa) * sixth
         plain = straight * self.twist + square * (self.bend + self.twist)
         R = times(self.whole, straight + square) + times(aa, quartic)
-        return aa * half, C, R + identity(R, plain)
+        return aa * half, C, R.wider(plain)
 
     def lip_beyond_tangent(self, phi: Expansion) -> Above:
         """A Lipschitz constant of what phi(v) has beyond its tangent at v(0) and d'H d + C[d] of `beyond_tangent`: of
@@ -230,18 +224,16 @@ class Jet:
         f0, f1, half, _ = FUNCTIONS[name].expansion(Near(self.c.value), ZERO).f
         _, _, bent, twisted = (f.size for f in phi.f)
         off, twice = self.v0.error, half * 2
-        c = Near(f0.value, f0.error + f1.size * self.c.error + bent * (off * off))
-        moved = Near(f1.value, f1.error + twice.size * self.c.error + twisted * (off * off) * 3)  # phi' at y = 0
+        c = f0.wider(f1.size * self.c.error + bent * (off * off))
+        moved = f1.wider(twice.size * self.c.error + twisted * (off * off) * 3)  # phi' at y = 0
         by_y = twice.size * self.sway
-        a = self.a * moved
-        a = Vector(a.value, a.error + by_y * (self.a.error + self.tilt))
+        a = (self.a * moved).wider(by_y * (self.a.error + self.tilt))
         return c, a, self.c_y * f1, self.a_y * moved + _each(self.c_y * twice, self.a)
 
 
 def _each(y: Near, a: Vector) -> Vector:
     """The vectors y_j a, (k, N, ...), of numbers y (N, ...) and vectors a (k, ...)."""
-    whole = Vector(a.value[:, None], a.error[None] if a.error is not ZERO else ZERO)
-    return whole * y
+    return Vector(a.value[:, None], a.error[None]) * y
 
 
 def constant(q: Fraction, U: Array, count: int) -> Jet:
@@ -255,13 +247,11 @@ def constant(q: Fraction, U: Array, count: int) -> Jet:
 def uncertain(lo: Fraction, hi: Fraction, U: Array, number: int, count: int) -> Jet:
     """A number of [lo, hi], lo + hi + (hi - lo) y over 2, y being the one of this number of `count`."""
     reach, here = near((hi - lo) / 2), np.arange(count) == number
-    c_y = Near(
-        np.where(here, reach.value, 0.0), reach.error * np.where(here, 1.0, 0.0) if reach.error is not ZERO else ZERO
-    )
+    c_y = Near(np.where(here, reach.value, 0.0), reach.error * np.where(here, 1.0, 0.0))
     return replace(constant((lo + hi) / 2, U, count), c_y=c_y)
 
 
 def between(lo: Fraction, hi: Fraction, U: Array, count: int) -> Jet:
     """A number of [lo, hi] of which nothing else is known, maybe another one wherever it is used."""
     middle = constant((lo + hi) / 2, U, count)
-    return replace(middle, c=Near(middle.c.value, middle.c.error + near((hi - lo) / 2).size))
+    return replace(middle, c=middle.c.wider(near((hi - lo) / 2).size))

@@ -19,7 +19,7 @@ from .decrease import Level, Models, are_finite, are_usable, rational, sides, si
 from .document import Intervals
 from .exact import contains_ball, exactly, fraction, is_definite, root_above
 from .jets import Jet, uncertain
-from .near import Array, Near, Vector, norm
+from .near import Array, Near, norm
 
 _MOST_CORNERS = 2**16  # of all cells
 _MOST_WORK = 2**26  # corners times n^4, which is what an inequality takes
@@ -74,10 +74,7 @@ class Local(Ball):
     def during(self, way: Way) -> list[Jet]:
         """The states within a way of the ball's."""
         moved = zip(self.states, *way, strict=True)
-        return [
-            replace(x, c=Near(x.c.value, x.c.error + far), a=Vector(x.a.value, x.a.error + along))
-            for x, far, along in moved
-        ]
+        return [replace(x, c=x.c.wider(far), a=x.a.wider(along)) for x, far, along in moved]
 
     def settled(self, v: Jet) -> Jet:
         """Set the value at d = 0 to exactly 0 at rest, where it is 0 in truth."""

@@ -80,10 +80,10 @@ class Above:
     def __mul__(self, other: Any) -> Above:
         """The product with bounds, or with exact numbers that are not negative. What is bounded by ZERO is 0,
         and so is its product with any number, whatever bounds that."""
-        if not isinstance(other, Above):
-            return Above(self.v * other + LEAST, self.k + 2)
         if self is ZERO or other is ZERO:
             return ZERO
+        if not isinstance(other, Above):
+            return Above(self.v * other + LEAST, self.k + 2)
         return Above(self.v * other.v + LEAST, self.k + other.k + 2)
 
     __radd__, __rmul__ = __add__, __mul__
@@ -205,13 +205,17 @@ class Near:
     def ends(self) -> tuple[Any, Any]:
         """(lo, hi), binary64 numbers around each number.
 
-        b = 4u |value| + error is computed as `top`, at least b (1 + 2^-41); then fl(value - top) <= value - top
+        b = 4u |value| + error is computed as `top`, at least b (1 + 4u); then fl(value - top) <= value - top
         + u (|value| + top) <= value - error. So with the other end.
         """
         if self.error is ZERO:
             return self.value, self.value
         reach = (self.error + size(self.value).ulps(2)).top
         return self.value - reach, self.value + reach
+
+    def wider(self, by: Above) -> Self:
+        """The same numbers, of which less is known."""
+        return type(self)(self.value, self.error + by, self.rough)
 
     def __add__(self, other: Near) -> Self:
         """The norm of a sum's roundings is at most u times that of the terms."""
@@ -267,6 +271,11 @@ class Form(Near):
 
     def length(self, x: Above) -> Above:
         return x.sum(0)
+
+    @property
+    def range(self) -> Near:
+        """The forms as numbers, whatever the symbols are."""
+        return Near(self.value[0], size(self.value[1:]).sum() + self.error)
 
     def raised(self, b: Near) -> Form:
         """The sum with numbers, at the first coefficient."""
@@ -417,11 +426,6 @@ def symmetrised(N: Tensor) -> Tensor:
     value = (X + X.transpose(3, 1, 2, 0) + X.transpose(0, 3, 2, 1) + X.transpose(0, 1, 3, 2)) / 4
     wrong = (N.error + N.size.ulps(4)).norm()
     return Tensor(value, wrong * np.ones(len(X)))
-
-
-def where(condition: Any, x: Near, y: Near) -> Near:
-    """x where the condition holds, else y."""
-    return Near(np.where(condition, x.value, y.value), x.error.where(condition, y.error))
 
 
 def combined(*terms: tuple[Any, Near]) -> tuple[Any, Above]:
@@ -626,24 +630,21 @@ def _atan(y: Array) -> Near:
 
 def tanh(x: Near) -> Near:
     """tanh of numbers near others; its slope is at most 1. The same holds of sin, cos and atan."""
-    t, error = _tanh(x.value)
-    return Near(t, error + x.error)
+    return Near(*_tanh(x.value)).wider(x.error)
 
 
 def sin_cos(x: Near) -> tuple[Near, Near]:
     s, c = _sin_cos(x.value)
-    return Near(s.value, s.error + x.error), Near(c.value, c.error + x.error)
+    return s.wider(x.error), c.wider(x.error)
 
 
 def atan(x: Near) -> Near:
-    a = _atan(x.value)
-    return Near(a.value, a.error + x.error)
+    return _atan(x.value).wider(x.error)
 
 
 def exp(x: Near) -> Near:
     """exp; its slope is at most its value at the upper end."""
-    e = _exp(x.value)
-    return Near(e.value, e.error + x.error * _exp(x.ends[1]).size)
+    return _exp(x.value).wider(x.error * _exp(x.ends[1]).size)
 
 
 def sqrt(x: Near) -> Near:

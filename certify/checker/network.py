@@ -131,7 +131,7 @@ def enclose_on_boxes(net: Folded, x: Form) -> Form:
         passed.append((layer.W, slope, fresh))
     error = _error_backwards(net.scale, passed, x.error)
     u = (h * Near(net.scale[:, None])).raised(net.offset[:, None])
-    u = Form(u.value, u.error + error)
+    u = u.wider(error)
     return clipped(u, *net.clip) if net.clip else u
 
 
@@ -140,7 +140,7 @@ def clipped(u: Form, least: Array, most: Array) -> Form:
 
     Nothing changes where v certainly stays between them.
     """
-    v = Near(u.value[0], size(u.value[1:]).sum() + u.error)
+    v = u.range
     lo, hi = v.ends
     inside = (lo >= least[:, None]) & (hi <= most[:, None])
     slope, shift, gap = clip_of(v, least[:, None], most[:, None])

@@ -15,7 +15,7 @@ from math import nextafter
 import numpy as np
 from flint import fmpq, fmpq_mat
 
-from .boxes import LEAF, Boxes, Leaves, batches, is_whole, keeps_inputs, middle, on_box
+from .boxes import LEAF, Boxes, Leaves, batches, is_whole, keeps_inputs, middle
 from .case import Case, Failures
 from .document import Network
 from .exact import exactly, inverse
@@ -45,7 +45,7 @@ class Layers:
 
     def least(self, x: Form) -> Array:
         """A lower bound of N (B,), affine on the boxes: good where these are large."""
-        least: Array = on_box(enclose_on_boxes(self.as_policy, x)).ends[0][0]
+        least: Array = enclose_on_boxes(self.as_policy, x).range.ends[0][0]
         return least
 
     def is_small(self, symbols: int) -> bool:
@@ -206,11 +206,11 @@ class Beyond(Boxes):
             rise, [below.at, lambda few: self.gap(centre[:, few], radius[:, few], self.c.c2, -1.0)]
         )
         finite = np.all([np.isfinite(v.size.top) for v in (N, *F)], axis=0)
-        return Leaves(self, first + left, "outer leaf ", on_box(u), bound, (bound < 0) & finite)
+        return Leaves(self, first + left, "outer leaf ", u.range, bound, (bound < 0) & finite)
 
     def is_outside(self, x: Form) -> Array:
         """True on each box that certainly lies outside the domain, along one of the states."""
-        lo, hi = on_box(x).ends
+        lo, hi = x.range.ends
         outside: Array = np.any((lo > self.largest) | (hi < self.least), axis=0)
         return outside
 

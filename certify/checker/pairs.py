@@ -27,7 +27,7 @@ def bound_of_pairs(p: Vector, T: Tensor, weight: Array) -> fmpq_mat:
     t = np.clip(np.sqrt(np.sqrt(np.where((tau > 0) & (tau < np.inf), tau, 1.0))), 1 / _FARTHEST, _FARTHEST)
     k = len(rows)
     S: Square = gram(Near(rows) * Near(t)) + gram(Near(whole.reshape(k, -1)).over(np.tile(t, whole.shape[1])))
-    found = exactly(Square(S.value, S.error + lost).majorant) * fmpq(2) ** (by_p + by_T)
+    found = exactly(S.wider(lost).majorant) * fmpq(2) ** (by_p + by_T)
     return (found + found.transpose()) / 2
 
 

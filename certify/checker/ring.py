@@ -11,7 +11,7 @@ from operator import add
 import numpy as np
 from flint import fmpq
 
-from .boxes import Boxes, Leaves, batches, is_whole, middle, multipliers, on_box
+from .boxes import Boxes, Leaves, batches, is_whole, middle, multipliers
 from .case import Case, Failures
 from .exact import fraction, root_above
 from .near import Above, Array, Near, near, size
@@ -74,7 +74,7 @@ class Ring(Boxes):
         if not (self.case.covered or self.c.step or np.all(meet)):
             # a division by a range that contains 0 has no finite model
             hold = np.where(meet, hold, np.all([np.isfinite(g.size.top) for g in G], axis=0))
-        return RingLeaves(self, first + met, "leaf ", on_box(u), bound, hold, meet, ends)
+        return RingLeaves(self, first + met, "leaf ", u.range, bound, hold, meet, ends)
 
     def misses(self, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
         """True on boxes with certainly V > c2 everywhere; with certainly V < c1; with certainly V >= c1."""

@@ -95,8 +95,7 @@ class Jet:
     def whole(self) -> Any:
         """A bound of the remainder and of sum_j B_j e_j, as a matrix."""
         with np.errstate(all="ignore"):
-            kept = jets.identity(self.model.E, self.model.Q.error + self.model.K.error)
-            return (self.model.whole + kept).majorant
+            return self.model.whole.wider(self.model.Q.error + self.model.K.error).majorant
 
     @property
     def size(self) -> Any:
@@ -206,5 +205,4 @@ def beyond_tangent(jet: Jet, f: Sequence[float], third: float, fourth: float) ->
     """H, C and R (a matrix) of a function whose expansion is given."""
     phi = SimpleNamespace(f=[Near(np.float64(v)) for v in f], third=Above(third), fourth=Above(fourth), last=Above(0.0))
     H, C, R = jet.model.beyond_tangent(phi)
-    kept = jets.identity(R, H.error + C.error)
-    return H.value, C.value, (R + kept).majorant
+    return H.value, C.value, R.wider(H.error + C.error).majorant
