@@ -174,7 +174,7 @@ def _next(
     if result.claim in ("practical", "nearby") and (centre := _centring(*asked)) is not None:
         return Step(
             (("--centre", centre),),
-            "shifted so that pi(0) = u_eq the loop rests where it should, and the stronger claim can be tried",
+            "shifted so that pi(0) = u_eq the operating point is the equilibrium, and the stronger claim can be tried",
         )
     if result.levels.roa is None and (off := _off_equilibrium(asked[0])) is not None:
         return Step((), off)

@@ -40,7 +40,7 @@ def reach(
     quiet: Quiet = False,
     importing: ImportOptions,
 ) -> None:
-    """Prove that a state, with what lies around it, converges: a tube around its trajectory into a certified set."""
+    """Prove that a state, with what lies around it, converges: a tube around its trajectory into a proved set."""
     start, drawing = time.perf_counter(), context.with_resource(Drawing())
     note, path = noting(quiet), the_policy(context, file, policy)
     with kind_called(_KIND):
