@@ -35,6 +35,14 @@ def test_the_changelog_begins_with_this_version() -> None:
     assert numbers == sorted(set(numbers), reverse=True)
 
 
+@pytest.mark.parametrize("page", ["README.md", "docs/believe.md", "docs/comparison.md", "docs/how-to/coq.md"])
+def test_a_page_says_how_many_lines_a_reviewer_reads(page: str) -> None:
+    """The checker has so many, to a tenth: `cat certify/checker/*.py | wc -l`."""
+    lines = sum(len(path.read_text("utf-8").splitlines()) for path in (ROOT / "certify" / "checker").glob("*.py"))
+    found = re.search(r"some (\d),(\d{3}) lines", (ROOT / page).read_text("utf-8"))
+    assert found is not None and abs(int(found[1] + found[2]) - lines) <= 0.1 * lines
+
+
 def test_every_citation_says_the_same() -> None:
     found, page = parsed("CITATION.cff"), (ROOT / "docs" / "citing.md").read_text("utf-8")
     assert found["cff-version"] == "1.2.0" and found["license"] == "MIT"
