@@ -291,7 +291,7 @@ def get_plant(name: str) -> Plant:
     if name not in known:
         raise InputError(
             f"no training options, box of initial states and positions are known for the plant {name!r}; "
-            f"known are {', '.join(known)}."
+            f"known are {', '.join(known)}. A plant of your own is a file: give FILE.toml, or FILE.py:NAME."
         )
     module = importlib.import_module(f"{shipped.__name__}.{name}")
     plant = getattr(module, "PLANT", None)

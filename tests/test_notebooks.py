@@ -64,7 +64,7 @@ def test_pendulum(monkeypatch: pytest.MonkeyPatch) -> None:
     text = text_of(notebook)
     assert "after 900 steps" in text
     assert "PROVED  pendulum" in text and "result: ACCEPTED" in text
-    assert "simulated, not proved: the certified set covers" in text
+    assert "simulated, not proved: the proved set covers" in text
     for what in ("level doubled", "another weight", "another leaf"):
         assert f"{what}: REJECTED rule=" in text
     images = [o for c in notebook.cells if c.cell_type == "code" for o in c.outputs if o.output_type == "display_data"]

@@ -232,7 +232,7 @@ def test_the_doctor_says_what_dreal_is(capsys: pytest.CaptureFixture[str], monke
     assert found["dReal"]["found"] == "--engine dreal and both; bounds, the default, needs no solver"
     for said in (
         "installs oneself",
-        "pip install 'certify[dreal]'",
+        "pip install '.[dreal]'",
         "IBEX 2.7.4 (libibex.so)",
         "the default, needs neither",
     ):
@@ -263,7 +263,7 @@ def test_a_missing_extra_is_named_with_its_command(
     monkeypatch.setattr("certify.analysis.installation.version_of", lambda name: None if name == "onnx" else "1.0")
     status, found = findings(capsys)
     assert status == 0
-    assert found["onnx"]["state"] == "missing" and found["onnx"]["advice"] == "pip install 'certify[onnx]'"
+    assert found["onnx"]["state"] == "missing" and found["onnx"]["advice"] == "pip install '.[onnx]'"
     assert found["safetensors"]["state"] == "ok"
 
 
@@ -274,7 +274,7 @@ def test_training_without_its_extra_ends_in_one_sentence(module: str, tmp_path: 
     done = subprocess.run([sys.executable, "-c", code, *given], capture_output=True, text=True, check=False)
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert f"{module} is not installed" in json.loads(done.stdout)["error"]
-    assert "pip install 'certify[controllers]'" in done.stderr
+    assert "pip install '.[controllers]'" in done.stderr
 
 
 @pytest.mark.parametrize("module", ["flint", "numba", "cvxpy"])

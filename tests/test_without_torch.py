@@ -91,7 +91,7 @@ def test_torchscript_names_what_is_missing(environment: dict[str, str], tmp_path
         torch.jit.save(traced, tmp_path / "script.pt")
     given = ["-m", "certify", "import", str(tmp_path / "script.pt"), *SAID, "--out", str(tmp_path / "p.pt")]
     done = subprocess.run([sys.executable, *given], env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 2 and "pip install 'certify[torch]'" in done.stderr and "Traceback" not in done.stderr
+    assert done.returncode == 2 and "pip install '.[torch]'" in done.stderr and "Traceback" not in done.stderr
 
 
 def test_no_module_imports_torch_when_it_is_loaded() -> None:

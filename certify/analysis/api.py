@@ -170,6 +170,7 @@ def certify_roa(
             load_seconds=seconds + time.perf_counter() - start,
             provenance=_provenance(policy) if provenance is None else provenance,
             progress=progress,
+            tell=notices.append,
         )
     except InputError as error:
         said = in_python(str(error))

@@ -61,7 +61,21 @@ def changes_of(texts: Mapping[str, Any]) -> PlantChanges:
 
 def _ranges(entries: Sequence[str], name: str) -> dict[str, Any]:
     pairs = dict(_assignment(entry, f"`{name}`") for entry in entries)
-    return {key: _value_or_range(value, key) for key, value in pairs.items()}
+    return {key: _entry(key, value, name) for key, value in pairs.items()}
+
+
+def _entry(key: str, text: str, name: str) -> Fraction | tuple[Fraction, Fraction]:
+    """The value or range of `key` in an option, which errors name with it."""
+    try:
+        found = _value_or_range(text, key)
+    except OptionError as error:
+        raise OptionError(
+            f"`{name}` takes a finite number such as {key}=0.15 or {key}=3/20, or a range {key}=LO..HI; "
+            f"found {key}={text}."
+        ) from error
+    if isinstance(found, tuple) and not found[0] < found[1]:
+        raise OptionError(f"`{name}` takes a range LO..HI with LO < HI; found {key}={text}.")
+    return found
 
 
 def _value_or_range(text: str, name: str) -> Fraction | tuple[Fraction, Fraction]:

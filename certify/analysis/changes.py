@@ -8,7 +8,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from certify.analysis.declaration import option
-from certify.errors import InputError
+from certify.errors import InputError, OptionError
 
 if TYPE_CHECKING:
     from certify.loop.plants import System
@@ -65,6 +65,10 @@ class PlantChanges:
             bounds = error if isinstance(error, Mapping) else {s.name: error for s in plant.inputs}
             plant = with_input_errors(plant, bounds)
         held = self.sample_time
+        lo, hi = held if isinstance(held, tuple) else (held, held)
+        if lo is not None and hi is not None and not (0 <= lo <= hi and hi > 0):
+            found = f"{float(lo):g}..{float(hi):g}" if isinstance(held, tuple) else f"{float(lo):g}"
+            raise OptionError(f"`sample_time` must be a positive time, or a range with 0 <= LO <= HI; found {found}.")
         return plant if held is None else plant.with_sample(held if isinstance(held, tuple) else (held, held))
 
     def _domain(self, plant: System) -> Mapping[str, Interval]:

@@ -81,7 +81,7 @@ def diagnose(
         fastest,
         slowest,
         tuple(pair for pair in hurts if pair[1] >= 0.1),
-        _next(result, options, proof, name, asked or (system, result.network), effort),
+        _next(result, options, proof, asked or (system, result.network), effort),
     )
 
 
@@ -162,24 +162,16 @@ def _next(
     result: RoaResult,
     options: RoaOptions,
     proof: Proof | None,
-    name: str | None,
     asked: tuple[System, TanhNetwork],
     effort: Effort,
 ) -> Step:
-    if result.stop is Stop.UNSTABLE:
-        other = "another policy, which stabilises the plant"
-        if result.verdict is Verdict.REFUTED:
-            return Step((), f"{other}: no V can prove the claim for this one")
-        return Step((), f"{other}; for this one no Lyapunov equation has a solution, so that you must give P yourself")
+    if (correction := _correction(result, options, asked[0])) is not None:
+        return correction
     if result.claim in ("practical", "nearby") and (centre := _centring(*asked)) is not None:
         return Step(
             (("--centre", centre),),
-            "shifted so that pi(0) = u_eq the loop rests where it should, and the stronger claim can be tried",
+            "shifted so that pi(0) = u_eq the operating point is the equilibrium, and the stronger claim can be tried",
         )
-    if result.levels.roa is None and (off := _off_equilibrium(asked[0])) is not None:
-        return Step((), off)
-    if options.level is not None and result.verdict is Verdict.REFUTED:
-        return Step((), "leave --level out for the largest level that can be proved")
     if result.stop is Stop.DOMAIN and options.level is None:
         return _wider_domain(result, options, effort)
     if result.stop is Stop.PATH:
@@ -293,12 +285,20 @@ def _has_tube(result: RoaResult, effort: Effort) -> bool:
     )
 
 
-def _off_equilibrium(system: System) -> str | None:
-    """The correction of a plant whose operating point is no equilibrium; None if it is one."""
-    try:
-        require_equilibrium(system, rounded=True)
-    except InputError as error:
-        return str(error)
+def _correction(result: RoaResult, options: RoaOptions, plant: System) -> Step | None:
+    """Correct the policy, the plant or the level, where no other option helps; None where one may."""
+    if result.stop is Stop.UNSTABLE:
+        other = "another policy, which stabilises the plant"
+        if result.verdict is Verdict.REFUTED:
+            return Step((), f"{other}: no V can prove the claim for this one")
+        return Step((), f"{other}; for this one no Lyapunov equation has a solution, so that you must give P yourself")
+    if options.level is not None and result.verdict is Verdict.REFUTED:
+        return Step((), "leave --level out for the largest level that can be proved")
+    if result.levels.roa is None:
+        try:
+            require_equilibrium(plant, rounded=True)
+        except InputError as error:
+            return Step((), str(error))
     return None
 
 

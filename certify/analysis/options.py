@@ -39,10 +39,10 @@ class RoaOptions:
     # fmt: off
     claim: Asked = option("auto", "claim", "word", first=True, help=(
         "asymptotic: trajectories converge to the origin. practical: they enter a small set and stay there. nearby: "
-        "they also converge to one equilibrium in it, if that can be shown. auto: asymptotic if the loop rests at the "
-        "origin exactly, else nearby."))
+        "they also converge to one equilibrium in it, if that can be shown. auto: asymptotic if the origin is "
+        "exactly an equilibrium of the loop, else nearby."))
     around: Around = option("auto", "claim", "word", metavar="POINT", help=(
-        "Where V is 0 if the loop does not rest at the origin. origin: there. rest: where the loop rests, which then "
+        "Where V is 0 if the origin is no equilibrium. origin: there. rest: at the loop's equilibrium, which then "
         "is the operating point. auto: rest if that is a stable point and nothing is given around the origin."))
     level: float | None = option(None, "claim", "number", _POSITIVE, first=True, help=(
         "Prove exactly V <= LEVEL; a smaller set counts as UNKNOWN. By default the largest level is looked for."))
@@ -172,7 +172,7 @@ _RULES: tuple[_Rule, ...] = (
     ),
     (
         lambda o: o.around == "rest" and o.claim == "asymptotic",
-        "`around` rest needs another `claim` than asymptotic, under which the loop rests at the origin.",
+        "`around` rest needs another `claim` than asymptotic, under which the origin is an equilibrium.",
     ),
     (
         lambda o: o.enlarges and (o.engine == "dreal" or o.claim in ("practical", "nearby")),

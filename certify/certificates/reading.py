@@ -55,6 +55,10 @@ def read_raw(path: Path) -> bytes:
                     "certificate's own file."
                 )
             raw = stream.read(MAX_BYTES + 1)
+    except FileNotFoundError as error:
+        raise CertificateFormatError(
+            f"{path} cannot be read: there is no such file. certify roa writes certificate.json into its folder --out."
+        ) from error
     except OSError as error:
         raise CertificateFormatError(f"{path} cannot be read: {error.strerror}.") from error
     if len(raw) > MAX_BYTES:

@@ -71,13 +71,9 @@ def certified(
         about = {"load_seconds": time.perf_counter() - start, "provenance": _provenance(policy)}
         result = run(plant, stored.network, folder, options, progress=progress, tell=later.append, **about)
     except KeyboardInterrupt:
-        search = folder / SEARCH
-        if largest is not None or not search.exists():
+        if largest is not None or not (folder / SEARCH).exists():
             raise
-        raise Interrupted(
-            f"interrupted; the search is kept in {search}, and the same command with --resume{_without(context)} "
-            "continues it."
-        ) from None
+        raise _interrupted(context, folder / SEARCH) from None
     finally:
         if progress is not None:
             progress.close()
@@ -101,6 +97,13 @@ def certified(
         if result.certificate is not None:
             say(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}")
     raise typer.Exit(result.verdict.exit_status)
+
+
+def _interrupted(context: typer.Context, search: Path) -> Interrupted:
+    return Interrupted(
+        f"interrupted; the search is kept in {search}, and the same command with --resume{_without(context)} "
+        "continues it."
+    )
 
 
 def _run_for(largest: Quantity | None, draw: Callable[[bytes], None]) -> Callable[..., RoaResult]:

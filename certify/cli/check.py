@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from pathlib import Path
 from typing import Annotated
 
@@ -39,8 +40,10 @@ def check(
         answer = {"result": "REJECTED", "rule": "policy", "at": "policy.sha256", "detail": detail}
         status, lines = 1, [f"REJECTED rule=policy at=policy.sha256: {detail}"]
     if "error" in answer and not as_json:
-        tell(f"certify: {answer['error']}")
+        tell(f"certify: {answer['error'].rstrip('.')}.{_next_step(certificate)}")
         raise typer.Exit(status)
+    if (answer.get("rule"), answer.get("at")) == ("format", "file") and _is_policy(certificate):
+        tell(f"certify: {certificate} is a policy file; certify roa {certificate} writes a certificate about it.")
     if answer.get("at") == "schema" and certificate.is_file():  # a pipe is read once
         from certify.certificates import read_raw
         from certify.certificates.formats import version_in
@@ -50,3 +53,15 @@ def check(
             tell(f"certify: {old}")
     say(json.dumps(answer) if as_json else "\n".join(lines))
     raise typer.Exit(status)
+
+
+def _next_step(path: Path) -> str:
+    """A sentence on where the certificate may be, after a path that cannot be read."""
+    if path.is_dir():
+        return f" Name the certificate in it: {path / 'certificate.json'}."
+    return "" if path.exists() else " certify roa writes certificate.json into its folder --out."
+
+
+def _is_policy(path: Path) -> bool:
+    """True if a file's form is that of a policy: an archive, as torch and stable-baselines3 write."""
+    return path.is_file() and (zipfile.is_zipfile(path) or path.suffix in (".onnx", ".safetensors"))

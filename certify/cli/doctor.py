@@ -127,7 +127,7 @@ def _optional() -> list[Finding]:
     findings = []
     for name, (module, extra, purpose) in _EXTRAS.items():
         version = version_of(name)
-        command = f"pip install 'certify[{extra}]'"
+        command = f"pip install '.[{extra}]'"
         if version is None or importlib.util.find_spec(module) is None:
             findings.append(Finding("optional", name, "missing", purpose, command))
         else:

@@ -39,7 +39,7 @@ def reach(
     quiet: Quiet = False,
     importing: ImportOptions,
 ) -> None:
-    """Prove that a state, with what lies around it, converges: a tube around its trajectory into a certified set."""
+    """Prove that a state, with what lies around it, converges: a tube around its trajectory into a proved set."""
     start, note, path = time.perf_counter(), noting(quiet), the_policy(context, file, policy)
     with kind_called(_KIND):
         stored = policy_in(path, importing, system, changes, note)

@@ -39,7 +39,7 @@ def sweep(
     folder = out if out is not None else Path("out") / read.name
     found = run_sweep(read, folder, place, (lambda *_: None) if quiet else _tell)
     if "parquet" not in found.files and not quiet:
-        tell("no Parquet file is written: it needs pyarrow, `pip install 'certify[parquet]'`")
+        tell("no Parquet file is written: it needs pyarrow, `pip install '.[parquet]'` in the project's folder")
     say(json.dumps(found.to_dict()) if as_json else _text(found))
     raise typer.Exit(found.exit_status)
 

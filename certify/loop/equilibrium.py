@@ -71,7 +71,9 @@ def seen_from(loop: ClosedLoop, rest: Rest) -> ClosedLoop:
     """
     system, network = loop.system, loop.network
     if network.centre != "none" or network.is_moved:
-        raise InputError("a loop that is to be seen from where it rests must have a policy without centring, as it is.")
+        raise InputError(
+            "a loop that is to be seen from its equilibrium must have a policy without centring, as it is."
+        )
     by = [_short(Fraction(v), hi - lo) for v, (lo, hi) in zip(rest.x, system.domain, strict=True)]
     u = [_short(Fraction(v), hi - lo) for v, (lo, hi) in zip(rest.u, system.input_bounds, strict=True)]
     origin = np.array([float(q) for q in by])

@@ -163,6 +163,8 @@ def _require_answers(
     if options.normaliser is None and not own:
         wanted.append("--normaliser none (nothing was done to the states)")
     if wanted:
-        raise InputError(f"the file does not say all that it is; nothing is guessed. Give {'; '.join(wanted)}.")
+        raise InputError(
+            f"the file does not fully define the function; these options are required: {'; '.join(wanted)}."
+        )
     if prefix is not None and own:
         raise InputError("--lyapunov-prefix must be left out: a file of two-stage says it itself.")

@@ -220,7 +220,7 @@ CLAIMS = {
             (
                 "Tube",
                 "With c(t) and P(t), which begin as c₀ and P₀, no trajectory from the start leaves "
-                "{(x − c(t))′P(t)(x − c(t)) ≤ 1}: on its edge the form falls along every trajectory; and at its end "
+                "{(x − c(t))′P(t)(x − c(t)) ≤ 1}: on its boundary the form falls along every trajectory; at its end "
                 "this ellipsoid lies in {V ≤ c₂}",
                 "one slab of time after the other, by the linearisation and a bound on its remainder that knows "
                 "directions and the motion of c(t)",

@@ -20,7 +20,7 @@ _LIMITS = {
     "requested": "the level that was asked for",
 }
 _OF_OUTER = {
-    "domain": "the domain: a larger one reaches its edge",
+    "domain": "the domain: a larger set reaches its boundary",
     "witness": "a state at which N does not fall",
     "effort": "the effort: more may be provable",
     "time": "the time limit: more may be provable",

@@ -1,6 +1,7 @@
 """Equations as MathML, which browsers typeset without help: a plant's, and a function that is an expression.
 
-A page shows the proved tree. Only numbers are multiplied out; nothing else is merged or cancelled. The result is marked
+A page shows the proved tree. Only numbers are multiplied out, and terms that are the number 0 left out, as that of a
+disturbance without a range; nothing else is merged or cancelled. The result is marked
 as safe to insert in a page, so every name is escaped here.
 """
 
@@ -29,7 +30,7 @@ def typeset(left: str, expression: Expression) -> Any:
 
 
 def multiplied_out(expression: Expression) -> Expression:
-    """The expression with each part that is a number replaced by that number."""
+    """The expression with each part that is a number replaced by that number, and without terms that are 0."""
     found: dict[Expression, Expression] = {}
     for node in nodes(expression):
         try:
@@ -39,7 +40,10 @@ def multiplied_out(expression: Expression) -> Expression:
         if value is not None:
             found[node] = Number(value)
         elif isinstance(node, Operation):
-            found[node] = Operation(node.operator, *(found[e] for e in node.operands))
+            parts = [found[e] for e in node.operands]
+            if node.operator == "+":  # one at least is no number
+                parts = [part for part in parts if not (isinstance(part, Number) and part.value == 0)]
+            found[node] = parts[0] if node.operator == "+" and len(parts) == 1 else Operation(node.operator, *parts)
         else:
             found[node] = node
     return found[expression]

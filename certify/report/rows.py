@@ -77,8 +77,8 @@ def _level_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
             "" if inner is None else inner_level(kind_of(result), inner),
         ),
         ("local c1", _level(local) if local != inner else ""),
-        ("enlarged c2", _level(levels.get("roa"))),
-        ("the domain's edge at", _level(levels.get("domain_limit"))),
+        ("proved c2", _level(levels.get("roa"))),
+        ("the domain's boundary at", _level(levels.get("domain_limit"))),
         ("the lowest violation found at", _level(levels.get("sampled_limit"))),
     ]
     stated = ", ".join(f"{name} {text}" for name, text in known if text)
@@ -123,7 +123,7 @@ def _candidates(result: Mapping[str, Any]) -> tuple[str, str]:
 def _operating_point(result: Mapping[str, Any]) -> tuple[str, str]:
     names, at = state_names(result), result["operating_point"]
     where = at_rest(names, [Fraction(at.get(name, 0)) for name in names], state_units(result))
-    rests = ", where the loop rests" if (result.get("rest") or {}).get("origin") else ""
+    rests = ", the loop's equilibrium" if (result.get("rest") or {}).get("origin") else ""
     return "operating point", f"{where}{rests}; the set lies around it, and its lengths are deviations from it"
 
 
@@ -165,7 +165,7 @@ def _rest(result: Mapping[str, Any]) -> tuple[str, str]:
     held = " at the nominal values" if result.get("uncertain") else ""
     each = zip(state_names(result), rest["values"], state_units(result), strict=True)
     where = ", ".join(f"{symbol(name)} = {quantity(value, unit, 9)}" for name, value, unit in each)
-    return "rests at", f"{where}{held}; eigenvalues there {', '.join(rest['eigenvalues']) or 'not enclosed'}"
+    return "equilibrium", f"{where}{held}; eigenvalues there {', '.join(rest['eigenvalues']) or 'not enclosed'}"
 
 
 def _functions(timing: TimingInWords) -> str:

@@ -26,10 +26,10 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Holds = Callable[[Array], Mask]
 SETTLED = 1e-3
-"""A run has settled when V is at most this share of the certified level: a thirtieth of the set's radius."""
+"""A run has settled when V is at most this share of the proved level: a thirtieth of the set's radius."""
 _GRID = {1: 401, 2: 35}
 _FINER = 8  # of the step, in runs that are asked again because they contradict what is claimed
-_HALVINGS = 2  # of the grid's cells along the edge of the region
+_HALVINGS = 2  # of the grid's cells along the boundary of the region
 _WIDTH = 4  # fine cells to either side that a smoothed value knows of
 _OUTSIDE = 1.01  # times the level: a run that starts below it and comes so high has left the set
 
@@ -44,7 +44,7 @@ class SimulatedRoa:
     attracted : runs that stayed in the domain and came near the origin; shape of the grid.
     left : runs that left the domain; shape of the grid. The others had not settled within the horizon, and count as
         not attracted.
-    certified : grid points in the certified set; shape of the grid.
+    certified : grid points in the proved set; shape of the grid.
     step, horizon : of the integration, in seconds; the horizon is how far it came if it ran out of time.
     """
 
@@ -174,17 +174,17 @@ def simulated_roa_fraction(
     """Simulate the closed loop from a grid over the domain and compare with `{x'Px <= level}`.
 
     A grid point counts as attracted if its run stays inside the domain and comes to `V <= settled` within the
-    horizon. A run from the certified set that leaves is simulated again in much smaller steps before it counts.
+    horizon. A run from the proved set that leaves is simulated again in much smaller steps before it counts.
 
     Parameters
     ----------
     system, network : the closed loop; one or two states.
-    P, level : the certified set.
+    P, level : the proved set.
     points : grid points along each state; default 401 for one state, 35 for two.
     step, horizon : in seconds; defaults from the eigenvalues, see `time_scales`.
     settled : the level that a run has to reach; default `SETTLED * level`, near the origin.
     deadline : a reading of `time.monotonic` at which the simulation ends wherever it is.
-    start, centre : (n, n) and (n,), of the ellipsoid {(x - c)'P(x - c) <= 1} that belongs to the certified set too,
+    start, centre : (n, n) and (n,), of the ellipsoid {(x - c)'P(x - c) <= 1} that belongs to the proved set too,
         where a tube leads from it; c = 0 without a centre.
     beyond : which states (N, n) of the domain belong to it besides, (N,).
 
@@ -247,17 +247,17 @@ def _run(
 def edge_of(
     flow: Flow, roa: SimulatedRoa, P: Array, target: float, deadline: float = math.inf
 ) -> tuple[Array, Array, Array]:
-    """The simulated region of a plane, four times finer along its edge: axes (K,), (L,) and a share in [0, 1], (K, L).
+    """The simulated region of a plane, four times finer along its boundary: axes (K,), (L,), a share in [0, 1], (K, L).
 
     Between grid points that agree nothing is simulated; where neighbours differ their middle is, twice. What is left
-    of the steps is smoothed over one fine cell, so that the line at 1/2 is as smooth as the edge is known.
+    of the steps is smoothed over one fine cell, so that the line at 1/2 is as smooth as the boundary is known.
 
     Raises
     ------
     InputError : the grid is not one of a plane.
     """
     if len(roa.axes) != 2:
-        raise InputError(f"the edge of a region is drawn in a plane; the grid has {len(roa.axes)} axes.")
+        raise InputError(f"the boundary of a region is drawn in a plane; the grid has {len(roa.axes)} axes.")
     (a, b), mask = roa.axes, roa.attracted
     for _ in range(_HALVINGS):
         if min(mask.shape) < 2 or time.monotonic() > deadline:

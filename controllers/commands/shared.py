@@ -47,7 +47,8 @@ def errors(context: typer.Context, as_json: bool) -> Iterator[None]:
     except ModuleNotFoundError as error:
         if error.name not in _EXTRA:
             raise
-        said = f"{error.name} is not installed, and training needs it; `pip install 'certify[controllers]'` brings it."
+        install = "`pip install '.[controllers]'` in the project's folder"
+        said = f"{error.name} is not installed, and training needs it; {install} brings it."
         raise _refused(said, as_json) from error
     except BrokenPipeError:  # nobody reads any more what is said
         raise

@@ -146,7 +146,7 @@ def theory(
         if proved is not None:
             require_same_loop(proved, policy.network, system)
             if any(proved.origin):
-                raise InputError("the certificate must be about the origin; it is about another point of rest.")
+                raise InputError("the certificate must be about the origin; it is about another equilibrium.")
             constants.append(_allowed_by_certificate(plant_now, J, proved))
     return Theory(system.name, policy.network.sha256(), tuple(constants))
 

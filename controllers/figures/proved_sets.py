@@ -48,7 +48,7 @@ def draw_growth(system: System, seed: int, proofs: Sequence[Proof], options: Pro
 
 
 def _draw_sets(figure: Any, panel: Any, system: System, proofs: Sequence[Proof]) -> None:
-    """The sets {x'Px <= level}, the domain's edge, and a scale of steps."""
+    """The sets {x'Px <= level}, the domain's boundary, and a scale of steps."""
     import matplotlib
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -61,7 +61,11 @@ def _draw_sets(figure: Any, panel: Any, system: System, proofs: Sequence[Proof])
         panel.plot(*outline, color=colours(scale(step)), lw=1.2)
     (left, right), (bottom, top) = (tuple(map(float, side)) for side in system.domain)
     panel.plot(
-        [left, right, right, left, left], [bottom, bottom, top, top, bottom], color=INK, lw=1.0, label="domain's edge"
+        [left, right, right, left, left],
+        [bottom, bottom, top, top, bottom],
+        color=INK,
+        lw=1.0,
+        label="domain's boundary",
     )
     panel.plot(0, 0, color=INK, marker="x", ls="", label="equilibrium")
     panel.set_xlabel(named(system, 0))

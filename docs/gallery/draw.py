@@ -115,7 +115,7 @@ def section(entry: Entry, certificate: Certificate) -> str:
             "",
             f"{entry.shows[0].upper()}{entry.shows[1:]}. Policy {'-'.join(map(str, network.layers))}.",
             "",
-            f"![The certified set of {entry.name}, section through the origin]({entry.name}.svg)",
+            f"![The proved set of {entry.name}, section through the origin]({entry.name}.svg)",
             "",
             f"On the axes ± {axes}; {kind} {size}{whose}; {inner}, c₂ = {below(certificate.roa)}.",
             "",

@@ -36,7 +36,7 @@ COMPARED = {
 }
 LOOKED_BACK = {
     "gain": "The learned gain and the mean action's Jacobian against the true gain, over steps",
-    "growth": "The certified set over training",
+    "growth": "The proved set over training",
 }
 HISTORIES = {"history": "", "first-steps": "-first"}  # folder of kept policies, what its pictures add to their names
 

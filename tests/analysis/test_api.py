@@ -124,7 +124,14 @@ def test_what_the_core_takes_is_taken(tmp_path: Path) -> None:
     assert json.loads((result.raw or b"").decode())["provenance"] == {"mine": "yes"}
     core = inspect.signature(__import__("certify.analysis.run", fromlist=["certify_roa"]).certify_roa).parameters
     ours = list(inspect.signature(certify_roa).parameters)
-    assert ours[:4] == ["system", "policy", "out", "options"] and set(core) - FOR_PROGRAMS <= set(ours)
+    assert ours[:4] == ["system", "policy", "out", "options"]
+    assert set(core) - FOR_PROGRAMS <= set(ours)
+
+
+def test_a_notice_says_where_an_earlier_certificate_is(tmp_path: Path) -> None:
+    certify_roa(*scalar_tanh(), tmp_path, level=0.5)
+    refuted = certify_roa(*scalar_tanh(), tmp_path, level=3.9)
+    assert refuted.verdict is Verdict.REFUTED and any("certificate.earlier.json" in n for n in refuted.notices)
 
 
 def test_options_by_name_are_those_of_the_options() -> None:
@@ -515,7 +522,7 @@ def test_plot_draws_the_certified_set(proved: RoaResult, away: RoaResult, tmp_pa
     figure.savefig(tmp_path / "set.png")
     assert (tmp_path / "set.png").read_bytes().startswith(b"\x89PNG")
     (texts,) = figure.legends
-    assert any("certified set" in t.get_text() for t in texts.get_texts())
+    assert any("proved set" in t.get_text() for t in texts.get_texts())
     (on_a_line,) = away.plot().axes
     assert on_a_line.get_xlabel() == "h − 0.1"
 

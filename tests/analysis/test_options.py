@@ -147,7 +147,7 @@ def test_changes_are_put_in_in_one_order() -> None:
     ("texts", "said"),
     [
         ({"parameters": ["m"]}, "`parameters` takes NAME=VALUE"),
-        ({"parameters": ["m=x=1"]}, "`m` must be a finite number"),
+        ({"parameters": ["m=x=1"]}, "`parameters` takes a finite number such as m=0.15"),
         ({"input_error": "0.1..0.2"}, "`input_error` must be a finite number"),
         ({"sample_time": "u=1"}, "`sample_time` must be a finite number"),
     ],

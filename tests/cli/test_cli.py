@@ -236,7 +236,7 @@ def test_bad_policies_exit_2_and_overwrite_nothing(
     ("arguments", "message"),
     [
         (["--system", "unicycle"], "unknown system"),
-        (["--system", "missing.toml"], "cannot be read"),
+        (["--system", "missing.toml"], "missing.toml cannot be read: there is no such file. Check its name"),
         (["--param", "z=1"], "no parameter"),
         (["--param", "m=0"], "must be positive"),
         (["--param", "m"], "NAME=VALUE"),
@@ -533,7 +533,15 @@ def test_both_checkers_refuse_a_level_that_was_not_proved(
         status, out, _ = run(capsys, "check", certificate, "--json", *program)
         assert status == 1 and json.loads(out)["result"] == "REJECTED"
         status, out, err = run(capsys, "check", tmp_path / "missing.json", *program)
-        assert (status, out) == (2, "") and "cannot be read" in err
+        assert (status, out) == (2, "") and "cannot be read" in err and "certify roa writes certificate.json" in err
+        status, out, err = run(capsys, "check", tmp_path, *program)
+        assert status == 2 and f"Name the certificate in it: {tmp_path / 'certificate.json'}." in err
+    assert "certify roa writes certificate.json" in run(capsys, "contains", tmp_path / "missing.json", "x=1")[2]
+
+
+def test_the_check_of_a_policy_says_that_it_is_one(policy_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = run(capsys, "check", policy_file)
+    assert status == 1 and out.startswith("REJECTED rule=format") and f"certify roa {policy_file} writes" in err
 
 
 def test_a_report_is_about_the_bytes_that_were_checked(
@@ -702,8 +710,11 @@ def test_three_ways_in_make_one_plant(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--param", "k=2..1"), "the range of k must satisfy lo < hi"),
-        (("--param", "k=1..much"), "`k` must be a finite number"),
+        (("--param", "k=2..1"), "--param takes a range LO..HI with LO < HI; found k=2..1."),
+        (("--param", "k=abc"), "--param takes a finite number such as k=0.15"),
+        (("--domain", "x=3..-3"), "--domain takes a range LO..HI with LO < HI; found x=3..-3."),
+        (("--sample-time", "-1"), "--sample-time must be a positive time, or a range with 0 <= LO <= HI; found -1."),
+        (("--param", "k=1..much"), "or a range k=LO..HI; found k=1..much."),
         (("--param", "wind=-1..1"), "soft_spring has no parameter 'wind'; it has: k"),
         (("--disturbance", "k=1"), "soft_spring has no disturbance 'k'; it has: wind"),
         (("--disturbance", "wind"), "--disturbance takes NAME=VALUE"),

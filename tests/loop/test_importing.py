@@ -155,7 +155,7 @@ def test_everything_that_is_missing_is_asked_for_at_once(tmp_path: Path) -> None
     for option in ("--states x0,x1", "--activation", "--squash", "--normaliser", "--action-scale", "--observes"):
         assert option in str(error.value)
     for missing in ("states", "activation", "squash", "normaliser", "action_scale"):
-        with pytest.raises(InputError, match=f"Give --{missing.replace('_', '-')}[^;]*$"):
+        with pytest.raises(InputError, match=f"required: --{missing.replace('_', '-')}[^;]*$"):
             import_policy(path, plant(), replace(LAYERS, **{missing: None}))
 
 
@@ -248,7 +248,7 @@ def test_outside_of_the_bounds_stable_baselines_clips_and_the_folded_policy_does
 
 def test_the_action_scale_is_asked_for_where_spaces_differ(stable: Any) -> None:
     _, _, _, path, _ = stable
-    with pytest.raises(InputError, match=r"Give --action-scale[^;]*$"):
+    with pytest.raises(InputError, match=r"required: --action-scale[^;]*$"):
         import_policy(path, plant(bound=5), replace(SAID, action_scale=None))
     assert import_policy(path, plant(bound=6), replace(SAID, action_scale=None)).policy.valid is None
 
@@ -665,7 +665,7 @@ def test_two_stage_files_are_centred_inside_the_squash(tmp_path: Path) -> None:
     assert policy.network.centre == "preactivation" and policy.beta is not None and imported.centring == {}
     assert policy.network.clip is not None and policy.network.clip[1].tolist() == [6.0, 6.0]
     for missing in ("squash", "action_scale", "states"):
-        with pytest.raises(InputError, match=f"Give --{missing.replace('_', '-')}[^;]*$"):
+        with pytest.raises(InputError, match=f"required: --{missing.replace('_', '-')}[^;]*$"):
             import_policy(path, system, replace(options, **{missing: None}))
     with pytest.raises(InputError, match="must be left out"):
         import_policy(path, system, replace(options, centre="output"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -565,6 +566,19 @@ def test_plant_says_what_cannot_be_controlled_and_what_does_not_rest(
 
 def _entries(matrix: sympy.Matrix) -> tuple[tuple[Expression, ...], ...]:
     return tuple(tuple(map(from_sympy, row)) for row in matrix.tolist())
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('name = "tank"', "name = tank", "in 'name = tank'. Put text and equations in quotes: name = \"tank\"."),
+        ("level = [0, 1]", "level = [1, 0]", "domain.level: the bounds of level must satisfy lo < hi; found [1, 0]."),
+    ],
+)
+def test_a_fault_of_the_file_is_named_with_its_repair(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in TANK
+    with pytest.raises(InputError, match=re.escape(said)):
+        load_system(write(tmp_path, TANK.replace(old, new)))
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -231,7 +231,7 @@ def test_what_is_given_in_deviations_from_the_origin_stays_there(tmp_path: Path)
 def test_without_a_stable_point_of_rest_it_is_not_asked_for(tmp_path: Path) -> None:
     loop = scalar(x + u, 0.5, 0.25)
     for options in (RoaOptions(around="rest"), RoaOptions(around="rest", claim="practical")):
-        with pytest.raises(InputError, match="stable point of rest"):
+        with pytest.raises(InputError, match="stable equilibrium"):
             certify_roa(loop.system, loop.network, tmp_path, options)
     with pytest.raises(InputError, match="`around` rest needs another `claim`"):
         RoaOptions(around="rest", claim="asymptotic")

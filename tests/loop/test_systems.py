@@ -326,7 +326,7 @@ def test_decimals_in_equations_are_exact() -> None:
         ('x1 = "x2"', 'x9 = "x2"', "x1"),
         ("states =", "stated =", "unknown keys"),
         ("name =", "name", "not valid TOML"),
-        ("[-5, 5]", "[5, -5]", "interior"),
+        ("[-5, 5]", "[5, -5]", "the bounds of x1 must satisfy lo < hi"),
     ],
 )
 def test_bad_toml(tmp_path: Path, old: str, new: str, message: str) -> None:

@@ -150,9 +150,9 @@ def test_everything_that_is_missing_is_asked_for_at_once(tmp_path: Path) -> None
     asked = ("--states x0,x1", "--observes", "--lyapunov-prefix", "--activation tanh", "--normaliser none")
     assert all(option in str(error.value) for option in asked)
     for missing in ("states", "activation", "normaliser"):
-        with pytest.raises(InputError, match=f"Give --{missing}[^;]*$"):
+        with pytest.raises(InputError, match=f"required: --{missing}[^;]*$"):
             import_lyapunov(path, plant(), replace(SAID, **{missing: None}), "V.net")
-    with pytest.raises(InputError, match=r"Give --states[^;]*$"):
+    with pytest.raises(InputError, match=r"required: --states[^;]*$"):
         import_lyapunov(changed(tmp_path), plant())
 
 

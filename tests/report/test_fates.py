@@ -151,7 +151,7 @@ def test_without_time_the_sets_are_drawn_and_nothing_is_called_leaving() -> None
     claimed = certificate(plane("-x/10", "-y*50"), 0.9)
     pictures, roa = draw(claimed, accepted=True, seconds=1e-9)
     texts = [key.text for key in pictures[0].legend]
-    assert texts[0].startswith("certified set") and any("not settled in" in text for text in texts)
+    assert texts[0].startswith("proved set") and any("not settled in" in text for text in texts)
     assert not any("leave" in text for text in texts)
     assert roa is not None and not roa.left.any() and roa.horizon == 0.0  # it says how far it came
     full, whole = draw(claimed, accepted=True)

@@ -113,6 +113,20 @@ def test_a_page_fits_and_can_be_read(
     assert overlapping is False
 
 
+def test_a_full_bar_reaches_the_end_of_its_frame(browser: Browser, pages: dict[str, Path]) -> None:
+    """The frame shows how long a bar can be, and fills its column up to the number."""
+    browser.show(pages["pendulum"], 800)
+    bar, filled, number = json.loads(
+        browser.evaluate(
+            "JSON.stringify(['.bar', '.bar i', '.track + .num'].map(s => "
+            "document.querySelector(`table.shares tbody ${s}`).getBoundingClientRect()).map(r => [r.left, r.right]))"
+        )
+    )
+    assert filled[0] == bar[0] and filled[1] == pytest.approx(bar[1], abs=0.01 * bar[1])
+    assert 0 <= number[0] - bar[1] < 30
+    assert browser.evaluate("getComputedStyle(document.querySelector('.bar')).outlineStyle") == "solid"
+
+
 def test_drawings_turn_dark_with_the_page(browser: Browser, pages: dict[str, Path]) -> None:
     """The corner of a drawing, read back through a canvas, is as dark as the page says: its text would not be seen."""
     brightest = (

@@ -204,7 +204,11 @@ def test_nothing_of_it_is_called_proved_unless_it_was_accepted(by_network: Case)
     page = replace(by_network, answer=answer).page()
     captions = [a.get("alt") or "" for _, a in page.tags]
     for shown in (page.text, *captions, *page.drawings()):
-        assert not re.search(r"certified|PROVED|(?<!here )(?<!nothing )is proved|was proved|ACCEPTED(?! or)", shown)
+        assert not re.search(
+            r"certified|proved (?:set|tube|start|outer)|PROVED"
+            r"|(?<!here )(?<!nothing )is proved|was proved|ACCEPTED(?! or)",
+            shown,
+        )
     assert "claimed outer set" in page.text and "enters the blue one, if the claim is true" in page.text
     assert "leaves of the outer set" not in page.text and "Shown on" not in page.text
 
@@ -276,15 +280,15 @@ def test_runs_from_the_outer_set_settle_and_its_share_counts(by_formula: Case) -
 def test_the_portrait_shows_both_sets(by_network: Case) -> None:
     pictures, _ = draw(by_network.certificate, accepted=True)
     first, texts = pictures[0], [key.text for key in pictures[0].legend]
-    assert texts[:2] == ["certified outer set, N = −2.55", "certified set, V = 0.25"]
+    assert texts[:2] == ["proved outer set, N = −2.55", "proved set, V = 0.25"]
     assert "N′F ≥ 0 on a grid*" in texts and START in first.svg.split("</style>")[-1]
-    assert "Magenta: the certified outer set {N ≤ n₂} in the domain" in first.caption
+    assert "Magenta: the proved outer set {N ≤ n₂} in the domain" in first.caption
     (surface,) = (p for p in pictures if p.title == "The policy's surface")
     assert "boundaries of the outer set (magenta)" in surface.caption
     (decay,) = (p for p in pictures if p.title == "V along trajectories")
     assert "that it comes down to c₂ in finite time is proved" in decay.caption
     legend = set_figure(by_network.certificate, accepted=True).legends[0]
-    assert "certified outer set, N = −2.55" in [t.get_text() for t in legend.get_texts()]
+    assert "proved outer set, N = −2.55" in [t.get_text() for t in legend.get_texts()]
 
 
 def test_sections_in_more_than_two_states() -> None:
@@ -305,7 +309,7 @@ def test_sections_in_more_than_two_states() -> None:
     pictures, roa = draw(certificate, accepted=True)
     assert roa is None and "of the outer set there is none" in pictures[0].about
     texts = [key.text for key in pictures[0].legend]
-    assert texts[0] == "certified outer set, N = 0.5: section through the origin"
+    assert texts[0] == "proved outer set, N = 0.5: section through the origin"
     assert "Of its domain {V ≤ c₂} takes" in pictures[0].caption
     assert "N′F ≥ 0 on a grid*" in texts and "< 0 at every grid point" not in pictures[0].caption
 
@@ -314,7 +318,7 @@ def test_an_interval_of_one_state(tmp_path: Path) -> None:
     case = Case.of(line(), tmp_path)
     pictures, roa = draw(case.certificate, accepted=True)
     assert case.answer["result"] == "ACCEPTED" and roa is not None
-    assert pictures[0].title == "N′F along the state" and "certified outer set" in {k.text for k in pictures[0].legend}
+    assert pictures[0].title == "N′F along the state" and "proved outer set" in {k.text for k in pictures[0].legend}
     assert roa.fraction == pytest.approx(math.sqrt(0.9), abs=0.01)
 
 

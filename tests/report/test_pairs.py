@@ -214,7 +214,7 @@ def test_the_figure_is_as_wide_as_its_columns(proved: Any, columns: Any, inches:
 
 def test_the_figure_says_what_was_accepted_and_what_is_simulated(proved: Any) -> None:
     svg = paper_figure(proved[0], True, PaperOptions(format="svg")).decode()
-    assert "certified set, V = " in svg and "* simulated or on a grid, not proved" in svg and "claimed" not in svg
+    assert "proved set, V = " in svg and "* simulated or on a grid, not proved" in svg and "claimed" not in svg
     assert "claimed set" in paper_figure(proved[0], False, PaperOptions(format="svg")).decode()
     assert paper_figure(proved[0], True, PaperOptions(format="png")).startswith(b"\x89PNG")
 

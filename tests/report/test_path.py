@@ -168,7 +168,11 @@ def test_nothing_is_called_proved_unless_it_was_accepted(proved: RoaResult, answ
     page = page_of(proved, answer)
     captions = [a.get("alt") or "" for _, a in page.tags]
     for shown in (page.text, *captions, *page.drawings()):
-        assert not re.search(r"certified|PROVED|(?<!here )(?<!nothing )is proved|was proved|ACCEPTED(?! or)", shown)
+        assert not re.search(
+            r"certified|proved (?:set|tube|start|outer)|PROVED"
+            r"|(?<!here )(?<!nothing )is proved|was proved|ACCEPTED(?! or)",
+            shown,
+        )
     assert "claimed tube" in page.text and "claimed start of the tube, around c₀" in page.text
 
 
@@ -280,7 +284,7 @@ def test_simulated_trajectories_stay_in_the_bands(proved: RoaResult) -> None:
 def test_a_plane_of_two_states_shows_start_path_and_tube(proved: RoaResult) -> None:
     pictures, roa = draw(certificate_of(proved), accepted=True)
     first, texts = pictures[0], [key.text for key in pictures[0].legend]
-    assert texts[0] == "certified start of the tube, around c₀" and "its path c(t)" in texts
+    assert texts[0] == "proved start of the tube, around c₀" and "its path c(t)" in texts
     assert any(re.fullmatch(r"the tube at \d+ moments", text) for text in texts)
     drawn = first.svg.split("</style>")[-1]
     assert START in drawn and START_FILL in drawn and "of which only the start, around c₀, is claimed" in first.caption
@@ -337,7 +341,7 @@ def test_one_state_has_an_interval_where_it_lies(tmp_path: Path) -> None:
     result = certify_roa(*scalar_tanh(), tmp_path, options)
     assert result.claim == "reached" and result.tube is not None
     page = page_of(result)
-    assert "certified start of the tube, around c₀" in page.text and "around the state c₀, x = 1.5," in page.text
+    assert "proved start of the tube, around c₀" in page.text and "around the state c₀, x = 1.5," in page.text
     low, high = Scene(certificate_of(result), accepted=True).start_on_line
     (half,) = extents(result.tube.start, 1.0)
     assert (low, high) == (1.5 - half, 1.5 + half) and 0.5 < low < high < 1.9150081
@@ -346,7 +350,7 @@ def test_one_state_has_an_interval_where_it_lies(tmp_path: Path) -> None:
 
 def test_the_figure_for_a_paper_shows_the_tube(proved: RoaResult) -> None:
     certificate = certificate_of(proved)
-    for accepted, word in ((True, "certified"), (False, "claimed")):
+    for accepted, word in ((True, "proved"), (False, "claimed")):
         svg = paper_figure(certificate, accepted, PaperOptions(format="svg")).decode()
         assert f"{word} start of the tube, around c₀" in svg and START_FILL in svg.split("</style>")[-1]
 

@@ -435,7 +435,7 @@ def test_the_simulated_share_is_the_sampled_one(pendulum_case: Case) -> None:
     c = pendulum_case.certificate
     roa = simulated_roa_fraction(c.system, c.network, c.P, c.roa)
     text = Page(pendulum_case.page()).text
-    assert f"By simulation, the certified set covers {100 * roa.fraction:.1f} % of the area" in text
+    assert f"By simulation, the proved set covers {100 * roa.fraction:.1f} % of the area" in text
     assert "did not settle" not in text
 
 
@@ -618,7 +618,7 @@ def test_other_dimensions(name: str, request: pytest.FixtureRequest) -> None:
         assert "x₁, x₂." in page.text and "all states together" in page.text
         assert (
             "its section through the origin" in page.text
-            and f"V = {below(case.certificate.roa, 4)}: projection" in page.text
+            and f"V = {below(case.certificate.roa)}: projection" in page.text
         )
         assert "By simulation" not in page.text
 
@@ -932,7 +932,7 @@ def test_a_practical_page_cannot_be_misread(practical_case: Case) -> None:
 def test_a_practical_summary_cannot_be_misread(practical_case: Case) -> None:
     text = " ".join(rendered(practical_case.result, 200).split())
     assert text.startswith("PROVED drifting: from {V <= 1.69999} every trajectory enters {V <= 0.333334} and stays")
-    assert "floor c0 0.333334, enlarged c2 1.69999" in text and "nothing is claimed about the origin" in text
+    assert "floor c0 0.333334, proved c2 1.69999" in text and "nothing is claimed about the origin" in text
     assert MISREAD.search(text) is None
 
 

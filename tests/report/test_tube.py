@@ -172,14 +172,18 @@ def test_nothing_of_a_tube_is_called_proved_unless_it_was_accepted(proved: RoaRe
     page = page_of(proved, answer)
     captions = [a.get("alt") or "" for _, a in page.tags]
     for shown in (page.text, *captions, *page.drawings()):
-        assert not re.search(r"certified|PROVED|(?<!here )(?<!nothing )is proved|was proved|ACCEPTED(?! or)", shown)
+        assert not re.search(
+            r"certified|proved (?:set|tube|start|outer)|PROVED"
+            r"|(?<!here )(?<!nothing )is proved|was proved|ACCEPTED(?! or)",
+            shown,
+        )
     assert "claimed tube" in page.text and "in its band, if the claim is true" in page.text
     assert "claimed start of the tube" in page.text
 
 
 def test_the_accepted_page_has_a_picture_of_the_tube_in_each_state(proved: RoaResult) -> None:
     page = page_of(proved)
-    assert "The tube in p." in page.text and "The tube in v." in page.text and "certified tube" in page.text
+    assert "The tube in p." in page.text and "The tube in v." in page.text and "proved tube" in page.text
     assert "if the claim is true" not in page.text and len(page.drawings()) == 5
 
 
@@ -277,7 +281,7 @@ def test_pictures_are_zoomed_to_the_larger_set_and_tell_the_two_apart() -> None:
     ]
     assert 0.1 <= max(map(abs, numbers)) <= 1.3 * 0.2
     texts = [key.text for key in first.legend]
-    assert texts[:2] == ["certified start of the tube: projection", "section of the start"]
+    assert texts[:2] == ["proved start of the tube: projection", "section of the start"]
     assert {key.colour for key in first.legend[:2]} == {START} and START in first.svg.split("</style>")[-1]
     assert "the start takes" in first.caption and "{V ≤ c₂}" in first.caption
     plain, _ = draw(replace(certificate, claim=Asymptotic(roa=1e-4, local=5e-5)), accepted=True)
@@ -332,7 +336,7 @@ def test_the_simulated_share_counts_the_start(proved: RoaResult) -> None:
 def test_the_figure_for_a_paper_shows_the_start(proved: RoaResult) -> None:
     certificate = certificate_of(proved)
     svg = paper_figure(certificate, True, PaperOptions(format="svg")).decode()
-    assert "certified start of the tube" in svg and START in svg.split("</style>")[-1]
+    assert "proved start of the tube" in svg and START in svg.split("</style>")[-1]
     assert "claimed start of the tube" in paper_figure(certificate, False, PaperOptions(format="svg")).decode()
 
 
@@ -340,7 +344,7 @@ def test_one_state_has_a_start_too(tmp_path: Path) -> None:
     result = certify_roa(*scalar_tanh(), tmp_path, RoaOptions(candidate="lyapunov", level=0.3, enlarge=True))
     assert result.claim == "enlarged"
     page = page_of(result)
-    assert "certified start of the tube" in page.text and "The tube in x." in page.text
+    assert "proved start of the tube" in page.text and "The tube in x." in page.text
     assert "length of the start" in page.text and len(page.drawings()) == 4
 
 

@@ -137,7 +137,7 @@ def test_everything_simulated_says_at_which_value(proved: RoaResult) -> None:
     assert "on the continuous closed loop with k = 1 N/m throughout" in found.text
     assert "all of them with k = 1 N/m from beginning to end" in found.text
     assert any(row[0] == "eigenvalues of the closed loop with k = 1 N/m" for row in found.rows if row)
-    assert "Modes at rest, with k = 1 N/m: " in found.text
+    assert "Modes at the equilibrium, with k = 1 N/m: " in found.text
 
 
 def test_what_was_not_proved_shrinks_by_the_ranges_alone() -> None:

@@ -72,7 +72,9 @@ def _with_claim(state: State) -> State:
         state = state.noting(f"practical stability is claimed, because {why}")
     if kind == "practical" and options.enlarges:
         if options.reach_from is not None:
-            raise InputError(f"a tube from a state needs a loop that rests at the origin; {'; '.join(state.notes)}.")
+            raise InputError(
+                f"a tube from a state needs a loop whose equilibrium is the origin; {'; '.join(state.notes)}."
+            )
         state = state.noting("a tube needs a set from which trajectories converge, and is not looked for")
         options = replace(options, enlarge=False, box=None)
     return replace(state, options=replace(options, claim=kind))
@@ -108,7 +110,7 @@ def _rest(loop: ClosedLoop, options: RoaOptions) -> tuple[Rest | None, ClosedLoo
     given = options.P is not None or options.level is not None or options.lyapunov is not None
     if options.around == "rest" and (rest is None or not rest.stable):
         found = "none was found" if rest is None else f"the one at {', '.join(rest.x)} is not"
-        raise OptionError(f"`around` rest needs a stable point of rest; {found}.")
+        raise OptionError(f"`around` rest needs a stable equilibrium; {found}.")
     if rest is None or not rest.stable or options.around == "origin" or (options.around == "auto" and given):
         return rest, loop
     moved = seen_from(loop, rest)
@@ -116,7 +118,7 @@ def _rest(loop: ClosedLoop, options: RoaOptions) -> tuple[Rest | None, ClosedLoo
 
 
 def _by_spectrum(state: State, rest: Rest | None) -> State:
-    """End the run if an eigenvalue decides; otherwise add the point of rest."""
+    """End the run if an eigenvalue decides; otherwise add the equilibrium."""
     options = state.options
     if state.kind == "asymptotic":
         unstable = by_spectrum(state.loop)

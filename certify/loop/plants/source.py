@@ -70,8 +70,12 @@ def read_plant_file(path: Path, what: str = "system file") -> PlantFile:
     """
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{what} {path} cannot be read: {error}.") from error
+    except FileNotFoundError as error:
+        raise InputError(f"{what} {path} cannot be read: there is no such file. Check its name and folder.") from error
+    except OSError as error:
+        raise InputError(f"{what} {path} cannot be read: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{what} {path} must be TOML, which is UTF-8 text; {error}.") from error
     odd: list[str] = []
 
     def number(literal: str) -> Any:
@@ -84,13 +88,29 @@ def read_plant_file(path: Path, what: str = "system file") -> PlantFile:
     try:
         data = tomllib.loads(text, parse_float=number)
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{what} {path} is not valid TOML: {error}.") from error
+        line = int(found[1]) if (found := re.search(r"at line (\d+)", str(error))) else 0
+        content = "".join(text.splitlines()[line - 1 : line]).strip()
+        hint = _hint(content)
+        shown = f" in {content[:60]!r}" if content else ""
+        raise InputError(f"{what} {path} is not valid TOML: {error}{shown}.{hint}") from error
     except InputError as error:
         line = next(i for i, content in enumerate(text.splitlines(), 1) if odd[0] in content)
         raise InputError(f"{path}, line {line}: {error}") from error
     except ValueError as error:  # an integer of thousands of digits
         raise InputError(f"{what} {path} cannot be read: {error}.") from error
     return PlantFile(path, data, _lines(text))
+
+
+def _hint(line: str) -> str:
+    """The likely repair of a line that is no TOML: text without quotes; empty for another fault.
+
+    >>> _hint("name = ball"), _hint("x = [1, 2")
+    (' Put text and equations in quotes: name = "ball".', '')
+    """
+    name, equals, value = (part.strip() for part in line.partition("="))
+    if not equals or not value or value[0] in "\"'[{":
+        return ""
+    return f' Put text and equations in quotes: {name} = "{value.partition("#")[0].strip()}".'
 
 
 def _lines(text: str) -> dict[str, int]:

@@ -217,9 +217,8 @@ def _interval(file: PlantFile, table: str, name: str) -> Interval:
         raise file.refuse(f"the bounds of {name} must be a pair [lo, hi]; found {value!r}.", table, name)
     lo, hi = (number_at(file, end, table, name) for end in value)
     if not lo < hi:
-        where = "interior: the bounds" if table == "domain" else "bounds"
         raise file.refuse(
-            f"the {where} of {name} must satisfy lo < hi; found [{float(lo):g}, {float(hi):g}].", table, name
+            f"the bounds of {name} must satisfy lo < hi; found [{float(lo):g}, {float(hi):g}].", table, name
         )
     return lo, hi
 

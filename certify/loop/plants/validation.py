@@ -59,6 +59,8 @@ def _check_names(system: System) -> None:
 
 def _check_intervals(system: System) -> None:
     for symbol, (lo, hi) in zip(system.states, system.domain, strict=True):
+        if lo > hi:
+            raise InputError(f"the domain of {symbol} must satisfy lo < hi; found [{float(lo):g}, {float(hi):g}].")
         if not lo < 0 < hi:
             raise InputError(
                 f"the domain of {symbol} must contain 0 in its interior, as a deviation from x_eq; "
@@ -109,6 +111,8 @@ def _check_ranges(system: System) -> None:
             raise InputError(
                 f"the range of {name} must satisfy lo < hi and hold its nominal value {float(nominal):g}; found "
                 f"[{float(lo):g}, {float(hi):g}]."
+                if lo < hi
+                else f"the range of {name} must satisfy lo < hi; found [{float(lo):g}, {float(hi):g}]."
             )
         if name in system.positive and not lo > 0:
             raise InputError(f"parameter {name} of {system.name} must be positive; found {float(lo):g} in its range.")

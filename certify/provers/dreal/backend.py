@@ -40,12 +40,12 @@ _EXACT = Context(prec=2000, Emax=10**6, Emin=-(10**6))
 _INLINED = 2**22  # characters of a file without definitions
 _CHILD = Path(__file__).with_name("child.py")
 _INSTALL = (
-    "It is a solver that one installs oneself. pip install 'certify[dreal]' brings its wheel, dreal==4.21.6.2 (Linux "
-    "on x86-64, Python 3.11), and no more: the wheel needs the shared library of IBEX 2.7.4 (libibex.so), which comes "
-    "from dReal's own package archive for Ubuntu or its Docker image, and Debian's coinor-libclp1, libnlopt0, "
-    "liblapack3 and libblas3. The wheel must be installed in the Python that runs this, because PYTHONPATH and the "
-    "current folder are not searched. A `dreal` binary on the PATH does as well. The engine bounds, the default, "
-    "needs neither."
+    "It is a solver that one installs oneself. pip install '.[dreal]' in the project's folder brings its wheel, "
+    "dreal==4.21.6.2 (Linux on x86-64, Python 3.11), and no more: the wheel needs the shared library of IBEX 2.7.4 "
+    "(libibex.so), which comes from dReal's own package archive for Ubuntu or its Docker image, and Debian's "
+    "coinor-libclp1, libnlopt0, liblapack3 and libblas3. The wheel must be installed in the Python that runs this, "
+    "because PYTHONPATH and the current folder are not searched. A `dreal` binary on the PATH does as well. The engine "
+    "bounds, the default, needs neither."
 )
 
 

@@ -62,7 +62,8 @@ def connect(address: str, patience: float = 30.0) -> Iterator[Client]:
         from distributed import Client, LocalCluster
     except ImportError as error:
         raise BackendError(
-            "a cluster needs Dask distributed, which is not installed; run `pip install 'certify[cluster]'`."
+            "a cluster needs Dask distributed, which is not installed; run "
+            "`pip install '.[cluster]'` in the project's folder."
         ) from error
     with _quiet(), ExitStack() as stack:
         if local is not None:

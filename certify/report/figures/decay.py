@@ -47,13 +47,13 @@ def decay(scene: Scene, paths: NDArray[np.float64], step: float) -> Picture:
     plain_powers(axes)
     axes.set_xlabel(scene.timing.axis)
     axes.set_ylabel("V(x(t))")
-    begin = f"on and in the {scene.word} set" if scene.start is None else "on the edge of the tube's start"
+    begin = f"on and in the {scene.word} set" if scene.start is None else "on the boundary of the tube's start"
     begin += "" if scene.centre is None else " around c₀"
-    begin = begin if scene.beyond is None else "at the edge of the outer set, in planes through the origin"
+    begin = begin if scene.beyond is None else "at the boundary of the outer set, in planes through the origin"
     return Picture(
         "V along trajectories",
         f"V from starting points {begin}: simulated{scene.held}, not proved{_dots(scene)}. "
-        + scene.words.decay.format(word=scene.proved),
+        + scene.words.decay.format(word=scene.word),
         to_svg(figure),
         simulated=True,
     )

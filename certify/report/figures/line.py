@@ -33,7 +33,7 @@ def line_figure(scene: Scene, roa: SimulatedRoa | None) -> Picture:
     wider = "" if scene.start is None else ", and around it the start of the tube that leads into it"
     if scene.beyond is not None:
         wider = ", and the outer set {N ≤ n₂} in the domain, from which every trajectory enters it"
-        wider += (", if the claim is true" if scene.proved == "claimed" else "") + ", drawn from a grid"
+        wider += (", if the claim is true" if scene.word == "claimed" else "") + ", drawn from a grid"
     if scene.centre is not None:
         wider = ", and the start of the tube that leads into it; nothing is claimed about states between them"
     return Picture(

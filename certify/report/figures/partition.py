@@ -30,7 +30,7 @@ def partition(scene: Scene, leaves: Leaves) -> Picture:
     axes.set_ylim(-1.04 * reach[1], 1.04 * reach[1])
     axes.set_xlabel(labels[0])
     axes.set_ylabel(labels[1])
-    shown = "showed" if scene.proved == "proved" else "has to show"
+    shown = "showed" if scene.word == "proved" else "has to show"
     always = " for all values in the ranges" if scene.system.ranges else ""
     asked = (
         f"On each blue one the checker {shown} {scene.timing.decrease} < 0{always}; the others lie outside the ring "

@@ -47,14 +47,14 @@ Region = tuple[Array, Array, Array]
 """Axes (K,), (L,) of a plane and the share of a simulated region around each point, (K, L)."""
 _ABOUT = (
     "Each picture shows two states. The section holds the states of the set in which all others are 0; the projection "
-    "holds the values that the two take anywhere in the set. Both are exact shapes. Trajectories start over the edge "
-    "of the projection, and are projected like it."
+    "holds the values that the two take anywhere in the set. Both are exact shapes. Trajectories start over the "
+    "boundary of the projection, and are projected like it."
 )
 _ABOUT_A_PATH = (
     "Each picture shows two states. Of {V ≤ c₂} the section holds the states in which all others are 0, the projection "
     "the values that the two take anywhere in it. The tube does not lie around the plane of the picture: all that is "
     "shown of it, its start and its path are projections, and where they overlap {V ≤ c₂} here the states need not lie "
-    "in it. Trajectories start over the edge of the start's projection, and are projected like it."
+    "in it. Trajectories start over the boundary of the start's projection, and are projected like it."
 )
 _ABOUT_AN_OUTER_SET = (
     "Each picture shows two states over their domain. Of the outer set, and of {V ≤ c₂}, the section holds the states "
@@ -82,7 +82,7 @@ def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
     elif scene.beyond is not None:
         meaning += (
             f"Magenta: the {scene.word} outer set {{N ≤ n₂}} in the domain, from which every trajectory enters the "
-            f"blue one{'' if scene.proved == 'proved' else ', if the claim is true'}; its outline is that on a grid. "
+            f"blue one{'' if scene.word == 'proved' else ', if the claim is true'}; its outline is that on a grid. "
         )
     about = _ABOUT if scene.centre is None else _ABOUT_A_PATH
     about = (about if scene.beyond is None else _ABOUT_AN_OUTER_SET) if len(scene.pairs) > 1 else ""
@@ -138,7 +138,7 @@ def _takes(shares: Array, names: Sequence[str], pair: Pair) -> str:
 
 def keys(scene: Scene, runs: Runs, region: Region | None, growing: bool) -> tuple[Key, ...]:
     """The legend of the planes; `growing` says whether Vdot >= 0 somewhere in one of them."""
-    outer = f"{scene.word} set, V = {below(scene.outer, 4)}"
+    outer = f"{scene.word} set, V = {below(scene.outer)}"
     inner = f"{scene.words.inner_set}, V = {inner_level(scene.kind, scene.inner, 3)}"
     start = f"{scene.word} {scene.words.start}"
     found = [Key(outer, SET, 1.8, fill=SET_FILL)]
@@ -169,8 +169,8 @@ def keys(scene: Scene, runs: Runs, region: Region | None, growing: bool) -> tupl
         found.append(Key(f"{scene.falling} ≥ 0 on a grid*", GROWTH, 1.0, fill=GROWTH_FILL))
     found += [Key(text, colour, 1.4, style) for _, colour, style, text in _kinds(scene, runs)]
     if region is not None:
-        found.append(Key("edge of the simulated region*", REGION, 1.4, "--"))
-    return (*found, Key("edge of the domain", INK, 1.0))
+        found.append(Key("boundary of the simulated region*", REGION, 1.4, "--"))
+    return (*found, Key("boundary of the domain", INK, 1.0))
 
 
 def _kinds(scene: Scene, runs: Runs) -> list[tuple[NDArray[np.bool_], str, Any, str]]:

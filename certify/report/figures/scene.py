@@ -41,7 +41,7 @@ from certify.report.words import deviation, exact_number, held_at, label
 Array = NDArray[np.float64]
 Leaves = tuple[Array, Array]
 """Boxes `lower <= z <= upper`, both (N, n)."""
-ON_BOUNDARY = 14  # trajectories that start on the certified boundary, in each plane
+ON_BOUNDARY = 14  # trajectories that start on the proved set's boundary, in each plane
 PATH_STEP = 0.6  # of the step of `time_scales`
 _MOST_LEAVES = 400_000
 _MOST_STEPS = 500
@@ -110,7 +110,7 @@ class Scene:
         self.certificate, self.beyond = certificate, certificate.claim.outer
         self.words = words_for(certificate.kind, self.timing, beyond=self.beyond is not None)
         self.kind = "asymptotic" if certificate.claim.floor is None else "practical"
-        self.word, self.proved = ("certified", "proved") if accepted else ("claimed", "claimed")
+        self.word = "proved" if accepted else "claimed"
         self.system, self.P = certificate.system, certificate.P
         self.inner, self.outer = inner_of(certificate), certificate.roa
         self.n = self.system.n
@@ -203,7 +203,7 @@ class Scene:
     @property
     def meaning(self) -> str:
         """The outer set's meaning, for captions."""
-        return self.words.meaning + ("" if self.proved == "proved" else ", if the claim is true")
+        return self.words.meaning + ("" if self.word == "proved" else ", if the claim is true")
 
     def growth(self, x: Array) -> Array:
         """V's change per unit of time in float64: Vdot, or D in steps; NaN where the equations have a pole.

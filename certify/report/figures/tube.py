@@ -76,7 +76,7 @@ def _keys(scene: Scene, runs: Runs) -> tuple[Key, ...]:
 def _about(scene: Scene) -> str:
     furthest = "the start drives" if scene.centre is None else "the tube drives"
     more = "" if scene.n <= MOST else f" The {MOST} of {scene.n} states that {furthest} furthest into the domain."
-    true = "" if scene.proved == "proved" else ", if the claim is true"
+    true = "" if scene.word == "proved" else ", if the claim is true"
     ellipsoid = "{x′P(t)x ≤ 1}" if scene.centre is None else "{(x − c(t))′P(t)(x − c(t)) ≤ 1}"
     reach = (
         ""

@@ -73,4 +73,4 @@ def _modes(found: Mapping[str, Any], held: str) -> str:
     """The closed loop's modes at the equilibrium in a sentence, with the uncertain values `held`."""
     if not found.get("stiffness"):
         return ""
-    return f"Modes at rest{f', {held}' if held else ''}: {modes(found['fastest'], found['slowest'])}."
+    return f"Modes at the equilibrium{f', {held}' if held else ''}: {modes(found['fastest'], found['slowest'])}."

@@ -94,7 +94,9 @@ def stable_baselines(part: str = "") -> ModuleType:
     try:
         return importlib.import_module("stable_baselines3" + (f".{part}" if part else ""))
     except ImportError as error:
-        raise InputError("stable-baselines3 is not installed; `pip install 'certify[baselines]'` brings it.") from error
+        raise InputError(
+            "stable-baselines3 is not installed; `pip install '.[baselines]'` in the project's folder brings it."
+        ) from error
 
 
 def as_trained(algorithm: Algorithm, policy: Any, system: System, steps: int, seed: int) -> Trained:

@@ -61,7 +61,8 @@ def test_a_plant_whose_operating_point_is_no_equilibrium_is_not_trained_for(tmp_
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["spaceship"], "spaceship"),
+        (["spaceship"], "'spaceship'"),
+        (["spaceship"], "A plant of your own is a file: give FILE.toml"),
         (["pendulum", "--gamma", "1.5"], "--gamma must be in [0, 1)"),
         (["pendulum", "--critic", "64,wide"], "--critic must be numbers"),
         (["pendulum", "--reward-weights", "1,2,3"], "--reward-weights must be 2 numbers"),

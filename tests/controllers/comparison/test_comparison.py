@@ -287,7 +287,10 @@ def test_without_stable_baselines_nothing_is_trained(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     result = _compare("pendulum", "--runs", tmp_path / "runs", "--out", tmp_path / "out")
     assert result.exit_code == 2
-    assert result.stderr == "Error: stable-baselines3 is not installed; `pip install 'certify[baselines]'` brings it.\n"
+    assert (
+        result.stderr == "Error: stable-baselines3 is not installed; "
+        "`pip install '.[baselines]'` in the project's folder brings it.\n"
+    )
     assert not list(tmp_path.iterdir())
 
 

@@ -302,5 +302,8 @@ def test_without_stable_baselines_the_command_says_what_to_install(tmp_path, mon
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     result = runner.invoke(app, ["train-baseline", "sac", "pendulum", "--out", str(tmp_path / "m.zip")])
     assert result.exit_code == 2
-    assert result.stderr == "Error: stable-baselines3 is not installed; `pip install 'certify[baselines]'` brings it.\n"
+    assert (
+        result.stderr == "Error: stable-baselines3 is not installed; "
+        "`pip install '.[baselines]'` in the project's folder brings it.\n"
+    )
     assert not list(tmp_path.iterdir())

@@ -212,7 +212,7 @@ def _require_answers(kind: Content, reading: Reading, options: ImportOptions, pl
     if options.observes is None and any(plant.exact_x_eq()):
         wanted.append(f"--observes absolute or deviation (the operating point of {plant.name} is not 0)")
     if wanted:
-        raise InputError(f"the file does not say all that its policy is; nothing is guessed. Give {'; '.join(wanted)}.")
+        raise InputError(f"the file does not fully define the policy; these options are required: {'; '.join(wanted)}.")
     for option, value, belongs in (
         ("--activation", options.activation, layers_only),
         ("--squash", options.squash, layers_only or kind == "two-stage"),

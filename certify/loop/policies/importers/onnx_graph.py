@@ -64,7 +64,8 @@ def read_onnx(raw: bytes, what: str, wanted: str | None = None, folder: Path | N
         from onnx.reference import ReferenceEvaluator
     except ImportError as error:
         raise InputError(
-            "a file of ONNX needs the package that reads it; install it with pip install 'certify[onnx]'."
+            "a file of ONNX needs the package that reads it; "
+            "install it with pip install '.[onnx]' in the project's folder."
         ) from error
     try:
         model = onnx.load_model_from_string(raw)

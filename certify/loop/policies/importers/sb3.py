@@ -109,7 +109,11 @@ def _elsewhere(archive: Archive) -> dict[str, str]:
     found: dict[str, str] = {}
     for member in sorted(set(archive.names) - {"policy.pth"}):
         if member.endswith(".pth"):
-            why = "the state of an optimiser" if "optimizer" in member else "not in policy.pth"
+            why = (
+                "the state of an optimiser"
+                if "optimizer" in member
+                else "no part of the policy: it lies beside policy.pth, which holds that"
+            )
             tensors = load_tensors(archive.read(member), member)
             found |= dict.fromkeys((f"{member.removesuffix('.pth')}/{name}" for name in tensors), why)
     return found

@@ -62,7 +62,8 @@ def load_safetensors(raw: bytes, what: str) -> dict[str, Numbers]:
         import safetensors
     except ImportError as error:
         raise InputError(
-            "a file of safetensors needs the package that reads it; install it with pip install 'certify[safetensors]'."
+            "a file of safetensors needs the package that reads it; "
+            "install it with pip install '.[safetensors]' in the project's folder."
         ) from error
     try:
         held = safetensors.deserialize(raw)  # type: ignore[no-untyped-call]

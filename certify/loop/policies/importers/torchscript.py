@@ -94,7 +94,7 @@ def _torch(what: str) -> Any:
     except ImportError as error:
         raise InputError(
             f"{what} is compared with torch itself, which is not installed; install it with pip install "
-            "'certify[torch]', or give the module's state_dict."
+            "'.[torch]' in the project's folder, or give the module's state_dict."
         ) from error
     return torch
 
