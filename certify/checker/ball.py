@@ -15,30 +15,16 @@ import numpy as np
 
 from .case import Case, Failures
 from .document import Intervals
-from .expression import evaluate
+from .expression import Call, evaluate
 from .functions import FUNCTIONS
-from .jets import Jet, between, constant, uncertain
-from .near import Above, Array, Cubic, Near, Square, Vector, all_near, mixed, near, size, stacked, triples, within
-from .network import Folded
+from .jets import Jet, Units, between, constant, uncertain
+from .near import ZERO, Above, Array, Cubic, Near, Square, Vector, all_near, mixed, near, size, stacked, triples, within
+from .network import norm2
+from .networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Sum
 
 _MOST_JETS = 2**26  # numbers in the matrices and tensors of all jets
 _MOST_NUMBERS = 2**25  # in those of a layer and the paths to it
 _MOST_PRODUCTS = 2**33  # in the sums over paths
-
-
-@dataclass(frozen=True)
-class Units:
-    """The remainder of each tanh q of the network: e_q(d) with |e_q(d)| <= d'R_q d, R (k, k, N). It reaches the inputs
-    as sum_q L_jq e_q, L (m, N)."""
-
-    L: Array
-    R: Array
-
-    @cached_property
-    def shares(self) -> Array:
-        """Bounds of these sums, (k, k, m)."""
-        found: Square = mixed(Square(self.R), Near(np.abs(self.L.T)))
-        return found.majorant
 
 
 @dataclass(frozen=True)
@@ -76,7 +62,7 @@ class Ball:
         n, still = len(self.J), self.motion is None
         m, w = ([Fraction(0)] * n, [Fraction(0)] * n) if self.motion is None else self.motion
         k = n if still else n + 1
-        nothing = constant(Fraction(0), np.zeros((k, k, 0)), self.count)
+        nothing = constant(Fraction(0), Units(np.zeros((k, k, 0))), self.count)
         jets = []
         for row, at, by in zip(self.J, m, w, strict=True):
             step = near(by)
@@ -86,8 +72,15 @@ class Ball:
 
     @cached_property
     def outputs(self) -> Jet:
-        """The last layer's values, squashed if the policy is: a batch of jets, whose errors belong to the units."""
-        return enclose_on_ball(self.case.net, self.states)
+        """The network's values, squashed if the policy is: a batch of jets, whose errors belong to the units."""
+        net = self.case.net
+        h = OnBall(len(self.states[0].a.value)).value(net.network, self.states, net.origin, net.shift)
+        return h.function("tanh") if net.squash else h
+
+    @cached_property
+    def units(self) -> Units:
+        """The errors of the inputs: sums of those of all units of the network, the squash's included."""
+        return reached(self.outputs, self.reach.value, self.case.net.scale)
 
     @cached_property
     def reach(self) -> Near:
@@ -95,37 +88,17 @@ class Ball:
         return Near(self.outputs.B.value) * Near(self.case.net.scale)
 
     @cached_property
-    def units(self) -> Units:
-        """All tanh of the network, the last layer's included, and how they reach the inputs."""
-        L = np.concatenate([self.reach.value, np.diag(self.case.net.scale)])
-        return Units(L.T, np.concatenate([self.outputs.U, self.outputs.remainder], 2))
-
-    @cached_property
     def inputs(self) -> list[Jet]:
         """pi(x) on the ball before the clip, each input with its own error."""
-        h, scale, m = self.outputs, Near(self.case.net.scale), len(self.case.c.inputs)
-        c = all_near(self.case.c.u_eq) if self.starts_at_u_eq else h.c * scale + self.case.net.offset
-        a, Q, K = h.a * scale, Square(h.Q.value) * scale, Cubic(h.K.value) * scale
-        E, lip = mixed(Square(h.U), Near(self.reach.error.top)), h.lipschitz * size(scale.value)
-        return [
-            Jet(
-                c[j],
-                a[j],
-                Q[j],
-                K[j],
-                E[j],
-                Near(np.eye(m)[j]),
-                self.units.shares,
-                Near(np.zeros(self.count)),
-                Vector(np.zeros((len(h.a.value), self.count))),
-                lip[j],
-            )
-            for j in range(m)
-        ]
+        h, scale = self.outputs, Near(self.case.net.scale)
+        at_0 = all_near(self.case.c.u_eq) if self.starts_at_u_eq else h.c * scale + self.case.net.offset
+        u = replace(h, c=at_0, a=h.a * scale, Q=Square(h.Q.value) * scale, K=Cubic(h.K.value) * scale)
+        E, lip = mixed(Square(h.units.U), Near(self.reach.error.top)), h.lipschitz * size(scale.value)
+        return rows(replace(u, E=E, lip=lip), range(len(self.case.c.inputs)), self.units, 0, self.count)
 
     def constant(self, q: Fraction) -> Jet:
         """A rational among the jets of this ball."""
-        return constant(q, self.units.shares, self.count)
+        return constant(q, self.units, self.count)
 
     def F(self, cell: Intervals = ()) -> list[Jet]:
         """The components of F on the ball, for all values of the uncertain quantities in a cell. At rest F(0) = 0, but
@@ -133,30 +106,44 @@ class Ball:
         return self.f(self.states, self.symbols(cell))
 
     def f(self, states: Sequence[Jet], quantities: Sequence[Jet]) -> list[Jet]:
-        """f(x, pi(x), q) at such states and quantities."""
-        return evaluate(self.case.c.dynamics, self.constant, [*self.shared(states), *self.inputs, *quantities])
+        """f(x, pi(x), q) at such states and quantities, all components in one family of errors: the inputs', and then
+        those of each call."""
+        units = self.units
+
+        def called(call: Call, arguments: list[Jet]) -> list[Jet]:
+            nonlocal units
+            h = OnBall(len(units.R)).value(call.network, arguments)
+            h = h.at(list(call.entries))
+            first, units = units.count, units.with_more(reached(h, h.B.value, np.ones(len(call.entries))))
+            plain = replace(h, Q=Square(h.Q.value), K=Cubic(h.K.value), E=Square(np.zeros_like(h.E.value)))
+            return rows(replace(plain, lip=h.lipschitz), range(len(call.entries)), units, first, self.count)
+
+        F = evaluate(self.case.c.dynamics, self.constant, [*self.shared(states), *self.inputs, *quantities], called)
+        return [f if f.units is units else f.among(units) for f in F]
 
     def shared(self, states: Sequence[Jet]) -> list[Jet]:
         """The states as jets with the inputs' errors."""
-        U = self.units.shares
-        return [replace(x, B=Near(np.zeros(U.shape[2])), U=U) for x in states]
+        return [replace(x, B=Near(np.zeros(self.units.count)), units=self.units) for x in states]
 
     def symbols(self, cell: Intervals) -> list[Jet]:
         """The uncertain quantities of a cell, as the numbers y have them."""
-        U = self.units.shares
-        return [uncertain(lo, hi, U, j, self.count) for j, (lo, hi) in enumerate(cell)]
+        return [uncertain(lo, hi, self.units, j, self.count) for j, (lo, hi) in enumerate(cell)]
 
     @property
     def ranges(self) -> list[Jet]:
         """The uncertain quantities, of which only their whole ranges are known."""
-        return [between(lo, hi, self.units.shares, self.count) for lo, hi in self.case.c.ranges]
+        return [between(lo, hi, self.units, self.count) for lo, hi in self.case.c.ranges]
 
 
 def fits(ball: Ball) -> Failures:
     """The jets take neither too much memory nor too much time."""
-    symbols = len(ball.J) + (ball.motion is not None)
-    operations = len(ball.case.c.dynamics.operations) * ball.order**2 * (1 + ball.count)
-    yield from too_large(ball.case.net, operations, symbols)
+    c, symbols = ball.case.c, len(ball.J) + (ball.motion is not None)
+    operations = (c.dynamics.size + c.policy.network.operations) * ball.order**2 * (1 + ball.count)
+    if operations * numbers_of(symbols) > _MOST_JETS:
+        yield "plant.dynamics", "the equations are too large for this rule"
+    for network in (c.policy.network, *(call.network for call in c.dynamics.calls.values())):
+        if is_too_large(network, symbols):
+            yield "networks", f"the network {network.name} is too large for this rule"
     return 0
 
 
@@ -180,53 +167,168 @@ def is_not_clipped(ball: Ball) -> Failures:
     return 0
 
 
-def too_large(net: Folded, operations: int, k: int) -> Failures:
-    """Places where jets of so many operations in k symbols, or the network's, take too much memory or time."""
-    numbers = k * k + len(triples(k)[0])
-    if operations * numbers > _MOST_JETS:
-        yield "plant.dynamics", "the equations are too large for this rule"
+def numbers_of(k: int) -> int:
+    """Numbers in the matrices and tensors of a jet."""
+    return k * k + len(triples(k)[0])
+
+
+def is_too_large(network: Network, k: int) -> bool:
+    """True if jets of a network in k symbols take too much memory or time."""
     columns, products = k, 0
-    for layer in net.layers[1:]:
-        rows, width = layer.W.shape
-        products += rows * columns * width
-        columns += width
-        products += rows * columns * numbers
-        if columns * (rows + numbers) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
-            yield "policy.layers", "the network is too large for this rule"
-    return 0
+    for number, step in enumerate(network.steps):
+        if isinstance(step, Affine) and number > 0:
+            rows, width = step.weight.shape
+            products += rows * columns * width + rows * columns * numbers_of(k)
+            if columns * (rows + numbers_of(k)) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
+                return True
+        columns += 0 if isinstance(step, Affine | Sum | Concat) else step.size
+    return False
 
 
-def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
-    """The last layer's values, squashed if the policy is, as a batch of jets; the states are jets without Q, K and E.
+# ------------------------------------------------------------------------------------------------------------- networks
 
-    Every layer's value is y(d) = y(0) + a.d + B A(d), where A_q is the difference of an earlier tanh from its tangent
-    at y_q(0), and B the product of weights and slopes with which it reaches y, so that errors cancel as they do in
-    truth. A_q(d) is d'H_q d + C_q[d] + e_q(d), |e_q(d)| <= d'R_q d, and e_q has the Lipschitz constant lips_q. Each
-    column of X = [a, B] has an error of its own.
+
+def reached(h: Jet, reach: Array, scale: Array) -> Units:
+    """The errors of the rows of a batch of jets, scaled, as sums over units: those of its family, which reach them by
+    `reach` (N, m), and for each row what else it does not know."""
+    return Units(np.concatenate([h.units.U, h.remainder], 2), np.concatenate([reach, np.diag(scale)]).T)
+
+
+def rows(u: Jet, of: Sequence[int], units: Units, first: int, count: int) -> list[Jet]:
+    """Some rows of a batch of jets, whose error is the one of its own number, from `first` on, in a family."""
+    k, one = len(u.a.value), np.eye(units.count)
+    nothing = Near(np.zeros(count)), Vector(np.zeros((k, count)))
+    return [Jet(u.c[j], u.a[j], u.Q[j], u.K[j], u.E[j], Near(one[first + j]), units, *nothing, u.lip[j]) for j in of]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A vector on a ball: y(0) + X (d, A), A stacking what the units so far add to their tangents, X (width, k + N),
+    each column within an error of its own. Those of its own units, if it has `own`, come last, are the identity, and
+    are not in X."""
+
+    y: Near
+    X: Vector
+    own: int | None = None  # the number of the first
+
+
+class OnBall(Algebra[Rows]):
+    """Networks on a ball.
+
+    Every vector is y(d) = y(0) + a.d + B A(d), where A_q is what a unit q adds to its tangent, and B has the products
+    of weights and slopes with which it arrives, so that errors cancel as they do in truth. A unit is an entry of a map,
+    or of expressions, or of an argument. A_q(d) is d'H_q d + C_q[d] + e_q(d), |e_q(d)| <= d'R_q d, and e_q has the
+    Lipschitz constant lips_q.
     """
-    k = len(states[0].a.value)
-    y = stacked([x.c for x in states])
-    X = Vector(
-        np.array([x.a.value for x in states]), stacked([Near(0.0, x.a.error) for x in states]).error.norm() * np.ones(k)
-    )
-    H, C, R = np.zeros((k, k, 0)), np.zeros((len(triples(k)[0]), 0)), np.zeros((k, k, 0))
-    lips = Above(np.zeros(0))
-    for number, layer in enumerate(net.layers):
-        y, X = y.through(layer.W) + layer.b, X.mapped(layer.W, layer.norm2)
-        if number > 0:  # the difference of the tanh just before arrives through W alone
-            X = X.beside(layer.W)
-        B, rows = Near(X.value[:, k:].T, X.error[k:, None]), np.ones(len(y.value))
-        a, Q, K = Vector(X.value[:, :k].T, X.error[:k].norm() * rows), mixed(Square(H), B), mixed(Cubic(C), B)
-        E = Square(np.zeros_like(Q.value), (B.error * Square(R).size[:, None]).sum() * rows)
-        lip = (B.size * lips[:, None]).sum()
-        of_y = Near(np.zeros((0, len(rows)))), Vector(np.zeros((k, 0, len(rows))))  # a policy knows nothing of y
-        value = Jet(y, a, Q, K, E, Near(B.value), R, *of_y, lip)
-        if number == len(net.layers) - 1:
-            break
-        phi = FUNCTIONS["tanh"].expansion(value.v0, value.radius)
+
+    def __init__(self, k: int) -> None:
+        self.k = k
+        self.H, self.C, self.R = np.zeros((k, k, 0)), np.zeros((len(triples(k)[0]), 0)), np.zeros((k, k, 0))
+        self.lips = Above(np.zeros(0))
+
+    def value(
+        self, network: Network, arguments: Sequence[Jet], origin: Array | None = None, shift: Near | None = None
+    ) -> Jet:
+        """The network's value at `origin` + the arguments, and a shift: a batch of jets, whose errors belong to the
+        units."""
+        x = self.entered(arguments)
+        x = x if origin is None or not np.any(origin) else replace(x, y=x.y + Near(origin))
+        h = self.run(network, x)
+        return self.jets(h if shift is None else replace(h, y=h.y + shift))
+
+    def entered(self, jets: Sequence[Jet]) -> Rows:
+        """Jets as a vector. What they have beyond a.d becomes units, unless there is nothing."""
+        y = stacked([v.v0 for v in jets])
+        errors = stacked([Near(0.0, v.gradient.error) for v in jets]).error.norm()
+        X = Vector(np.array([v.a.value for v in jets]), errors * np.ones(self.k))
+        if not any(np.any(part) for v in jets for part in (v.Q.value, v.K.value, v.remainder, v.B.value)):
+            return Rows(y, X)
+        H, C = np.stack([v.Q.value for v in jets], -1), np.stack([v.K.value for v in jets], -1)
+        R = np.stack([(Square(v.remainder) + v.shares).majorant for v in jets], -1)
+        return Rows(y, X, self.with_units(H, C, R, Above(np.array([v.lipschitz.top for v in jets]))))
+
+    def with_units(self, H: Array, C: Array, R: Array, lips: Above) -> int:
+        """Add units; the number of the first."""
+        first = self.R.shape[2]
+        self.H, self.C, self.R = (np.concatenate(pair, -1) for pair in ((self.H, H), (self.C, C), (self.R, R)))
+        self.lips = self.lips.beside(lips)
+        return first
+
+    def columns(self, v: Rows, units: int) -> Vector:
+        """X among so many units, those of its own among them."""
+        X = v.X if v.own is None else wider(v.X, self.k + v.own).beside(np.eye(len(v.X.value)))
+        return wider(X, self.k + units)
+
+    def jets(self, v: Rows) -> Jet:
+        """A vector as a batch of jets."""
+        X, k = v.X if v.own is None else self.columns(v, v.own + len(v.X.value)), self.k
+        B, ones = Near(X.value[:, k:].T, X.error[k:, None]), np.ones(len(X.value))
+        N = len(B.value)
+        R = self.R[..., :N]
+        a, Q, K = Vector(X.value[:, :k].T, X.error[:k].norm() * ones), *self.beyond(B)
+        E = Square(np.zeros_like(Q.value), (B.error * Square(R).size[:, None]).sum() * ones)
+        of_y = Near(np.zeros((0, len(ones)))), Vector(np.zeros((k, 0, len(ones))))  # a network knows nothing of y
+        return Jet(v.y, a, Q, K, E, Near(B.value), Units(R), *of_y, (B.size * self.lips[:N, None]).sum())
+
+    def beyond(self, B: Near) -> tuple[Square, Cubic]:
+        """Q and K of vectors that units reach by B (N, width)."""
+        N = len(B.value)
+        return mixed(Square(self.H[..., :N]), B), mixed(Cubic(self.C[:, :N]), B)
+
+    def affine(self, step: Affine, v: Rows) -> Rows:
+        X = v.X if v.own is None else wider(v.X, self.k + v.own)
+        X = X.mapped(step.weight, norm2(step))
+        if v.own is not None:  # the units of the step just before arrive through W alone
+            X = X.beside(step.weight)
+        return Rows(v.y.through(step.weight) + Near(step.bias), X)
+
+    def map(self, step: Map, v: Rows) -> Rows:
+        value = self.jets(v)
+        phi = FUNCTIONS[step.function].expansion(value.v0, value.radius)
         bent, twisted, rest = value.beyond_tangent(phi)
         rest = rest.wider(bent.error + twisted.error)
-        H, C, R = (np.concatenate(pair, -1) for pair in ((H, bent.value), (C, twisted.value), (R, rest.majorant)))
-        lips = lips.beside(value.lip_beyond_tangent(phi) + bent.error * 2 + twisted.error * 3)
-        y, X = phi.f[0], X.times(phi.f[1])
-    return value.function("tanh") if net.squash else value
+        lips = value.lip_beyond_tangent(phi) + bent.error * 2 + twisted.error * 3
+        X = self.columns(v, value.units.count).times(phi.f[1])
+        return Rows(phi.f[0], X, self.with_units(bent.value, twisted.value, rest.majorant, lips))
+
+    def clip(self, step: Clip, v: Rows) -> Rows:
+        """Entries that are certainly not clipped stay, those that certainly are become constant, others NaN."""
+        value = self.jets(v)
+        lo, hi = value.range.ends
+        free, low, high = (lo > step.lo) & (hi < step.hi), hi < step.lo, lo > step.hi
+        slope = np.where(free, 1.0, np.where(low | high, 0.0, np.nan))
+        y = Near(np.where(free, v.y.value, np.where(low, step.lo, step.hi)), v.y.error * slope)
+        return Rows(y, self.columns(v, value.units.count).times(Near(slope)))
+
+    def sum(self, step: Sum, vectors: Sequence[Rows]) -> Rows:
+        units = self.R.shape[2]
+        y, X = vectors[0].y, self.columns(vectors[0], units)
+        for v in vectors[1:]:
+            y, X = y + v.y, X + self.columns(v, units)
+        return Rows(y, X)
+
+    def concat(self, step: Concat, vectors: Sequence[Rows]) -> Rows:
+        parts, error = [self.columns(v, self.R.shape[2]) for v in vectors], ZERO
+        for X in parts:
+            error = error + X.error * X.error
+        y = np.concatenate([v.y.value for v in vectors])
+        of_y = np.concatenate([v.y.error.top + 0 * v.y.value for v in vectors])
+        return Rows(Near(y, Above(of_y)), Vector(np.concatenate([X.value for X in parts]), error.root))
+
+    def observe(self, step: Observe, v: Rows) -> Rows:
+        u = self.jets(v)
+        nothing = Near(np.zeros(0)), Vector(np.zeros((self.k, 0)))
+        entries = [
+            Jet(u.c[j], u.a[j], u.Q[j], u.K[j], u.E[j], Near(u.B.value[:, j]), u.units, *nothing, u.lip[j])
+            for j in range(len(v.y.value))
+        ]
+        made = evaluate(step.tape, lambda q: constant(q, u.units, 0), entries)
+        return self.entered(made)
+
+
+def wider(X: Vector, columns: int) -> Vector:
+    """X with columns of zeros, up to so many."""
+    more = columns - X.value.shape[1]
+    if more == 0:
+        return X
+    return Vector(np.concatenate([X.value, np.zeros((len(X.value), more))], 1), X.error.beside(Above(np.zeros(more))))

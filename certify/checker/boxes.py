@@ -14,8 +14,10 @@ from flint import fmpq_mat
 
 from .case import Case, Failures
 from .exact import fraction
-from .expression import evaluate
+from .expression import Call, evaluate
 from .near import Above, Array, Form, Near, all_near, near, size, within
+from .network import entries, prepare
+from .networks import Network
 from .processes import Batch
 from .taylor import Taylor, affine, combination, constant, pairs, upper_bound
 
@@ -39,15 +41,27 @@ class Boxes(ABC):
     """Boxes with corners lo and hi (n, B) in z, batched; S = T'PT."""
 
     def __init__(self, case: Case, T: Array, S: fmpq_mat, more: int = 0) -> None:
-        """`more` symbols come after those of the box, the inputs and the uncertain quantities."""
+        """`more` symbols come after those of the box, the inputs, the uncertain quantities, and entries of calls."""
         self.case, self.c, self.T, self.net = case, case.c, T, case.net
         self.n, self.m, self.k = len(case.c.states), len(case.c.inputs), len(case.c.uncertain)
-        self.symbols = self.n + self.m + self.k + more
+        self.calls = self.n + self.m + self.k  # the first symbol of an entry of a call
+        self.symbols = self.calls + self.c.dynamics.entries + more
+        prepare(*self.networks)
         rows = [all_near(fraction(v) for v in row) for row in S.tolist()]
         whole, axes = np.array([row.value for row in rows]), np.eye(self.n, dtype=bool)
         self.S = np.diag(whole)  # the diagonal
         wrong = Above(np.array([row.error.v for row in rows]), max(row.error.k for row in rows))
         self.S_rest = wrong + size(np.where(axes, 0.0, whole))  # bounds what S is beside it
+
+    @property
+    def width(self) -> int:
+        """The most entries of a vector of the networks."""
+        return max(step.size for network in self.networks for step in network.steps)
+
+    @property
+    def networks(self) -> list[Network]:
+        """The policy's, and that of each call in the equations."""
+        return [self.c.policy.network, *(call.network for call in self.c.dynamics.calls.values())]
 
     @abstractmethod
     def leaves(self) -> Iterator[Batch]:
@@ -79,8 +93,8 @@ class Boxes(ABC):
         return Form(z).through(self.T)
 
     def models(self, x: Form, u: Form) -> tuple[list[Taylor], list[Taylor]]:
-        """States and inputs on the boxes; symbols: n box coordinates, m input errors, k uncertain quantities, and the
-        period if it has a range."""
+        """States and inputs on the boxes; symbols: n box coordinates, m input errors, k uncertain quantities, entries
+        of calls, and the period if it has a range."""
         batch = u.error.v.shape[1]
         zeros, errors = np.zeros((self.symbols - self.n, batch)), np.eye(self.m)[:, :, None] * u.error.top[:, None]
         states = [affine(x.value[0, i], np.concatenate([x.value[1:, i], zeros]), x.error[i]) for i in range(self.n)]
@@ -99,7 +113,11 @@ class Boxes(ABC):
 
     def f(self, states: list[Taylor], held: list[Taylor]) -> list[Taylor]:
         """f of states, and of inputs and uncertain quantities."""
-        return evaluate(self.c.dynamics, self.constant(len(held[0].c)), [*states, *held])
+        return evaluate(self.c.dynamics, self.constant(len(held[0].c)), [*states, *held], self.called)
+
+    def called(self, call: Call, arguments: list[Taylor]) -> list[Taylor]:
+        """Entries of a network's value, each with its symbol for the error."""
+        return entries(call, arguments, self.calls)
 
     def number(self, pair: tuple[Fraction, Fraction], symbol: int, batch: int) -> Taylor:
         """A number of a range, by its symbol."""

@@ -43,10 +43,10 @@ def contracts(ball_: Contracted) -> Failures:
     for cell in ball_.case.cells:
         F = ball_.F(cell)
         lips = [float(f.lipschitz.top) for f in F]
-        if not (are_finite(F, ball_.units) and np.all(np.isfinite(lips))):
+        if not (are_finite(F) and np.all(np.isfinite(lips))):
             yield ball_.at, "F has no finite model"
             return count
-        models = Models(ball_.J, F, ball_.units, rest=True)
+        models = Models(ball_.J, F, rest=True)
         b = P * models.J  # b_i is row i
         rest = _turning(models, b, ball_.by.weights.tolist()) + _twisting(models, b, ball_.by.weight)
         for i, lip in enumerate(lips):

@@ -17,7 +17,6 @@ from itertools import product
 import numpy as np
 from flint import fmpq, fmpq_mat
 
-from .ball import Units
 from .document import Multipliers, Path
 from .exact import exactly, is_definite, root_above
 from .jets import Jet, unpacked
@@ -40,10 +39,10 @@ class Models:
     """G on a ball: `f_i + a_i.d + d'Q_i d + K_i[d] + sum_jq B_ij L_jq e_q + r_i`, f_i within `error`, a_i within
     `slack`, |r_i| <= d'E_i d; d has k entries. Along a path it is F - v. At rest f_i is exactly 0."""
 
-    def __init__(self, J: Array, G: Sequence[Jet], units: Units, rest: bool, velocity: Sequence[fmpq] = ()) -> None:
+    def __init__(self, J: Array, G: Sequence[Jet], rest: bool, velocity: Sequence[fmpq] = ()) -> None:
         """J is (n, n), v the velocity of a path, `rest` says whether G vanishes at d = 0. Parameters are finite; see
         `are_finite`. Where y is uncertain these are the models at y = 0; see `corners`."""
-        self.J, self.units = exactly(J), units
+        self.J, self.units = exactly(J), G[0].units
         self.K = np.stack([g.K.value for g in G], -1)
         self.shares = np.array([g.B.value for g in G])
         self.B = exactly(self.shares)
@@ -79,14 +78,17 @@ def are_usable(by: Multipliers, path: Path | None = None) -> bool:
     return signs and (all(beta > 0 for beta in by.apart) or all(g > 0 for g in joint))
 
 
-def are_finite(F: Sequence[Jet], units: Units) -> bool:
+def are_finite(F: Sequence[Jet]) -> bool:
     """True if every component has a finite model, and the sums of squares in binary64 are finite."""
+    units = F[0].units
     parts = [
         part
         for f in F
         for part in (f.c.value, f.error.top, f.a.value, f.slack.top, f.Q.value, f.remainder, f.B.value, f.twist.top)
     ]
-    return all(np.all(np.isfinite(part)) for part in (*parts, norm(units.L, (0, 1)).top, norm(units.R, (0, 1, 2)).top))
+    return all(
+        np.all(np.isfinite(part)) for part in (*parts, norm(units.reach, (0, 1)).top, norm(units.R, (0, 1, 2)).top)
+    )
 
 
 def shows(models: Models, P: fmpq_mat, R: fmpq_mat, by: Multipliers, path: Path | None = None) -> bool:
@@ -177,7 +179,7 @@ def doubts(
 
 def size_beyond(models: Models, P: Array) -> float:
     """Gamma: an upper bound of ||g||_P / ||d||^2, g the models less (f, A d); maybe infinite, or NaN."""
-    L, often = models.units.L, triples(models.A.ncols())[-1]
+    L, often = models.units.reach, triples(models.A.ncols())[-1]
     R, E = (norm(M, (0, 1)) for M in (models.units.R, models.Es))
     c = Near(L).through(models.shares)
     each = at_least_0((c * c.through(P)).sum())
@@ -209,7 +211,7 @@ def cubic(models: Models, b: fmpq_mat, by: Multipliers) -> fmpq_mat:
 
 def of_units(models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:
     """S_units: 2 sum_q (p_q.d) e_q, p_q = sum_i b_i sum_j B_ij L_jq."""
-    L, R = models.units.L, models.units.R
+    L, R = models.units.reach, models.units.R
     if not np.any(L):
         return fmpq_mat(b.ncols(), b.ncols())
     row, by = in_binary64(models.B.transpose() * b)

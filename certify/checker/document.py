@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
-import struct
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -16,10 +14,12 @@ from numpy.typing import NDArray
 
 from .errors import Rejected
 from .expression import Tape, parse
+from .networks import Network, hashed
+from .networks import read as read_networks
 from .schema import Value
 from .strict import MAX_VALUES, load
 
-MAX_STATES, MAX_LAYERS, MAX_WIDTH, MAX_SLABS = 64, 64, 2**14, 10**4
+MAX_STATES, MAX_SLABS = 64, 10**4
 MAX_ORDER = 8  # of a series in time
 MAX_CELLS, MAX_CUTS = 4096, 64  # of the box of uncertain quantities in all, and of one range
 CLAIMS = ("asymptotic", "practical", "nearby", "enlarged", "reached")
@@ -29,53 +29,30 @@ Array = NDArray[np.float64]
 Intervals = tuple[tuple[Fraction, Fraction], ...]
 
 
-def hashed(heading: str, arrays: Iterable[Array]) -> str:
-    """sha256 of a heading, then shape and little-endian numbers of each array (FORMAT.md)."""
-    digest = hashlib.sha256(heading.encode())
-    for numbers in arrays:
-        digest.update(struct.pack(f"<{1 + numbers.ndim}Q", numbers.ndim, *numbers.shape))
-        digest.update(numbers.astype("<f8").tobytes())
-    return digest.hexdigest()
-
-
 @dataclass(frozen=True)
 class Policy:
-    """The network as stated in the file: exact binary64 numbers."""
+    """The policy as stated in the file: exact binary64 numbers."""
 
-    weights: tuple[Array, ...]
-    biases: tuple[Array, ...]
+    network: Network
     scale: Array
     offset: Array
     squash: str
     centre: str
     clip: tuple[Array, Array] | None = None  # lo, hi
-    origin: Array | None = None  # the layers read origin + x; None for 0
+    origin: Array | None = None  # the network reads origin + x; None for 0
 
     def sha256(self) -> str:
         """Hash of squash, centre, then each array."""
-        layers = [array for layer in zip(self.weights, self.biases, strict=True) for array in layer]
-        arrays = (*layers, self.scale, self.offset, *(self.clip or ()))
-        return hashed(f"certify-policy/1\0{self.squash}\0{self.centre}\0", arrays)
-
-
-@dataclass(frozen=True)
-class Network:
-    """A function of the states: layers with tanh between them, the last of which has one row."""
-
-    weights: tuple[Array, ...]
-    biases: tuple[Array, ...]
-
-    def sha256(self) -> str:
-        """Hash of each array."""
-        layers = zip(self.weights, self.biases, strict=True)
-        return hashed("certify-lyapunov/1\0", [array for layer in layers for array in layer])
+        arrays = [array for step in self.network.steps for array in step.arrays]
+        heading = f"certify-policy/1\0{self.squash}\0{self.centre}\0"
+        return hashed(heading, (*arrays, self.scale, self.offset, *(self.clip or ())), self.network.words())
 
 
 @dataclass(frozen=True)
 class Outer:
-    """The function N, an expression's tape or a network, and the level n2 of {N <= n2}."""
+    """The function N, an expression's tape, and the level n2 of {N <= n2}."""
 
-    function: Tape | Network
+    function: Tape
     level: float
 
 
@@ -188,6 +165,7 @@ class Certificate:
     u_eq: tuple[Fraction, ...]
     domain: Intervals
     input_bounds: Intervals
+    networks: tuple[Network, ...]
     policy: Policy
     P: Array
     levels: dict[str, float]
@@ -228,15 +206,16 @@ def read(path: str) -> Certificate:
 
 def certificate(data: Any, sha256: str) -> Certificate:
     """A JSON value as a certificate."""
-    keys = "schema claim plant policy lyapunov levels evidence provenance"
-    schema, claim, plant, policy, lyapunov, levels, evidence, provenance = Value(data).keys(keys)
-    schema.choice("certify-certificate/8")
+    keys = "schema claim networks plant policy lyapunov levels evidence provenance"
+    schema, claim, functions, plant, policy, lyapunov, levels, evidence, provenance = Value(data).keys(keys)
+    schema.choice("certify-certificate/9")
     known = isinstance(claim.raw, dict) and claim.raw.get("kind") in CLAIMS
     claim.must(known, f"an object of kind {' or '.join(CLAIMS)}")
     kind = claim.raw["kind"]
-    stated = _plant(plant)
+    networks = read_networks(functions)
+    stated = _plant(plant, networks)
     n, m = len(stated["states"]), len(stated["inputs"])
-    stated["policy"] = _policy(policy, n, m, kind in PRACTICAL)
+    stated["policy"] = _policy(policy, networks, n, m, kind in PRACTICAL)
     stated_of = {"enlarged": " start", "reached": " start centre"}
     _, rate, sample, beyond, *of_tube = claim.keys("kind rate sample outer" + stated_of.get(kind, ""))
     fall, periods = rate.binary64(), _sample(sample)
@@ -244,7 +223,7 @@ def certificate(data: Any, sha256: str) -> Certificate:
     plain = periods is None and not stated["discrete"]
     sample.must(plain or kind not in (*WITH_TUBE, "nearby"), "null, and the plant continuous, under this claim")
     sample.must(periods is None or not stated["discrete"], "null where time is discrete")
-    outer = _outer(beyond, stated["states"])
+    outer = _outer(beyond, stated["states"], networks)
     beyond.must(outer is None or (plain and fall == 0 and kind not in WITH_TUBE), "null under this claim")
     form, P = lyapunov.keys("kind P")
     form.choice("quadratic")
@@ -256,6 +235,7 @@ def certificate(data: Any, sha256: str) -> Certificate:
         fall,
         periods,
         **stated,
+        networks=tuple(networks.values()),
         P=P.array(n, n),
         levels=numbers,
         evidence=_evidence(
@@ -263,7 +243,7 @@ def certificate(data: Any, sha256: str) -> Certificate:
             n,
             len(stated["uncertain"]),
             kind,
-            periods is not None,
+            MAX_ORDER if periods is not None and not stated["dynamics"].calls else 1,
             outer is not None,
             plain and fall == 0 and outer is None,
         ),
@@ -274,7 +254,7 @@ def certificate(data: Any, sha256: str) -> Certificate:
     )
 
 
-def _plant(plant: Value) -> dict[str, Any]:
+def _plant(plant: Value, networks: Mapping[str, Network]) -> dict[str, Any]:
     keys = "name time states inputs uncertain dynamics u_eq domain input_bounds"
     name, time, *names, uncertain, dynamics, u_eq, domain, bounds = plant.keys(keys)
     states, inputs = (value.listed(Value.name, 1, MAX_STATES) for value in names)
@@ -289,7 +269,7 @@ def _plant(plant: Value) -> dict[str, Any]:
         "inputs": inputs,
         "uncertain": others,
         "ranges": tuple(interval for _, interval in quantities),
-        "dynamics": parse(dynamics.listed(lambda tree: tree.raw, n), everything, dynamics.at),
+        "dynamics": parse(dynamics.listed(lambda tree: tree.raw, n), everything, dynamics.at, networks),
         "u_eq": u_eq.listed(Value.rational, m),
         "domain": domain.listed(Value.interval, n),
         "input_bounds": bounds.listed(Value.interval, m),
@@ -309,50 +289,29 @@ def _quantity(value: Value) -> tuple[str, tuple[Fraction, Fraction]]:
     return name.name(), interval.interval()
 
 
-def _policy(value: Value, n: int, m: int, practical: bool) -> Policy:
-    names = "layers squash centre scale offset clip origin sha256"
-    layers, squash, centre, scale, offset, clip, origin, sha256 = value.keys(names)
-    weights, biases = _layers(layers, n, m)
+def _policy(value: Value, networks: Mapping[str, Network], n: int, m: int, practical: bool) -> Policy:
+    names = "network squash centre scale offset clip origin sha256"
+    named, squash, centre, scale, offset, clip, origin, sha256 = value.keys(names)
+    network = networks.get(named.name())
+    named.must(network is not None and (network.reads, network.gives) == (n, m), f"a network from {n} to {m} numbers")
     words = squash.choice("tanh", "identity"), centre.choice("output", "preactivation", "none")
     centre.must(words != ("identity", "preactivation"), "another where squash is not 'tanh'")
     at = origin.array(n)
     moved = bool(np.any(at != 0))
     origin.must(not moved or (practical and words[1] == "none"), "0 under this claim and centring")
-    policy = Policy(weights, biases, scale.array(m), offset.array(m), *words, _clip(clip, m), at if moved else None)
+    policy = Policy(networks[named.raw], scale.array(m), offset.array(m), *words, _clip(clip, m), at if moved else None)
     scale.must(bool(np.all(policy.scale != 0)), "nonzero")
     check_hash(policy, sha256.raw)
     return policy
 
 
-def _layers(layers: Value, n: int, m: int) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Weights and biases from n numbers to m."""
-    read: list[tuple[Array, Array]] = []
-    columns = n  # of a layer: the rows of the layer before
-    for shape, weight, bias in layers.listed(lambda layer: layer.keys("shape weight bias"), 1, MAX_LAYERS):
-        rows, stated = shape.listed(lambda size: size.raw, 2)
-        fits = type(rows) is type(stated) is int and 1 <= rows <= MAX_WIDTH and stated == columns
-        shape.must(fits, f"[out, {columns}] with out at most {MAX_WIDTH}")
-        read.append((weight.array(rows, columns), bias.array(rows)))
-        columns = rows
-    layers.must(columns == m, f"a network with {m} outputs")
-    weights, biases = zip(*read, strict=True)
-    return weights, biases
-
-
-def _outer(value: Value, states: tuple[str, ...]) -> Outer | None:
+def _outer(value: Value, states: tuple[str, ...], networks: Mapping[str, Network]) -> Outer | None:
     if value.raw is None:
         return None
-    kinds = ("network", "expression")
-    value.must(isinstance(value.raw, dict) and value.raw.get("kind") in kinds, f"of kind {' or '.join(kinds)}, or null")
-    if value.raw["kind"] == "network":
-        _, layers, level = value.keys("kind layers level")
-        function: Tape | Network = Network(*_layers(layers, len(states), 1))
-    else:
-        _, tree, level = value.keys("kind expression level")
-        function = parse((tree.raw,), states, tree.at)
+    tree, level = value.keys("expression level")
     n2 = level.binary64()
     level.must(math.isfinite(n2), "finite")
-    return Outer(function, n2)
+    return Outer(parse((tree.raw,), states, tree.at, networks), n2)
 
 
 def _outer_tree(value: Value, n: int, asked: bool) -> OuterTree | None:
@@ -363,13 +322,13 @@ def _outer_tree(value: Value, n: int, asked: bool) -> OuterTree | None:
     return OuterTree(T.array(n, n), root.array(n), tree.octets(), faces.listed(Value.octets, 2 * n))
 
 
-def _local(value: Value, n: int, claim: str, sampled: bool) -> LocalBall | None:
+def _local(value: Value, n: int, claim: str, most: int) -> LocalBall | None:
     if claim in PRACTICAL and value.raw is None:
         return None
     J, multipliers, weight, edge, order = value.keys("J multipliers weight edge order")
     k = edge.binary64()
     edge.must(0 <= k < math.inf and (k == 0 or claim in PRACTICAL), "0, or a multiplier under a practical claim")
-    return LocalBall(J.array(n, n), _multipliers(multipliers, weight, n, n), k, _order(order, sampled))
+    return LocalBall(J.array(n, n), _multipliers(multipliers, weight, n, n), k, order.integer(1, most))
 
 
 def _contraction(value: Value, n: int, claim: str) -> Contraction | None:
@@ -378,11 +337,6 @@ def _contraction(value: Value, n: int, claim: str) -> Contraction | None:
         return None
     J, weights, weight = value.keys("J weights weight")
     return Contraction(J.array(n, n), weights.array(n), weight.array(n, n))
-
-
-def _order(value: Value, sampled: bool) -> int:
-    value.must(type(value.raw) is int and 1 <= value.raw <= (MAX_ORDER if sampled else 1), "an order that is allowed")
-    return int(value.raw)
 
 
 def _slab(value: Value, n: int, claim: str) -> Slab:
@@ -417,12 +371,12 @@ def _clip(value: Value, m: int) -> tuple[Array, Array] | None:
 def check_hash(policy: Policy, stated: Any) -> None:
     """Rule `hash`."""
     if stated != policy.sha256():
-        raise Rejected("hash", "policy.sha256", "does not match the layers in the file")
+        raise Rejected("hash", "policy.sha256", "does not match the network in the file")
 
 
-def _evidence(value: Value, n: int, k: int, claim: str, sampled: bool, outer: bool, plain: bool) -> Partition | Trusted:
-    """k quantities are uncertain; `outer` says that a function is stated, `plain` that none is, nor a rate, of a loop
-    without steps."""
+def _evidence(value: Value, n: int, k: int, claim: str, most: int, outer: bool, plain: bool) -> Partition | Trusted:
+    """k quantities are uncertain; series in time have an order of at most `most`; `outer` says that a function is
+    stated, `plain` that none is, nor a rate, of a loop without steps."""
     kinds = (
         "partition-tree",
         *(("trusted-solver",) if plain and not k and claim not in (*WITH_TUBE, "nearby") else ()),
@@ -432,14 +386,13 @@ def _evidence(value: Value, n: int, k: int, claim: str, sampled: bool, outer: bo
     if value.raw["kind"] == "partition-tree":
         keys = "kind T root tree order cells local contraction tube outer"
         _, T, root, tree, order, cells, local, contraction, tube, beyond = value.keys(keys)
-        cuts = cells.listed(lambda cut: cut.raw, k)
-        whole = all(type(cut) is int and 1 <= cut <= MAX_CUTS for cut in cuts)
-        cells.must(whole and math.prod(cuts) <= MAX_CELLS, f"from 1 to {MAX_CUTS} parts each, {MAX_CELLS} in all")
+        cuts = cells.listed(lambda cut: cut.integer(1, MAX_CUTS), k)
+        cells.must(math.prod(cuts) <= MAX_CELLS, f"{MAX_CELLS} parts in all")
         value.must(k == 0 or claim not in WITH_TUBE, "another where quantities are uncertain")
         slabs = tube.listed(lambda slab: _slab(slab, n, claim), *((1, MAX_SLABS) if claim in WITH_TUBE else (0, 0)))
-        ball = _local(local, n, claim, sampled)
+        ball = _local(local, n, claim, most)
         close = _contraction(contraction, n, claim)
-        by_boxes = T.array(n, n), root.array(n), tree.octets(), _order(order, sampled)
+        by_boxes = T.array(n, n), root.array(n), tree.octets(), order.integer(1, most)
         return Partition(*by_boxes, cuts, ball, close, slabs, _outer_tree(beyond, n, outer))
     _, solver, version, precision, queries = value.keys("kind solver version precision queries")
     precision.must(precision.binary64() > 0, "positive")

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import reduce
 from math import isqrt
+from operator import add
 
 import numpy as np
 from flint import fmpq, fmpq_mat, fmpz
 from numpy.typing import NDArray
 
 from .document import Policy
-from .expression import MAX_BITS
+from .expression import MAX_BITS, Call, evaluate
 from .functions import FUNCTIONS, Undecided
+from .networks import Affine, Algebra, Clip, Concat, Map, Observe, Sum
 
 MAX_INVERSE_BITS = 2**14  # of a number in a matrix all of whose inverse is wanted, times the matrix's size
 MAX_MATRIX_BITS = 2**16  # of a number in a matrix, times the matrix's size: beyond, a decision takes minutes
@@ -115,27 +119,47 @@ class Exact:
         return self if self.value is None else Exact(FUNCTIONS[name].exact(self.value))
 
 
-def raw_at_origin(policy: Policy) -> list[Fraction | None]:
-    """raw(0), None where it is not known: tanh is known at exact 0 alone, and 0 times an unknown number is 0."""
-    layers = [*zip(policy.weights, policy.biases, strict=True), (np.diag(policy.scale), policy.offset)]
-    h: list[Fraction | None] = [Fraction(0)] * policy.weights[0].shape[1]
-    for k, (W, b) in enumerate(layers):
-        if 0 < k < len(policy.weights) or (k > 0 and policy.squash == "tanh"):
-            h = [Fraction(0) if v == 0 else None for v in h]
-        h = [_affine(row, bias, h) for row, bias in zip(W.tolist(), b.tolist(), strict=True)]
-    return h
+class Exactly(Algebra[list[Exact]]):
+    """Networks of such numbers."""
+
+    def affine(self, step: Affine, v: list[Exact]) -> list[Exact]:
+        return [_row(row, bias, v) for row, bias in zip(step.weight.tolist(), step.bias.tolist(), strict=True)]
+
+    def map(self, step: Map, v: list[Exact]) -> list[Exact]:
+        return [x.function(step.function) for x in v]
+
+    def clip(self, step: Clip, v: list[Exact]) -> list[Exact]:
+        return [_clipped(x, *ends) for x, *ends in zip(v, step.lo.tolist(), step.hi.tolist(), strict=True)]
+
+    def sum(self, step: Sum, vectors: Sequence[list[Exact]]) -> list[Exact]:
+        return [reduce(add, entries) for entries in zip(*vectors, strict=True)]
+
+    def concat(self, step: Concat, vectors: Sequence[list[Exact]]) -> list[Exact]:
+        return [x for v in vectors for x in v]
+
+    def observe(self, step: Observe, v: list[Exact]) -> list[Exact]:
+        return evaluate(step.tape, Exact, v)
+
+    def entries(self, call: Call, arguments: list[Exact]) -> list[Exact]:
+        """A call in equations."""
+        value = self.run(call.network, arguments)
+        return [value[i] for i in call.entries]
 
 
 def policy_at_origin(policy: Policy) -> list[Fraction | None]:
-    """pi(0) without centring: raw(0), clipped."""
-    raw = raw_at_origin(policy)
-    if policy.clip is None:
-        return raw
-    ends = ([Fraction(v) for v in end.tolist()] for end in policy.clip)
-    return [None if v is None else min(max(v, lo), hi) for v, lo, hi in zip(raw, *ends, strict=True)]
+    """pi(0) without centring, None where it is not known."""
+    values, u = Exactly().run(policy.network, [Exact(Fraction(0))] * policy.network.reads), list[Exact]()
+    for j, (v, scale, offset) in enumerate(zip(values, policy.scale.tolist(), policy.offset.tolist(), strict=True)):
+        raw = Exact(Fraction(offset)) + Exact(Fraction(scale)) * (v.function("tanh") if policy.squash == "tanh" else v)
+        u.append(_clipped(raw, *(end.tolist()[j] for end in policy.clip)) if policy.clip else raw)
+    return [x.value for x in u]
 
 
-def _affine(row: list[float], bias: float, h: list[Fraction | None]) -> Fraction | None:
-    terms = [None if v is None else Fraction(w) * v for w, v in zip(row, h, strict=True) if w != 0]
-    known = [v for v in terms if v is not None]
-    return sum(known, Fraction(bias)) if len(known) == len(terms) else None
+def _clipped(x: Exact, lo: float, hi: float) -> Exact:
+    return x if x.value is None else Exact(min(max(x.value, Fraction(lo)), Fraction(hi)))
+
+
+def _row(row: list[float], bias: float, v: list[Exact]) -> Exact:
+    terms = [None if x.value is None else Fraction(w) * x.value for w, x in zip(row, v, strict=True) if w != 0]
+    known = [q for q in terms if q is not None]
+    return Exact(sum(known, Fraction(bias)) if len(known) == len(terms) else None)

@@ -1,29 +1,53 @@
 """The plant's equations: a JSON tree becomes a tape of operations, each evaluated once.
 
 A leaf is a name or an exact fraction; a node is `["+", a, b, ...]`, `["*", a, b, ...]`, `["-", a]`,
-`["-", a, b]`, `["/", a, b]`, `["**", a, k]` with an integer k, or `[f, a]` with a function f.
-Powers and tan are expanded here, so that an arithmetic needs only +, *, unary -, and `function` for inv and the others.
-The result of these four on rationals alone is a rational, computed here.
+`["-", a, b]`, `["/", a, b]`, `["**", a, k]` with an integer k, `[f, a]` with a function f, or a call of a network,
+`["network", name, i, a, ...]`. Powers and tan are expanded here, so that an arithmetic needs only +, *, unary -,
+`function` for inv and the others, and a function that calls networks. The result of +, *, - and inv on rationals alone
+is a rational, computed here.
 """
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import reduce
-from typing import Any
+from functools import cached_property, reduce
+from typing import TYPE_CHECKING, Any
 
 from . import strict
 from .schema import Value
 
+if TYPE_CHECKING:
+    from .networks import Network
+
 MAX_OPERATIONS, MAX_DEPTH, MAX_EXPONENT = 20_000, 200, 64
 MAX_BITS = 2**14  # of a numerator or a denominator
-Operation = tuple[Any, ...]  # ("const", q) | ("var", i) | (name, operand indices ...)
-_LEAVES = ("const", "var")
 _OPERATORS: dict[str, Callable[..., Any]] = {"+": operator.add, "*": operator.mul, "neg": operator.neg}
 Part = int | Fraction  # of an operation: an index on the tape, or a number that stands on it only if it has to
+
+
+@dataclass(frozen=True)
+class Operation:
+    """An operation on earlier values, by their indices; a rational, a name's number, a network or an entry's number is
+    its detail."""
+
+    name: str
+    operands: tuple[int, ...] = ()
+    detail: Any = None
+
+
+@dataclass(frozen=True)
+class Call:
+    """A call of a network, of whose value these entries are used; `first` counts those of the calls before."""
+
+    network: Network
+    entries: tuple[int, ...]
+    first: int
+
+
+Calling = Callable[[Call, list[Any]], Sequence[Any]]  # the entries that a call uses, given the arguments
 
 
 @dataclass(frozen=True)
@@ -34,28 +58,68 @@ class Tape:
     outputs: tuple[int, ...]
     trees: tuple[Any, ...]
 
+    @cached_property
+    def calls(self) -> dict[int, Call]:
+        """The calls, by their index on the tape."""
+        used: dict[int, list[int]] = {k: [] for k, operation in enumerate(self.operations) if operation.name == "call"}
+        for operation in self.operations:
+            if operation.name == "entry":
+                used[operation.operands[0]].append(operation.detail)
+        found, first = dict[int, Call](), 0
+        for k, entries in used.items():
+            found[k] = Call(self.operations[k].detail, tuple(sorted(entries)), first)
+            first += len(entries)
+        return found
 
-def evaluate(tape: Tape, constant: Callable[[Fraction], Any], variables: Sequence[Any]) -> list[Any]:
+    @property
+    def entries(self) -> int:
+        """The number of entries of calls."""
+        return sum(len(call.entries) for call in self.calls.values())
+
+    @property
+    def size(self) -> int:
+        """The number of operations, with those in networks, for each call."""
+        return len(self.operations) + sum(call.network.operations for call in self.calls.values())
+
+
+def no_calls(call: Call, arguments: list[Any]) -> Sequence[Any]:
+    """The calling of expressions in which no network is called."""
+    raise TypeError("no network is called here")
+
+
+def evaluate(
+    tape: Tape, constant: Callable[[Fraction], Any], variables: Sequence[Any], calling: Calling = no_calls
+) -> list[Any]:
     """The outputs of `tape` at `variables` (states, inputs, uncertain quantities), in their arithmetic; a value is kept
     no longer than it is needed."""
-    last = {i: k for k, (name, *operands) in enumerate(tape.operations) if name not in _LEAVES for i in operands}
+    last = {i: k for k, operation in enumerate(tape.operations) for i in operation.operands}
     last |= dict.fromkeys(tape.outputs, len(tape.operations))
     values: dict[int, Any] = {}
-    for k, (name, *operands) in enumerate(tape.operations):
-        if name in _LEAVES:
-            values[k] = constant(operands[0]) if name == "const" else variables[operands[0]]
-            continue
-        a, *b = [values[i] for i in operands]
-        values[k] = _OPERATORS[name](a, *b) if name in _OPERATORS else a.function(name)
-        for i in set(operands):
+    for k, operation in enumerate(tape.operations):
+        given, detail = [values[i] for i in operation.operands], operation.detail
+        match operation.name:
+            case "const":
+                values[k] = constant(detail)
+            case "var":
+                values[k] = variables[detail]
+            case "call":
+                values[k] = dict(zip(tape.calls[k].entries, calling(tape.calls[k], given), strict=True))
+            case "entry":
+                values[k] = given[0][detail]
+            case "+" | "*" | "neg":
+                values[k] = _OPERATORS[operation.name](*given)
+            case name:
+                values[k] = given[0].function(name)
+        for i in set(operation.operands):
             if last[i] == k:
                 del values[i]
     return [values[i] for i in tape.outputs]
 
 
-def parse(trees: Sequence[Any], names: Sequence[str], at: str) -> Tape:
-    """Compile trees over `names`, which stand at this place; raises `Rejected` under rule `format`."""
-    builder = _Builder({name: i for i, name in enumerate(names)}, at)
+def parse(trees: Sequence[Any], names: Sequence[str], at: str, networks: Mapping[str, Network] | None = None) -> Tape:
+    """Compile trees over `names`, which stand at this place and may call networks; raises `Rejected` under rule
+    `format`."""
+    builder = _Builder({name: i for i, name in enumerate(names)}, at, networks or {})
     outputs = tuple(builder.index(builder.build(tree, f"{at}[{i}]", 0)) for i, tree in enumerate(trees))
     return Tape(tuple(operation for _, operation in builder.tape.values()), outputs, tuple(trees))
 
@@ -63,15 +127,15 @@ def parse(trees: Sequence[Any], names: Sequence[str], at: str) -> Tape:
 class _Builder:
     """Appends operations; an operation that already stands on the tape is shared."""
 
-    def __init__(self, names: dict[str, int], at: str) -> None:
-        self.names, self.at, self.visited = names, at, 0
+    def __init__(self, names: dict[str, int], at: str, networks: Mapping[str, Network]) -> None:
+        self.names, self.at, self.networks, self.visited = names, at, networks, 0
         self.tape: dict[str, tuple[int, Operation]] = {}  # by strings, whose hashes nobody can predict
 
     def apply(self, name: str, *parts: Part) -> Part:
         """An operation on parts; a number where all of them are numbers, and it is not a function's."""
         numbers = [part for part in parts if isinstance(part, Fraction)]
         if len(numbers) < len(parts) or (name not in _OPERATORS and name != "inv"):
-            return self.push(name, *map(self.index, parts))
+            return self.push(name, tuple(map(self.index, parts)))
         if name == "inv" and numbers[0] == 0:
             strict.fail(self.at, "a division by the number 0")
         made: Fraction = 1 / numbers[0] if name == "inv" else _OPERATORS[name](*numbers)
@@ -81,10 +145,11 @@ class _Builder:
 
     def index(self, part: Part) -> int:
         """The position of a part on the tape."""
-        return self.push("const", part) if isinstance(part, Fraction) else part
+        return self.push("const", detail=part) if isinstance(part, Fraction) else part
 
-    def push(self, *operation: Any) -> int:
-        index, _ = self.tape.setdefault(" ".join(map(_word, operation)), (len(self.tape), operation))
+    def push(self, name: str, operands: tuple[int, ...] = (), detail: Any = None) -> int:
+        key = " ".join([name, *map(str, operands), _word(detail)])
+        index, _ = self.tape.setdefault(key, (len(self.tape), Operation(name, operands, detail)))
         if index >= MAX_OPERATIONS:
             strict.fail(self.at, f"more than {MAX_OPERATIONS} operations")
         return index
@@ -95,12 +160,14 @@ class _Builder:
         if depth > MAX_DEPTH or self.visited > MAX_OPERATIONS:
             strict.fail(at, f"deeper than {MAX_DEPTH} or more than {MAX_OPERATIONS} nodes")
         if isinstance(tree, str) and tree in self.names:
-            return self.push("var", self.names[tree])
+            return self.push("var", detail=self.names[tree])
         if isinstance(tree, str):
             return Value(tree, at).rational()
         if not isinstance(tree, list) or len(tree) < 2 or not isinstance(tree[0], str):
             strict.fail(at, "a node must be a list: an operator and its operands")
         name, *arguments = tree
+        if name == "network":
+            return self.call(arguments, at, depth)
         if name == "**" and len(arguments) == 2:
             return self.power(self.build(arguments[0], at, depth + 1), arguments[1], at)
         match name, [self.build(a, at, depth + 1) for a in arguments]:
@@ -118,6 +185,15 @@ class _Builder:
                 return self.apply("*", self.apply("sin", a), self.apply("inv", self.apply("cos", a)))
         strict.fail(at, f"operator {name[:20]!a} with {len(arguments)} operands is not in the grammar")
 
+    def call(self, arguments: list[Any], at: str, depth: int) -> Part:
+        """An entry of a network's value; calls with the same arguments are one."""
+        name, entry, *given = [*arguments, None, None][: max(2, len(arguments))]
+        network = self.networks.get(name) if isinstance(name, str) else None
+        if network is None or type(entry) is not int or not 0 <= entry < network.gives or len(given) != network.reads:
+            strict.fail(at, "a call must name a network, an entry of its value, and its arguments")
+        operands = tuple(self.index(self.build(a, at, depth + 1)) for a in given)
+        return self.push("entry", (self.push("call", operands, network),), entry)
+
     def power(self, base: Part, exponent: Any, at: str) -> Part:
         if type(exponent) is not int or not 0 < abs(exponent) <= MAX_EXPONENT:
             strict.fail(at, f"an exponent must be a nonzero integer up to {MAX_EXPONENT}")
@@ -129,6 +205,8 @@ class _Builder:
         return result if exponent > 0 else self.apply("inv", result)
 
 
-def _word(part: Any) -> str:
-    """A part of an operation, for the tape's keys; Python writes no integer of more than 4,300 decimal digits."""
-    return f"{part.numerator:x}/{part.denominator:x}" if isinstance(part, Fraction) else str(part)
+def _word(detail: Any) -> str:
+    """A detail, for the tape's keys; Python writes no integer of more than 4,300 decimal digits."""
+    if isinstance(detail, Fraction):
+        return f"{detail.numerator:x}/{detail.denominator:x}"
+    return str(getattr(detail, "name", detail))

@@ -16,11 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from .near import ZERO, Above, Near, atan, exp, inverse, lower, near, sin_cos, sqrt, tanh
+from .near import ZERO, Above, Array, Near, atan, exp, inverse, lines_around_tanh, lower, near, sin_cos, sqrt, tanh
 
 Three = tuple[Near, Near, Near]
 Four = tuple[Near, Near, Near, Near]
 Constant = Callable[[Fraction], Any]
+Lines = tuple[Array, Array, Above]
 FourBounds = tuple[Above, Above, Above, Above]
 _ONE, _TWO, _THIRD, _UNIT = Near(np.float64(1)), Near(np.float64(2)), near(Fraction(1, 3)), Above(1.0)
 _TANH_FOURTH, _ATAN_FOURTH, _STEEPEST = Above(4.1).over(24.0), Above(4.7).over(24.0), Above(16.0).over(24.0)
@@ -130,9 +131,20 @@ class Function(ABC):
     def expansion(self, v0: Near, radius: Above) -> Expansion:
         return Expansion(self, v0, radius)
 
+    def lines(self, centre: Array, radius: Above) -> Lines:
+        """Parallel lines around phi: (s, m, gap) with |phi(v) - s v - m| <= gap for all |v - centre| <= radius, here
+        the tangent's; NaN where phi may be undefined."""
+        e = self.expansion(Near(centre), radius)
+        f0, f1, f2 = e.stored
+        m = f0 - Near(centre) * Near(f1.value)
+        return f1.value, m.value, m.error + (f1.error + (f2.size + e.third * radius) * radius) * radius
+
 
 class _Tanh(Function):
     name = "tanh"
+
+    def lines(self, centre: Array, radius: Above) -> Lines:
+        return lines_around_tanh(centre, radius)
 
     def at(self, c: Near) -> Three:
         t = tanh(c)

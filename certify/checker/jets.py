@@ -36,10 +36,64 @@ def times(E: Square, k: Above) -> Square:
 
 
 @dataclass(frozen=True)
+class Units:
+    """The errors e_j that a family of jets has in common, |e_j(d)| <= d'U_j d, U (k, k, m).
+
+    They are sums of those of units: e_j = sum_q L_jq e_q, L (m, N), |e_q(d)| <= d'R_q d, R (k, k, N). A family that was
+    made of another one by further errors, after its own, has it as `base`.
+    """
+
+    R: Array
+    L: Array | None = None  # None if each unit's error is one of the common ones
+    base: Units | None = None
+
+    @cached_property
+    def U(self) -> Array:
+        """Bounds of the errors as matrices."""
+        if self.L is None:
+            return self.R
+        found: Square = mixed(Square(self.R), Near(np.abs(self.L.T)))
+        return found.majorant
+
+    @property
+    def reach(self) -> Array:
+        """L."""
+        return np.eye(self.R.shape[2]) if self.L is None else self.L
+
+    @property
+    def count(self) -> int:
+        """m."""
+        return int(self.R.shape[2]) if self.L is None else len(self.L)
+
+    def with_more(self, more: Units) -> Units:
+        """The family with further errors, of units of their own."""
+        if self.L is None or more.L is None:
+            raise TypeError("the errors of each of these families must be sums")
+        (m, N), (others, own) = self.L.shape, more.L.shape
+        L = np.block([[self.L, np.zeros((m, own))], [np.zeros((others, N)), more.L]])
+        return Units(np.concatenate([self.R, more.R], 2), L, self)
+
+    def is_made_of(self, other: Units) -> bool:
+        """True if the other family is this one or one of its bases."""
+        return self is other or (self.base is not None and self.base.is_made_of(other))
+
+
+def aligned(x: Jet, y: Jet) -> tuple[Jet, Jet]:
+    """Two jets in one family, the larger of the two."""
+    if x.units is y.units:
+        return x, y
+    if x.units.is_made_of(y.units):
+        return x, y.among(x.units)
+    if y.units.is_made_of(x.units):
+        return x.among(y.units), y
+    raise ValueError("two jets must have errors in common")
+
+
+@dataclass(frozen=True)
 class Jet:
     """`c`, gradient `a` (k,), half the Hessian `Q` (k, k), a sixth of the third derivatives `K` as `triples` has them,
-    remainder `E` (k, k), `B` (m,) of the errors within `U` (k, k, m), what y adds to c and a, `c_y` (N,) and `a_y`
-    (k, N), and the Lipschitz constant `lip`; or a batch along one more axis, of all but U."""
+    remainder `E` (k, k), `B` (m,) of the errors of `units`, what y adds to c and a, `c_y` (N,) and `a_y`
+    (k, N), and the Lipschitz constant `lip`; or a batch along one more axis, of all but the units."""
 
     c: Near
     a: Vector
@@ -47,10 +101,21 @@ class Jet:
     K: Cubic
     E: Square
     B: Near
-    U: Array
+    units: Units
     c_y: Near
     a_y: Vector
     lip: Above
+
+    def at(self, of: list[int]) -> Jet:
+        """Some members of a batch, whose B means itself."""
+        x, of_y = self, (Near(self.c_y.value[:, of]), Vector(self.a_y.value[:, :, of]))
+        return Jet(x.c[of], x.a[of], x.Q[of], x.K[of], x.E[of], Near(x.B.value[:, of]), x.units, *of_y, x.lip[of])
+
+    def among(self, units: Units) -> Jet:
+        """The same among further errors, which it does not have."""
+        more = np.zeros(units.count - len(self.B.value))
+        error = self.B.error if self.B.error is ZERO else self.B.error.beside(Above(more))
+        return replace(self, B=Near(np.concatenate([self.B.value, more]), error), units=units)
 
     @cached_property
     def sway(self) -> Above:
@@ -92,7 +157,7 @@ class Jet:
         """A matrix M with |v(d) - v(0) - a.d - d'Q d - K[d] - sum_j B_j e_j(d)| <= d'M d for the stored Q, K and B."""
         E = self.E
         if self.B.error is not ZERO:
-            E = E + mixed(Square(self.U), Near(self.B.error.top + 0 * self.B.value))
+            E = E + mixed(Square(self.units.U), Near(self.B.error.top + 0 * self.B.value))
         found: Array = E.wider(self.Q.error + self.K.error).majorant
         return found
 
@@ -114,7 +179,7 @@ class Jet:
     @cached_property
     def shares(self) -> Square:
         """Bound of sum_j B_j e_j as a matrix."""
-        found: Square = mixed(Square(self.U), Near(self.B.size.top))
+        found: Square = mixed(Square(self.units.U), Near(self.B.size.top))
         return found
 
     @cached_property
@@ -140,16 +205,16 @@ class Jet:
         return bend + twist + self.lip, bend * 2 + twist * 3 + self.lip, twist + self.lip, twist * 3 + self.lip
 
     def __add__(self, other: Jet) -> Jet:
-        x, y = self, other
+        x, y = aligned(self, other)
         Q, K, E, B = x.Q + y.Q, x.K + y.K, x.E + y.E, x.B + y.B
-        return Jet(x.c + y.c, x.a + y.a, Q, K, E, B, x.U, x.c_y + y.c_y, x.a_y + y.a_y, x.lip + y.lip)
+        return Jet(x.c + y.c, x.a + y.a, Q, K, E, B, x.units, x.c_y + y.c_y, x.a_y + y.a_y, x.lip + y.lip)
 
     def __neg__(self) -> Jet:
         x = self
-        return Jet(-x.c, -x.a, -x.Q, -x.K, x.E, -x.B, x.U, -x.c_y, -x.a_y, x.lip)
+        return Jet(-x.c, -x.a, -x.Q, -x.K, x.E, -x.B, x.units, -x.c_y, -x.a_y, x.lip)
 
     def __mul__(self, other: Jet) -> Jet:
-        x, y = self, other
+        x, y = aligned(self, other)
         c = x.c * y.c
         a, a_y = x.a * y.c + y.a * x.c, x.a_y * y.c + y.a_y * x.c
         if x.c_y.value.size:  # second order in y is lost
@@ -169,7 +234,7 @@ class Jet:
             y.K * x.v0 + x.K * y.v0 + symmetric(x.gradient, y.Q) + symmetric(y.gradient, x.Q),
             E,
             y.B * x.v0 + x.B * y.v0,
-            x.U,
+            x.units,
             x.c_y * y.c + y.c_y * x.c,
             a_y,
             lip,
@@ -185,7 +250,7 @@ class Jet:
             c, a, c_y, a_y = self._by_y(name, phi)
         E = times(self.E, f1.size) + R
         lip = f1.size * self.lip + self.lip_beyond_tangent(phi)
-        return Jet(c, a, self.Q * f1 + H, self.K * f1 + C, E, self.B * f1, self.U, c_y, a_y, lip)
+        return Jet(c, a, self.Q * f1 + H, self.K * f1 + C, E, self.B * f1, self.units, c_y, a_y, lip)
 
     def beyond_tangent(self, phi: Expansion) -> tuple[Square, Cubic, Square]:
         """(H, C, R): phi(v) less its tangent at v(0) is d'H d + C[d] within d'R d.
@@ -236,22 +301,22 @@ def _each(y: Near, a: Vector) -> Vector:
     return Vector(a.value[:, None], a.error[None]) * y
 
 
-def constant(q: Fraction, U: Array, count: int) -> Jet:
+def constant(q: Fraction, units: Units, count: int) -> Jet:
     """A rational among the jets with these errors and `count` numbers y."""
-    k, m = U.shape[1:]
+    k, m = len(units.R), units.count
     Q, K = np.zeros((k, k)), np.zeros(len(triples(k)[0]))
     nothing = Vector(np.zeros(k)), Square(Q), Cubic(K), Square(Q), Near(np.zeros(m))
-    return Jet(near(q), *nothing, U, Near(np.zeros(count)), Vector(np.zeros((k, count))), ZERO)
+    return Jet(near(q), *nothing, units, Near(np.zeros(count)), Vector(np.zeros((k, count))), ZERO)
 
 
-def uncertain(lo: Fraction, hi: Fraction, U: Array, number: int, count: int) -> Jet:
+def uncertain(lo: Fraction, hi: Fraction, units: Units, number: int, count: int) -> Jet:
     """A number of [lo, hi], lo + hi + (hi - lo) y over 2, y being the one of this number of `count`."""
     reach, here = near((hi - lo) / 2), np.arange(count) == number
     c_y = Near(np.where(here, reach.value, 0.0), reach.error * np.where(here, 1.0, 0.0))
-    return replace(constant((lo + hi) / 2, U, count), c_y=c_y)
+    return replace(constant((lo + hi) / 2, units, count), c_y=c_y)
 
 
-def between(lo: Fraction, hi: Fraction, U: Array, count: int) -> Jet:
+def between(lo: Fraction, hi: Fraction, units: Units, count: int) -> Jet:
     """A number of [lo, hi] of which nothing else is known, maybe another one wherever it is used."""
-    middle = constant((lo + hi) / 2, U, count)
+    middle = constant((lo + hi) / 2, units, count)
     return replace(middle, c=middle.c.wider(near((hi - lo) / 2).size))

@@ -10,7 +10,9 @@ from collections.abc import Sequence
 from math import prod
 
 from .case import Case, Failures
-from .document import Array, Certificate, Network, Outer, Partition
+from .document import Array, Certificate, Partition
+from .expression import Tape
+from .networks import Affine, Clip, Map, Network, Observe
 
 MOST_NUMBERS = 2**25
 MOST_WORK, MOST_IN_PATIENCE = 3 * 2**37, 2**46  # ten minutes; many hours, if somebody says that there is time for it
@@ -36,33 +38,38 @@ def in_short(count: int) -> str:
 
 
 class Net:
-    """The sums over a network's layers, (rows, columns) of each."""
+    """The sums over the affine steps of networks: rows, columns, and the units of the network before each."""
 
-    def __init__(self, weights: Sequence[Array]) -> None:
-        before, self.layers = 0, list[tuple[int, int, int]]()
-        for W in weights:
-            rows, columns = W.shape
-            self.layers.append((rows, columns, before))
-            before += rows
-        self.units, self.widest = before, max((rows for rows, _, _ in self.layers), default=0)
-        self.entries = sum(rows * columns for rows, columns, _ in self.layers)
+    def __init__(self, networks: Sequence[Network]) -> None:
+        self.units, self.affine = 0, list[tuple[int, int, int]]()
+        for network in networks:
+            before = 0
+            for step in network.steps:
+                if isinstance(step, Affine):
+                    self.affine.append((*step.weight.shape, before))
+                elif isinstance(step, Map | Clip | Observe):
+                    before += step.size
+            self.units += before
+        self.widest = max((step.size for network in networks for step in network.steps), default=0)
+        self.steps = sum(len(network.steps) for network in networks)
+        self.entries = sum(rows * columns for rows, columns, _ in self.affine)
 
     @property
     def folded(self) -> int:
-        return sum(r * c * (2**9 + 8 * min(r, c)) for r, c, _ in self.layers)
+        return sum(r * c * (2**9 + 8 * min(r, c)) for r, c, _ in self.affine)
 
     @property
     def paths(self) -> int:
-        return sum(r * before * (c + 3 * 2**6) for r, c, before in self.layers) // 8
+        return sum(r * before * (c + 3 * 2**6) for r, c, before in self.affine) // 8
 
-    def on_a_leaf(self, n: int, m: int) -> int:
-        return sum(r * (c * (n + m + 2) + 5 * before + 64 * (n + m) + 7 * 2**9) for r, c, before in self.layers)
+    def on_a_leaf(self, symbols: int) -> int:
+        return sum(r * (c * (symbols + 2) + 5 * before + 64 * symbols + 7 * 2**9) for r, c, before in self.affine)
 
     def on_a_ball(self, d: int, t: int) -> int:
-        return sum(r * (c * (d + before) + before * t) + 2**21 for r, c, before in self.layers) + 64 * self.units * t
+        return sum(r * (c * (d + before) + before * t) + 2**21 for r, c, before in self.affine) + 64 * self.units * t
 
     def models(self, area: int) -> int:
-        return sum(r * area * (2 * c + 64) for r, c, _ in self.layers)
+        return sum(r * area * (2 * c + 64) for r, c, _ in self.affine)
 
 
 class Sizes:
@@ -73,10 +80,12 @@ class Sizes:
         self.n, self.m, quantities = len(c.states), len(c.inputs), len(c.uncertain)
         self.varies = int(c.sample is not None and c.sample[0] < c.sample[1])
         self.y = quantities + self.varies
-        self.s = self.n + self.m + self.y
+        self.z = c.dynamics.entries
+        self.s = self.n + self.m + self.y + self.z
         self.d = self.n + (c.claim == "reached")
         self.t = 2 * self.d**2 + self.d * (self.d + 1) * (self.d + 2) // 6
-        self.a, self.net = len(c.dynamics.operations), Net(c.policy.weights)
+        self.a = c.dynamics.size + c.policy.network.operations
+        self.net = Net([c.policy.network, *_called(c.dynamics)])
 
     # ------------------------------------------------------------------------------------------------------ numbers
 
@@ -88,12 +97,13 @@ class Sizes:
         order = max(self.evidence.order, self.evidence.local.order if self.evidence.local else 1)
         values = (4 * order if self.c.sample else 1) * self.a + 2 * self.n + 8
         if self.asked or self.c.outer:
-            found += values * (self.s + 1) ** 2 + 2**14 * (self.n + self.m + len(self.net.layers))
+            found += values * (self.s + 1) ** 2 + 2**14 * (self.n + self.m + self.z + self.net.steps)
         if self.evidence.local or self.evidence.contraction or self.evidence.tube:
-            found += values * (self.t + self.d * self.y + self.m) + self.d**4 // 4
-            found += sum(4 * rows * before for rows, _, before in self.net.layers) + 3 * self.net.units * self.t
+            found += values * (self.t + self.d * self.y + self.m + self.z) + self.d**4 // 4
+            found += sum(4 * rows * before for rows, _, before in self.net.affine) + 3 * self.net.units * self.t
         if self.c.outer:
-            area, N, of_tape = (self.s + 1) ** 2, *_function(self.c.outer)
+            tape, area = self.c.outer.function, (self.s + 1) ** 2
+            N, of_tape = Net(_called(tape)), tape.size
             found += 4 * N.entries + 2 * N.units * area + 8 * of_tape * area
         return found
 
@@ -102,7 +112,7 @@ class Sizes:
     def work(self) -> int:
         """Elementary operations."""
         found = 2**15 * self.a + self.net.folded + self.inverse(self.bits(self.c.P))
-        if self.c.policy.centre == "none" and not self.c.practical:
+        if not self.c.practical:
             found += 2**12 * self.net.entries
         if not isinstance(self.evidence, Partition):
             return found
@@ -142,23 +152,23 @@ class Sizes:
         return leaves * (of_each + 2**11 + 2**7 * self.n + self.n**3)
 
     def policies(self, leaves: int) -> int:
-        each, batches = self.net.on_a_leaf(self.n, self.m), 1 + leaves * self.net.widest // 2**14
+        each, batches = self.net.on_a_leaf(self.s), 1 + leaves * self.net.widest // 2**14
         return leaves * each // 8 + batches * self.net.paths
 
     def of_ring(self, leaves: int) -> int:
-        order, calls = self._partition.order, self.n * self.s**2 + 160 * len(self.net.layers)
+        order, calls = self._partition.order, self.n * self.s**2 + 160 * self.net.steps
         models = self.a * self.evaluations(order) + self.n**2 + 4 * self.n
         return self.boxes(leaves, models, self.a * (order + 1), self.s, calls) + self.policies(leaves)
 
     @property
     def ball(self) -> int:
-        """The policy on a ball, once."""
+        """The networks on a ball, once."""
         return self.net.on_a_ball(self.d, self.t)
 
     @property
     def model(self) -> int:
         """An operation of the equations in models on a ball."""
-        return 2**17 + 64 * self.t + 16 * self.d**2 * (self.m + self.y)
+        return 2**17 + 64 * self.t + 16 * self.d**2 * (self.m + self.y + self.z)
 
     @property
     def inequality(self) -> int:
@@ -188,14 +198,15 @@ class Sizes:
         evidence = self._partition.outer
         if self.c.outer is None or evidence is None:
             return 0
-        N, of_tape = _function(self.c.outer)
-        calls, values = 200 * len(N.layers), max(N.widest, 2 * of_tape)
+        tape = self.c.outer.function
+        N, of_tape = Net(_called(tape)), tape.size
+        calls, values = 200 * N.steps, max(N.widest, 2 * of_tape)
         faces, leaves = sum(tree.count(LEAF) for tree in evidence.faces), evidence.tree.count(LEAF)
         found = N.folded + self.inverse(self.bits(evidence.T))
         found += 2**8 * sum(map(len, (evidence.tree, *evidence.faces)))
         found += self.boxes(faces, of_tape, values, self.n, calls) + faces * N.models((self.n + 4) ** 2)
-        found += (faces + leaves) * N.on_a_leaf(self.n, 1) // 8 + (1 + faces + leaves) * N.paths
-        models, calls = self.a + 8 * of_tape + 4 * self.n, calls + self.n * self.s**2 + 160 * len(self.net.layers)
+        found += (faces + leaves) * N.on_a_leaf(self.n + 1) // 8 + (1 + faces + leaves) * N.paths
+        models, calls = self.a + 8 * of_tape + 4 * self.n, calls + self.n * self.s**2 + 160 * self.net.steps
         found += self.boxes(leaves, models, max(values, self.a), self.s, calls)
         return found + leaves * N.models((self.s + 4) ** 2) + self.policies(leaves)
 
@@ -206,8 +217,6 @@ class Sizes:
         return self.evidence
 
 
-def _function(outer: Outer) -> tuple[Net, int]:
-    """Its layers, or the operations of its expression."""
-    if isinstance(outer.function, Network):
-        return Net(outer.function.weights), 0
-    return Net(()), len(outer.function.operations)
+def _called(tape: Tape) -> list[Network]:
+    """The networks that equations call, once for each call."""
+    return [call.network for call in tape.calls.values()]

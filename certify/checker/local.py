@@ -84,7 +84,7 @@ class Local(Ball):
     def period(self) -> Jet:
         """h, by the last of the numbers y if it has a range."""
         lo, hi = self.case.c.sample or (Fraction(0), Fraction(0))
-        return uncertain(lo, hi, self.units.shares, self.count - 1, self.count) if lo < hi else self.constant(hi)
+        return uncertain(lo, hi, self.units, self.count - 1, self.count) if lo < hi else self.constant(hi)
 
     @cached_property
     def later(self) -> list[Jet]:
@@ -118,7 +118,7 @@ class Local(Ball):
         level = None if self.at_rest else Level(rational(c.c0), rational(by.edge))
         for cell in self.case.cells:
             G = self.G(cell)
-            models = Models(self.J, G, self.units, self.at_rest) if are_finite(G, self.units) else None
+            models = Models(self.J, G, self.at_rest) if are_finite(G) else None
             most = size_beyond(models, c.P) if models is not None and h > 0 else 0.0
             if models is None or not np.isfinite(most):
                 yield None

@@ -1,17 +1,21 @@
-"""The policy: its layers, the centring folded into them, and its enclosure on boxes, affine in the box coordinates.
+"""Networks on boxes: their enclosure as forms that are affine in the box coordinates, and the policy's, with its
+centring, scale and clip.
 
-At x = 0 the policy equals u_eq by its form, which the local rule uses; local.py has the enclosure on the ball.
+At x = 0 the policy equals u_eq by its form, which the local rule uses; ball.py has the models on the ball.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
 from .document import Policy
+from .expression import Call, evaluate
+from .functions import FUNCTIONS
 from .near import (
     ZERO,
     Above,
@@ -21,66 +25,292 @@ from .near import (
     Uniform,
     all_near,
     clip_of,
-    lines_around_tanh,
     near_atanh,
     norm,
     size,
     spectral_norm,
     stacked,
 )
+from .networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Step, Sum
+from .taylor import Taylor, affine, constants
+
+TANH = Map((0,), 0, "tanh")  # the policy's squash
+
+
+@cache
+def norm2(step: Affine) -> Above:
+    """An upper bound of ||W||_2."""
+    return spectral_norm(step.weight)
+
+
+def prepare(*networks: Network) -> None:
+    """Compute what all boxes need of networks once, before there are several processes."""
+    for network in networks:
+        for step in network.steps:
+            if isinstance(step, Affine):
+                norm2(step)
 
 
 @dataclass(frozen=True)
-class Layer:
-    """`W h + b`; `norm2` is an upper bound of ||W||_2."""
+class Enclosed:
+    """A vector on boxes: it lies within errors of the forms h (k + 1, width, B), which mean themselves.
 
-    W: Array
-    b: Near
-    norm2: Above
+    The errors are of two ages: `fresh` (width, B) bounds those that the last steps have added, `old` (width, B) those
+    that came through a matrix; `ball` (B,) bounds the 2-norm of the old ones. `step` is the number of the step that
+    made the vector, 0 for the argument.
+    """
+
+    h: Form
+    fresh: Above
+    old: Above
+    ball: Above
+    step: int
 
     @cached_property
-    def rows(self) -> Above:
-        """Upper bounds of the rows' 2-norms, (rows, 1)."""
-        return norm(self.W, 1)[:, None]
+    def spread(self) -> Above:
+        """Upper bound of what the coefficients of the symbols add."""
+        return size(self.h.value[1:]).sum()
 
-    def affine(self, h: Form) -> Form:
-        """`W h + b` of forms h (k, width, B)."""
-        return h.through(self.W).raised(self.b[:, None])
+    @property
+    def error(self) -> Above:
+        """Upper bound of both errors."""
+        return self.fresh + self.old
+
+    @property
+    def plain(self) -> Form:
+        """The forms, whose size is known from their spread."""
+        found = Form(self.h.value)
+        found.size = size(self.h.value[0]) + self.spread
+        return found
+
+
+class OnBoxes(Algebra[Enclosed]):
+    """Networks on a batch of boxes.
+
+    Forwards, fresh errors pass through |W|, old ones through |W| or ||W_i|| ball, whichever is less; the 2-norm of all
+    passes through ||W||_2. That gives the ranges over which functions are relaxed. The value's own error is found
+    backwards: `added` has what each step adds, and its magnitude counts times that of the weight with which it reaches
+    the value, so that errors cancel through W as they do in truth.
+    """
+
+    def __init__(self, network: Network, x: Form) -> None:
+        """x (k + 1, reads, B) is the argument."""
+        self.network, self.added = network, [x.error]
+        self.slopes: list[Array | None] = [None]  # of the lines that a step takes for its function
+        self.steps: list[Step | None] = [None]
+        start = Enclosed(Form(x.value), x.error, ZERO, ZERO, 0)
+        self.last = self.run(network, start)
+
+    def then(self, step: Step, v: Enclosed) -> Enclosed:
+        """One more step, of the value."""
+        self.last = self.make(step, [v])
+        return self.last
+
+    def shift(self, by: Near) -> None:
+        """Add numbers (width,) to the value."""
+        v = self.last
+        moved = v.h.raised(by[:, None])
+        self.added[v.step] = self.added[v.step] + moved.error
+        self.last = Enclosed(Form(moved.value), v.fresh + moved.error, v.old, v.ball, v.step)
+
+    def make(self, step: Step, vectors: Sequence[Enclosed]) -> Enclosed:
+        self.steps.append(step)
+        self.slopes.append(None)
+        self.added.append(ZERO)
+        return super().make(step, vectors)
+
+    def affine(self, step: Affine, v: Enclosed) -> Enclosed:
+        W, bound = step.weight, norm2(step)
+        y = v.h.through(W).raised(Near(step.bias[:, None]))
+        old = v.fresh.through(W)
+        if v.old is not ZERO:
+            old = old + v.old.through(W).least(norm(W, 1)[:, None] * v.ball)
+        self.added[-1] = y.error
+        return Enclosed(Form(y.value), y.error, old, bound * (v.ball + v.fresh.norm()), len(self.steps) - 1)
+
+    def map(self, step: Map, v: Enclosed) -> Enclosed:
+        lines = FUNCTIONS[step.function].lines(v.h.value[0], v.spread + v.error)
+        return self.by_lines(v, (v.plain * Near(lines[0])).raised(Near(lines[1])), lines[0], lines[2])
+
+    def clip(self, step: Clip, v: Enclosed) -> Enclosed:
+        h, slope, gap = clipped(v.plain, v.spread + v.error, step.lo, step.hi)
+        return self.by_lines(v, h, slope, gap)
+
+    def by_lines(self, v: Enclosed, h: Form, slope: Array, gap: Above) -> Enclosed:
+        """A function of v that lies within `gap` of lines of these slopes; h are the lines of the forms."""
+        new, steep = gap + h.error, size(slope)
+        if v.step and self.steps[v.step] is not None and self.is_read_once(v.step):
+            new, self.added[v.step] = new + self.added[v.step] * steep, ZERO  # one product less on the way back
+            passed = v.old * steep
+            ball = (v.ball * steep.max()).least(passed.norm())
+        else:
+            passed = v.error * steep
+            ball = ((v.ball + v.fresh.norm()) * steep.max()).least(passed.norm())
+        self.added[-1], self.slopes[-1] = new, slope
+        return Enclosed(Form(h.value), new, passed, ball, len(self.steps) - 1)
+
+    def is_read_once(self, k: int) -> bool:
+        """True if the errors that step k adds reach the value through the step in hand alone, and are fresh."""
+        return isinstance(self.steps[k], Affine) and self.network.readers[k] <= 1
+
+    def sum(self, step: Sum, vectors: Sequence[Enclosed]) -> Enclosed:
+        h, (first, *others) = vectors[0].h, vectors
+        fresh, old, ball = first.fresh, first.old, first.ball
+        for v in others:
+            h, fresh, old, ball = h + v.h, fresh + v.fresh, old + v.old, ball + v.ball
+        self.added[-1] = h.error
+        return Enclosed(Form(h.value), fresh + h.error, old, ball, len(self.steps) - 1)
+
+    def concat(self, step: Concat, vectors: Sequence[Enclosed]) -> Enclosed:
+        h = Form(np.concatenate([v.h.value for v in vectors], 1))
+        fresh, old = (
+            Above(np.concatenate([part.top + 0 * v.spread.v for part, v in zip(parts, vectors, strict=True)]))
+            for parts in ([v.fresh for v in vectors], [v.old for v in vectors])
+        )
+        squares = ZERO
+        for v in vectors:
+            squares = squares + v.ball * v.ball
+        return Enclosed(h, fresh, old, squares.root, len(self.steps) - 1)
+
+    def observe(self, step: Observe, v: Enclosed) -> Enclosed:
+        x = models(v.h, v.error)
+        y = evaluate(step.tape, constants(x[0]), x)
+        h = forms(y)
+        self.added[-1] = h.error
+        return Enclosed(Form(h.value), h.error, ZERO, ZERO, len(self.steps) - 1)
+
+    def backwards(self, rows: Array) -> Above:
+        """Bounds of the errors of `rows` (m, width) times the value, (m, B).
+
+        A weight (width, m, B) has the numbers with which an error of a vector reaches these.
+        """
+        weights: dict[int, Uniform] = {self.last.step: Uniform(rows.T[:, :, None])}
+        result = ZERO
+        for k in reversed(range(len(self.steps))):
+            weight, step = weights.pop(k, None), self.steps[k]
+            if weight is None:
+                continue
+            if self.added[k] is not ZERO:
+                result = result + ((size(weight.value) + weight.error) * self.added[k][:, None]).sum()
+            for i, part in self.before(k, step, weight):
+                weights[i] = weights[i] + part if i in weights else part
+        return result
+
+    def before(self, k: int, step: Step | None, weight: Uniform) -> list[tuple[int, Uniform]]:
+        """The weights with which errors of the vectors that a step reads reach the value through it."""
+        of = (k - 1,) if step is TANH else () if step is None else step.of
+        match step:
+            case Affine():
+                return [(of[0], weight.through(step.weight.T))]
+            case Map() | Clip():
+                return [(of[0], weight.times(self.slopes[k][:, None]))]  # type: ignore[index]
+            case Sum():
+                return [(i, weight) for i in of]
+            case Concat():
+                ends = np.cumsum([0, *(self.width(i) for i in of)])
+                return [
+                    (i, Uniform(weight.value[a:b], weight.error))
+                    for i, a, b in zip(of, ends[:-1], ends[1:], strict=True)
+                ]
+        return []  # the argument, or expressions, which keep no way back
+
+    def width(self, k: int) -> int:
+        """The number of entries of vector k."""
+        step = self.steps[k]
+        return self.network.reads if step is None else step.size
+
+
+def enclose(network: Network, x: Form, entries: Sequence[int]) -> Form:
+    """Some entries of the network's value on boxes, x (k + 1, reads, B) being the argument."""
+    boxes = OnBoxes(network, x)
+    rows = np.eye(network.gives)[list(entries)]
+    return Form(boxes.last.h.value[:, list(entries)], boxes.backwards(rows))
+
+
+def entries(call: Call, arguments: Sequence[Taylor], first: int) -> list[Taylor]:
+    """The entries that a call in equations uses, as models: the error of each has a symbol of its own, from `first` on,
+    which no argument knows."""
+    u, found = enclose(call.network, forms(arguments), call.entries), list[Taylor]()
+    for j in range(len(call.entries)):
+        g = u.value[1:, j].copy()
+        own = first + call.first + j
+        g[own] = np.where(g[own] == 0, u.error.top[j], np.nan)
+        found.append(affine(u.value[0, j], g))
+    return found
+
+
+def models(h: Form, error: Above) -> list[Taylor]:
+    """The entries of a vector as models."""
+    wide = error.top + 0 * h.value[0]
+    return [affine(h.value[0, i], h.value[1:, i], Above(wide[i])) for i in range(h.value.shape[1])]
+
+
+def forms(v: Sequence[Taylor]) -> Form:
+    """Models as forms: what is of second order becomes an error."""
+    value = np.stack([np.concatenate([x.c[None], x.g]) for x in v], 1)
+    return Form(value, Above(np.stack([(x.r + x.quadratic).top + 0 * x.c for x in v])))
+
+
+def clipped(v: Form, error: Above, least: Array, most: Array) -> tuple[Form, Array, Above]:
+    """Lines around `min(max(v, least), most)`, of numbers within `error` of the first coefficients of the forms v:
+    these lines of the forms, their slopes, and how far from them it may be; least and most (m,).
+
+    Nothing changes where v certainly stays between them.
+    """
+    numbers = Near(v.value[0], error)
+    lo, hi = numbers.ends
+    inside = (lo >= least[:, None]) & (hi <= most[:, None])
+    slope, shift, gap = clip_of(numbers, least[:, None], most[:, None])
+    cut = (v * Near(slope)).raised(Near(shift))
+    kept = Form(np.where(inside, v.value, cut.value), Above(np.where(inside, 0.0, cut.error.top)))
+    return kept, np.where(inside, 1.0, slope), Above(np.where(inside, 0.0, gap.top))
+
+
+# ---------------------------------------------------------------------------------------------------------- the policy
 
 
 @dataclass(frozen=True)
 class Folded:
-    """`u = scale * h + offset`, h the last layer's value (through tanh if `squash`), the centring folded in; `clip`
-    (lo, hi) is applied to that."""
+    """`u = scale * h + offset`, h the network's value at origin + x, `shift` added (through tanh if `squash`), so that
+    the centring is part of it; `clip` (lo, hi) is applied to that."""
 
-    layers: tuple[Layer, ...]
+    network: Network
+    origin: Array
+    shift: Near | None
     squash: bool
     scale: Array
     offset: Near
     clip: tuple[Array, Array] | None = None
 
+    def on_boxes(self, x: Form) -> OnBoxes:
+        """The network's value, shifted and squashed."""
+        boxes = OnBoxes(self.network, x.raised(Near(self.origin[:, None])) if np.any(self.origin) else x)
+        if self.shift is not None:
+            boxes.shift(self.shift)
+        if self.squash:
+            boxes.then(TANH, boxes.last)
+        return boxes
 
-def layer(W: Array, b: Array) -> Layer:
-    """A layer as it stands in the file."""
-    return Layer(W, Near(b), spectral_norm(W))
+    @cached_property
+    def at_origin(self) -> Near:
+        """The network's value at x = 0, shifted and squashed, as on a box of one point, (m,)."""
+        boxes = self.on_boxes(Form(np.zeros((1, self.network.reads, 1)), Above(np.zeros((self.network.reads, 1)))))
+        return Near(boxes.last.h.value[0, :, 0], boxes.backwards(np.eye(self.network.gives))[:, 0])
 
 
 def fold(policy: Policy, u_eq: tuple[Fraction, ...]) -> Folded:
-    """Fold the origin into the first bias, the centring into the last or the offset; rule `centring` has to hold."""
-    first, *others = (layer(W, b) for W, b in zip(policy.weights, policy.biases, strict=True))
-    if policy.origin is not None:
-        first = replace(first, b=Near(policy.origin).through(first.W) + first.b)
-    plain = Folded((first, *others), policy.squash == "tanh", policy.scale, Near(policy.offset), policy.clip)
-    one, zero = np.ones_like(policy.scale), np.zeros_like(policy.scale)
+    """Fold the centring into a shift or the offset; rule `centring` has to hold."""
+    origin = np.zeros(policy.network.reads) if policy.origin is None else policy.origin
+    squash, clip = policy.squash == "tanh", policy.clip
+    plain = Folded(policy.network, origin, None, squash, policy.scale, Near(policy.offset), clip)
     if policy.centre == "none":
         return plain
     if policy.centre == "preactivation":
-        last = plain.layers[-1]
-        bare = Folded((*plain.layers[:-1], replace(last, b=Near(zero))), False, one, Near(zero))
         beta = stacked([near_atanh(q) for q in reaches(policy, u_eq)])
-        return replace(plain, layers=(*plain.layers[:-1], replace(last, b=beta - _at_origin(bare))))
-    h = _at_origin(replace(plain, scale=one, offset=Near(zero), clip=None))
-    return replace(plain, offset=all_near(u_eq) - h * Near(policy.scale))
+        shift = beta - Folded(policy.network, origin, None, False, policy.scale, Near(policy.offset)).at_origin
+        return Folded(policy.network, origin, shift, squash, policy.scale, Near(policy.offset), clip)
+    offset = all_near(u_eq) - plain.at_origin * Near(policy.scale)
+    return Folded(policy.network, origin, None, squash, policy.scale, offset, clip)
 
 
 def reaches(policy: Policy, u_eq: tuple[Fraction, ...]) -> list[Fraction]:
@@ -89,72 +319,12 @@ def reaches(policy: Policy, u_eq: tuple[Fraction, ...]) -> list[Fraction]:
     return [(u - Fraction(offset)) / Fraction(scale) for u, offset, scale in each]
 
 
-def _at_origin(net: Folded) -> Near:
-    """The network's value at x = 0, as a box of one point, (m,)."""
-    n = net.layers[0].W.shape[1]
-    u = enclose_on_boxes(net, Form(np.zeros((n + 1, n, 1)), Above(np.zeros((n, 1)))))
-    return Near(u.value[0, :, 0], u.error[:, 0])
-
-
 def enclose_on_boxes(net: Folded, x: Form) -> Form:
-    """The policy on a batch of boxes, x the state, as forms in d in [-1, 1]^n: x (n + 1, n, B), u (n + 1, m, B).
-
-    Each layer's value is an affine form h in d, plus errors of two ages. `fresh` (width, B) bounds, component by
-    component, what the relaxation just before and its roundings have added. `old` (width, B) bounds component by
-    component what came through from before that, and `ball` (B,) the 2-norm of the same vector of old errors.
-    Forwards, fresh errors pass through |W|, old ones through |W| or ||W_i|| ball, whichever is less; the 2-norm of all
-    passes through ||W||_2. That gives the range over which tanh is relaxed. The output's own error is found backwards:
-    each layer's fresh error times the magnitude of the weight with which it reaches the output, so that errors cancel
-    through W as they do in truth.
-    """
-    h, fresh, old, ball = Form(x.value), x.error, ZERO, ZERO
-    passed: list[tuple[Array, Array | None, Above]] = []  # W, slope of the relaxation, fresh error behind it
-    for k, layer in enumerate(net.layers):
-        y = layer.affine(h)
-        if k == len(net.layers) - 1 and not net.squash:
-            passed.append((layer.W, None, y.error))
-            h = Form(y.value)
-            break
-        error = fresh.through(layer.W) + y.error
-        if old is not ZERO:
-            error = error + old.through(layer.W).least(layer.rows * ball)
-        ball = layer.norm2 * (ball + fresh.norm()) + y.error.norm()
-        spread = size(y.value[1:]).sum()
-        slope, shift, gap = lines_around_tanh(y.value[0], spread + error)
-        plain = Form(y.value)
-        plain.size = size(y.value[0]) + spread
-        h = (plain * Near(slope)).raised(Near(shift))
-        fresh = gap + y.error * slope + h.error
-        h = Form(h.value)
-        old = error * slope
-        ball = (ball * size(slope).max()).least(old.norm())
-        passed.append((layer.W, slope, fresh))
-    error = _error_backwards(net.scale, passed, x.error)
-    u = (h * Near(net.scale[:, None])).raised(net.offset[:, None])
-    u = u.wider(error)
-    return clipped(u, *net.clip) if net.clip else u
-
-
-def clipped(u: Form, least: Array, most: Array) -> Form:
-    """`min(max(v, least), most)` of the affine forms v, again as affine forms; least and most (m,).
-
-    Nothing changes where v certainly stays between them.
-    """
-    v = u.range
-    lo, hi = v.ends
-    inside = (lo >= least[:, None]) & (hi <= most[:, None])
-    slope, shift, gap = clip_of(v, least[:, None], most[:, None])
-    cut = (u * Near(slope)).raised(Near(shift))
-    return Form(np.where(inside, u.value, cut.value), Above(np.where(inside, u.error.top, (cut.error + gap).top)))
-
-
-def _error_backwards(scale: Array, passed: list[tuple[Array, Array | None, Above]], of_x: Above) -> Above:
-    """Bound of each output's error, shape (m, B).
-
-    `weight` (width, m, B) are the numbers with which an error behind the layer in hand reaches the output.
-    """
-    weight, result = Uniform(np.diag(scale)[:, :, None]), ZERO
-    for W, slope, fresh in reversed(passed):
-        result = result + ((size(weight.value) + weight.error) * fresh[:, None]).sum()
-        weight = (weight if slope is None else weight.times(slope[:, None])).through(W.T)
-    return result + ((size(weight.value) + weight.error) * of_x[:, None]).sum()
+    """The policy on a batch of boxes, x the state, as forms in d in [-1, 1]^n: x (n + 1, n, B), u (n + 1, m, B)."""
+    boxes = net.on_boxes(x)
+    u = (boxes.last.plain * Near(net.scale[:, None])).raised(net.offset[:, None])
+    u = u.wider(boxes.backwards(np.diag(net.scale)))
+    if net.clip is None:
+        return u
+    cut, slope, gap = clipped(Form(u.value), u.range.error, *net.clip)
+    return cut.wider(u.error * slope + gap)

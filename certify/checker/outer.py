@@ -1,114 +1,146 @@
 """The rules for {N <= n2} beyond {V <= c2}: N is above n2 on the domain's faces, and falls where V >= c2 and N <= n2.
 
-They take models of N, and of its derivative along F, on boxes. A network goes through them layer by layer, its units on
-an axis of their own; an expression as a power series in time.
+They take models of N, and of its derivative along F, on boxes. Networks go through them step by step, the entries of a
+vector on an axis of their own.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property, partial
+from functools import partial, reduce
 from math import nextafter
+from operator import add
 
 import numpy as np
 from flint import fmpq, fmpq_mat
 
 from .boxes import LEAF, Boxes, Leaves, batches, is_whole, keeps_inputs, middle
 from .case import Case, Failures
-from .document import Network
 from .exact import exactly, inverse
-from .expression import Tape, evaluate
-from .flow import Series
+from .expression import Call, Tape, evaluate
 from .functions import FUNCTIONS
 from .near import Above, Array, Form, Near, near
-from .network import Folded, enclose_on_boxes, layer
+from .network import enclose_on_boxes, entries, models, prepare
+from .networks import Affine, Algebra, Clip, Concat, Map, Observe, Sum
 from .processes import Batch, in_order
-from .taylor import Taylor, affine, constant, upper_bound
+from .taylor import Taylor, constant, constants, upper_bound
 
 _BATCH_NUMBERS = 1_000_000  # in the largest array of a batch
 _MOST_NUMBERS, _MOST_VALUES = 2**22, 2**26  # of a box: in the models of a network, and of all of an expression's values
 
 
-class Layers:
-    """A network's models: each layer's values before the next tanh, one row per unit, (width, B) and more behind."""
+@dataclass(frozen=True)
+class Dual:
+    """A model of v, or models in rows, on the symbols of the box, and one of its derivative along F, on all symbols;
+    None where that is 0, or not asked."""
 
-    def __init__(self, net: Network) -> None:
-        self.net, self.values = net, max(len(W) for W in net.weights)
+    value: Taylor
+    rate: Taylor | None = None
 
-    @cached_property
-    def as_policy(self) -> Folded:
-        """The same network as a policy, for the enclosure of rule `ring`."""
-        layers = tuple(layer(W, b) for W, b in zip(self.net.weights, self.net.biases, strict=True))
-        return Folded(layers, False, np.ones(1), Near(np.zeros(1)))
+    def __add__(self, other: Dual) -> Dual:
+        x, y = self.rate, other.rate
+        return Dual(self.value + other.value, x + y if x is not None and y is not None else x if y is None else y)
 
-    def least(self, x: Form) -> Array:
-        """A lower bound of N (B,), affine on the boxes: good where these are large."""
-        least: Array = enclose_on_boxes(self.as_policy, x).range.ends[0][0]
-        return least
+    def __neg__(self) -> Dual:
+        return Dual(-self.value, None if self.rate is None else -self.rate)
 
-    def is_small(self, symbols: int) -> bool:
-        """True if the models in so many symbols fit in memory."""
-        numbers: int = sum(len(W) * (W.shape[1] + symbols**2) for W in self.net.weights)
-        return numbers <= _MOST_NUMBERS
+    def __mul__(self, other: Dual) -> Dual:
+        terms = [
+            v.value.widened(w.rate.symbols) * w.rate for v, w in ((self, other), (other, self)) if w.rate is not None
+        ]
+        return Dual(self.value * other.value, reduce(add, terms) if terms else None)
 
-    def models(self, states: Sequence[Taylor]) -> list[Taylor]:
-        """The models of each layer; the last is N, in one row."""
-        found = [_stacked(states)]
-        for k, (W, b) in enumerate(zip(self.net.weights, self.net.biases, strict=True)):
-            found.append(_through(W, found[-1].function("tanh") if k else found[0], b))
-        return found[1:]
+    def function(self, name: str) -> Dual:
+        """phi(v) for a function phi of the table; its derivative is phi'(v) times that of v."""
+        v, rate = self.value, self.rate
+        if rate is not None:
+            slope = v.composed(FUNCTIONS[name].expansion(Near(v.c), v.moved).derivative)
+            rate = slope.widened(rate.symbols) * rate
+        return Dual(v.function(name), rate)
 
-    def value(self, models: Sequence[Taylor]) -> Taylor:
-        """N."""
-        return _row(models[-1])
-
-    def along(self, models: Sequence[Taylor], F: Sequence[Taylor]) -> Taylor:
-        """N'F: y_1 = W_1 F, y_(k+1) = W_(k+1) (tanh'(a_k) y_k)."""
-        first, *later = self.net.weights
-        y = _through(first, _stacked(F))
-        for W, a in zip(later, models, strict=False):
-            slope = a.composed(FUNCTIONS["tanh"].expansion(Near(a.c), a.moved).derivative)
-            y = _through(W, slope.widened(y.symbols) * y)
-        return _row(y)
+    def through(self, W: Array, b: Array) -> Dual:
+        """`W v + b` of models in rows."""
+        return Dual(_through(W, self.value, b), None if self.rate is None else _through(W, self.rate))
 
 
-class Formula:
-    """An expression's models are those of the states; N and N'F are the first two coefficients of a series in time."""
+class InRows(Algebra[Dual]):
+    """Networks of such models, each vector in rows (width, B)."""
+
+    def affine(self, step: Affine, v: Dual) -> Dual:
+        return v.through(step.weight, step.bias)
+
+    def map(self, step: Map, v: Dual) -> Dual:
+        return v.function(step.function)
+
+    def clip(self, step: Clip, v: Dual) -> Dual:
+        """Nothing: N has to have a derivative."""
+        return Dual(v.value.scaled(np.nan))
+
+    def sum(self, step: Sum, vectors: Sequence[Dual]) -> Dual:
+        return reduce(add, vectors)
+
+    def concat(self, step: Concat, vectors: Sequence[Dual]) -> Dual:
+        return _stacked([row for v in vectors for row in _rows(v)])
+
+    def observe(self, step: Observe, v: Dual) -> Dual:
+        made: list[Dual] = evaluate(step.tape, _numbers(v.value), _rows(v))
+        return _stacked(made)
+
+    def entries(self, call: Call, arguments: list[Dual]) -> list[Dual]:
+        """A call in equations."""
+        value = _rows(self.run(call.network, _stacked(arguments)))
+        return [value[i] for i in call.entries]
+
+
+class Function:
+    """N on boxes, and its derivative along F."""
 
     def __init__(self, tape: Tape) -> None:
-        self.tape, self.values = tape, 2 * len(tape.operations)
+        self.tape, networks = tape, [call.network for call in tape.calls.values()]
+        self.values = max(2 * tape.size, *(step.size for net in networks for step in net.steps), 0)
+        self.weights = [step.weight for net in networks for step in net.steps if isinstance(step, Affine)]
+        prepare(*networks)
 
     def is_small(self, symbols: int) -> bool:
-        """True if the models in so many symbols take acceptable time."""
-        return len(self.tape.operations) * symbols**2 <= _MOST_VALUES
+        """True if the models in so many symbols take an acceptable amount of memory and time."""
+        numbers = sum(len(W) * (W.shape[1] + symbols**2) for W in self.weights)
+        return numbers <= _MOST_NUMBERS and self.tape.size * symbols**2 <= _MOST_VALUES
 
-    def least(self, x: Form) -> Array:
-        """No bound before there are models."""
-        return np.full(x.value.shape[2], -np.inf)
-
-    def models(self, states: Sequence[Taylor]) -> list[Taylor]:
-        """The states."""
-        return list(states)
-
-    def value(self, models: Sequence[Taylor]) -> Taylor:
-        """N."""
-        N: Taylor = evaluate(self.tape, _numbers(models[0]), models)[0]
+    def along(self, states: Sequence[Taylor], F: Sequence[Taylor | None]) -> Dual:
+        """N, and its derivative where F is given."""
+        variables = [Dual(x, f) for x, f in zip(states, F, strict=True)]
+        N: Dual = evaluate(self.tape, _numbers(states[0]), variables, InRows().entries)[0]
         return N
 
-    def along(self, models: Sequence[Taylor], F: Sequence[Taylor]) -> Taylor:
-        """N'F."""
-        number = _numbers(F[0])
-        series = [Series([x.widened(f.symbols), f], 2, number) for x, f in zip(models, F, strict=True)]
-        N: Series = evaluate(self.tape, lambda q: Series([number(q)], 2, number), series)[0]
-        rise: Taylor = N.parts[1] if len(N.parts) > 1 else number(Fraction(0))
-        return rise
+    def is_above(self, x: Form, level: float) -> Array:
+        """True on boxes on which N is certainly above the level."""
+        above = np.zeros(x.value.shape[2], dtype=bool)
+        if self.weights:  # forms are good where boxes are large
+            above = self._shows(x, level, self._by_forms)
+        left = np.flatnonzero(np.logical_not(above))
+        above[left] = self._shows(x[:, left], level, lambda states: self.along(states, [None] * len(states)).value)
+        return above
+
+    def _shows(self, x: Form, level: float, value: Callable[[list[Taylor]], Taylor]) -> Array:
+        N = value(models(Form(x.value), x.error))
+        shown: Array = np.isfinite(N.size.top) & (upper_bound(-N) < -level)
+        return shown
+
+    def _by_forms(self, states: list[Taylor]) -> Taylor:
+        """N by the forms of the networks' values, each with a symbol for its error."""
+        first = states[0].symbols
+        wide = [x.widened(first + self.tape.entries) for x in states]
+        N: Taylor = evaluate(self.tape, constants(wide[0]), wide, lambda call, given: entries(call, given, first))[0]
+        return N
 
 
 def is_small(case: Case) -> Failures:
     """`outer`: N is small enough."""
-    if not _function(case).is_small(len(case.c.states) + len(case.c.inputs) + len(case.c.uncertain)):
+    c = case.c
+    if not _function(case).is_small(len(c.states) + len(c.inputs) + len(c.uncertain) + c.dynamics.entries):
         yield "claim.outer", "too many numbers or operations for so many symbols"
     return 0
 
@@ -136,11 +168,12 @@ def is_above_on_faces(case: Case) -> Failures:
     return count
 
 
-def _below_on_face(function: Layers | Formula, level: float, doubt: Above, first: int, lo: Array, hi: Array) -> Array:
+def _below_on_face(function: Function, level: float, doubt: Above, first: int, lo: Array, hi: Array) -> Array:
     """The leaves of a face, by their numbers, on which N is not certainly above the level."""
     centre, radius = middle(lo, hi)
     x = np.concatenate([centre[None], np.eye(len(lo))[:, :, None] * radius])
-    return first + _below_level(function, Form(x, doubt * np.ones_like(centre)), level)[0]
+    below = np.logical_not(function.is_above(Form(x, doubt * np.ones_like(centre)), level))
+    return first + np.flatnonzero(below)
 
 
 def contains_domain(case: Case) -> Failures:
@@ -184,9 +217,8 @@ class Beyond(Boxes):
 
     def leaves(self) -> Iterator[Batch]:
         """The tree's leaves in batches."""
-        width = max(max(layer.W.shape) for layer in self.net.layers)
-        values = max(self.function.values, len(self.c.dynamics.operations))
-        size = _batch(max(self.symbols**2 * values, (self.symbols + 4) * width))
+        values = max(self.function.values, self.c.dynamics.size)
+        size = _batch(max(self.symbols**2 * values, (self.symbols + 4) * self.width))
         return batches(self.evidence.tree, -self.evidence.root, self.evidence.root, size)
 
     def examine(self, first: int, lo: Array, hi: Array) -> Leaves:
@@ -194,13 +226,14 @@ class Beyond(Boxes):
         centre, radius = middle(lo, hi)
         x = self.states(centre, radius)
         close = np.flatnonzero(np.logical_not(self.is_outside(x) | (self.levels(lo, hi)[1] < self.c.c2)))
-        left, models = _below_level(self.function, x[:, close], self.level)
-        left, N = close[left], self.function.value(models).widened(self.symbols)
+        left = close[np.logical_not(self.function.is_above(x[:, close], self.level))]
         x, centre, radius = x[:, left], centre[:, left], radius[:, left]
         u = enclose_on_boxes(self.net, x)
         states, held = self.models(x, u)
         F = self.f(states, [*held, *self.quantities(len(left))])
-        rise = self.function.along(models, F)
+        both = self.function.along(models(Form(x.value), x.error), F)
+        N, none = both.value.widened(self.symbols), constant(Fraction(0), self.symbols, len(left))
+        rise = none if both.rate is None else both.rate
         below = constant(Fraction(self.level), self.symbols, len(left)) + -N
         bound = self.least_bound(
             rise, [below.at, lambda few: self.gap(centre[:, few], radius[:, few], self.c.c2, -1.0)]
@@ -221,9 +254,8 @@ OF_OUTER_TREE = (("outer", contains_domain), ("outer", is_partition))
 ON_OUTER_LEAVES = (("inputs", keeps_inputs), ("outer", falls))
 
 
-def _function(case: Case) -> Layers | Formula:
-    function = case.outer[0].function
-    return Layers(function) if isinstance(function, Network) else Formula(function)
+def _function(case: Case) -> Function:
+    return Function(case.outer[0].function)
 
 
 def _batch(numbers: int) -> int:
@@ -231,31 +263,35 @@ def _batch(numbers: int) -> int:
     return max(1, min(4096, _BATCH_NUMBERS // numbers))
 
 
-def _below_level(function: Layers | Formula, x: Form, level: float) -> tuple[Array, list[Taylor]]:
-    """The boxes, by their indices, on which N is not certainly above the level, and the function's models on these."""
-    left = np.flatnonzero(np.logical_not(function.least(x) > level))
-    x = x[:, left]
-    models = function.models([affine(x.value[0, i], x.value[1:, i], x.error[i]) for i in range(x.value.shape[1])])
-    N = function.value(models)
-    above = np.isfinite(N.size.top) & (upper_bound(-N) < -level)
-    still = np.flatnonzero(np.logical_not(above))
-    return left[still], [v.at(still) for v in models]
-
-
-def _numbers(like: Taylor) -> Callable[[Fraction], Taylor]:
+def _numbers(like: Taylor) -> Callable[[Fraction], Dual]:
     """The function that gives a rational's model."""
-    return lambda q: constant(q, like.symbols, len(like.c))
+    number = constants(like)
+    return lambda q: Dual(number(q))
 
 
-def _stacked(models: Sequence[Taylor]) -> Taylor:
+def _stacked(duals: Sequence[Dual]) -> Dual:
     """Models as rows of one."""
+    rates = [v.rate for v in duals]
+    some = next((rate for rate in rates if rate is not None), None)
+    if some is None:
+        return Dual(_in_rows([v.value for v in duals]))
+    none = constants(some)(Fraction(0))
+    return Dual(_in_rows([v.value for v in duals]), _in_rows([none if rate is None else rate for rate in rates]))
+
+
+def _in_rows(models: Sequence[Taylor]) -> Taylor:
     c, p = np.stack([v.c for v in models]), np.stack([v.p for v in models], 1)
     return Taylor(c, p, Above(np.stack([v.r.top + np.zeros_like(v.c) for v in models])))
 
 
-def _row(models: Taylor) -> Taylor:
-    """The first of such models."""
-    return Taylor(models.c[0], models.p[:, 0], models.r[0])
+def _rows(v: Dual) -> list[Dual]:
+    """The rows of such models."""
+    rate = v.rate
+    return [Dual(_row(v.value, i), None if rate is None else _row(rate, i)) for i in range(len(v.value.c))]
+
+
+def _row(models: Taylor, i: int) -> Taylor:
+    return Taylor(models.c[i], models.p[:, i], models.r[i])
 
 
 def _through(W: Array, v: Taylor, b: Array | None = None) -> Taylor:

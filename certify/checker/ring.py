@@ -43,9 +43,8 @@ class Ring(Boxes):
     @property
     def batch(self) -> int:
         """The number of leaves per batch."""
-        width = max(max(layer.W.shape) for layer in self.net.layers)
-        values = len(self.c.dynamics.operations) * (self.case.partition.order + 1)
-        numbers = max(width * (self.symbols + 4), self.symbols * self.symbols * (values + 4))
+        values = self.c.dynamics.size * (self.case.partition.order + 1)
+        numbers = max(self.width * (self.symbols + 4), self.symbols * self.symbols * (values + 4))
         return int(max(1, min(4096, _BATCH_NUMBERS // numbers)))
 
     def leaves(self) -> Iterator[Batch]:

@@ -20,7 +20,7 @@ from . import ball, boxes, limits, local, ring
 from .case import Case, Failures
 from .document import Certificate, Partition
 from .errors import Rejected
-from .exact import Exact, policy_at_origin
+from .exact import Exact, Exactly, policy_at_origin
 from .expression import evaluate
 from .functions import Undecided
 from .near import Array, self_test
@@ -50,7 +50,7 @@ def equilibrium(case: Case) -> Failures:
     c = case.c
     at_rest = [*[Fraction(0)] * len(c.states), *c.u_eq, *[None] * len(c.uncertain)]
     try:
-        F = evaluate(c.dynamics, Exact, [Exact(q) for q in at_rest])
+        F = evaluate(c.dynamics, Exact, [Exact(q) for q in at_rest], Exactly().entries)
     except Undecided as error:
         yield "plant.dynamics", f"f(0, u_eq) is not decided exactly: {error}"
     else:
@@ -92,8 +92,13 @@ def centring(case: Case) -> Failures:
         limits = zip(*(end.tolist() for end in policy.clip), u_eq, strict=True)
         if not all(Fraction(lo) < u < Fraction(hi) for lo, hi, u in limits):
             yield "policy.clip", "u_eq must lie strictly inside the clip"
-    if policy.centre == "none" and not case.c.practical and policy_at_origin(policy) != list(u_eq):
-        yield "policy.centre", "pi(0) = u_eq cannot be shown exactly without centring"
+    if policy.centre == "none" and not case.c.practical:
+        try:
+            shown = policy_at_origin(policy) == list(u_eq)
+        except Undecided:
+            shown = False
+        if not shown:
+            yield "policy.centre", "pi(0) = u_eq cannot be shown exactly without centring"
     return 1
 
 

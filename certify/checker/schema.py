@@ -53,6 +53,11 @@ class Value:
     def choice(self, *words: str) -> str:
         return self.text("|".join(words), " or ".join(words))
 
+    def integer(self, least: int, most: int) -> int:
+        """An integer of this range; true and false are none."""
+        self.must(type(self.raw) is int and least <= self.raw <= most, f"an integer from {least} to {most}")
+        return int(self.raw)
+
     def name(self) -> str:
         return self.text(r"[A-Za-z_][A-Za-z0-9_]{0,63}", "an identifier")
 

@@ -8,6 +8,7 @@ H = sum |q_ij|. Arrays carry the batch on their last axis.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache, cached_property
@@ -151,12 +152,26 @@ def constant(q: Fraction, symbols: int, batch: int) -> Taylor:
     return affine(np.full(batch, number.value), np.zeros((symbols, batch)), number.error)
 
 
+def constants(like: Taylor) -> Callable[[Fraction], Taylor]:
+    """The function that gives a rational's model among such models."""
+    return lambda q: constant(q, like.symbols, like.c.shape[-1])
+
+
 def upper_bound(model: Taylor) -> Array:
-    """An upper bound of the model over the box, (B,); the lesser of two."""
+    """An upper bound of the model over the box, (B,); the least of three."""
     bound = _separately(model)
     left = np.flatnonzero(np.logical_not(bound < 0))
     if len(left):
-        bound[left] = np.fmin(bound[left], _at_a_corner(model.at(left)))
+        few = model.at(left)
+        first = np.where(few.g < 0, -1.0, 1.0)
+        # a coefficient of about 0, as multipliers make them, says nothing of its sign: ask the gradient at that corner
+        i, j = pairs(few.symbols)
+        mixed = np.where((i == j)[:, None], 0.0, few.q)
+        gradient = few.g.copy()
+        np.add.at(gradient, i, mixed * first[j])
+        np.add.at(gradient, j, mixed * first[i])
+        for corner in (first, np.where(gradient < 0, -1.0, 1.0)):
+            bound[left] = np.fmin(bound[left], _at_a_corner(few, corner))
     return bound
 
 
@@ -176,20 +191,19 @@ def _separately(model: Taylor) -> Array:
     return found
 
 
-def _at_a_corner(model: Taylor) -> Array:
-    """The value at the corner s to which the gradient points, and what the terms of second order may add elsewhere.
+def _at_a_corner(model: Taylor, s: Array) -> Array:
+    """The value at a corner s, of 1 and -1, and what the other terms may add elsewhere.
 
     With d_i = s_i (1 - w_i), 0 <= w_i <= 2, and R_ij = s_i s_j Q_ij, Q symmetric, `g.d + d'Q d` is
-    `sum |g_i| + s'Q s - sum_i w_i (|g_i| + 2 sum_j R_ij) + w'R w`; and `w'R w <= 2 sum_i w_i sum_j max(R_ij, 0)`, since
-    `w_i w_j <= w_i + w_j`. So the two sums add at most `2 sum_i max(0, 2 sum_j max(-R_ij, 0) - |g_i|)`.
+    `s.g + s'Q s - sum_i w_i (s_i g_i + 2 sum_j R_ij) + w'R w`; and `w'R w <= 2 sum_i w_i sum_j max(R_ij, 0)`, since
+    `w_i w_j <= w_i + w_j`. So the two sums add at most `2 sum_i max(0, 2 sum_j max(-R_ij, 0) - s_i g_i)`.
     """
     i, j = pairs(model.symbols)
-    s = np.where(model.g < 0, -1.0, 1.0)
     R = s[i] * s[j] * model.q  # R_ii, and 2 R_ij
     down = np.where((i == j)[:, None], 2.0, 1.0) * np.maximum(-R, 0.0)
     meets = np.zeros((model.symbols, len(i)))
     meets[i, np.arange(len(i))] = meets[j, np.arange(len(j))] = 1.0
-    more = Above(down).through(meets).less(np.abs(model.g)).sum() * 2
-    at = Near(model.c) + Near(np.abs(model.g)).sum() + Near(R).sum()
+    more = Above(down).through(meets).less(s * model.g).sum() * 2
+    at = Near(model.c) + Near(s * model.g).sum() + Near(R).sum()
     found: Array = (at + Near(0 * model.c, more + model.r)).ends[1]
     return found

@@ -132,9 +132,9 @@ def fits(piece: Piece) -> Failures:
 def decreases(piece: Piece) -> Failures:
     """`tube`: x'P(t)x decreases on the ball without its centre; along a path e'P(t)e where it is 1."""
     F = piece.F()
-    if not are_finite(F, piece.units):
+    if not are_finite(F):
         yield piece.at, "F has no finite model"
-    models = Models(piece.J, F, piece.units, piece.slab.path is None, piece.velocity)
+    models = Models(piece.J, F, piece.slab.path is None, piece.velocity)
     for P, rate in zip(piece.coefficients, piece.rates, strict=True):
         if not shows(models, P, rate, piece.slab.multipliers, piece.slab.path):
             yield piece.at, "the decrease of x'P(t)x is not shown"

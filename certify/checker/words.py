@@ -6,8 +6,8 @@ import math
 from fractions import Fraction
 from typing import Any
 
-from .document import Array, Certificate, Network, Partition, Policy
-from .expression import Tape
+from .document import Array, Certificate, Partition, Policy
+from .networks import Map, Network, Observe, Step, Sum, hashed
 
 CLAIMS = {
     "asymptotic": "the origin is asymptotically stable, and every trajectory of the closed loop that starts in "
@@ -86,7 +86,6 @@ def _falling(c: Certificate) -> str:
 
 def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
     """The plant, the policy, V, what is claimed of them, what held, and the verdict, line by line."""
-    widths = [len(c.states), *map(len, c.policy.weights)]
     inputs = zip(c.inputs, c.input_bounds, c.u_eq, strict=True)
     if answer["result"] == "TRUSTED":
         rest = f"not checked, the solver's word: {', '.join(answer['answers'])}"
@@ -109,14 +108,15 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         *(f"  {name}{after} = {expression(tree)}" for name, tree in zip(c.states, c.dynamics.trees, strict=True)),
         *(f"  domain {name} in {_interval(pair)}" for name, pair in zip(c.states, c.domain, strict=True)),
         *(f"  input {name} in {_interval(pair)}, u_eq = {_number(u)}" for name, pair, u in inputs),
-        f"policy {'-'.join(map(str, widths))} tanh, squash {c.policy.squash}, centred by {c.policy.centre}, "
+        *(f"network {network.name}: {_network(network)}" for network in c.networks),
+        f"policy: network {c.policy.network.name}, squash {c.policy.squash}, centred by {c.policy.centre}, "
         f"{_clip(c.policy)}"
         f"sha256 {c.policy.sha256()}",
-        *([] if c.policy.origin is None else [f"  its layers read ({_matrix(c.policy.origin[None])}) + x"]),
+        *([] if c.policy.origin is None else [f"  its network reads ({_matrix(c.policy.origin[None])}) + x"]),
         f"V(x) = x'Px with P = {_matrix(c.P)}",
         *([] if c.start is None else [f"S = {_matrix(c.start)}"]),
         *([] if c.centre is None else [f"c = {' '.join(map(repr, c.centre.tolist()))}"]),
-        *([] if c.outer is None else [_function(c.outer.function)]),
+        *([] if c.outer is None else [f"N(x) = {expression(c.outer.function.trees[0])}"]),
         *claim(c),
         "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items()),
         "modules that were used: " + ", ".join(answer["modules"]),
@@ -126,11 +126,28 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
     ]
 
 
-def _function(N: Tape | Network) -> str:
-    if isinstance(N, Network):
-        widths = [N.weights[0].shape[1], *map(len, N.weights)]
-        return f"N: the {'-'.join(map(str, widths))} tanh network with sha256 {N.sha256()}"
-    return f"N(x) = {expression(N.trees[0])}"
+def _network(network: Network) -> str:
+    """The network's form, or its steps, of vectors v0 = x, v1, v2 and so on."""
+    numbers = (
+        f"sha256 {hashed('certify-network/1', [a for step in network.steps for a in step.arrays], network.words())}"
+    )
+    if network.is_chain:
+        return f"{'-'.join(map(str, network.widths))} tanh, {numbers}"
+    return f"{'; '.join(f'v{k} = {_step(step)}' for k, step in enumerate(network.steps, 1))}; {numbers}"
+
+
+def _step(step: Step) -> str:
+    of = [f"v{i}" for i in step.of]
+    match step:
+        case Map():
+            return f"{step.function}({of[0]})"
+        case Sum():
+            return " + ".join(of)
+        case Observe():
+            made = ", ".join(expression(tree) for tree in step.tape.trees)
+            return f"({made}) of ({', '.join(step.names)}) = {of[0]}"
+    word = {"Affine": "W {} + b", "Clip": "clip({})", "Concat": "({})"}[type(step).__name__]
+    return f"{word.format(', '.join(of))}, {step.size} entries"
 
 
 def _matrix(A: Array) -> str:
@@ -151,6 +168,9 @@ def expression(tree: Any) -> str:
     if not isinstance(tree, list):
         return str(tree) if str(tree).isidentifier() or str(tree).isdecimal() else f"({tree})"
     name, *operands = tree
+    if name == "network":
+        function, entry, *arguments = operands
+        return f"{function}[{entry}]({', '.join(map(expression, arguments))})"
     words = [expression(operand) for operand in operands]
     if name.isalpha():
         return f"{name}({words[0]})"
