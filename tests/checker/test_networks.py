@@ -1,0 +1,259 @@
+"""Networks of all kinds of steps: what the checker says of them on boxes and on balls holds of their values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+
+from certify.checker import ball, network
+from certify.checker.exact import Exact, Exactly
+from certify.checker.expression import Tape, evaluate, parse
+from certify.checker.functions import Undecided
+from certify.checker.jets import Jet, Units, constant
+from certify.checker.near import Above, Form, Near, Vector
+from certify.checker.networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Step, Sum
+from certify.checker.outer import Dual, InRows
+from certify.checker.taylor import Taylor, constants
+from certify.checker.taylor import affine as form_of
+
+Array = Any
+SEEDS = range(60)
+FUNCTIONS: dict[str, Callable[[Array], Array]] = {
+    "tanh": np.tanh,
+    "sin": np.sin,
+    "cos": np.cos,
+    "exp": np.exp,
+    "atan": np.arctan,
+    "sqrt": np.sqrt,
+}
+TREES = [["sin", "a"], ["*", "a", "a"], ["cos", ["+", "a", "1/3"]], "a", ["-", ["exp", ["*", "1/4", "a"]], "a"]]
+
+
+class Numbers(Algebra[Array]):
+    """Plain numbers, (width, B)."""
+
+    def affine(self, step: Affine, v: Array) -> Array:
+        return step.weight @ v + step.bias[:, None]
+
+    def map(self, step: Map, v: Array) -> Array:
+        return FUNCTIONS[step.function](v)
+
+    def clip(self, step: Clip, v: Array) -> Array:
+        return np.clip(v, step.lo[:, None], step.hi[:, None])
+
+    def sum(self, step: Sum, vectors: Any) -> Array:
+        return sum(vectors)
+
+    def concat(self, step: Concat, vectors: Any) -> Array:
+        return np.concatenate(vectors)
+
+    def observe(self, step: Observe, v: Array) -> Array:
+        return np.array([Plain.of(step.tape, list(v))[i] for i in range(len(step.tape.outputs))])
+
+
+class Plain:
+    """A number on a tape."""
+
+    def __init__(self, v: Array) -> None:
+        self.v = v
+
+    def __add__(self, other: Plain) -> Plain:
+        return Plain(self.v + other.v)
+
+    def __mul__(self, other: Plain) -> Plain:
+        return Plain(self.v * other.v)
+
+    def __neg__(self) -> Plain:
+        return Plain(-self.v)
+
+    def function(self, name: str) -> Plain:
+        return Plain(1 / self.v if name == "inv" else FUNCTIONS[name](self.v))
+
+    @classmethod
+    def of(cls, tape: Tape, variables: list[Array]) -> list[Array]:
+        def called(call: Any, given: list[Plain]) -> list[Plain]:
+            value = Numbers().run(call.network, np.array([x.v + 0 * variables[0] for x in given]))
+            return [Plain(value[i]) for i in call.entries]
+
+        return [x.v for x in evaluate(tape, lambda q: Plain(float(q)), [Plain(v) for v in variables], called)]
+
+
+def a_network(seed: int, reads: int, gives: int, kinds: str = "affine map clip sum concat observe") -> Network:
+    """A network of random steps, which read random vectors before them."""
+    rng = np.random.default_rng(seed)
+    sizes, steps = [reads], list[Step]()
+
+    def add(step: Step) -> None:
+        steps.append(step)
+        sizes.append(step.size)
+
+    for kind in [*rng.choice(kinds.split(), int(rng.integers(2, 9))), "affine"]:
+        i = int(rng.integers(max(0, len(sizes) - 3), len(sizes)))
+        same = [j for j, size in enumerate(sizes) if size == sizes[i]]
+        few = (int(rng.choice(same)), i)
+        match kind:
+            case "affine":
+                rows = gives if len(steps) and kind == "affine" and rng.random() < 0.2 else int(rng.integers(1, 5))
+                add(Affine((i,), rows, rng.normal(size=(rows, sizes[i])) * 0.8, rng.normal(size=rows) * 0.3))
+            case "map":
+                add(Map((i,), sizes[i], str(rng.choice(["tanh", "tanh", "sin", "cos", "atan", "exp"]))))
+            case "clip":
+                middle = rng.normal(size=sizes[i]) * 0.4
+                add(Clip((i,), sizes[i], middle - rng.random(sizes[i]), middle + rng.random(sizes[i])))
+            case "sum":
+                add(Sum(few, sizes[i]))
+            case "concat":
+                two = (int(rng.integers(0, len(sizes))), i)
+                add(Concat(two, sum(sizes[j] for j in two)))
+            case "observe":
+                names = tuple("abcdefghijklmnop"[: sizes[i]])
+                chosen = [TREES[int(k)] for k in rng.integers(0, len(TREES), 3)]
+                add(Observe((i,), 3, names, parse(chosen, names, "here")))
+    last = len(steps)
+    add(Affine((last,), gives, rng.normal(size=(gives, sizes[last])), rng.normal(size=gives)))
+    return Network("net", reads, tuple(steps))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_value_lies_within_its_enclosure_on_boxes(seed: int) -> None:
+    rng = np.random.default_rng(1000 + seed)
+    net, radius = a_network(seed, 3, 2), 10.0 ** rng.uniform(-6, 0.5, 5)
+    x = np.concatenate([rng.normal(size=(1, 3, 5)), rng.normal(size=(4, 3, 5)) * radius])
+    doubt = np.abs(rng.normal(size=(3, 5))) * radius * 0.1
+    with np.errstate(all="ignore"):
+        u = network.enclose(net, Form(x, Above(doubt)), (1, 0, 1))
+    for _ in range(40):
+        d = np.sign(rng.normal(size=(4, 5))) * rng.random((4, 5)) ** rng.choice([0.0, 0.2, 1.0])
+        at = x[0] + np.einsum("kb,knb->nb", d, x[1:]) + doubt * np.sign(rng.normal(size=(3, 5)))
+        value = Numbers().run(net, at)[[1, 0, 1]]
+        off = np.abs(value - u.value[0] - np.einsum("kb,knb->nb", d, u.value[1:]))
+        assert not np.any(off > u.error.top + 1e-12 * (1 + np.abs(value)))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_call_in_equations_is_one_with_its_value(seed: int) -> None:
+    """With a symbol for the error of each entry: some number of [-1, 1] for it gives the value."""
+    rng = np.random.default_rng(2000 + seed)
+    net, radius = a_network(seed, 2, 2), 10.0 ** rng.uniform(-6, -0.5)
+    tape = parse(
+        [["+", ["network", "net", 1, ["*", "x", "y"], "y"], ["*", "x", ["network", "net", 0, "y", "2/3"]]]],
+        ("x", "y"),
+        "here",
+        {"net": net},
+    )
+    centre, wide = rng.normal(size=2), np.diag([radius, radius])
+    states = [
+        form_of(np.array([centre[i]]), np.concatenate([wide[i], np.zeros(tape.entries)])[:, None]) for i in range(2)
+    ]
+    with np.errstate(all="ignore"):
+        (f,) = evaluate(tape, constants(states[0]), states, lambda call, given: network.entries(call, given, 2))
+    for _ in range(40):
+        d = rng.uniform(-1, 1, 2)
+        (value,) = Plain.of(tape, [np.array([v]) for v in centre + wide @ d])
+        i, j = np.triu_indices(f.symbols)
+        own = np.concatenate([d, np.full(tape.entries, np.nan)])
+        mixed, plain = np.where(np.isnan(own[i] * own[j]), 0, own[i] * own[j]), np.where(np.isnan(own), 0, own)
+        loose = np.abs(f.g[2:, 0]).sum() + np.abs(f.q[np.isnan(own[i] * own[j]), 0]).sum()
+        known = f.c[0] + plain @ f.g[:, 0] + mixed @ f.q[:, 0]
+        assert not abs(value[0] - known) > loose + f.r.top[0] + 1e-12 * (1 + abs(value[0]))
+
+
+def a_jet(rng: Any, k: int, scale: float, units: Units) -> tuple[Jet, Callable[[Array], Array]]:
+    """x on a ball, exactly, and its function of d."""
+    c, a = float(rng.normal()), rng.normal(size=k) * scale
+    x = constant(Fraction(0), units, 0)
+    jet = Jet(
+        Near(np.float64(c)),
+        Vector(a),
+        *(getattr(x, name) for name in ("Q", "K", "E", "B", "units", "c_y")),
+        x.a_y,
+        x.lip,
+    )
+    return jet, lambda d: c + a @ d
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_value_lies_within_its_model_on_a_ball(seed: int) -> None:
+    """Clips act nowhere or everywhere on the ball, or there is no finite model."""
+    rng = np.random.default_rng(3000 + seed)
+    k, scale = 3, 10.0 ** rng.uniform(-4, -0.7)
+    net, units = a_network(seed, 3, 2), Units(np.zeros((k, k, 0)), np.zeros((0, 0)))
+    given = [a_jet(rng, k, scale, units) for _ in range(3)]
+    bent = [jet * jet + jet.function("sin") if seed % 2 else jet for jet, _ in given]
+    with np.errstate(all="ignore"):
+        h = ball.OnBall(k).value(net, bent)
+    if "Clip" not in {type(step).__name__ for step in net.steps}:
+        assert np.all(np.isfinite(h.v0.size.top))
+    steps = np.zeros((2, 2))
+    for _ in range(40):
+        d = rng.normal(size=(k, 2))
+        d *= rng.random(2) ** rng.choice([0.0, 0.3]) / np.linalg.norm(d, axis=0)
+        value, middle = (
+            Numbers().run(net, np.array([f(at) ** 2 + np.sin(f(at)) if seed % 2 else f(at) for _, f in given]))
+            for at in (d, np.zeros((k, 1)))
+        )
+        for j in range(2):
+            off = np.abs(middle[j] - h.v0.value[j])
+            assert not np.any(off > h.v0.error.top[j] + 1e-12)
+            for p in range(2):
+                steps[j, p] = beyond(h, j, d[:, p], value[j, p] - middle[j, 0])
+        # the remainder beyond a.d + d'Q d + K[d] has the Lipschitz constant that is stated
+        apart = np.linalg.norm(d[:, 0] - d[:, 1])
+        assert not np.any(np.abs(steps[:, 0] - steps[:, 1]) > h.lipschitz.top * apart + 1e-11)
+
+
+def beyond(h: Jet, j: int, d: Array, moved: float) -> float:
+    """What a value has beyond its model, which is less than is stated."""
+    a, Q, (p, q, r, often) = h.a.value[:, j], h.Q.value[..., j], ball.triples(len(d))
+    known = a @ d + d @ Q @ d + np.sum(often * h.K.value[:, j] * d[p] * d[q] * d[r])
+    M = h.remainder[..., j] + np.tensordot(h.units.U, np.abs(h.B.value[:, j]), 1)
+    rest = moved - known
+    slack = h.a.error.top[j] * np.linalg.norm(d)
+    assert not abs(rest) > d @ M @ d + slack + 1e-12
+    return float(rest)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_models_in_rows_contain_values_and_their_derivatives(seed: int) -> None:
+    rng = np.random.default_rng(4000 + seed)
+    net, radius = a_network(seed, 2, 1, "affine map sum concat observe"), 10.0 ** rng.uniform(-5, -0.5)
+    centre, F = rng.normal(size=2), rng.normal(size=2)
+    states = [form_of(np.array([centre[i]]), np.eye(2)[i][:, None] * radius) for i in range(2)]
+    rates = [form_of(np.array([F[i]]), np.zeros((3, 1))) for i in range(2)]
+    tape = parse([["*", "x", ["network", "net", 0, "x", ["+", "x", "y"]]]], ("x", "y"), "here", {"net": net})
+    number = constants(states[0])
+    (N,) = evaluate(
+        tape,
+        lambda q: Dual(number(q)),
+        [Dual(x, f) for x, f in zip(states, rates, strict=True)],
+        InRows().entries,
+    )
+    for _ in range(30):
+        d = rng.uniform(-1, 1, 2)
+        at = centre + radius * d
+        (value,) = Plain.of(tape, [np.array([v]) for v in at])
+        (more,), (less,) = (Plain.of(tape, [np.array([v]) for v in at + h * F]) for h in (1e-6, -1e-6))
+        assert within(N.value, d, value[0], 1e-12)
+        assert within(N.rate, np.append(d, 0.0), (more[0] - less[0]) / 2e-6, 1e-7)
+
+
+def within(model: Taylor, d: Array, value: float, tolerance: float) -> bool:
+    i, j = np.triu_indices(model.symbols)
+    known = model.c[0] + d @ model.g[:, 0] + (d[i] * d[j]) @ model.q[:, 0]
+    return bool(abs(value - known) <= model.r.top[0] + tolerance * (1 + abs(value)))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_exact_values_are_the_networks(seed: int) -> None:
+    """At a rational point a value is exact, or not known."""
+    net = a_network(seed, 2, 2, "affine clip sum concat affine map")
+    try:
+        value = Exactly().run(net, [Exact(Fraction(0)), Exact(Fraction(3, 8))])
+    except Undecided:
+        return
+    plain = Numbers().run(net, np.array([[0.0], [0.375]]))
+    assert all(q.value is None or abs(float(q.value) - p[0]) < 1e-9 for q, p in zip(value, plain, strict=True))
