@@ -4,7 +4,8 @@ A leaf is a name or an exact fraction; a node is `["+", a, b, ...]`, `["*", a, b
 `["-", a, b]`, `["/", a, b]`, `["**", a, k]` with an integer k, `[f, a]` with a function f, or a call of a network,
 `["network", name, i, a, ...]`. Powers and tan are expanded here, so that an arithmetic needs only +, *, unary -,
 `function` for inv and the others, and a function that calls networks. The result of +, *, - and inv on rationals alone
-is a rational, computed here.
+is a rational, computed here. abs is a function; `["min", a, b, ...]`, `["max", a, b, ...]` and `["clip", v, lo, hi]`
+are written with it.
 """
 
 from __future__ import annotations
@@ -179,11 +180,21 @@ class _Builder:
                 return self.apply("+", a, self.apply("neg", b))
             case "/", [a, b]:
                 return self.apply("*", a, self.apply("inv", b))
-            case (("sin" | "cos" | "tanh" | "exp" | "atan" | "sqrt"), [a]):
+            case (("sin" | "cos" | "tanh" | "exp" | "atan" | "sqrt" | "abs"), [a]):
                 return self.apply(name, a)
             case "tan", [a]:
                 return self.apply("*", self.apply("sin", a), self.apply("inv", self.apply("cos", a)))
+            case (("min" | "max"), [first, *others]) if others:
+                return reduce(lambda a, b: self.extreme(name, a, b), others, first)
+            case "clip", [v, lo, hi]:
+                return self.extreme("min", self.extreme("max", v, lo), hi)
         strict.fail(at, f"operator {name[:20]!a} with {len(arguments)} operands is not in the grammar")
+
+    def extreme(self, name: str, a: Part, b: Part) -> Part:
+        """The larger of two numbers, (a + b + |a - b|)/2, or the lesser one, with -|a - b|."""
+        apart = self.apply("abs", self.apply("+", a, self.apply("neg", b)))
+        apart = apart if name == "max" else self.apply("neg", apart)
+        return self.apply("*", Fraction(1, 2), self.apply("+", self.apply("+", a, b), apart))
 
     def call(self, arguments: list[Any], at: str, depth: int) -> Part:
         """An entry of a network's value; calls with the same arguments are one."""

@@ -382,6 +382,101 @@ class _Sine(Function):
         return y
 
 
+class _Sign(Function):
+    """1 or -1, of numbers that are certainly not 0; equations do not have it."""
+
+    name, partial = "sign", True
+
+    def at(self, c: Near) -> Three:
+        sign, none = np.where(c.value < 0, -1.0, 1.0), np.zeros_like(c.value)
+        return Near(sign), Near(none), Near(none)
+
+    def sixth(self, c: Near, f: Three) -> Near:
+        return f[2]
+
+    def slopes(self, v0: Near) -> FourBounds:
+        return _no_more(v0), _no_more(v0), _no_more(v0), _no_more(v0)
+
+    def third(self, e: Expansion) -> Above:
+        return _no_more(e.v)
+
+    def fourth(self, e: Expansion) -> Above:
+        return _no_more(e.v)
+
+    def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
+        return [v[0].function("sign"), *[constant(Fraction(0))] * (count - 1)]
+
+
+class _Abs(Function):
+    """|v|: smooth where v is certainly not 0; elsewhere it lies between two lines."""
+
+    name = "abs"
+
+    def exact(self, q: Fraction) -> Fraction | None:
+        return abs(q)
+
+    def at(self, c: Near) -> Three:
+        sign, none = np.where(c.value < 0, -1.0, 1.0), np.zeros_like(c.value)
+        return Near(np.abs(c.value)), Near(sign), Near(none)
+
+    def sixth(self, c: Near, f: Three) -> Near:
+        return f[2]
+
+    def slopes(self, v0: Near) -> FourBounds:
+        return _UNIT, _no_more(v0), _no_more(v0), _no_more(v0)
+
+    def third(self, e: Expansion) -> Above:
+        return _no_more(e.v)
+
+    def fourth(self, e: Expansion) -> Above:
+        return _no_more(e.v)
+
+    def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
+        sign = v[0].function("sign") if count > 1 else None
+        return [v[0].function("abs"), *(sign * v[k] if k < len(v) else constant(Fraction(0)) for k in range(1, count))]
+
+    def expansion(self, v0: Near, radius: Above) -> Expansion:
+        return _Corner(self, v0, radius)
+
+    def lines(self, centre: Array, radius: Above) -> Lines:
+        """Of slopes near the chord's; |v| - s v is linear to both sides of 0, and so is extreme at ends, or at 0."""
+        lo, hi = Near(centre, radius).ends
+        s = np.clip((np.abs(hi) - np.abs(lo)) / (hi - lo), -1.0, 1.0)
+        s = np.where(lo >= 0, 1.0, np.where(hi <= 0, -1.0, s))
+        at = np.array([lo, hi, np.clip(0.0, lo, hi)])
+        lows, highs = (Near(np.abs(at)) - Near(at) * Near(s)).ends
+        upper, lower_end = np.max(highs, axis=0), np.min(lows, axis=0)
+        m = 0.5 * (upper + lower_end)
+        return s, m, (Near(upper) - Near(m)).size.most((Near(lower_end) - Near(m)).size)
+
+
+class _Corner(Expansion):
+    """|v| around v0. On boxes the lines around it will do where the sign of v is not certain, with an error of the
+    value; a derivative it has only where that is certain."""
+
+    @cached_property
+    def stored(self) -> Three:
+        c, none = self.v0.value, np.zeros_like(self.v0.value)
+        s, m, gap = self.phi.lines(c, self.v0.error + self.radius)
+        return Near(c) * Near(s) + Near(m, gap), Near(s), Near(none)
+
+    @cached_property
+    def f(self) -> Four:
+        smooth = Above(0 * self.fourth.v)  # NaN where the sign is not certain
+        f0, f1, f2 = self.phi.at(Near(self.v0.value))
+        return f0.wider(self.v0.error + smooth), f1.wider(smooth), f2.wider(smooth), f2.wider(smooth)
+
+    @cached_property
+    def third(self) -> Above:
+        """Lines leave nothing."""
+        return ZERO
+
+
+def _no_more(x: Near) -> Above:
+    """0 where numbers are certainly not 0, else NaN."""
+    return Above(0 * lower(x))
+
+
 def _positive(x: Near) -> Any:
     """Lower bounds, NaN unless they are positive and finite."""
     return np.where(x.value > 0, lower(x), np.nan)
@@ -394,5 +489,9 @@ def _step(v: list[Any], w: list[Any], k: int, constant: Constant) -> Any:
 
 
 FUNCTIONS: dict[str, Function] = {
-    row.name: row for row in (_Inverse(), _Tanh(), _Exp(), _Atan(), _Sqrt(), _Sine("sin", "cos"), _Sine("cos", "sin"))
+    row.name: row
+    for row in (
+        *(_Inverse(), _Tanh(), _Exp(), _Atan(), _Sqrt()),
+        *(_Sine("sin", "cos"), _Sine("cos", "sin"), _Abs(), _Sign()),
+    )
 }

@@ -126,10 +126,11 @@ class Ring(Boxes):
         return np.moveaxis(np.array(found), 1, 0)
 
     def of_mean(self, f: Taylor) -> Taylor:
-        """A model with the symbols of uncertain quantities, as their means: what is of second order in them, whose mean
-        is another, becomes part of the remainder."""
-        i, j = (self.n + self.m <= index for index in pairs(self.symbols))
-        own = self.symbols + np.flatnonzero(i & j & (pairs(self.symbols)[1] < self.n + self.m + self.k))
+        """A model with the symbols of uncertain quantities, and of the errors of calls, which change within a period
+        too, as their means: what is of second order in them, whose mean is another, becomes part of the remainder."""
+        last = self.calls + self.c.dynamics.entries
+        i, j = ((self.n + self.m <= index) & (index < last) for index in pairs(self.symbols))
+        own = self.symbols + np.flatnonzero(i & j)
         p = f.p.copy()
         p[own] = 0.0
         return Taylor(f.c, p, f.r + size(f.p[own]).sum())

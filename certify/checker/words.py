@@ -173,7 +173,7 @@ def expression(tree: Any) -> str:
         return f"{function}[{entry}]({', '.join(map(expression, arguments))})"
     words = [expression(operand) for operand in operands]
     if name.isalpha():
-        return f"{name}({words[0]})"
+        return f"{name}({', '.join(words)})"
     return f"(-{words[0]})" if name == "-" and len(words) == 1 else f"({f' {name} '.join(words)})"
 
 

@@ -29,7 +29,14 @@ FUNCTIONS: dict[str, Callable[[Array], Array]] = {
     "exp": np.exp,
     "atan": np.arctan,
     "sqrt": np.sqrt,
+    "abs": np.abs,
 }
+CORNERS = [
+    ["abs", "a"],
+    ["min", "a", "1/7", ["*", "a", "a"]],
+    ["clip", ["sin", ["*", "2", "a"]], "-1/2", "1/3"],
+    ["max", "a", "0"],
+]
 TREES = [["sin", "a"], ["*", "a", "a"], ["cos", ["+", "a", "1/3"]], "a", ["-", ["exp", ["*", "1/4", "a"]], "a"]]
 
 
@@ -85,6 +92,7 @@ class Plain:
 def a_network(seed: int, reads: int, gives: int, kinds: str = "affine map clip sum concat observe") -> Network:
     """A network of random steps, which read random vectors before them."""
     rng = np.random.default_rng(seed)
+    trees = [*TREES, *CORNERS] if seed % 3 == 0 and "clip" in kinds else TREES
     sizes, steps = [reads], list[Step]()
 
     def add(step: Step) -> None:
@@ -111,7 +119,7 @@ def a_network(seed: int, reads: int, gives: int, kinds: str = "affine map clip s
                 add(Concat(two, sum(sizes[j] for j in two)))
             case "observe":
                 names = tuple("abcdefghijklmnop"[: sizes[i]])
-                chosen = [TREES[int(k)] for k in rng.integers(0, len(TREES), 3)]
+                chosen = [trees[int(k)] for k in rng.integers(0, len(trees), 3)]
                 add(Observe((i,), 3, names, parse(chosen, names, "here")))
     last = len(steps)
     add(Affine((last,), gives, rng.normal(size=(gives, sizes[last])), rng.normal(size=gives)))
@@ -186,7 +194,7 @@ def test_a_value_lies_within_its_model_on_a_ball(seed: int) -> None:
     bent = [jet * jet + jet.function("sin") if seed % 2 else jet for jet, _ in given]
     with np.errstate(all="ignore"):
         h = ball.OnBall(k).value(net, bent)
-    if "Clip" not in {type(step).__name__ for step in net.steps}:
+    if seed % 3 and "Clip" not in {type(step).__name__ for step in net.steps}:
         assert np.all(np.isfinite(h.v0.size.top))
     steps = np.zeros((2, 2))
     for _ in range(40):
@@ -257,3 +265,36 @@ def test_exact_values_are_the_networks(seed: int) -> None:
         return
     plain = Numbers().run(net, np.array([[0.0], [0.375]]))
     assert all(q.value is None or abs(float(q.value) - p[0]) < 1e-9 for q, p in zip(value, plain, strict=True))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_corners_of_equations_lie_in_their_models(seed: int) -> None:
+    """abs, min, max and clip: on boxes between lines, on balls where the sign is certain."""
+    rng = np.random.default_rng(5000 + seed)
+    tree = [
+        "+",
+        ["abs", ["-", "x", ["*", "y", "y"]]],
+        ["*", "y", ["clip", "x", "-1/2", "1/3"]],
+        ["min", "x", "y", "1/5"],
+    ]
+    tape = parse([tree, ["max", "x", ["sin", "y"]]], ("x", "y"), "here")
+    centre, radius = rng.normal(size=2), 10.0 ** rng.uniform(-6, 0.3)
+    states = [form_of(np.array([centre[i]]), np.eye(2)[i][:, None] * radius) for i in range(2)]
+    units = Units(np.zeros((2, 2, 0)), np.zeros((0, 0)))
+    jets = [a_jet(rng, 2, radius, units) for _ in range(2)]
+    with np.errstate(all="ignore"):
+        on_box = evaluate(tape, constants(states[0]), states)
+        on_ball = evaluate(tape, lambda q: constant(q, units, 0), [jet for jet, _ in jets])
+    for _ in range(40):
+        d = rng.uniform(-1, 1, 2)
+        for model, value in zip(on_box, Plain.of(tape, [np.array([v]) for v in centre + radius * d]), strict=True):
+            assert np.isfinite(model.r.top[0]) and within(model, d, value[0], 1e-12)
+        d /= max(1.0, np.linalg.norm(d))
+        at = [np.array([f(d)]) for _, f in jets]
+        for v, value in zip(on_ball, Plain.of(tape, at), strict=True):
+            p, q, r, often = ball.triples(2)
+            known = v.c.value + v.a.value @ d + d @ v.Q.value @ d + np.sum(often * v.K.value * d[p] * d[q] * d[r])
+            off = v.c.error.top + v.a.error.top * np.linalg.norm(d) + d @ v.remainder @ d
+            assert not abs(value[0] - known) > off + 1e-12 * (1 + abs(value[0]))
+    if radius < 1e-5:
+        assert all(np.isfinite(v.v0.size.top) for v in on_ball)
