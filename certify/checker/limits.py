@@ -153,7 +153,8 @@ class Sizes:
 
     def policies(self, leaves: int) -> int:
         each, batches = self.net.on_a_leaf(self.s), 1 + leaves * self.net.widest // 2**14
-        return leaves * each // 8 + batches * self.net.paths
+        times = self.evaluations(self._partition.order) if self.z else 1  # of calls, in those of the equations
+        return times * (leaves * each // 8 + batches * self.net.paths)
 
     def of_ring(self, leaves: int) -> int:
         order, calls = self._partition.order, self.n * self.s**2 + 160 * self.net.steps
@@ -166,9 +167,10 @@ class Sizes:
         return self.net.on_a_ball(self.d, self.t)
 
     @property
-    def model(self) -> int:
-        """An operation of the equations in models on a ball."""
-        return 2**17 + 64 * self.t + 16 * self.d**2 * (self.m + self.y + self.z)
+    def equations(self) -> int:
+        """The equations in models on a ball, once, with the networks that they call."""
+        calls = self.ball if self.z else 0
+        return self.a * (2**17 + 64 * self.t + 16 * self.d**2 * (self.m + self.y + self.z)) + calls
 
     @property
     def inequality(self) -> int:
@@ -182,14 +184,14 @@ class Sizes:
         if evidence.local:
             times = cells + (self.evaluations(evidence.local.order) + 8 if self.c.sample else 0)
             corners = cells * 2**self.y
-            found += self.ball + self.a * times * self.model + corners * self.inequality + self.decision(self.n)
+            found += self.ball + times * self.equations + corners * self.inequality + self.decision(self.n)
         if evidence.contraction:
             corners = cells * 2**self.y
-            found += self.ball + self.a * cells * self.model + corners * self.inequality + self.decision(self.n)
+            found += self.ball + cells * self.equations + corners * self.inequality + self.decision(self.n)
         return found
 
     def of_tube(self) -> int:
-        of_each = self.ball + self.a * self.model + 3 * (self.inequality + self.decision(self.n))
+        of_each = self.ball + self.equations + 3 * (self.inequality + self.decision(self.n))
         tube = self._partition.tube
         nodes = [P for slab in tube for P in (slab.middle, slab.end)] + ([] if self.c.start is None else [self.c.start])
         return len(tube) * of_each + sum(self.inverse(self.bits(P)) for P in nodes)
