@@ -143,9 +143,8 @@ def _networks(outer: Outer | None) -> list[dict[str, Any]]:
 
 def _outer(outer: Outer, system: System) -> dict[str, Any]:
     N = outer.function
-    neural = isinstance(N, Neural)
-    tree = ["network", N_NAME, 0, *(s.name for s in system.states)] if neural else to_tree(N.expression)
-    return {"expression": tree, "level": float(outer.level).hex()}
+    called: list[Any] = ["network", N_NAME, 0, *(s.name for s in system.states)]
+    return {"expression": called if isinstance(N, Neural) else to_tree(N.expression), "level": float(outer.level).hex()}
 
 
 def _for_people(system: System) -> dict[str, dict[str, str]]:

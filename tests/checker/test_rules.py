@@ -35,7 +35,7 @@ from certify.checker.boxes import batches
 from certify.checker.case import Case
 from certify.checker.document import Policy
 from certify.checker.errors import Rejected
-from certify.checker.exact import raw_at_origin
+from certify.checker.exact import policy_at_origin
 from certify.checker.near import Above, Near, within
 from certify.checker.ring import Ring, is_partition
 from certify.checker.rules import Tally
@@ -961,7 +961,7 @@ def test_without_centring_the_equilibrium_is_decided_exactly(
     if known:
         assert not failures and network.fold(policy, (u_eq,)).offset.value is policy.offset
     else:
-        assert [at for at, _ in failures] == ["policy.centre"] and raw_at_origin(policy) != [u_eq]
+        assert [at for at, _ in failures] == ["policy.centre"] and policy_at_origin(policy) != [u_eq]
 
 
 def test_a_leaf_that_overflows_is_never_accepted() -> None:

@@ -482,7 +482,7 @@ def test_runs_of_the_pendulum_stay_in_its_tube() -> None:
     assert (policy.squash, policy.centre, policy.clip) == ("tanh", "preactivation", None)
 
     def net(x: np.ndarray) -> np.ndarray:
-        for W, b in zip(policy.weights, policy.biases, strict=True):
+        for W, b in (step.arrays for step in policy.network.steps if step.arrays):
             y = W @ x + b[:, None]
             x = np.tanh(y)
         return y

@@ -16,24 +16,29 @@ def newer(data: Any) -> Any:
     """A document of format 8 as one of format 9; others, and what is no document, as they are."""
     if not isinstance(data, dict) or data.get("schema") != EARLIER:
         return data
-    networks, states = list[Any](), data["plant"].get("states") if isinstance(data.get("plant"), dict) else None
-    reads, made = len(states) if isinstance(states, list) else 1, dict[str, Any]()
-    for key, value in data.items():
-        if key == "policy" and isinstance(value, dict) and "layers" in value:
-            networks.insert(0, {"name": "policy", "reads": reads, "steps": _steps(value["layers"])})
-            value = {"network": "policy", **{k: v for k, v in value.items() if k != "layers"}}
-        elif key == "claim" and isinstance(value, dict) and isinstance(value.get("outer"), dict):
-            value, own = {**value, "outer": dict(value["outer"])}, value["outer"]
-            if own.get("kind") == "network" and "layers" in own:
-                networks.append({"name": "N", "reads": reads, "steps": _steps(own["layers"])})
-                call = ["network", "N", 0, *(states if isinstance(states, list) else [])]
-                value["outer"] = {"expression": call, **{k: v for k, v in own.items() if k not in ("kind", "layers")}}
-            elif own.get("kind") == "expression":
-                value["outer"] = {k: v for k, v in own.items() if k != "kind"}
-        made[key] = LATER if key == "schema" else value
+    states = data["plant"].get("states") if isinstance(data.get("plant"), dict) else None
+    names = states if isinstance(states, list) else []
+    networks, made = list[Any](), {**data, "schema": LATER}
+    policy, claim = data.get("policy"), data.get("claim")
+    if isinstance(policy, dict) and "layers" in policy:
+        networks.append({"name": "policy", "reads": len(names) or 1, "steps": _steps(policy["layers"])})
+        made["policy"] = {"network": "policy", **{k: v for k, v in policy.items() if k != "layers"}}
+    if isinstance(claim, dict) and isinstance(claim.get("outer"), dict):
+        made["claim"] = {**claim, "outer": _outer(claim["outer"], names, networks)}
     place = list(made).index("claim") + 1 if "claim" in made else 0
     entries = list(made.items())
     return dict([*entries[:place], ("networks", networks), *entries[place:]])
+
+
+def _outer(outer: Document, names: list[Any], networks: list[Any]) -> Document:
+    """N as an expression; a network of its own joins the others."""
+    if outer.get("kind") == "expression":
+        return {k: v for k, v in outer.items() if k != "kind"}
+    if outer.get("kind") != "network" or "layers" not in outer:
+        return outer
+    networks.append({"name": "N", "reads": len(names) or 1, "steps": _steps(outer["layers"])})
+    rest = {k: v for k, v in outer.items() if k not in ("kind", "layers")}
+    return {"expression": ["network", "N", 0, *names], **rest}
 
 
 def _steps(layers: Any) -> Any:
