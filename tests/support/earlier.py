@@ -6,6 +6,7 @@ in a document of format 8 is wrong in what becomes of it, at the place that its 
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 Document = dict[str, Any]
@@ -68,6 +69,23 @@ def earlier(data: Document) -> Document:
             {"kind": "network", "layers": networks[tree[1]]} if called else {"kind": "expression", "expression": tree}
         )
         made["claim"] = {**data["claim"], "outer": {**stated, **rest}}
+    return made
+
+
+def strictly_earlier(data: Any) -> Document:
+    """The document of format 8 from which this one of format 9 comes.
+
+    Raises
+    ------
+    ValueError : it comes from none.
+    """
+    try:
+        made = earlier(data) if data["schema"] == LATER else None
+        same = made is not None and json.dumps(newer(made), sort_keys=True) == json.dumps(data, sort_keys=True)
+    except (KeyError, TypeError, AttributeError, IndexError) as error:
+        raise ValueError("no document of layers") from error
+    if made is None or not same:
+        raise ValueError("no document of layers")
     return made
 
 
