@@ -566,3 +566,17 @@ def test_a_practical_claim_with_one_level_asks_the_leaves(tmp_path: Path) -> Non
     for wrong in ("x", ["*", "-1", "x", ["/", "x", "x"]]):
         assert outcome(dump(grow(edited(stable, "plant.dynamics.0", wrong), max_leaves=50)), tmp_path) == "ring"
     assert outcome(dump(edited(stable, "evidence.tree", "AA==")), tmp_path) == "tree"
+
+
+def test_the_format_s_own_example_is_accepted_with_its_margin(tmp_path: Path) -> None:
+    """FORMAT.md prints one certificate in full and works out its numbers."""
+    text = (Path(document.__file__).parent / "FORMAT.md").read_text(encoding="utf-8")
+    [example] = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
+    file = write(example.encode(), tmp_path)
+    answer = run(file)
+    assert "ACCEPTED c1=0.25 c2=2.0" in answer.stdout and "margins: local 62.9%" in answer.stdout
+    [margin] = re.findall(r"a margin of ([0-9.]+) %", text)
+    assert f"local {margin}%" in answer.stdout
+    judge = [sys.executable, "-m", "certify.reference", str(file)]
+    assert "ACCEPTED" in subprocess.run(judge, capture_output=True, text=True, check=False).stdout
+    assert "REJECTED rule=domain" in run(write(example.replace("+1", "+2").encode(), tmp_path)).stdout
