@@ -174,14 +174,12 @@ def numbers_of(k: int) -> int:
 
 def is_too_large(network: Network, k: int) -> bool:
     """True if jets of a network in k symbols take too much memory or time."""
-    columns, products = k, 0
-    for number, step in enumerate(network.steps):
-        if isinstance(step, Affine) and number > 0:
-            rows, width = step.weight.shape
-            products += rows * columns * width + rows * columns * numbers_of(k)
-            if columns * (rows + numbers_of(k)) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
+    products = 0
+    for rows, width, before in network.shapes:
+        if before:
+            products += rows * (k + before) * (width + numbers_of(k))
+            if (k + before) * (rows + numbers_of(k)) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
                 return True
-        columns += 0 if isinstance(step, Affine | Sum | Concat) else step.size
     return False
 
 

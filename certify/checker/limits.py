@@ -12,7 +12,7 @@ from math import prod
 from .case import Case, Failures
 from .document import Array, Certificate, Partition
 from .expression import Tape
-from .networks import Affine, Clip, Map, Network, Observe
+from .networks import Network
 
 MOST_NUMBERS = 2**25
 MOST_WORK, MOST_IN_PATIENCE = 3 * 2**37, 2**46  # ten minutes; many hours, if somebody says that there is time for it
@@ -38,38 +38,38 @@ def in_short(count: int) -> str:
 
 
 class Net:
-    """The sums over the affine steps of networks: rows, columns, and the units of the network before each."""
+    """Sums over the steps of networks, as `Network.shapes` has them."""
 
     def __init__(self, networks: Sequence[Network]) -> None:
-        self.units, self.affine = 0, list[tuple[int, int, int]]()
-        for network in networks:
-            before = 0
-            for step in network.steps:
-                if isinstance(step, Affine):
-                    self.affine.append((*step.weight.shape, before))
-                elif isinstance(step, Map | Clip | Observe):
-                    before += step.size
-            self.units += before
-        self.widest = max((step.size for network in networks for step in network.steps), default=0)
-        self.steps = sum(len(network.steps) for network in networks)
-        self.entries = sum(rows * columns for rows, columns, _ in self.affine)
+        steps = [step for network in networks for step in network.steps]
+        self.steps = [shape for network in networks for shape in network.shapes]
+        self.units, self.kept = sum(step.units for step in steps), sum(network.kept for network in networks)
+        self.widest, self.reads = max((step.size for step in steps), default=0), sum(len(step.of) for step in steps)
+        self.entries = sum(rows * columns for rows, columns, _ in self.steps)
 
     @property
     def folded(self) -> int:
-        return sum(r * c * (2**9 + 8 * min(r, c)) for r, c, _ in self.affine)
+        return sum(r * c * (2**9 + 8 * min(r, c)) for r, c, _ in self.steps)
 
     @property
     def paths(self) -> int:
-        return sum(r * before * (c + 3 * 2**6) for r, c, before in self.affine) // 8
+        return sum(r * before * (c + 3 * 2**6) for r, c, before in self.steps) // 8
+
+    def held_on_leaves(self, symbols: int) -> int:
+        """Vectors that wait for a step, on as many leaves as are examined at once."""
+        return 2**14 * (self.reads + self.kept * symbols)
+
+    def held_on_a_ball(self, d: int, t: int) -> int:
+        return sum(4 * r * (d + before) for r, _, before in self.steps) + 3 * self.units * t
 
     def on_a_leaf(self, symbols: int) -> int:
-        return sum(r * (c * (symbols + 2) + 5 * before + 64 * symbols + 7 * 2**9) for r, c, before in self.affine)
+        return sum(r * (c * (symbols + 2) + 5 * before + 64 * symbols + 7 * 2**9) for r, c, before in self.steps)
 
     def on_a_ball(self, d: int, t: int) -> int:
-        return sum(r * (c * (d + before) + before * t) + 2**21 for r, c, before in self.affine) + 64 * self.units * t
+        return sum(r * (c * (d + before) + before * t) + 2**21 for r, c, before in self.steps) + 64 * self.units * t
 
     def models(self, area: int) -> int:
-        return sum(r * area * (2 * c + 64) for r, c, _ in self.affine)
+        return sum(r * area * (2 * c + 64) for r, c, _ in self.steps)
 
 
 class Sizes:
@@ -97,14 +97,16 @@ class Sizes:
         order = max(self.evidence.order, self.evidence.local.order if self.evidence.local else 1)
         values = (4 * order if self.c.sample else 1) * self.a + 2 * self.n + 8
         if self.asked or self.c.outer:
-            found += values * (self.s + 1) ** 2 + 2**14 * (self.n + self.m + self.z + self.net.steps)
+            found += values * (self.s + 1) ** 2 + 2**14 * (self.n + self.m + self.z)
+            found += self.net.held_on_leaves(self.s + self.m + self.z)
         if self.evidence.local or self.evidence.contraction or self.evidence.tube:
             found += values * (self.t + self.d * self.y + self.m + self.z) + self.d**4 // 4
-            found += sum(4 * rows * before for rows, _, before in self.net.affine) + 3 * self.net.units * self.t
+            found += self.net.held_on_a_ball(self.d, self.t)
         if self.c.outer:
             tape, area = self.c.outer.function, (self.s + 1) ** 2
             N, of_tape = Net(_called(tape)), tape.size
-            found += 4 * N.entries + 2 * N.units * area + 8 * of_tape * area
+            found += 4 * N.entries + sum(2 * rows * area for rows, *_ in N.steps) + 8 * of_tape * area
+            found += N.held_on_leaves(self.s + 1)
         return found
 
     # --------------------------------------------------------------------------------------------------------- work
@@ -157,7 +159,7 @@ class Sizes:
         return times * (leaves * each // 8 + batches * self.net.paths)
 
     def of_ring(self, leaves: int) -> int:
-        order, calls = self._partition.order, self.n * self.s**2 + 160 * self.net.steps
+        order, calls = self._partition.order, self.n * self.s**2 + 160 * self.net.reads
         models = self.a * self.evaluations(order) + self.n**2 + 4 * self.n
         return self.boxes(leaves, models, self.a * (order + 1), self.s, calls) + self.policies(leaves)
 
@@ -202,13 +204,13 @@ class Sizes:
             return 0
         tape = self.c.outer.function
         N, of_tape = Net(_called(tape)), tape.size
-        calls, values = 200 * N.steps, max(N.widest, 2 * of_tape)
+        calls, values = 200 * N.reads, max(N.widest, 2 * of_tape)
         faces, leaves = sum(tree.count(LEAF) for tree in evidence.faces), evidence.tree.count(LEAF)
         found = N.folded + self.inverse(self.bits(evidence.T))
         found += 2**8 * sum(map(len, (evidence.tree, *evidence.faces)))
         found += self.boxes(faces, of_tape, values, self.n, calls) + faces * N.models((self.n + 4) ** 2)
         found += (faces + leaves) * N.on_a_leaf(self.n + 1) // 8 + (1 + faces + leaves) * N.paths
-        models, calls = self.a + 8 * of_tape + 4 * self.n, calls + self.n * self.s**2 + 160 * self.net.steps
+        models, calls = self.a + 8 * of_tape + 4 * self.n, calls + self.n * self.s**2 + 160 * self.net.reads
         found += self.boxes(leaves, models, max(values, self.a), self.s, calls)
         return found + leaves * N.models((self.s + 4) ** 2) + self.policies(leaves)
 

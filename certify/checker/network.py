@@ -222,8 +222,8 @@ class OnBoxes(Algebra[Enclosed]):
 
 def enclose(network: Network, x: Form, entries: Sequence[int]) -> Form:
     """Some entries of the network's value on boxes, x (k + 1, reads, B) being the argument."""
-    boxes = OnBoxes(network, x)
-    rows = np.eye(network.gives)[list(entries)]
+    boxes, rows = OnBoxes(network, x), np.zeros((len(entries), network.gives))
+    rows[range(len(entries)), list(entries)] = 1.0
     return Form(boxes.last.h.value[:, list(entries)], boxes.backwards(rows))
 
 

@@ -40,6 +40,11 @@ class Step:
         """The numbers that the file states."""
         return ()
 
+    @property
+    def units(self) -> int:
+        """Entries that add something to their tangents on a ball, at most."""
+        return 0 if isinstance(self, Affine | Sum | Concat) else self.size
+
 
 @dataclass(frozen=True, eq=False)
 class Affine(Step):
@@ -110,6 +115,27 @@ class Network:
     def operations(self) -> int:
         """Operations of all expressions of `observe`."""
         return sum(len(step.tape.operations) for step in self.steps if isinstance(step, Observe))
+
+    @cached_property
+    def shapes(self) -> list[tuple[int, int, int]]:
+        """For rule `limits`, steps with their rows, columns, and the units before them.
+
+        A step that is not `affine` has its entries as rows, the vectors that it reads as columns. A `map` of what an
+        `affine` step has just made is part of that.
+        """
+        found, before, last = list[tuple[int, int, int]](), 0, None
+        for k, step in enumerate(self.steps):
+            if isinstance(step, Affine):
+                found.append((*step.weight.shape, before))
+            elif not (isinstance(step, Map) and isinstance(last, Affine) and step.of == (k,)):
+                found.append((step.size, len(step.of), before))
+            before, last = before + step.units, step
+        return found
+
+    @property
+    def kept(self) -> int:
+        """The number of vectors that a step reads which is not the next."""
+        return len({i for k, step in enumerate(self.steps) for i in step.of if i < k})
 
     @property
     def is_chain(self) -> bool:
@@ -184,7 +210,7 @@ KEYS = {
 
 def _step(value: Value, sizes: Sequence[int]) -> Step:
     """A step after vectors of these sizes."""
-    known = isinstance(value.raw, dict) and value.raw.get("kind") in KEYS
+    known = isinstance(value.raw, dict) and isinstance(value.raw.get("kind"), str) and value.raw["kind"] in KEYS
     value.must(known, f"an object of kind {' or '.join(KEYS)}")
     kind = value.raw["kind"]
     _, of, *others = value.keys(f"kind of {KEYS[kind]}")
@@ -261,7 +287,7 @@ class Algebra(ABC, Generic[V]):
         for k, step in enumerate(network.steps, 1):
             vectors[k] = self.make(step, [vectors[i] for i in step.of])
             left.subtract(step.of)
-            for i in set(step.of):
+            for i in {*step.of, k} - {len(network.steps)}:
                 if not left[i]:
                     del vectors[i]
         return vectors[len(network.steps)]  # type: ignore[no-any-return]

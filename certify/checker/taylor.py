@@ -20,7 +20,6 @@ import numpy as np
 from .functions import FUNCTIONS, Derivative, Expansion
 from .near import ZERO, Above, Array, Form, Near, combined, near, products, size
 
-
 _NOISE = 2.0**-30  # of all coefficients
 
 
