@@ -1,17 +1,18 @@
-"""Certificates for the tests of the proofs in Coq: plain dictionaries in the format of the file."""
+"""Certificates for the tests of the proofs in Coq: plain dictionaries in the format of the file, format 9."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from certify.certificates import loop_sections
+from certify.certificates.encoding import network_section
 from certify.loop.plants import get_system, load_system
-from certify.loop.policies import load_policy
-from tests.support.certificates import make
+from certify.loop.policies import TanhNetwork, load_policy
+from tests.support.certificates import dump, make
+from tests.support.earlier import newer
 
 Document = dict[str, Any]
 ROOT = Path(__file__).parent.parent.parent
@@ -23,8 +24,9 @@ def pendulum(level: float = 0.999999) -> Document:
     """The pendulum under the policy that ships, with the largest set that is proved of it."""
     network = load_policy(ROOT / "examples" / "policies" / "pendulum.pt").network
     return {
-        "schema": "certify-certificate/8",
+        "schema": "certify-certificate/9",
         "claim": {"kind": "asymptotic", "rate": (0.0).hex(), "sample": None, "outer": None},
+        "networks": _networks(network),
         **loop_sections(get_system("pendulum"), network),
         "lyapunov": {"kind": "quadratic", "P": PENDULUM_P},
         "levels": {"local": (0.1).hex(), "roa": level.hex()},
@@ -43,13 +45,19 @@ def van_der_pol() -> Document:
     sections["plant"]["dynamics"][1] = ["+", "u", "x1", product]
     return pendulum(float.fromhex("0x1.0195ba0d914e0p+0")) | {
         **sections,
+        "networks": _networks(network),
         "lyapunov": {"kind": "quadratic", "P": "QIsBytoP4z9YzrRRitjJv1jOtFGK2Mm/CacyC7q61z8="},
     }
 
 
+def _networks(network: TanhNetwork) -> list[Document]:
+    return [network_section("policy", network.weights, network.biases)]
+
+
 def scalar() -> Document:
     """xdot = x/2 + u, u = -tanh(x), on {x^2 <= 1}, by hand: it decays as |x| < 1.915."""
-    return make([["+", ["*", "1/2", "x"], "u"]], [([[1.0]], [0.0])], [[1.0]], (0.5, 1.0), centre="none", scale=(-1.0,))
+    layers = [([[1.0]], [0.0])]
+    return newer(make([["+", ["*", "1/2", "x"], "u"]], layers, [[1.0]], (0.5, 1.0), centre="none", scale=(-1.0,)))
 
 
 def everything() -> Document:
@@ -67,13 +75,13 @@ def everything() -> Document:
         (rng.standard_normal((3, 2)), rng.standard_normal(3)),
         (rng.standard_normal((2, 3)), np.array([0.0, -0.5])),
     ]
-    return make(
+    return newer(make(
         [first, second], layers, [[1.0, 0.125], [0.125, 0.3]], (0.001, 0.01), states=("x", "y"), inputs=("u", "w"),
         u_eq=("1/7", "0"), domain=(("-1/2", "157/50"), ("-1", "1")), input_bounds=(("-1", "3/2"), ("-2", "2")),
         centre="output", scale=(0.1, -0.7), offset=(1e-300, 3.0),
-    )  # fmt: skip
+    ))  # fmt: skip
 
 
 def raw(data: Document) -> bytes:
-    """The bytes of a certificate."""
-    return json.dumps(data).encode("ascii")
+    """The bytes of a certificate; a document of format 8 becomes one of today."""
+    return dump(data)

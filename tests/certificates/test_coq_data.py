@@ -7,6 +7,7 @@ import hashlib
 import math
 import re
 import struct
+from collections.abc import Callable
 from fractions import Fraction
 from typing import Any
 
@@ -18,6 +19,7 @@ from certify.certificates.coq.text import claim_text, dyadic, number
 from certify.errors import CertifyError, InputError
 from tests.certificates.coq_cases import Document, everything, pendulum, raw, scalar
 from tests.support.certificates import edited, encode, policy_hash, rehash
+from tests.support.earlier import earlier
 
 # Reading Coq's text: numbers, names, applications, lists and pairs.
 
@@ -144,7 +146,10 @@ def test_every_number_of_the_certificate_is_in_coqs_text(data: Document) -> None
             numbers(policy["scale"]), numbers(policy["offset"]), plant["u_eq"], plant["input_bounds"], strict=True
         )
     ]
-    for k, layer in enumerate(policy["layers"], 1):
+    (network,) = data["networks"]
+    affine = [step for step in network["steps"] if step["kind"] == "affine"]
+    assert network["name"] == policy["network"] and len(network["steps"]) == 2 * len(affine) - 1
+    for k, layer in enumerate(affine, 1):
         weights = rows(layer["weight"], layer["shape"][1])
         assert found[f"layer_{k}"][0] == "layer"
         assert found[f"layer_{k}"][1] == [
@@ -152,7 +157,7 @@ def test_every_number_of_the_certificate_is_in_coqs_text(data: Document) -> None
         ]
     squash = {"tanh": "ByTanh", "identity": "ByIdentity"}[policy["squash"]]
     centre = {"output": "AtOutput", "preactivation": "AtPreactivation", "none": "NotCentred"}[policy["centre"]]
-    layers = [f"layer_{k}" for k in range(1, len(policy["layers"]) + 1)]
+    layers = [f"layer_{k}" for k in range(1, len(affine) + 1)]
     assert found["certificate"] == (
         "certificate",
         ("Certificate", "field", "domain", "channels", layers, squash, centre, "P", "level"),
@@ -178,7 +183,7 @@ def test_the_hashes_are_those_of_the_bytes() -> None:
     given = raw(everything())
     text = claim_text(read_claim(given), Fraction(1))
     assert f"sha256 of the certificate: {hashlib.sha256(given).hexdigest()}\n" in text
-    assert f"sha256 of its policy:      {policy_hash(everything()['policy'])}\n" in text
+    assert f"sha256 of its policy:      {policy_hash(earlier(everything())['policy'])}\n" in text
     assert hashlib.sha256(given + b" ").hexdigest() in claim_text(read_claim(given + b" "), Fraction(1))
 
 
@@ -222,11 +227,12 @@ def test_names_say_nothing_to_coq() -> None:
 
 UNSUPPORTED = {
     "claims of kind practical": ("claim.kind", "practical"),
-    "an outer set": ("claim.outer", {"kind": "network"}),
+    "an outer set": ("claim.outer", {"expression": "x", "level": (1.0).hex()}),
     "an input that is held": ("claim.sample", ["0", "1/10"]),
     "plants in discrete time": ("plant.time", "discrete"),
     "uncertain quantities": ("plant.uncertain", [{"name": "q", "range": ["0", "1"]}]),
     "a clip": ("policy.clip", [encode([-1.0]), encode([1.0])]),
+    "more than one network": ("networks", lambda networks: [*networks, networks[0] | {"name": "N"}]),
     "functions V of kind network": ("lyapunov.kind", "network"),
 }
 
@@ -235,6 +241,24 @@ UNSUPPORTED = {
 def test_what_coqs_statement_cannot_say_is_refused(found: str) -> None:
     with pytest.raises(InputError, match=rf"found {found}.*a proof in Coq is there for"):
         read_claim(raw(rehash(edited(scalar(), *UNSUPPORTED[found]))))
+
+
+TANH: Document = {"kind": "map", "of": [1], "function": "tanh"}
+OTHER_STEPS = "affine steps with tanh between them"
+
+
+def then(step: Document) -> Callable[[list[Document]], list[Document]]:
+    """A network of one layer goes on with a step, and the layer again."""
+    return lambda steps: [*steps, step, steps[0] | {"of": [2]}]
+
+
+def deep(layers: int) -> Callable[[list[Document]], list[Document]]:
+    """A network of one layer has it so many times."""
+    return lambda steps: [(TANH if k % 2 else steps[0]) | {"of": [k]} for k in range(2 * layers - 1)]
+
+
+def without(key: str) -> Callable[[Document], Document]:
+    return lambda section: {k: v for k, v in section.items() if k != key}
 
 
 MALFORMED = {
@@ -248,8 +272,8 @@ MALFORMED = {
     "a provenance that is a list": ("provenance", [], "provenance must be an object"),
     "an integer of eleven digits": ("provenance", {"seed": 10**10}, "integers must have at most 10 characters"),
     "a layer of 16,385 rows": (
-        "policy.layers",
-        [{"shape": [16385, 1], "weight": "", "bias": ""}],
+        "networks.0.steps",
+        [{"kind": "affine", "of": [0], "shape": [16385, 1], "weight": "", "bias": ""}],
         "at most 16384 rows",
     ),
     "another policy": ("policy.scale", encode([-2.0]), "sha256 must be"),
@@ -277,7 +301,32 @@ MALFORMED = {
     "a power of 0": ("plant.dynamics.0", ["**", "x", 0], "integer exponent"),
     "a power of True": ("plant.dynamics.0", ["**", "x", True], "integer exponent"),
     "equations less": ("plant.dynamics", [], "`dynamics` must be a list of 1"),
-    "layers that do not chain": ("policy.layers.0.shape", [1, 2], "layers must lead from"),
+    "a call in an equation": ("plant.dynamics.0", ["network", "policy", 0, "x"], "found 'policy'"),
+    "a clip in an equation": ("plant.dynamics.0", ["clip", "x", "-1", "1"], "operators must be those"),
+    "a least in an equation": ("plant.dynamics.0", ["min", "x", "u"], "operators must be those"),
+    "layers that do not chain": ("networks.0.steps.0.shape", [1, 2], "layers must lead from"),
+    "a layer of another shape": ("networks.0.steps.0.shape", [True, 1], r"must have a shape \[out, in\]"),
+    "a layer with an unknown key": ("networks.0.steps.0", lambda step: step | {"gain": "2"}, "found the keys .*gain"),
+    "a layer less a key": ("networks.0.steps.0", without("bias"), "a step must have"),
+    "a layer of another vector": ("networks.0.steps.0.of", [1], OTHER_STEPS),
+    "a layer of False": ("networks.0.steps.0.of", [False], "a step must have"),
+    "a layer more": ("networks.0.steps", then(TANH), "sha256 must be"),
+    "a tanh with an unknown key": ("networks.0.steps", then(TANH | {"gain": "2"}), "found the keys .*gain"),
+    "a tanh that is not named": ("networks.0.steps", then({"kind": "map", "of": [1]}), "a step must have"),
+    "another function": ("networks.0.steps", then(TANH | {"function": "sin"}), OTHER_STEPS),
+    "a tanh of the argument": ("networks.0.steps", then(TANH | {"of": [0]}), OTHER_STEPS),
+    "a tanh of True": ("networks.0.steps", then(TANH | {"of": [True]}), "a step must have"),
+    "a tanh at the end": ("networks.0.steps", lambda steps: [*steps, TANH], OTHER_STEPS),
+    "a sum": ("networks.0.steps", then({"kind": "sum", "of": [0, 1]}), OTHER_STEPS),
+    "no steps": ("networks.0.steps", [], OTHER_STEPS),
+    "257 steps": ("networks.0.steps", deep(129), "at most 256 steps"),
+    "a network of a name that is none": ("networks.0.name", "a policy", "must have one named 'policy'"),
+    "a network with an unknown key": ("networks.0", lambda network: network | {"gives": 1}, "exactly the keys"),
+    "a network that reads two numbers": ("networks.0.reads", 2, "must read 1 states; found 2"),
+    "a network that reads True": ("networks.0.reads", True, "must read 1 states; found True"),
+    "a network twice": ("networks", lambda networks: 2 * networks, "found more than one network"),
+    "no network": ("networks", [], "must have one named 'policy'; found none"),
+    "a policy of another network": ("policy.network", "N", "must have one named 'N'"),
 }
 
 
@@ -286,6 +335,17 @@ def test_what_is_no_certificate_is_refused(name: str) -> None:
     path, value, message = MALFORMED[name]
     with pytest.raises(CertifyError, match=message):
         read_claim(raw(edited(scalar(), path, value)))
+
+
+def test_a_network_has_a_name() -> None:
+    data = edited(edited(scalar(), "policy.network", "a policy"), "networks.0.name", "a policy")
+    with pytest.raises(CertifyError, match="a network's name must be an identifier"):
+        read_claim(raw(data))
+
+
+def test_networks_of_the_most_steps_are_read() -> None:
+    data = edited(scalar(), "networks.0.steps", deep(128))
+    assert len(data["networks"][0]["steps"]) == 255 and len(read_claim(raw(rehash(data))).network.weights) == 128
 
 
 def test_a_matrix_that_is_not_symmetric_is_refused() -> None:
@@ -303,7 +363,8 @@ def test_a_matrix_that_is_not_symmetric_is_refused() -> None:
         (b'{"schema": 1, "schema": 2}', "each key once"),
         (b'{"schema": 1.5}', "must not be decimal"),
         (b'{"schema": NaN}', "must not be decimal"),
-        (b'{"schema": "certify-certificate/8"}', "must be as FORMAT.md has it"),
+        (b'{"schema": "certify-certificate/8"}', "must have the schema.*An earlier release"),
+        (b'{"schema": "certify-certificate/9"}', "must be as FORMAT.md has it"),
     ],
 )
 def test_bytes_that_are_no_certificate_are_refused(given: bytes, message: str) -> None:

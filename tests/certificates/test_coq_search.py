@@ -208,7 +208,7 @@ def test_limits_end_the_search() -> None:
         ("plant.dynamics.0", ["+", ["*", "1/2", "x"], "u", "1/9"], r"found 1/9 in entry 0"),
         ("plant.dynamics.0", ["+", ["*", "1/2", "x"], "u", ["sin", "1"]], "found no rational number"),
         ("plant.dynamics.0", ["+", "u", ["/", "x", "x"]], "found no rational number"),
-        ("policy.layers.0.bias", encode([0.5]), "must have no biases"),
+        ("networks.0.steps.0.bias", encode([0.5]), "must have no biases"),
         ("policy.offset", encode([0.5]), "must have no biases and the offset u_eq"),
     ],
 )

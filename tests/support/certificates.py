@@ -26,7 +26,7 @@ from certify.checker.errors import Rejected
 from certify.checker.near import within
 from certify.checker.outer import Beyond
 from certify.checker.ring import Ring
-from tests.support.earlier import newer
+from tests.support.earlier import earlier, newer
 
 Document = dict[str, Any]
 LEAF = 255
@@ -57,7 +57,8 @@ def policy_hash(policy: Document) -> str:
 
 
 def rehash(data: Document) -> Document:
-    data["policy"]["sha256"] = policy_hash(data["policy"])
+    """The document, of format 8 or 9, with the hash of its policy, whose network has layers."""
+    data["policy"]["sha256"] = policy_hash(earlier(data)["policy"])
     return data
 
 

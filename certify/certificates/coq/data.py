@@ -30,7 +30,7 @@ from certify.loop.policies import TanhNetwork
 Array = NDArray[np.float64]
 Interval = tuple[Fraction, Fraction]
 _MOST = 64  # states, inputs
-_MOST_ROWS = 2**14  # of a layer
+_MOST_STEPS, _MOST_ROWS = 256, 2**14  # of a network, of a layer
 _LONGEST = 10  # characters of an integer
 _KEYS = {
     "certificate": ("schema", "claim", "networks", "plant", "policy", "lyapunov", "levels", "evidence", "provenance"),
@@ -40,10 +40,12 @@ _KEYS = {
     "lyapunov": ("kind", "P"),
     "levels": ("local", "roa"),
 }
+_NETWORK_KEYS = ("name", "reads", "steps")
+_STEP_KEYS = ({"kind", "of", "shape", "weight", "bias"}, {"kind", "of", "function"})  # of a layer, of a tanh
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}", re.ASCII)
 _WHAT_IS = (
     "a proof in Coq is there for claims of kind asymptotic in continuous time, nothing of the plant uncertain, no "
-    "input held over a period, no clip, no set beyond the ellipsoid, V = x'Px"
+    "input held over a period, no clip, no set beyond the ellipsoid, no network but the policy's, V = x'Px"
 )
 
 
@@ -114,7 +116,7 @@ def _claimed(data: Any, sha256: str) -> Claimed:
             f"a certificate must have the schema {SCHEMA!r}; found another.{f' {known}' if known else ''}"
         )
     claim, plant, policy, lyapunov, levels = (data[k] for k in ("claim", "plant", "policy", "lyapunov", "levels"))
-    _require_supported(claim, plant, policy, lyapunov)
+    _require_supported(claim, data["networks"], plant, policy, lyapunov)
     for name, section in {"certificate": data, **{k: data[k] for k in _KEYS if k != "certificate"}}.items():
         if not isinstance(section, dict) or set(section) != set(_KEYS[name]):
             raise CertificateFormatError(
@@ -153,12 +155,13 @@ def _claimed(data: Any, sha256: str) -> Claimed:
     )
 
 
-def _require_supported(claim: Any, plant: Any, policy: Any, lyapunov: Any) -> None:
+def _require_supported(claim: Any, networks: Any, plant: Any, policy: Any, lyapunov: Any) -> None:
     found = {
         f"claims of kind {claim['kind']}": claim["kind"] != "asymptotic",
         "an outer set": claim["outer"] is not None,
         "an input that is held over a period": claim["sample"] is not None,
         f"plants in {plant['time']} time": plant["time"] != "continuous",
+        "more than one network": len(networks) > 1,
         "uncertain quantities": plant["uncertain"] != [],
         "a clip": policy["clip"] is not None,
         f"functions V of kind {lyapunov['kind']}": lyapunov["kind"] != "quadratic",
@@ -169,17 +172,25 @@ def _require_supported(claim: Any, plant: Any, policy: Any, lyapunov: Any) -> No
 
 
 def _network(policy: Mapping[str, Any], stated: Mapping[str, Any], n: int, m: int) -> TanhNetwork:
-    layers = layers_of(stated)
-    if set(stated) != {"name", "reads", "steps"} or stated["reads"] != n or type(stated["reads"]) is not int:
-        raise CertificateFormatError(f"the policy's network must have a name, steps, and read {n} states.")
+    layers, steps = layers_of(stated), stated["steps"]
+    if set(stated) != set(_NETWORK_KEYS) or not isinstance(steps, list) or len(steps) > _MOST_STEPS:
+        raise CertificateFormatError(
+            f"the policy's network must have exactly the keys {', '.join(_NETWORK_KEYS)}, and a list of at most "
+            f"{_MOST_STEPS} steps; found {str(sorted(stated))[:200]} and {len(steps)}."
+        )
+    _name(stated["name"], "a network's name")
+    if stated["reads"] != n or type(stated["reads"]) is not int:
+        raise CertificateFormatError(f"the policy's network must read {n} states; found {str(stated['reads'])[:40]}.")
+    for k, step in enumerate(steps):
+        if set(step) != _STEP_KEYS[k % 2] or type(step["of"][0]) is not int:
+            raise CertificateFormatError(
+                f"a step must have a kind, the number of a vector in `of`, and a function or a shape [out, in], a "
+                f"weight and a bias, nothing else; found the keys {str(sorted(step))[:200]}."
+            )
     shapes = [tuple(layer["shape"]) for layer in layers]
-    for layer, shape in zip(layers, shapes, strict=True):
-        if (
-            set(layer) != {"kind", "of", "shape", "weight", "bias"}
-            or len(shape) != 2
-            or any(type(k) is not int or k < 1 for k in shape)
-        ):
-            raise CertificateFormatError(f"a layer must have a shape [out, in], a weight and a bias; found {shape}.")
+    for shape in shapes:
+        if len(shape) != 2 or any(type(k) is not int or k < 1 for k in shape):
+            raise CertificateFormatError(f"a layer must have a shape [out, in]; found {shape}.")
     if any(shape[0] > _MOST_ROWS for shape in shapes):
         raise CertificateFormatError(f"a layer must have at most {_MOST_ROWS} rows; found the shapes {shapes}.")
     if shapes[0][1] != n or shapes[-1][0] != m or any(b[1] != a[0] for a, b in pairwise(shapes)):
