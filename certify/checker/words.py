@@ -127,13 +127,12 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
 
 
 def _network(network: Network) -> str:
-    """The network's form, or its steps, of vectors v0 = x, v1, v2 and so on."""
-    numbers = (
-        f"sha256 {hashed('certify-network/1', [a for step in network.steps for a in step.arrays], network.words())}"
-    )
+    """The network's form, or its steps, of vectors v0 = x, v1, v2 and so on; by its hash reports name N too."""
+    arrays = [array for step in network.steps for array in step.arrays]
+    sha256 = hashed("certify-lyapunov/1\0", arrays, network.words())
     if network.is_chain:
-        return f"{'-'.join(map(str, network.widths))} tanh, {numbers}"
-    return f"{'; '.join(f'v{k} = {_step(step)}' for k, step in enumerate(network.steps, 1))}; {numbers}"
+        return f"{'-'.join(map(str, network.widths))} tanh, sha256 {sha256}"
+    return f"{'; '.join(f'v{k} = {_step(step)}' for k, step in enumerate(network.steps, 1))}; sha256 {sha256}"
 
 
 def _step(step: Step) -> str:

@@ -53,8 +53,10 @@ def test_the_largest_level_ends_where_the_function_rises(tmp_path: Path) -> None
     assert 0.99 < result.outer.level < 1 and result.outer.limit == "witness"
     assert result.outer.witness is not None and 0.99 < abs(result.outer.witness[0]) < 1.01
     assert abs(result.outer.volume - 2) < 5 * result.outer.deviation + 0.01
-    stated = json.loads((tmp_path / "certificate.json").read_text())["claim"]["outer"]
-    assert stated["kind"] == "expression" and float.fromhex(stated["level"]) == result.outer.level
+    data = json.loads((tmp_path / "certificate.json").read_text())
+    stated = data["claim"]["outer"]
+    assert stated["expression"] == ["**", "x", 2] and [one["name"] for one in data["networks"]] == ["policy"]
+    assert float.fromhex(stated["level"]) == result.outer.level
     assert result.checker is not None and result.checker["outer"]["level"] == result.outer.level
 
 
