@@ -153,7 +153,7 @@ def test_the_version_says_what_a_verdict_rests_on(capsys: pytest.CaptureFixture[
     assert _run(["--version"], False) == 0
     text = capsys.readouterr().out
     assert text.startswith(f"certify {certify.__version__}\n")
-    for part in ("certify-certificate/8", "certify-policy/1", f"numpy {np.__version__}", "python-flint"):
+    for part in ("certify-certificate/9", "certify-policy/1", f"numpy {np.__version__}", "python-flint"):
         assert part in text
     for program in ("checker", "reference"):
         assert f"{program:<10} sha256 {source_sha256(program)}" in text  # type: ignore[arg-type]

@@ -16,7 +16,7 @@ from certify.loop.expressions import Expression, Operation, Tree, constant_of, g
 from certify.loop.plants import System
 from certify.loop.policies import TanhNetwork
 
-MOST_STATES, MOST_LAYERS, MOST_ROWS = 64, 64, 2**14
+MOST_STATES, MOST_LAYERS, MOST_ROWS = 64, 128, 2**14
 MOST_NODES, MOST_DEPTH, MOST_EXPONENT, MOST_DIGITS = 20_000, 200, 64, 1201
 MOST_NUMBERS = 2**26  # operations times the numbers of a jet, under the rule `local`
 _LARGEST = Fraction(2) ** 1000

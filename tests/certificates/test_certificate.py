@@ -21,6 +21,7 @@ from certify.checker import ball as checker_ball
 from certify.checker import document as checker_document
 from certify.checker import exact as checker_exact
 from certify.checker import expression as checker_expression
+from certify.checker import networks as checker_networks
 from certify.errors import CertificateFormatError, InputError
 from certify.loop.expressions import Number, from_tree, symbols, tan, to_tree
 from certify.loop.plants import available_systems, get_system
@@ -128,7 +129,7 @@ TAMPERED: dict[str, tuple[Callable[[Document], None], str]] = {
     "equilibrium input": (replaced("plant", "u_eq", to=["1/1000000"]), "equilibrium"),
     "gravity": (constant("981/100", "981/10"), "local|ring"),
     "damping with the wrong sign": (constant('["-", ["*", ["/", "1/10",', '["-", ["*", ["/", "-1",'), "local|ring"),
-    "weights": (scaled("policy", "layers", 2, "weight", by=-1.0), "hash"),
+    "weights": (scaled("networks", 0, "steps", 4, "weight", by=-1.0), "hash"),
     "scale": (scaled("policy", "scale", by=1.25), "hash"),
     "centring": (replaced("policy", "centre", to="none"), "hash"),
     "schema": (replaced("schema", to="certify-certificate/2"), "format"),
@@ -198,7 +199,8 @@ def test_expressions_survive_the_round_trip() -> None:
         (lambda b: b"", "JSON"),
         (lambda b: b.replace(b'"0x1.', b'"0x01.', 1), "hex float"),
         (lambda b: b.replace(b'"shape": [16, 2]', b'"shape": [16, 99999999999999]', 1), "too long"),
-        (lambda b: b.replace(b'"shape": [16, 2]', b'"shape": [true, 2]', 1), "shape|out"),
+        (lambda b: b.replace(b'"shape": [16, 2]', b'"shape": [true, 2]', 1), "must be an integer from 1 to 16384"),
+        (lambda b: b.replace(b'"shape": [16, 2]', b'"shape": [16, 3]', 1), "must be [out, 2]"),
         (lambda b: b + b" " * (256 * 2**20), "larger"),
     ],
 )
@@ -241,10 +243,10 @@ def test_a_check_that_needs_patience_is_said(tmp_path: Path, monkeypatch: pytest
 
 def test_the_limits_are_the_checker_s() -> None:
     """The producer names what the checker would refuse; the two share no line, so the numbers are compared."""
-    assert (limits.MOST_STATES, limits.MOST_LAYERS, limits.MOST_ROWS) == (
+    assert (limits.MOST_STATES, 2 * limits.MOST_LAYERS - 1, limits.MOST_ROWS) == (
         checker_document.MAX_STATES,
-        checker_document.MAX_LAYERS,
-        checker_document.MAX_WIDTH,
+        checker_networks.MAX_STEPS - 1,  # tanh is between layers
+        checker_networks.MAX_WIDTH,
     )
     assert (limits.MOST_NODES, limits.MOST_DEPTH, limits.MOST_EXPONENT) == (
         checker_expression.MAX_OPERATIONS,

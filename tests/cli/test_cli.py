@@ -333,9 +333,7 @@ def test_a_certificate_of_another_version_is_told_who_reads_it(
     certificate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = certificate.read_text()
-    certificate.write_text(text.replace("certify-certificate/8", "certify-certificate/7", 1))
-    earlier = "commit eb6ab75 of certify was the last to read it. To have a certificate of today, run certify roa again"
-    for command, status, *more in (
+    commands: list[tuple[object, ...]] = [
         ("check", 1),
         ("check", 1, "--json"),
         ("check", 1, "--reference"),
@@ -343,13 +341,18 @@ def test_a_certificate_of_another_version_is_told_who_reads_it(
         ("report", 2),
         ("plot", 2, "--out", tmp_path / "f.svg"),
         ("prove-in-coq", 2, "--out", tmp_path / "coq"),
-    ):
-        found, out, err = run(capsys, command, certificate, *more)
-        assert found == status and earlier in err and ("REJECTED" in out) == (command == "check")
-    certificate.write_text(text.replace("certify-certificate/8", "certify-certificate/99", 1))
+    ]
+    for version, commit, some in ((8, "edc76f2", commands), (7, "eb6ab75", commands[:3])):
+        certificate.write_text(text.replace("certify-certificate/9", f"certify-certificate/{version}", 1))
+        last = f"commit {commit} of certify was the last to read it"
+        earlier = f"{last}. To have a certificate of today, run certify roa again"
+        for command, status, *more in some:
+            found, out, err = run(capsys, command, certificate, *more)
+            assert found == status and earlier in err and ("REJECTED" in out) == (command == "check")
+    certificate.write_text(text.replace("certify-certificate/9", "certify-certificate/99", 1))
     assert "A later release of certify wrote it" in run(capsys, "check", certificate)[2]
-    for other in ("certify-policy/1", "certify-certificate/x", "certify-certificate/8"):
-        certificate.write_text(text.replace('"certify-certificate/8"', f'"{other}"', 1).replace('"rational"', '"odd"'))
+    for other in ("certify-policy/1", "certify-certificate/x", "certify-certificate/9"):
+        certificate.write_text(text.replace('"certify-certificate/9"', f'"{other}"', 1).replace('"rational"', '"odd"'))
         assert "release" not in run(capsys, "check", certificate)[2]
 
 

@@ -27,7 +27,7 @@ from certify.certificates.claims import Asymptotic, conditions
 from certify.certificates.claims.queries import query
 from certify.certificates.verdict import Verdict
 from certify.checker import network as checker
-from certify.checker.document import Policy as CheckerPolicy
+from certify.checker.near import Form
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number
@@ -135,9 +135,20 @@ def test_ranges_that_meet_none_one_or_both_corners(who: str, mid: float, spread:
         require_enclosed(who, mid, [-spread / 2, spread / 2], error, -1.0, 1.0)
 
 
+def own_of_a_clip(mid: float, slopes: list[float], error: float) -> tuple[float, float, float]:
+    """What the checker's clip to [-1, 1] makes of a form whose own error is elsewhere: the slope by which that counts,
+    how far the clip is from this line, and what has been rounded."""
+    v = plain.form(np.array([[mid, *slopes]])[:, :, None], np.array([[error]]))
+    cut, slope, gap = checker.clipped(Form(v.value), v.range.error, np.array([-1.0]), np.array([1.0]))
+    return float(slope[0, 0]), float(gap.top[0, 0]), float(cut.error.top[0, 0])
+
+
 @pytest.mark.parametrize("who", ENCLOSURES)
 def test_nothing_changes_inside_and_all_is_known_beyond(who: str) -> None:
     mid, slopes, error = ENCLOSURES[who](0.25, [0.5, -0.125], 0.0625, -1.0, 1.0)
+    if who == "checker":  # it multiplies the error by a slope of 1, which rounds upwards
+        assert 0.0625 <= error < 0.0625 * (1 + 2**-48) and own_of_a_clip(0.25, [0.5, -0.125], 0.0625) == (1.0, 0.0, 0.0)
+        error = 0.0625
     assert (mid, slopes, error) == (0.25, [0.5, -0.125], 0.0625)
     mid, slopes, error = ENCLOSURES[who](7.0, [0.5, -0.125], 0.0625, -1.0, 1.0)
     assert abs(float(mid) - 1) < 1e-11 and slopes == [0.0, 0.0] and 0 <= float(error) < 1e-11
@@ -167,7 +178,7 @@ def test_the_policy_on_boxes_and_at_points(squash: str, centre: str) -> None:
     """The producer's and the checker's enclosures against ball arithmetic, and the policy in four arithmetics."""
     network = clipped_pendulum(squash, centre, 2.0)
     loop = ClosedLoop(get_system("pendulum"), network)
-    theirs = CheckerPolicy(*(getattr(network, f.name) for f in dataclasses.fields(CheckerPolicy)))
+    theirs = plain.policy(network)
     generator, active = np.random.default_rng(3), 0
     for size in (1e-3, 0.05, 0.4, 3.0):
         x = generator.standard_normal((2, 3, 6)) * np.array([1.0, size, size])[None, :, None]
@@ -281,12 +292,11 @@ def test_the_queries_ask_that_the_clip_does_not_act_on_the_local_level() -> None
 
 def test_a_file_with_a_clip_is_version_2_and_without_stays_version_1(tmp_path: Path) -> None:
     network = clipped_pendulum("tanh", "output", 2.0)
-    plain = dataclasses.replace(network, clip=None)
-    assert network.sha256() != plain.sha256()
+    unclipped = dataclasses.replace(network, clip=None)
+    assert network.sha256() != unclipped.sha256()
     assert network.sha256() != dataclasses.replace(network, clip=(network.clip[0], network.clip[1] * 2)).sha256()  # type: ignore[index]
-    theirs = CheckerPolicy(*(getattr(network, f.name) for f in dataclasses.fields(CheckerPolicy)))
-    assert theirs.sha256() == network.sha256()
-    for policy, version in ((network, "certify-policy/2"), (plain, "certify-policy/1")):
+    assert plain.policy(network).sha256() == network.sha256()
+    for policy, version in ((network, "certify-policy/2"), (unclipped, "certify-policy/1")):
         save_policy(tmp_path / "a.pt", Policy(policy, "pendulum"))
         stored = torch.load(tmp_path / "a.pt", weights_only=True)
         assert stored["format"] == version and ("clip" in stored["output"]) is (policy.clip is not None)

@@ -5,18 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from fractions import Fraction
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from flint import arb
 from numpy.typing import NDArray
 
 from certify.checker import near, network, taylor
+from certify.checker.document import Policy
 from certify.checker.expression import parse
 from certify.checker.functions import FUNCTIONS
 from certify.checker.near import Above, Form, Near
 from certify.checker.networks import Affine, Map, Network, Step
 from certify.checker.outer import Function
+
+if TYPE_CHECKING:
+    from certify.loop.policies import TanhNetwork
 
 Array = NDArray[np.float64]
 Pair = tuple[Any, Any]
@@ -191,6 +195,13 @@ def chain(weights: Sequence[Array], biases: Sequence[Array], name: str = "policy
             steps.append(Map((len(steps),), steps[-1].size, "tanh"))
         steps.append(Affine((len(steps),), len(W), W, b))
     return Network(name, weights[0].shape[1], tuple(steps))
+
+
+def policy(given: TanhNetwork) -> Policy:
+    """A policy of the producer as the checker has it."""
+    origin = given.origin if given.is_moved else None
+    own = given.scale, given.offset, given.squash, given.centre, given.clip, origin
+    return Policy(chain(given.weights, given.biases), *own)
 
 
 def layers(network: Network) -> list[tuple[Array, Array]]:
