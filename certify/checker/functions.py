@@ -439,7 +439,7 @@ class _Abs(Function):
         return _Corner(self, v0, radius)
 
     def lines(self, centre: Array, radius: Above) -> Lines:
-        """Of slopes near the chord's; |v| - s v is linear to both sides of 0, and so is extreme at ends, or at 0."""
+        """Slopes are near the chord's; |v| - s v is linear to both sides of 0, and so is extreme at ends, or at 0."""
         lo, hi = Near(centre, radius).ends
         s = np.clip((np.abs(hi) - np.abs(lo)) / (hi - lo), -1.0, 1.0)
         s = np.where(lo >= 0, 1.0, np.where(hi <= 0, -1.0, s))
