@@ -25,7 +25,7 @@ from .evidence import Ball, Path
 from .fields import exact
 from .loop import Field
 from .model import Model
-from .network import Units
+from .tangents import Units
 from .rational import positive_definite
 from .refusal import require
 from .symmetric import orders, pairs, places

@@ -6,12 +6,12 @@ all 0: constants have no g, and what is affine has no Q.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from functools import cache
 
-from flint import arb, arb_mat
+from flint import arb, arb_mat, fmpq
 
-from .balls import ONE, SPREAD, ZERO, derivatives, third, total
+from .balls import ONE, SPREAD, ZERO, derivatives, largest_fourth, third, total
 from .refusal import Refused
 
 HALF = ONE / 2
@@ -130,12 +130,50 @@ class Taylor:
         Q = plus(mix(p.c, q.Q, q.c, p.Q), outer + outer.transpose())
         return Taylor(p.c * q.c, q.g * p.c + p.g * q.c, Q, r)
 
+    def slopes(self, symbols: int) -> list[arb]:
+        """g, which has so many entries or none."""
+        return [ZERO] * symbols if self.g is None else list(self.g.entries())
+
+    @property
+    def reach(self) -> arb:
+        """A bound of how far the model is from c."""
+        return sum(self.reaches(), self.r)
+
+    def sign(self) -> int:
+        """1 or -1 where it certainly has this sign on all of the box, else 0."""
+        return 1 if self.c > self.reach else -1 if -self.c > self.reach else 0
+
     def function(self, name: str) -> Taylor:
-        """phi(c) + phi'(c) e + phi''(c) e^2 / 2 + phi'''(.) e^3 / 6 with e the model less its constant c."""
+        """phi of the model."""
+        if name == "abs":
+            return self.absolute()
+        at = derivatives(name, self.c)
+        return self.expanded(name, at[:3], third(name, at[3], self.c, self.reach))
+
+    def slope_of(self, name: str) -> Taylor:
+        """phi' of the model: its third derivative is the fourth of phi."""
+        at = derivatives(name, self.c)
+        return self.expanded(name, at[1:], largest_fourth(name, at[0], self.c, self.reach))
+
+    def absolute(self) -> Taylor:
+        """s v + shift within gap where the sign is not certain, s the chord's slope: |v| - s v is least at 0."""
+        sign = self.sign()
+        if sign:
+            return self if sign > 0 else -self
+        lo, hi = arb((self.c - self.reach).lower()), arb((self.c + self.reach).upper())
+        s = ((abs(hi) - abs(lo)) / (hi - lo)).mid() if hi > lo else ZERO
+        s = s.max(-ONE).min(ONE)
+        gap = (abs(lo) - s * lo).max(abs(hi) - s * hi) / 2
+        return (self.scaled(s) + Taylor(gap)).widened(gap)
+
+    def expanded(self, name: str, at: Sequence[arb], most: arb | None) -> Taylor:
+        """phi(c) + phi'(c) e + phi''(c) e^2 / 2 + phi'''(.) e^3 / 6 with e the model less its constant c.
+
+        `at` has the first three of these, `most` is a bound of |phi'''|, or None where phi may be undefined.
+        """
         first, second = self.reaches()
         rest = second + self.r
-        reach, at = first + rest, derivatives(name, self.c)
-        most = third(name, at[3], self.c, reach)
+        reach = first + rest
         if most is None:
             raise Refused(
                 "ring",
@@ -201,3 +239,7 @@ class Taylor:
 def positive_part(v: arb) -> arb:
     """A number at or above v and 0, and the greater of both if that is certain."""
     return ZERO if v <= 0 else v if v >= 0 else abs(v)
+
+
+def constant(q: fmpq) -> Taylor:
+    return Taylor(arb(q))
