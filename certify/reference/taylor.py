@@ -14,7 +14,7 @@ from flint import arb, arb_mat, fmpq
 from .balls import ONE, SPREAD, ZERO, derivatives, largest_fourth, third, total
 from .refusal import Refused
 
-HALF = ONE / 2
+HALF, NOISE = ONE / 2, arb(2) ** -30
 
 
 def mix(a: arb, x: arb_mat | None, b: arb, y: arb_mat | None) -> arb_mat | None:
@@ -215,16 +215,16 @@ class Taylor:
         return result
 
     def from_corner(self) -> arb:
-        """The value at the corner to which g points, and a bound of what a move away from it adds.
+        """The value at a corner, that to which g points, and a bound of what a move away from it adds.
 
         With M_ij = s_i s_j Q_ij for signs s_i, of which any will do, and d_i = s_i (1 - w_i), this is sum_i w_i (sum_j
         -M_ij (2 - w_j) - s_i g_i), where w_i and 2 - w_j lie in [0, 2].
         """
         if self.g is None or self.Q is None:
             return self.c + self.r + self.first
-        g, result = self.g.entries(), self.c + self.r
-        negative = [bool(v < 0) for v in g]
-        for v, s, row in zip(g, negative, self.Q.tolist(), strict=True):
+        g, rows, result = self.g.entries(), self.Q.tolist(), self.c + self.r
+        negative = pointing_down(g, rows)
+        for v, s, row in zip(g, negative, rows, strict=True):
             lost = v if s else -v  # -s_i g_i, and what may be gained is added
             result -= lost
             for t, q in zip(negative, row, strict=True):
@@ -234,6 +234,25 @@ class Taylor:
                     lost += 2 * positive_part(-M)
             result += 2 * positive_part(lost)
         return result
+
+
+def pointing_down(g: Sequence[arb], rows: Sequence[Sequence[arb]]) -> list[bool]:
+    """For each symbol True if the corner is where it is -1.
+
+    A multiplier makes a coefficient of about 0, whose sign says nothing: there the terms of second order choose, with
+    the signs of all other symbols.
+    """
+    least = NOISE * sum(map(abs, g), ZERO)
+    negative, faint = [bool(v < 0) for v in g], [bool(abs(v) <= least) for v in g]
+    if not any(faint):
+        return negative
+    result = list[bool]()
+    for row, own, weak in zip(rows, negative, faint, strict=True):
+        if weak:
+            others = (-q if s else q for q, s, without in zip(row, negative, faint, strict=True) if not without)
+            own = bool(sum(others, ZERO) < 0)
+        result.append(own)
+    return result
 
 
 def positive_part(v: arb) -> arb:
