@@ -159,7 +159,7 @@ class Models:
         def of_call(call: Call, given: Sequence[Taylor]) -> Vector:
             return affine.called(call, given, symbols, before)
 
-        wide = [v if v.g is None else Taylor(v.c, arb_mat(1, symbols, wider(v, symbols))) for v in x]
+        wide = [Taylor(v.c, arb_mat(1, symbols, wider(v, symbols)), None, v.second + v.r) for v in x]
         value: Taylor = self.N.evaluate(dict(zip(self.states, wide, strict=True)), constant, of_call)[0]
         return value
 
