@@ -104,7 +104,7 @@ class Sizes:
         if self.c.outer:
             tape, area = self.c.outer.function, (self.s + 1) ** 2
             N, of_tape = Net(_called(tape)), tape.size
-            found += 4 * N.entries + 2 * N.units * area + 8 * of_tape * area
+            found += 4 * N.entries + 2 * sum(rows for rows, _, _ in N.affine) * area + 8 * of_tape * area
         return found
 
     # --------------------------------------------------------------------------------------------------------- work

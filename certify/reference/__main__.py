@@ -73,9 +73,8 @@ def further(c: Certificate) -> str:
         return ""
     return (
         f"; and every trajectory that starts in the domain where N(x) <= {N.level!r}, N being the expression that the "
-        f"certificate states, stays in the union of that set and V <= {c.outer!r}, enters V <= {c.outer!r} in finite time, and is one of these from "
-        f"then on, "
-        f"with {', '.join(c.plant.inputs)} within the input bounds{whatever(c)}"
+        f"certificate states, stays in the union of that set and V <= {c.outer!r}, enters V <= {c.outer!r} in finite "
+        f"time, and is one of these from then on, with {', '.join(c.plant.inputs)} within the input bounds{whatever(c)}"
     )
 
 

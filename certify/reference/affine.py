@@ -38,7 +38,9 @@ class Forms:
     made: `ways` has these, and what a matrix of numbers with which this vector reaches something is for each of them.
     """
 
-    def __init__(self, rows: Rows, fresh: Rows | None = None, old: Rows | None = None, gaps: Rows | None = None) -> None:
+    def __init__(
+        self, rows: Rows, fresh: Rows | None = None, old: Rows | None = None, gaps: Rows | None = None
+    ) -> None:
         self.rows, self.fresh, self.old, self.gaps = rows, fresh, old, gaps
         self.ways: list[tuple[Forms, Callable[[Rows], Rows]]] = []
         self.measured: Callable[[], list[arb]] = lambda: []
@@ -94,7 +96,9 @@ class OnBoxes:
         if v.old is None:
             return None if v.fresh is None else (step.magnitudes * arb_mat(v.fresh)).tolist()
         if v.fresh is None:
-            through = [([], row) for row in (step.magnitudes * arb_mat(v.old)).tolist()]
+            through: list[tuple[list[arb], list[arb]]] = [
+                ([], row) for row in (step.magnitudes * arb_mat(v.old)).tolist()
+            ]
         else:
             each = step.magnitudes * arb_mat([f + o for f, o in zip(v.fresh, v.old, strict=True)])
             through = [(row[: self.count], row[self.count :]) for row in each.tolist()]
@@ -126,7 +130,8 @@ class OnBoxes:
             rows.append(entries)
             slopes.append(steep)
             gaps.append(apart)
-        old = v.error and [[abs(s) * e for s, e in zip(*each, strict=True)] for each in zip(slopes, v.error, strict=True)]
+        both_rows = zip(slopes, v.error or [], strict=v.error is not None)
+        old = v.error and [[abs(s) * e for s, e in zip(*each, strict=True)] for each in both_rows]
         result = Forms(rows, gaps, old, gaps)
 
         def measured() -> list[arb]:
@@ -290,7 +295,7 @@ def max_of(values: Sequence[arb]) -> arb:
     return arb(result.upper())
 
 
-# ---------------------------------------------------------------------------------- lines: |phi(y) - slope y - shift| <= gap
+# ------------------------------------------------------------------------- lines: |phi(y) - slope y - shift| <= gap
 
 
 def tangent(name: str, middle: arb, reach: arb) -> Line | None:

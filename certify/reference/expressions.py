@@ -50,8 +50,8 @@ RATIONALLY: Mapping[str, Callable[..., fmpq]] = {
 PLAIN = ("sin", "cos", "tanh", "exp", "atan", "sqrt")  # smooth functions that are one operation
 HALF = fmpq(1, 2)
 
-# ("name", str), ("rational", fmpq), ("network", str, numbers of earlier steps), ("entry", the number of such a call, i),
-# or the name of an operation and the numbers of earlier steps
+# ("name", str), ("rational", fmpq), ("network", str, numbers of earlier steps), ("entry", the number of such a call,
+# i), or the name of an operation and the numbers of earlier steps
 Step = tuple[Any, ...]
 Called = Callable[["Call", Sequence[Any]], Sequence[Any]]
 

@@ -12,7 +12,7 @@ from itertools import islice
 from flint import arb, arb_mat, fmpq_mat
 
 from .affine import Form, OnBoxes, batch, called, clip
-from .balls import ZERO, beta, bounded_by_form, finite, total, within_bounds
+from .balls import ZERO, beta, bounded_by_form, total, within_bounds
 from .document import Certificate
 from .evidence import Covering, Tree
 from .expressions import Call

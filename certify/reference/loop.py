@@ -102,9 +102,7 @@ class Loop:
         states = self.states(J, None, steady=True)
         return self.unclipped(states, *self.inputs(states, True, rule, at), rule, at)
 
-    def unclipped(
-        self, states: Sequence[Model], u: Sequence[Model], units: Units, rule: str, at: str
-    ) -> Known:
+    def unclipped(self, states: Sequence[Model], u: Sequence[Model], units: Units, rule: str, at: str) -> Known:
         """States and inputs, which no clip changes, or a refusal."""
         c = self.c
         for j, v in enumerate(u):

@@ -234,7 +234,8 @@ def read_step(value: Any, at: str, sizes: Sequence[int]) -> Step:
     require(before, "format", f"{at}.of", "the numbers of vectors before it were expected")
     fits = len(of) >= 2 if many else len(of) == 1
     require(fits, "format", f"{at}.of", "two or more vectors were expected" if many else "one vector was expected")
-    return read(step, at, tuple(of), [sizes[i] for i in of])
+    made: Step = read(step, at, tuple(of), [sizes[i] for i in of])
+    return made
 
 
 def read_affine(step: Mapping[str, Any], at: str, of: tuple[int, ...], sizes: Sequence[int]) -> Affine:

@@ -25,7 +25,7 @@ from .functions import Beyond, beyond_tangent, expansion, unsure
 from .model import Model
 from .networks import Affine, Clip, Concat, Map, Observe, Sum
 from .refusal import Refused
-from .symmetric import half, no_form, whole
+from .symmetric import half, whole
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,9 @@ class OnBall:
         each = [expansion(y, step.function) for y in models]
         for y, phi in zip(models, each, strict=True):
             self.stack.append(beyond_tangent(y, phi))
-        off, slack = ([*part] for part in zip(*(unsure(y, phi) for y, phi in zip(models, each, strict=True)), strict=True))
+        off, slack = (
+            [*part] for part in zip(*(unsure(y, phi) for y, phi in zip(models, each, strict=True)), strict=True)
+        )
         values, slopes = [phi.at[0] for phi in each], [phi.at[1] for phi in each]
         return self.made(lambda: self.widened(v.tangent).scaled(slopes, values, True), off, slack)
 
@@ -206,7 +208,9 @@ class OnBall:
             else:
                 raise Refused("local", "ball", "a clip in a network may begin to act")
         doubts = [(k * off, k * slack) for k, (off, slack) in zip(factors, v.doubts(), strict=True)]
-        return self.made(lambda: v.tangent.scaled(factors, values, False), *([*part] for part in zip(*doubts, strict=True)))
+        return self.made(
+            lambda: v.tangent.scaled(factors, values, False), *([*part] for part in zip(*doubts, strict=True))
+        )
 
     def sum(self, step: Sum, *vectors: Vector) -> Vector:
         def make() -> Tangent:
@@ -254,7 +258,9 @@ class OnBall:
     def weighted(self, v: Vector, factors: Sequence[arb], at_0: list[arb]) -> Vector:
         """Every entry times a factor, with these values."""
         doubts = [(abs(k) * off, abs(k) * slack) for k, (off, slack) in zip(factors, v.doubts(), strict=True)]
-        return self.made(lambda: v.tangent.scaled(factors, at_0, False), *([*part] for part in zip(*doubts, strict=True)))
+        return self.made(
+            lambda: v.tangent.scaled(factors, at_0, False), *([*part] for part in zip(*doubts, strict=True))
+        )
 
     # ------------------------------------------------------------------------------------------------- the results
 

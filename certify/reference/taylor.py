@@ -246,13 +246,11 @@ def pointing_down(g: Sequence[arb], rows: Sequence[Sequence[arb]]) -> list[bool]
     negative, faint = [bool(v < 0) for v in g], [bool(abs(v) <= least) for v in g]
     if not any(faint):
         return negative
-    result = list[bool]()
-    for row, own, weak in zip(rows, negative, faint, strict=True):
-        if weak:
-            others = (-q if s else q for q, s, without in zip(row, negative, faint, strict=True) if not without)
-            own = bool(sum(others, ZERO) < 0)
-        result.append(own)
-    return result
+    strong = [(j, s) for j, (s, weak) in enumerate(zip(negative, faint, strict=True)) if not weak]
+    return [
+        bool(sum((-row[j] if s else row[j] for j, s in strong), ZERO) < 0) if weak else own
+        for row, own, weak in zip(rows, negative, faint, strict=True)
+    ]
 
 
 def positive_part(v: arb) -> arb:
