@@ -39,7 +39,7 @@ class InRows:
         return [x.function(step.function) for x in v]
 
     def clip(self, step: Clip, v: Vector) -> Vector:
-        """Of numbers alone, for a clip has no model."""
+        """Numbers alone, for a clip has no model."""
         if not all(x.g is None and x.r.is_zero() for x in v):
             raise Refused("ring", "leaf", "a clip has no model")
         return [Taylor(x.c.max(arb(lo)).min(arb(hi))) for x, lo, hi in zip(v, step.lo, step.hi, strict=True)]

@@ -53,7 +53,7 @@ def coefficients(name: str, y: arb) -> Four:
 
 @dataclass(frozen=True)
 class Beyond:
-    """What a number adds to its tangent: d'Hd + C[d] within d'Rd; `lip`, if needed, is a constant of what is beyond."""
+    """The part of a number beyond its tangent: d'Hd + C[d] within d'Rd; `lip`, if needed, is a constant of what is beyond."""
 
     H: arb_mat
     C: arb_mat
@@ -111,7 +111,7 @@ def expansion(v: Model, name: str) -> Expansion:
 
 
 def beyond_tangent(v: Model, phi: Expansion) -> Beyond:
-    """What phi of v adds to phi(v(0)) + phi' times what v adds to v(0); what is beyond v's K counts with phi'.
+    """The part of phi of v beyond phi(v(0)) and phi' times what v adds to v(0); what is beyond v's K counts with phi'.
 
     With D = v - v(0), y = a.d and z = D - y, within curve and d'Wd: h D^2 is h y^2 and 2 h y d'Qd but for what is
     left of z in 2 h y z and for h z^2; g D^3 is g y^3 but for g z (3 y^2 + 3 y z + z^2); and D^4 is at most

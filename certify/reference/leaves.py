@@ -296,7 +296,7 @@ class Leaves:
 
 
 def centred(c: Certificate) -> tuple[list[arb], list[arb]]:
-    """What centring adds to the network's output, and the offset with what it adds to that."""
+    """The shift by which centring changes the network's output, and the offset with what it adds to that."""
     policy, nothing, offset = c.policy, [ZERO] * c.m, [arb(v) for v in c.policy.offset]
     if policy.centre == "none":
         return nothing, offset

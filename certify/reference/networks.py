@@ -39,7 +39,7 @@ class Step:
         return ()
 
     def words(self) -> str:
-        """What is hashed of it beside its arrays."""
+        """The words that are hashed beside its arrays."""
         return f"{self.kind} {' '.join(map(str, self.of))}\0"
 
 
@@ -120,7 +120,7 @@ class Observe(Step):
 
 
 class Algebra(Protocol):
-    """What each kind of step makes of vectors."""
+    """A meaning of vectors: each kind of step makes one of those before it."""
 
     def affine(self, step: Affine, v: Any, /) -> Any: ...
     def map(self, step: Map, v: Any, /) -> Any: ...

@@ -59,7 +59,7 @@ class Units:
         return finite(self.L.entries()) and all(finite(row) for row in self.R)
 
     def beside(self, other: Units) -> Units:
-        """Those of both, each of which its own entries see."""
+        """The units of both, each seen by its own entries."""
         ours, theirs = [ZERO] * len(self.R), [ZERO] * len(other.R)
         rows = [[*row, *theirs] for row in self.L.tolist()] + [[*ours, *row] for row in other.L.tolist()]
         return Units(self.n, arb_mat(len(rows), len(ours + theirs), [v for row in rows for v in row]), self.R + other.R)
