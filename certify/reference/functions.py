@@ -53,7 +53,7 @@ def coefficients(name: str, y: arb) -> Four:
 
 @dataclass(frozen=True)
 class Beyond:
-    """The part of a number beyond its tangent: d'Hd + C[d] within d'Rd; `lip`, if needed, is a constant of what is beyond."""
+    """The part of a number beyond its tangent, d'Hd + C[d] within d'Rd; `lip`, if needed, is a constant of the rest."""
 
     H: arb_mat
     C: arb_mat
