@@ -67,17 +67,14 @@ def of_trajectories(c: Certificate) -> str:
 
 
 def further(c: Certificate) -> str:
-    """The statement about the outer set of a second function; a network is named by its hash."""
+    """The statement about the outer set of a second function."""
     N = c.beyond
     if N is None:
         return ""
-    is_network = N.expression is None
-    which = f"the network {N.sha256}" if is_network else "the expression that the certificate states"
     return (
-        f"; and every trajectory that starts in the domain where N(x) <= {N.level!r}, N being {which}, stays in the "
-        f"union of that set and V <= {c.outer!r}, enters V <= {c.outer!r} in finite time, and is one of these from "
-        f"then on, "
-        f"with {', '.join(c.plant.inputs)} within the input bounds{whatever(c)}"
+        f"; and every trajectory that starts in the domain where N(x) <= {N.level!r}, N being the expression that the "
+        f"certificate states, stays in the union of that set and V <= {c.outer!r}, enters V <= {c.outer!r} in finite "
+        f"time, and is one of these from then on, with {', '.join(c.plant.inputs)} within the input bounds{whatever(c)}"
     )
 
 

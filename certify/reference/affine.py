@@ -1,144 +1,280 @@
-"""Layers of tanhs on leaves, between affine forms: the policy before its scale, and a network N.
+"""Networks on leaves, between affine forms.
 
-The weights meet several leaves at a time: a layer is one product of matrices of balls whose columns are the centres and
-the half-widths of all leaves of a batch, and one of magnitudes for their errors. What is left to Python is a few
-operations for each tanh of each leaf.
+The weights meet several leaves at a time: an affine step is one product of matrices of balls whose columns are the
+centres and the half-widths of all leaves of a batch, and one of magnitudes for their errors. What is left to Python is
+a few operations for each entry of a `map` on each leaf.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 
 from flint import arb, arb_mat
 
-from .balls import ONE, ZERO, absolute, norm, spectral_norm, total, weights
-from .layers import Layer
+from .balls import ONE, ZERO, derivatives, norm, third, total
+from .expressions import Call
+from .networks import Affine, Clip, Concat, Map, Network, Observe, Sum
+from .refusal import Refused
+from .taylor import Taylor, constant
 
-Affine = tuple[arb, list[arb], arb]  # mid + slopes.d within an error
-Rows = list[list[arb]]  # for each tanh of a layer a number for each leaf
-COLUMNS, WIDE = 48, 64  # of a product; layers from this width on take more of them at once without loss
+Form = tuple[arb, list[arb], arb]  # mid + slopes.d within an error
+Rows = list[list[arb]]  # for each entry of a vector a number for each leaf
+Line = tuple[arb, arb, arb]  # slope, shift and gap
+COLUMNS, WIDE = 48, 64  # of a product; networks from this width on take more of them at once without loss
 
 
-class Network:
-    """Layers with tanh between them, and behind the last if `squashed`; `last_bias` may replace that of the last."""
+def batch(network: Network, symbols: int) -> int:
+    """The number of leaves that should meet the weights together."""
+    narrow = max(network.sizes) < WIDE
+    return max(1, (COLUMNS if narrow else 8 * COLUMNS) // (symbols + 1))
 
-    def __init__(self, layers: Sequence[Layer], squashed: bool = False, last_bias: list[arb] | None = None) -> None:
-        self.layers, self.weights = layers, weights(layers)
-        self.biases = [[arb(b) for b in layer.bias] for layer in layers]
-        if last_bias is not None:
-            self.biases[-1] = last_bias
-        self.absolute = [absolute(W) for W in self.weights]
-        self.tanhs = len(layers) if squashed else len(layers) - 1  # so many layers have tanhs behind them
 
-    def batch(self, symbols: int) -> int:
-        """The number of leaves that should meet the weights together."""
-        narrow = max(layer.rows for layer in self.layers) < WIDE
-        return max(1, (COLUMNS if narrow else 8 * COLUMNS) // (symbols + 1))
+class Forms:
+    """A vector on some leaves: `rows` has for each entry the constant and the coefficients on each leaf.
+
+    An entry differs from its form by at most a fresh error and an old one; None stands for none. `length` bounds the
+    2-norm of all that is old. `gaps` are errors that arise at this vector, all others come from vectors of which it is
+    made: `ways` has these, and what a matrix of numbers with which this vector reaches something is for each of them.
+    """
+
+    def __init__(
+        self, rows: Rows, fresh: Rows | None = None, old: Rows | None = None, gaps: Rows | None = None
+    ) -> None:
+        self.rows, self.fresh, self.old, self.gaps = rows, fresh, old, gaps
+        self.ways: list[tuple[Forms, Callable[[Rows], Rows]]] = []
+        self.measured: Callable[[], list[arb]] = lambda: []
 
     @cached_property
-    def lengths(self) -> list[list[arb]]:
-        """The 2-norm of each row of each layer."""
-        return [[norm(row) for row in W.tolist()] for W in self.weights]
+    def length(self) -> list[arb]:
+        """For each leaf, where there is an old error."""
+        return self.measured()
 
     @cached_property
-    def norms(self) -> list[arb]:
-        return [spectral_norm(W) for W in self.weights]
+    def error(self) -> Rows | None:
+        return both(self.fresh, self.old)
 
-    def outputs(self, forms: arb_mat, count: int) -> list[list[Affine]]:
-        """The form of each output on each leaf, given x on the leaves: a column for its centre and one for each symbol.
+    def lengths(self, count: int) -> list[arb]:
+        """Bounds of the 2-norms of all errors."""
+        old = self.length if self.old is not None else [ZERO] * count
+        if self.fresh is None:
+            return old
+        return [v + norm(fresh) for v, fresh in zip(old, by_leaf(self.fresh), strict=True)]
 
-        Each tanh lies in slope y + shift +- gap on the range of its y, which is that of the form and of the errors
-        before it. The outputs see each gap through the product of weights and slopes on its way to them.
-        """
-        stride = forms.ncols() // count
-        slopes, gaps, errors = list[Rows](), list[Rows](), Errors.none(count)
-        for k in range(self.tanhs):
-            rows, steep, apart = list[list[arb]](), Rows(), Rows()
-            behind = errors.behind(self, k)
-            for row, bias, each in zip((self.weights[k] * forms).tolist(), self.biases[k], behind, strict=True):
-                entries, s, g = relaxed(row, bias, each, stride)
-                rows.append(entries)
-                steep.append(s)
-                apart.append(g)
-            errors = errors.passed(self, k, behind, steep, apart)
-            forms = arb_mat(rows)
+
+class OnBoxes:
+    """Networks between affine forms on `count` leaves, on each of which `undefined` tells whether something may be."""
+
+    def __init__(self, count: int) -> None:
+        self.count, self.made, self.undefined = count, list[Forms](), set[int]()
+
+    def given(self, rows: Rows, errors: Rows | None = None) -> Forms:
+        """The vector that a network reads."""
+        return self.vector(Forms(rows, errors, gaps=errors))
+
+    def vector(self, v: Forms, *ways: tuple[Forms, Callable[[Rows], Rows]]) -> Forms:
+        v.ways = [(source, way) for source, way in ways if source.error is not None]
+        self.made.append(v)
+        return v
+
+    def stride(self, v: Forms) -> int:
+        return len(v.rows[0]) // self.count
+
+    # --------------------------------------------------------------------------------------------------- the steps
+
+    def affine(self, step: Affine, v: Forms) -> Forms:
+        W, stride = step.W, self.stride(v)
+        rows = (W * arb_mat(v.rows)).tolist()
+        for row, bias in zip(rows, step.b, strict=True):
+            row[::stride] = [x + bias for x in row[::stride]]
+        result = Forms(rows, old=self.through(step, v))
+        result.measured = lambda: [step.norm * x for x in v.lengths(self.count)]
+        return self.vector(result, (v, lambda ways: (W.transpose() * arb_mat(ways)).tolist()))
+
+    def through(self, step: Affine, v: Forms) -> Rows | None:
+        """The errors behind the weights, old ones through magnitudes or the norm of a row, whichever is less."""
+        if v.old is None:
+            return None if v.fresh is None else (step.magnitudes * arb_mat(v.fresh)).tolist()
+        if v.fresh is None:
+            through: list[tuple[list[arb], list[arb]]] = [
+                ([], row) for row in (step.magnitudes * arb_mat(v.old)).tolist()
+            ]
+        else:
+            each = step.magnitudes * arb_mat([f + o for f, o in zip(v.fresh, v.old, strict=True)])
+            through = [(row[: self.count], row[self.count :]) for row in each.tolist()]
+        result = Rows()
+        for (fresh, old), length in zip(through, step.row_norms, strict=True):
+            row = [lesser(o, length * x) for o, x in zip(old, v.length, strict=True)]
+            result.append([f + o for f, o in zip(fresh, row, strict=True)] if fresh else row)
+        return result
+
+    def map(self, step: Map, v: Forms) -> Forms:
+        return self.relaxed(v, [step.function] * step.size)
+
+    def clip(self, step: Clip, v: Forms) -> Forms:
+        return self.relaxed(v, [(arb(lo), arb(hi)) for lo, hi in zip(step.lo, step.hi, strict=True)])
+
+    def relaxed(self, v: Forms, kinds: Sequence[str | tuple[arb, arb]]) -> Forms:
+        """Each entry's function between two lines on the range of the entry; a clip has its two ends for a name."""
+        rows, slopes, gaps, stride = Rows(), Rows(), Rows(), self.stride(v)
+        errors = v.error or [[ZERO] * self.count] * len(v.rows)
+        for row, kind, error in zip(v.rows, kinds, errors, strict=True):
+            entries, steep, apart = list[arb](), list[arb](), list[arb]()
+            for b, e in enumerate(error):
+                middle, *coefficients = row[b * stride : (b + 1) * stride]
+                slope, shift, gap = self.line(kind, middle, sum(map(abs, coefficients), e), b)
+                entries.append(slope * middle + shift)
+                entries += [slope * x for x in coefficients]
+                steep.append(slope)
+                apart.append(gap)
+            rows.append(entries)
             slopes.append(steep)
             gaps.append(apart)
-        rows = forms.tolist()
-        if self.tanhs < len(self.weights):
-            rows = (self.weights[-1] * forms).tolist()
-            for row, bias in zip(rows, self.biases[-1], strict=True):
-                row[::stride] = [v + bias for v in row[::stride]]
-        places = range(0, stride * count, stride)
-        return [
-            [(row[b], row[b + 1 : b + stride], error) for b, error in zip(places, own, strict=True)]
-            for row, own in zip(rows, self.backwards(slopes, gaps, count), strict=True)
-        ]
+        both_rows = zip(slopes, v.error or [], strict=v.error is not None)
+        old = v.error and [[abs(s) * e for s, e in zip(*each, strict=True)] for each in both_rows]
+        result = Forms(rows, gaps, old, gaps)
 
-    def backwards(self, slopes: list[Rows], gaps: list[Rows], count: int) -> Rows:
-        """The error of each output on each leaf: each gap times the magnitude of its way to the output."""
-        m = self.layers[-1].rows
-        errors = [[ZERO] * count for _ in range(m)]
-        last = [[ONE if i == j else ZERO for j in range(m)] for i in range(m)]
-        if self.tanhs < len(self.weights):
-            last = self.weights[-1].transpose().tolist()
-        ways = [[w for w in row for _ in range(count)] for row in last]
-        for k in reversed(range(self.tanhs)):  # ways[i] is from tanh i of layer k to output 0 on all leaves, to 1, ...
-            for way, gap in zip(ways, gaps[k], strict=True):
+        def measured() -> list[arb]:
+            each = zip(v.lengths(self.count), by_leaf(slopes), by_leaf(old or []), strict=True)
+            return [lesser(max_of([abs(s) for s in steep]) * x, norm(after)) for x, steep, after in each]
+
+        result.measured = measured
+        return self.vector(result, (v, lambda ways: scaled(ways, slopes)))
+
+    def line(self, kind: str | tuple[arb, arb], middle: arb, reach: arb, leaf: int) -> Line:
+        if not isinstance(kind, str):
+            return clipped(middle - reach, middle + reach, *kind)
+        result = tanh_between(middle - reach, middle + reach) if kind == "tanh" else tangent(kind, middle, reach)
+        if result is None:
+            self.undefined.add(leaf)
+            return ZERO, ZERO, arb("nan")
+        return result
+
+    def sum(self, step: Sum, *vectors: Forms) -> Forms:
+        rows, fresh, old = vectors[0].rows, vectors[0].fresh, vectors[0].old
+        for v in vectors[1:]:
+            rows, fresh, old = both(rows, v.rows) or [], both(fresh, v.fresh), both(old, v.old)
+        result = Forms(rows, fresh, old)
+        result.measured = lambda: [total(each) for each in zip(*(v.length for v in vectors if v.old), strict=True)]
+        return self.vector(result, *((v, lambda ways: ways) for v in vectors))
+
+    def concat(self, step: Concat, *vectors: Forms) -> Forms:
+        fresh, old = (self.stacked([part(v) for v in vectors], vectors) for part in (fresh_of, old_of))
+        result = Forms([row for v in vectors for row in v.rows], fresh, old)
+        result.measured = lambda: [norm(each) for each in zip(*(v.length for v in vectors if v.old), strict=True)]
+        ways, start = list[tuple[Forms, Callable[[Rows], Rows]]](), 0
+        for v in vectors:
+            ways.append((v, part_of(start, start + len(v.rows))))
+            start += len(v.rows)
+        return self.vector(result, *ways)
+
+    def stacked(self, parts: Sequence[Rows | None], vectors: Sequence[Forms]) -> Rows | None:
+        if all(part is None for part in parts):
+            return None
+        each = zip(parts, vectors, strict=True)
+        return [row for part, v in each for row in (part or [[ZERO] * self.count] * len(v.rows))]
+
+    def observe(self, step: Observe, v: Forms) -> Forms:
+        """The expressions of models of the entries, on one leaf after the other."""
+        forms, gaps = (Rows([] for _ in range(step.size)) for _ in range(2))
+        errors, stride = v.error or [[ZERO] * self.count] * len(v.rows), self.stride(v)
+        for b in range(self.count):
+            each = zip(step.names, v.rows, errors, strict=True)
+            names = {name: model_of(row[b * stride : (b + 1) * stride], error[b]) for name, row, error in each}
+            try:
+                results: list[Taylor] = step.expressions.evaluate(names, constant)
+            except Refused:
+                self.undefined.add(b)
+                results = [Taylor(ZERO, r=arb("nan"))] * step.size
+            for f, row, gap in zip(results, forms, gaps, strict=True):
+                row += [f.c, *f.slopes(stride - 1)]
+                gap.append(f.second + f.r)
+        return self.vector(Forms(forms, gaps, gaps=gaps))
+
+    def shifted(self, v: Forms, shifts: Iterable[arb]) -> Forms:
+        """v and a number more in each entry."""
+        rows, stride = [list(row) for row in v.rows], self.stride(v)
+        for row, shift in zip(rows, shifts, strict=True):
+            row[::stride] = [x + shift for x in row[::stride]]
+        result = Forms(rows, v.fresh, v.old)
+        result.measured = lambda: v.length
+        return self.vector(result, (v, lambda ways: ways))
+
+    # ------------------------------------------------------------------------------------------------- the results
+
+    def forms(self, v: Forms, wanted: Sequence[int]) -> list[list[Form]]:
+        """Some entries of a vector, each on each leaf."""
+        stride, nan = self.stride(v), arb("nan")
+        result = []
+        for i, errors in zip(wanted, self.errors(v, wanted), strict=True):
+            each = []
+            for b, error in enumerate(errors):
+                mid, *slopes = v.rows[i][b * stride : (b + 1) * stride]
+                each.append((nan, slopes, nan) if b in self.undefined else (mid, slopes, error))
+            result.append(each)
+        return result
+
+    def errors(self, v: Forms, wanted: Sequence[int]) -> Rows:
+        """Each gap times the magnitude of the number with which it reaches an entry, over all vectors before."""
+        count, m = self.count, len(wanted)
+        errors = [[ZERO] * count for _ in wanted]
+        at_last = [[ONE if i == j else ZERO for j in wanted for _ in range(count)] for i in range(len(v.rows))]
+        ways = {id(v): at_last}  # for each entry that to the first that is wanted on all leaves, to the second, ...
+        for vector in reversed(self.made):
+            way = ways.pop(id(vector), None)
+            if way is None:
+                continue
+            for row, gap in zip(way, vector.gaps or [], strict=vector.gaps is not None):
                 for j in range(m):
-                    part = way[j * count : (j + 1) * count]
+                    part = row[j * count : (j + 1) * count]
                     errors[j] = [e + abs(w) * g for e, w, g in zip(errors[j], part, gap, strict=True)]
-            if k:
-                scaled = [
-                    [w * s for w, s in zip(way, steep * m, strict=True)]
-                    for way, steep in zip(ways, slopes[k], strict=True)
-                ]
-                ways = (self.weights[k].transpose() * arb_mat(scaled)).tolist()
+            for source, back in vector.ways:
+                more = back(way)
+                ways[id(source)] = both(ways.get(id(source)), more) or []
         return errors
 
 
-class Errors:
-    """Bounds of what the values in front of a layer differ from their forms by, on each leaf.
+def called(call: Call, given: Sequence[Taylor], symbols: int, first: int) -> list[Taylor]:
+    """Entries of a call on a leaf, each with a symbol of its own; that of the first is number `first`."""
+    algebra = OnBoxes(1)
+    rows = [[v.c, *v.slopes(symbols)] for v in given]
+    value = call.network.run(algebra, algebra.given(rows, [[v.second + v.r] for v in given]))
+    result = []
+    for k, ((mid, slopes, error),) in enumerate(algebra.forms(value, call.entries), first + call.place):
+        slopes[k] += error
+        result.append(Taylor(mid, arb_mat(1, symbols, slopes)))
+    return result
 
-    `fresh` is by the gaps of the tanhs just before, `old` by what came through these; `length` bounds the 2-norm of all
-    that is old.
-    """
 
-    def __init__(self, fresh: Rows, old: Rows, length: list[arb]) -> None:
-        self.fresh, self.old, self.length = fresh, old, length
+def model_of(form: list[arb], error: arb) -> Taylor:
+    c, *g = form
+    return Taylor(c, arb_mat(1, len(g), g), r=error)
 
-    @classmethod
-    def none(cls, count: int) -> Errors:
-        return cls([], [], [ZERO] * count)
 
-    def behind(self, network: Network, k: int) -> Rows:
-        """The errors behind layer k's weights, old ones through magnitudes or the norm of a row, whichever is less."""
-        rows, count = network.layers[k].rows, len(self.length)
-        if not self.fresh:
-            return [[ZERO] * count] * rows
-        if not self.old:
-            through: Rows = (network.absolute[k] * arb_mat(self.fresh)).tolist()
-            return through
-        both = (network.absolute[k] * arb_mat([f + o for f, o in zip(self.fresh, self.old, strict=True)])).tolist()
-        return [
-            [f + lesser(o, length * v) for f, o, v in zip(row[:count], row[count:], self.length, strict=True)]
-            for row, length in zip(both, network.lengths[k], strict=True)
-        ]
+def fresh_of(v: Forms) -> Rows | None:
+    return v.fresh
 
-    def passed(self, network: Network, k: int, behind: Rows, slopes: Rows, gaps: Rows) -> Errors:
-        """The errors behind the tanhs of layer k."""
-        if not self.fresh:
-            return Errors(gaps, [], self.length)
-        old = [[s * e for s, e in zip(*both, strict=True)] for both in zip(slopes, behind, strict=True)]
-        if k + 1 == network.tanhs:
-            return Errors(gaps, old, self.length)
-        length = []
-        leaves = zip(self.length, by_leaf(self.fresh), by_leaf(slopes), by_leaf(old), strict=True)
-        for before, fresh, steep, after in leaves:
-            through = network.norms[k] * (before + norm(fresh))
-            length.append(lesser(max_of(steep) * through, norm(after)))
-        return Errors(gaps, old, length)
+
+def old_of(v: Forms) -> Rows | None:
+    return v.old
+
+
+def part_of(start: int, end: int) -> Callable[[Rows], Rows]:
+    return lambda ways: ways[start:end]
+
+
+def both(a: Rows | None, b: Rows | None) -> Rows | None:
+    """The sum of two of equal shape; None is 0."""
+    if a is None or b is None:
+        return b if a is None else a
+    return [[x + y for x, y in zip(*each, strict=True)] for each in zip(a, b, strict=True)]
+
+
+def scaled(ways: Rows, slopes: Rows) -> Rows:
+    result = Rows()
+    for way, steep in zip(ways, slopes, strict=True):
+        result.append([w * s for w, s in zip(way, steep * (len(way) // len(steep)), strict=True)])
+    return result
 
 
 def by_leaf(rows: Rows) -> Rows:
@@ -159,23 +295,20 @@ def max_of(values: Sequence[arb]) -> arb:
     return arb(result.upper())
 
 
-def relaxed(row: list[arb], bias: arb, errors: list[arb], stride: int) -> tuple[list[arb], list[arb], list[arb]]:
-    """The forms of a tanh on all leaves, given those of its y without the bias; the lines' slopes, and their gaps."""
-    entries, slopes, gaps = list[arb](), list[arb](), list[arb]()
-    for b, error in enumerate(errors):
-        middle, *coefficients = row[b * stride : (b + 1) * stride]
-        middle += bias
-        reach = sum(map(abs, coefficients), error)
-        slope, shift, gap = lines(middle - reach, middle + reach)
-        entries.append(slope * middle + shift)
-        entries += [slope * v for v in coefficients]
-        slopes.append(slope)
-        gaps.append(gap)
-    return entries, slopes, gaps
+# ------------------------------------------------------------------------- lines: |phi(y) - slope y - shift| <= gap
 
 
-def lines(lo: arb, hi: arb) -> tuple[arb, arb, arb]:
-    """slope, shift, gap with |tanh(y) - slope y - shift| <= gap on [lo, hi]; the slope is near the chord's.
+def tangent(name: str, middle: arb, reach: arb) -> Line | None:
+    """The tangent in the middle of |y - middle| <= reach; None where the function may be undefined."""
+    value, slope, second, at = derivatives(name, middle)
+    most = third(name, at, middle, reach)
+    if most is None:
+        return None
+    return slope, value - slope * middle, abs(second) / 2 * reach * reach + most / 6 * reach**3
+
+
+def tanh_between(lo: arb, hi: arb) -> Line:
+    """tanh on [lo, hi]; the slope is near the chord's.
 
     The extrema of tanh(y) - slope y are at the ends or where tanh(y)^2 = 1 - slope; a point that may lie in [lo, hi]
     counts, and one that does not lie there can only make the gap too wide. A ball for an end holds the end.
@@ -198,18 +331,16 @@ def lines(lo: arb, hi: arb) -> tuple[arb, arb, arb]:
     return slope, (top + bottom) / 2, (top - bottom) / 2
 
 
-def clip(y: Affine, lo: arb, hi: arb) -> Affine:
-    """min(max(y, lo), hi) of an affine form.
+def clipped(first: arb, last: arb, lo: arb, hi: arb) -> Line:
+    """min(max(y, lo), hi) on [first, last].
 
     It is y where y certainly lies between them. Else it lies between two lines of a slope from 0 to 1: clip(y) - slope
     y rises between lo and hi and falls elsewhere, so it is least and greatest at the ends of the range of y, at lo or
     at hi; a corner that is certain to lie outside of the range does not count.
     """
-    mid, coefficients, error = y
-    reach = total(abs(v) for v in coefficients) + error
-    first, last = arb((mid - reach).lower()), arb((mid + reach).upper())
+    first, last = arb(first.lower()), arb(last.upper())
     if first >= lo and last <= hi:
-        return y
+        return ONE, ZERO, ZERO
     ends = first.max(lo).min(hi), last.max(lo).min(hi)
     slope = ((ends[1] - ends[0]) / (last - first)).mid() if first < last else ZERO
     slope = ZERO if slope < 0 else ONE if slope > 1 else slope
@@ -218,5 +349,12 @@ def clip(y: Affine, lo: arb, hi: arb) -> Affine:
     top = bottom = away[0]
     for v in away[1:]:
         top, bottom = top.max(v), bottom.min(v)
-    shift, gap = (top + bottom) / 2, (top - bottom) / 2
+    return slope, (top + bottom) / 2, (top - bottom) / 2
+
+
+def clip(y: Form, lo: arb, hi: arb) -> Form:
+    """min(max(y, lo), hi) of an affine form."""
+    mid, coefficients, error = y
+    reach = total(abs(v) for v in coefficients) + error
+    slope, shift, gap = clipped(mid - reach, mid + reach, lo, hi)
     return slope * mid + shift, [slope * v for v in coefficients], slope * error + gap

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import cache
+from typing import TYPE_CHECKING
 
 from flint import arb, arb_mat
 
-from .document import Certificate
 from .fields import exact
-from .layers import Layer
+
+if TYPE_CHECKING:
+    from .document import Certificate
 
 PRECISION = 128  # bits
 ON_LEAVES = 64  # the same on leaves, of which there are many
@@ -78,7 +80,7 @@ def certainly_definite(A: arb_mat) -> bool:
 
 
 def derivatives(name: str, y: arb) -> tuple[arb, arb, arb, arb]:
-    """phi, phi', phi'', phi''' on a ball; the slope of tanh, which no equation names, is a function of its own."""
+    """phi, phi', phi'', phi''' on a ball."""
     if name == "1/":
         p = 1 / y
         return p, -(p * p), 2 * p * p * p, -6 * p * p * p * p
@@ -86,10 +88,6 @@ def derivatives(name: str, y: arb) -> tuple[arb, arb, arb, arb]:
         t = y.tanh()
         slope = 1 - t * t
         return t, slope, -2 * t * slope, (6 * t * t - 2) * slope
-    if name == "tanh'":
-        t = y.tanh()
-        slope = 1 - t * t
-        return slope, -2 * t * slope, (6 * t * t - 2) * slope, 8 * t * (2 - 3 * t * t) * slope
     if name == "exp":
         e = y.exp()
         return e, e, e, e
@@ -128,8 +126,6 @@ def third(name: str, at: arb, y: arb, reach: arb) -> arb | None:
         return 6 * (3 * s + w) / (8 * s * s * s * (s + w) * (s + w) * (s + w))
     if name in ("tanh", "atan"):
         return arb(2)
-    if name == "tanh'":
-        return fourth_of_tanh(abs(at), reach)
     if name == "exp":
         return (y + reach).exp()
     if name not in ("sin", "cos"):
@@ -185,32 +181,6 @@ def largest_fourth(name: str, at: arb, y: arb, reach: arb) -> arb | None:
         return 6 * (3 * least + farthest) / (nearest**4 * least * least)
     s, w, far = arb(y.lower()).sqrt(), least.sqrt(), arb(y.upper()).sqrt()
     return 6 * (8 * far * far + 9 * far * w + 3 * w * w) / (16 * s**5 * w * (s + w) ** 3)
-
-
-def weights(layers: Sequence[Layer]) -> list[arb_mat]:
-    return [arb_mat(layer.rows, layer.columns, [arb(w) for w in layer.weight]) for layer in layers]
-
-
-def biased(W: arb_mat, layer: Layer, h: arb_mat) -> arb_mat:
-    """W h + b, h a column."""
-    return W * h + arb_mat(layer.rows, 1, [arb(b) for b in layer.bias])
-
-
-def tanhs(column: arb_mat) -> arb_mat:
-    return arb_mat(column.nrows(), 1, [v.tanh() for v in column.entries()])
-
-
-def origin(c: Certificate) -> arb_mat:
-    """The layers' inputs at x = 0, a column."""
-    return arb_mat(c.n, 1, [arb(v) for v in c.policy.origin])
-
-
-def net_at_0(c: Certificate, matrices: Sequence[arb_mat]) -> list[arb]:
-    """The network's output at x = 0, given the weights."""
-    h = origin(c)
-    for k, (W, layer) in enumerate(zip(matrices, c.policy.layers, strict=True)):
-        h = biased(W, layer, tanhs(h) if k else h)
-    return list(h.entries())
 
 
 def beta(c: Certificate) -> list[arb]:

@@ -25,10 +25,10 @@ from .evidence import Ball, Path
 from .fields import exact
 from .loop import Field
 from .model import Model
-from .network import Units
 from .rational import positive_definite
 from .refusal import require
 from .symmetric import orders, pairs, places
+from .tangents import Units
 
 MAX_CORNERS = 2**16  # of one cell
 NO_STEP = fmpq(0)

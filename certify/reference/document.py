@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
-import struct
 from array import array
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,15 +13,13 @@ from flint import fmpq, fmpq_mat
 
 from .evidence import WITH_FLOOR, WITH_TUBE, Tree, Trusted, read_evidence
 from .expressions import Equations, equations, rational
-from .fields import binary64, column, entries, exact, keys, little_endian, numbers, square
-from .layers import Layer, bytes_of, read_layers
+from .fields import IDENTIFIER, MAX_NAMES, binary64, column, entries, exact, keys, numbers, square
+from .networks import Network, packed, read_networks
 from .refusal import Refused, require
 
 MAX_BYTES, MAX_BYTES_BEYOND_ASCII = 256 * 2**20, 16 * 2**20
 MAX_TOKENS = 10**6  # commas and opening brackets
-MAX_NAMES = 64
-SCHEMA, CLAIMS = "certify-certificate/8", ("asymptotic", *WITH_FLOOR, *WITH_TUBE)
-IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
+SCHEMA, CLAIMS = "certify-certificate/9", ("asymptotic", *WITH_FLOOR, *WITH_TUBE)
 
 Interval = tuple[fmpq, fmpq]
 
@@ -48,13 +45,13 @@ class Plant:
 
 @dataclass(frozen=True)
 class Policy:
-    layers: tuple[Layer, ...]
+    network: Network
     squash: str
     centre: str
     scale: array[float]
     offset: array[float]
     clip: tuple[array[float], array[float]] | None
-    origin: array[float]  # the layers read origin + x
+    origin: array[float]  # the network reads origin + x
     sha256: str
 
     def limits(self, j: int) -> tuple[fmpq, fmpq] | None:
@@ -64,16 +61,10 @@ class Policy:
 
 @dataclass(frozen=True)
 class Function:
-    """N, of which the claim has the set {N <= level} beside {V <= c2}: `layers` or an `expression`, and not both."""
+    """N, of which the claim has the set {N <= level} beside {V <= c2}: an expression in the states."""
 
-    layers: tuple[Layer, ...]
-    expression: Equations | None
+    expression: Equations
     level: float
-
-    @property
-    def sha256(self) -> str:
-        """The hash by which a network is named; the file does not state it."""
-        return hashlib.sha256(b"certify-lyapunov/1\0" + b"".join(bytes_of(self.layers))).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -132,7 +123,7 @@ class Certificate:
 
 def read(raw: bytes) -> Certificate:
     """The certificate in the bytes of a file, in the order of FORMAT.md's sections."""
-    sections = ("schema", "claim", "plant", "policy", "lyapunov", "levels", "evidence", "provenance")
+    sections = ("schema", "claim", "networks", "plant", "policy", "lyapunov", "levels", "evidence", "provenance")
     data = keys(parsed(raw), "file", *sections)
     require(data["schema"] == SCHEMA, "format", "schema", f"'{SCHEMA}' was expected")
     require(isinstance(data["provenance"], dict), "format", "provenance", "an object was expected")
@@ -143,7 +134,8 @@ def read(raw: bytes) -> Certificate:
     more = {"enlarged": ("start",), "reached": ("start", "centre")}.get(claim, ())
     said = keys(said, "claim", "kind", "rate", "sample", "outer", *more)
     rate, sample = read_rate(said["rate"], claim), read_sample(said["sample"])
-    plant = read_plant(data["plant"])
+    networks = read_networks(data["networks"], "networks")
+    plant = read_plant(data["plant"], networks)
     n = len(plant.states)
     fixed = claim not in WITH_TUBE or not plant.uncertain
     require(fixed, "format", "plant.uncertain", f"nothing may be uncertain with claim '{claim}'")
@@ -154,11 +146,11 @@ def read(raw: bytes) -> Certificate:
     require(free, "format", "claim.sample", f"null was expected with claim '{claim}', or in discrete time")
     start = square(said["start"], "claim.start", n) if "start" in said else None
     centre = column(said["centre"], "claim.centre", n) if "centre" in said else None
-    beyond = None if said["outer"] is None else read_function(said["outer"], plant.states)
+    beyond = None if said["outer"] is None else read_function(said["outer"], plant.states, networks)
     simple = not (claim in WITH_TUBE or rate > 0 or sample is not None or plant.discrete)
     plainly = beyond is None or simple
     require(plainly, "format", "claim.outer", "null was expected with a tube, a rate, a sample and in discrete time")
-    policy = read_policy(data["policy"], n, len(plant.inputs), claim)
+    policy = read_policy(data["policy"], networks, n, len(plant.inputs), claim)
     lyapunov = keys(data["lyapunov"], "lyapunov", "kind", "P")
     require(lyapunov["kind"] == "quadratic", "format", "lyapunov.kind", "'quadratic' was expected")
     P = square(lyapunov["P"], "lyapunov.P", n)
@@ -167,7 +159,8 @@ def read(raw: bytes) -> Certificate:
     *floor, inner, outer = (binary64(levels[name], f"levels.{name}") for name in named_levels)
     least = floor[0] if floor else None
     further = beyond is not None
-    evidence = read_evidence(data["evidence"], n, len(plant.uncertain), claim, sample is not None, further)
+    longer = sample is not None and not plant.dynamics.calls  # a series goes through no network
+    evidence = read_evidence(data["evidence"], n, len(plant.uncertain), claim, longer, further)
     replayed = isinstance(evidence, Tree) or (simple and not further)
     require(replayed, "format", "evidence.kind", "a rate, a sample, discrete time and another set must be replayed")
     return Certificate(claim, rate, sample, start, centre, beyond, plant, policy, P, least, inner, outer, evidence)
@@ -188,17 +181,12 @@ def read_sample(value: Any) -> Interval | None:
     return lo, hi
 
 
-def read_function(value: Any, states: tuple[str, ...]) -> Function:
+def read_function(value: Any, states: tuple[str, ...], networks: Mapping[str, Network]) -> Function:
     """Its values are those at states alone, and its expression is held to the limits of the plant's by itself."""
-    at, network = "claim.outer", isinstance(value, dict) and value.get("kind") == "network"
-    what = "layers" if network else "expression"
-    function = keys(value, at, "kind", what, "level")
-    known = function["kind"] in ("network", "expression")
-    require(known, "format", f"{at}.kind", "'network' or 'expression' was expected")
+    at = "claim.outer"
+    function = keys(value, at, "expression", "level")
     level = binary64(function["level"], f"{at}.level")
-    if network:
-        return Function(read_layers(function["layers"], f"{at}.layers", len(states), 1), None, level)
-    return Function((), equations([function["expression"]], set(states), f"{at}.expression"), level)
+    return Function(equations([function["expression"]], set(states), f"{at}.expression", networks), level)
 
 
 def parsed(raw: bytes) -> Any:
@@ -233,7 +221,7 @@ def integer(text: str) -> int:
     return int(text)
 
 
-def read_plant(value: Any) -> Plant:
+def read_plant(value: Any, networks: Mapping[str, Network]) -> Plant:
     sections = ("name", "time", "states", "inputs", "uncertain", "dynamics", "u_eq", "domain", "input_bounds")
     plant = keys(value, "plant", *sections)
     timed = plant["time"] in ("continuous", "discrete")
@@ -257,7 +245,7 @@ def read_plant(value: Any) -> Plant:
         discrete=plant["time"] == "discrete",
         states=tuple(states),
         inputs=tuple(inputs),
-        dynamics=equations(entries(plant["dynamics"], "plant.dynamics", n), names, "plant.dynamics"),
+        dynamics=equations(entries(plant["dynamics"], "plant.dynamics", n), names, "plant.dynamics", networks),
         u_eq=tuple(rational(q, f"plant.u_eq.{j}") for j, q in enumerate(u_eq)),
         domain=intervals(plant["domain"], "plant.domain", n),
         input_bounds=intervals(plant["input_bounds"], "plant.input_bounds", m),
@@ -276,15 +264,18 @@ def interval(value: Any, at: str) -> Interval:
     return lo, hi
 
 
-def read_policy(value: Any, n: int, m: int, claim: str) -> Policy:
+def read_policy(value: Any, networks: Mapping[str, Network], n: int, m: int, claim: str) -> Policy:
     """The hash is taken over the very bytes that were decoded."""
-    policy = keys(value, "policy", "layers", "squash", "centre", "scale", "offset", "clip", "origin", "sha256")
+    policy = keys(value, "policy", "network", "squash", "centre", "scale", "offset", "clip", "origin", "sha256")
     squash, centre = policy["squash"], policy["centre"]
     require(squash in ("tanh", "identity"), "format", "policy.squash", "'tanh' or 'identity' was expected")
     require(centre in ("output", "preactivation", "none"), "format", "policy.centre", "an unknown centring")
     both = squash == "tanh" or centre != "preactivation"
     require(both, "format", "policy.centre", "'preactivation' needs squash 'tanh'")
-    layers = read_layers(policy["layers"], "policy.layers", n, m)
+    name = policy["network"]
+    network = networks.get(name) if isinstance(name, str) else None
+    if network is None or network.reads != n or network.size != m:
+        raise Refused("format", "policy.network", f"the name of a network from {n} numbers to {m} was expected")
     scale, offset = numbers(policy["scale"], "policy.scale", m), numbers(policy["offset"], "policy.offset", m)
     require(all(s != 0 for s in scale), "format", "policy.scale", "must not be 0")
     clip = read_clip(policy["clip"], m)
@@ -292,13 +283,14 @@ def read_policy(value: Any, n: int, m: int, claim: str) -> Policy:
     still = all(v == 0 for v in origin) or (claim in WITH_FLOOR and centre == "none")
     require(still, "format", "policy.origin", "must be 0 where the origin is an equilibrium, or by centring u_eq")
     digest = hashlib.sha256(f"certify-policy/1\0{squash}\0{centre}\0".encode())
-    for part in bytes_of(layers):
+    for part in network.hashed():
         digest.update(part)
     for values in (scale, offset, *(clip or ())):
-        digest.update(struct.pack("<2Q", 1, m) + little_endian(values))
+        digest.update(packed((m,), values))
+    digest.update(network.described())
     sha256 = digest.hexdigest()
     require(policy["sha256"] == sha256, "hash", "policy.sha256", f"the policy's hash is {sha256}")
-    return Policy(layers, squash, centre, scale, offset, clip, origin, sha256)
+    return Policy(network, squash, centre, scale, offset, clip, origin, sha256)
 
 
 def read_clip(value: Any, m: int) -> tuple[array[float], array[float]] | None:

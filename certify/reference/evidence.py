@@ -119,7 +119,7 @@ class Trusted:
 
 
 def read_evidence(value: Any, n: int, k: int, claim: str, sampled: bool, further: bool) -> Tree | Trusted:
-    """`further` says whether the claim has an `outer`."""
+    """`sampled` says whether a series in time may have an order above 1, `further` whether the claim has an `outer`."""
     if isinstance(value, dict) and value.get("kind") == "trusted-solver":
         said = claim not in (*WITH_TUBE, "nearby")
         require(said, "format", "evidence.kind", f"claim '{claim}' must be replayed")
@@ -158,7 +158,7 @@ def read_covering(value: Any, n: int, further: bool) -> Covering | None:
 
 
 def read_order(value: Any, at: str, sampled: bool) -> int:
-    """Without a sample there is no series, whose order is then 1."""
+    """Without a sample there is no series, and one through networks is not known: then the order is 1."""
     most = MAX_ORDER if sampled else 1
     good = type(value) is int and 1 <= value <= most  # True is an int to isinstance
     require(good, "format", at, f"an integer from 1 to {most} was expected")

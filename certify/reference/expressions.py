@@ -11,13 +11,17 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 from flint import fmpq
 
-from .refusal import require
+from .refusal import Refused, require
 
-MAX_NESTING, MAX_NODES = 200, 20_000  # of lists; of lists, names and numbers in all equations
+if TYPE_CHECKING:
+    from .networks import Network
+
+MAX_NESTING, MAX_NODES = 200, 20_000  # of lists; of lists, names and numbers in all equations, and of operations
 RATIONAL = re.compile(r"-?(0|[1-9][0-9]{0,1200})(/[1-9][0-9]{0,1200})?")
 OPERANDS = {
     "+": (1, MAX_NODES),
@@ -31,6 +35,10 @@ OPERANDS = {
     "exp": (1, 1),
     "atan": (1, 1),
     "sqrt": (1, 1),
+    "abs": (1, 1),
+    "min": (2, MAX_NODES),
+    "max": (2, MAX_NODES),
+    "clip": (3, 3),
 }
 MAX_BITS = 2**14  # of a numerator or a denominator
 RATIONALLY: Mapping[str, Callable[..., fmpq]] = {
@@ -39,9 +47,13 @@ RATIONALLY: Mapping[str, Callable[..., fmpq]] = {
     "-": operator.neg,
     "1/": lambda q: 1 / q,
 }
-PLAIN = ("sin", "cos", "tanh", "exp", "atan", "sqrt")  # functions that are one operation
+PLAIN = ("sin", "cos", "tanh", "exp", "atan", "sqrt")  # smooth functions that are one operation
+HALF = fmpq(1, 2)
 
-Step = tuple[Any, ...]  # ("name", str), ("rational", fmpq), or a name and the numbers of earlier steps
+# ("name", str), ("rational", fmpq), ("network", str, numbers of earlier steps), ("entry", the number of such a call,
+# i), or the name of an operation and the numbers of earlier steps
+Step = tuple[Any, ...]
+Called = Callable[["Call", Sequence[Any]], Sequence[Any]]
 
 
 def rational(text: Any, at: str) -> fmpq:
@@ -51,11 +63,29 @@ def rational(text: Any, at: str) -> fmpq:
 
 
 @dataclass(frozen=True)
+class Call:
+    """A network at given arguments: `entries` of its value are used, the first as number `place` of all calls'."""
+
+    network: Network
+    entries: tuple[int, ...]
+    place: int
+
+
+@dataclass(frozen=True)
 class Equations:
-    """`steps` in an order in which they can be evaluated; `results` are the steps whose values are the equations'."""
+    """`steps` in an order in which they can be evaluated; `results` are the steps whose values are the equations'.
+
+    `calls` has those steps that are calls of networks.
+    """
 
     steps: tuple[Step, ...]
     results: tuple[int, ...]
+    calls: Mapping[int, Call]
+
+    @property
+    def entries(self) -> int:
+        """The number of entries of calls that are used."""
+        return sum(len(call.entries) for call in self.calls.values())
 
     @cached_property
     def used_up(self) -> list[list[int]]:
@@ -67,21 +97,43 @@ class Equations:
                 found[k].append(operand)
         return found
 
-    def evaluate(self, names: Mapping[str, Any], constant: Callable[[fmpq], Any]) -> list[Any]:
+    def evaluate(
+        self, names: Mapping[str, Any], constant: Callable[[fmpq], Any], called: Called | None = None
+    ) -> list[Any]:
         """Over anything that has `+`, `*`, unary `-` and `function(name)`; `1/` is a function.
 
-        A value is dropped after its last use: a model of many variables is large.
+        `called` gives the entries of a call that are used. A value is dropped after its last use: a model of many
+        variables is large.
         """
         values: dict[int, Any] = {}
         for k, (step, used_up) in enumerate(zip(self.steps, self.used_up, strict=True)):
-            values[k] = evaluated(step, values, names, constant)
+            if step[0] == "network":
+                if called is None:
+                    raise TypeError("nothing is said of calls")
+                call = self.calls[k]
+                given = called(call, [values[operand] for operand in step[2:]])
+                values[k] = dict(zip(call.entries, given, strict=True))
+            else:
+                values[k] = evaluated(step, values, names, constant)
             for operand in used_up:
                 del values[operand]
         return [values[k] for k in self.results]
 
 
 def operands_of(step: Step) -> Sequence[int]:
-    return () if step[0] in ("name", "rational") else step[1:]
+    if step[0] in ("name", "rational"):
+        return ()
+    return step[2:] if step[0] == "network" else step[1:2] if step[0] == "entry" else step[1:]
+
+
+def moved(step: Step, place: Mapping[int, int]) -> Step:
+    """The same, its operands being at other places."""
+    if step[0] in ("name", "rational"):
+        return step
+    operands = [place[k] for k in operands_of(step)]
+    if step[0] == "network":
+        return *step[:2], *operands
+    return (step[0], *operands, step[2]) if step[0] == "entry" else (step[0], *operands)
 
 
 def evaluated(step: Step, values: Mapping[int, Any], names: Mapping[str, Any], constant: Callable[[fmpq], Any]) -> Any:
@@ -90,6 +142,8 @@ def evaluated(step: Step, values: Mapping[int, Any], names: Mapping[str, Any], c
         return names[first]
     if kind == "rational":
         return constant(first)
+    if kind == "entry":
+        return values[first][step[2]]
     if kind == "+":
         return values[first] + values[step[2]]
     if kind == "*":
@@ -100,8 +154,8 @@ def evaluated(step: Step, values: Mapping[int, Any], names: Mapping[str, Any], c
 class _Compiler:
     """Checks the grammar and writes the steps down, each once."""
 
-    def __init__(self, names: set[str], at: str) -> None:
-        self.names, self.at, self.nodes = names, at, 0
+    def __init__(self, names: set[str], at: str, networks: Mapping[str, Network]) -> None:
+        self.names, self.at, self.networks, self.nodes = names, at, networks, 0
         self.steps, self.rationals = dict[Step, int](), dict[int, fmpq]()
 
     def step(self, *step: Any) -> int:
@@ -130,6 +184,8 @@ class _Compiler:
         require(well_formed, "format", at, "an expression was expected")
         require(depth < MAX_NESTING, "format", at, f"expressions nest more than {MAX_NESTING} deep")
         name, *rest = node
+        if name == "network":
+            return self.call(rest, at, depth)
         if name == "**":
             good = len(rest) == 2 and type(rest[1]) is int and 0 < abs(rest[1]) <= 64
             require(good, "format", at, "the exponent must be an integer, not 0 and at most 64 in magnitude")
@@ -137,17 +193,41 @@ class _Compiler:
             return result if rest[1] > 0 else self.step("1/", result)
         least, most = OPERANDS.get(name, (1, 0))
         require(least <= len(rest) <= most, "format", at, "an operator with its number of operands was expected")
-        first, *others = [self.compile(operand, at, depth + 1) for operand in rest]
-        if name in PLAIN:
+        return self.operation(name, [self.compile(operand, at, depth + 1) for operand in rest])
+
+    def operation(self, name: str, operands: list[int]) -> int:
+        first, *others = operands
+        if name in (*PLAIN, "abs"):
             return self.step(name, first)
         if name == "tan":
             return self.step("*", self.step("sin", first), self.step("1/", self.step("cos", first)))
         if name == "-" and not others:
             return self.step("-", first)
+        if name == "clip":
+            return self.extreme("min", self.extreme("max", first, others[0]), others[1])
         for other in others:  # from left to right
+            if name in ("min", "max"):
+                first = self.extreme(name, first, other)
+                continue
             term = self.step("-", other) if name == "-" else self.step("1/", other) if name == "/" else other
             first = self.step("+" if name in "+-" else "*", first, term)
         return first
+
+    def extreme(self, name: str, a: int, b: int) -> int:
+        """The lesser or the greater of two: half of their sum, and of how far they are apart."""
+        apart = self.step("abs", self.step("+", a, self.step("-", b)))
+        if name == "min":
+            apart = self.step("-", apart)
+        return self.step("*", self.step("rational", HALF), self.step("+", self.step("+", a, b), apart))
+
+    def call(self, rest: list[Any], at: str, depth: int) -> int:
+        """An entry of the value of a network."""
+        name, i, *arguments = rest if len(rest) >= 2 else (None, None)
+        network = self.networks.get(name) if isinstance(name, str) else None
+        if network is None or type(i) is not int or not 0 <= i < network.size or len(arguments) != network.reads:
+            raise Refused("format", at, "a network's name, a number of its value's and its arguments were expected")
+        operands = [self.compile(operand, at, depth + 1) for operand in arguments]
+        return self.step("entry", self.step("network", name, *operands), i)
 
     def power(self, base: int, k: int) -> int:
         """The square of the power of half the exponent, times the base if k is odd."""
@@ -158,13 +238,24 @@ class _Compiler:
         return self.step("*", square, base) if k % 2 else square
 
 
-def equations(nodes: Sequence[Any], names: set[str], at: str) -> Equations:
-    """Rule `format` for the expressions of a plant."""
-    compiler = _Compiler(names, at)
+def equations(
+    nodes: Sequence[Any], names: set[str], at: str, networks: Mapping[str, Network] = MappingProxyType({})
+) -> Equations:
+    """Rule `format` for expressions in some names, which may call these networks."""
+    compiler = _Compiler(names, at, networks)
     results = [compiler.compile(node, f"{at}.{i}") for i, node in enumerate(nodes)]
     steps, wanted = list(compiler.steps), set(results)
     for k in reversed(range(len(steps))):
         wanted |= set(operands_of(steps[k])) if k in wanted else set()
+    require(len(wanted) <= MAX_NODES, "format", at, f"more than {MAX_NODES} operations in the equations")
     place = {k: number for number, k in enumerate(sorted(wanted))}
-    kept = [(s[0], *(place[k] for k in s[1:])) if operands_of(s) else s for s in (steps[k] for k in place)]
-    return Equations(tuple(kept), tuple(place[k] for k in results))
+    kept = tuple(moved(steps[k], place) for k in place)
+    used = dict[int, list[int]]()
+    for step in kept:
+        if step[0] == "entry":
+            used.setdefault(step[1], []).append(step[2])
+    calls, count = dict[int, Call](), 0
+    for k in sorted(used):
+        calls[k] = Call(networks[kept[k][1]], tuple(used[k]), count)
+        count += len(used[k])
+    return Equations(kept, tuple(place[k] for k in results), calls)

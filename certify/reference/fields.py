@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import math
+import re
 import sys
 from array import array
 from typing import Any
@@ -12,6 +13,9 @@ from typing import Any
 from flint import fmpq, fmpq_mat
 
 from .refusal import Refused, require
+
+MAX_NAMES = 64
+IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
 
 
 def keys(value: Any, at: str, *names: str) -> dict[str, Any]:

@@ -17,19 +17,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from flint import arb, fmpq
+from flint import arb
 
 from .balls import SPREAD, ZERO
 from .document import Certificate, Interval
 from .evidence import Ball
-from .expressions import Equations
+from .expressions import Called, Equations
 from .fields import exact
 from .loop import Field, Known, Loop
 from .model import Model
 from .rational import inverse_diagonal
 from .refusal import Refused, require
 from .series import Constant, added, coefficients
-from .taylor import Taylor
+from .taylor import Taylor, constant
 
 ATTEMPTS, MORE = 12, arb(1.25)  # more than the last hi |f| is tried, as long as that grows by more than this
 LEAST = arb(2) ** -200  # of what is tried: hi |f| < kappa is asked, also where f is 0
@@ -167,7 +167,7 @@ def in_domain(c: Certificate, states: Sequence[arb], F: Sequence[arb], at: str) 
 class Moving:
     """The numbers of a leaf by their names: `symbols` are models in d, `anything` what is uncertain without a symbol.
 
-    `bounds` are those of the |x_i| that count.
+    `bounds` are those of the |x_i| that count, and `called` gives the entries of calls.
     """
 
     states: Mapping[str, Taylor]
@@ -175,10 +175,7 @@ class Moving:
     uncertain: Mapping[str, Taylor]
     anything: Mapping[str, Taylor]
     bounds: Sequence[arb]
-
-
-def constant(q: fmpq) -> Taylor:
-    return Taylor(arb(q))
+    called: Called
 
 
 def reached_from(c: Certificate, leaf: Moving, at: str) -> dict[str, Taylor]:
@@ -188,7 +185,7 @@ def reached_from(c: Certificate, leaf: Moving, at: str) -> dict[str, Taylor]:
     for _ in range(ATTEMPTS):
         moved = dict(zip(names, map(widened, leaf.states.values(), far), strict=True))
         try:
-            F = c.plant.dynamics.evaluate({**moved, **leaf.inputs, **leaf.anything}, constant)
+            F = c.plant.dynamics.evaluate({**moved, **leaf.inputs, **leaf.anything}, constant, leaf.called)
         except Refused as no:
             raise Refused("flow", at, no.detail) from None
         require(all(f.is_finite() for f in F), "flow", at, "F has no finite model within a period")
@@ -223,12 +220,12 @@ def mean_on(
         return v.scaled(period.c) if period.g is None else period * v
 
     try:
-        x_1 = c.plant.dynamics.evaluate({**start, **leaf.inputs, **leaf.uncertain}, constant)
+        x_1 = c.plant.dynamics.evaluate({**start, **leaf.inputs, **leaf.uncertain}, constant, leaf.called)
         held = {**leaf.inputs, **leaf.anything}
         tail = later(c.plant.dynamics, leaf.states, within, held, constant, order, lambda v: v, times_h)
     except Refused as no:
         raise Refused("flow", at, no.detail) from None
-    x_1 = [f.averaged(range(place, place + c.k)) for f in x_1]
+    x_1 = [f.averaged(range(place, place + c.k + c.plant.dynamics.entries)) for f in x_1]
     G = [f if t is None else f + t for f, t in zip(x_1, tail, strict=True)]
     require(all(g.is_finite() for g in G), "flow", at, "the series of F has no finite model")
     return G

@@ -1,81 +1,184 @@
 """N of a claim that goes beyond {V <= c2}, and how it changes along F, in models on a box.
 
-A network's layers are products of matrices: a row for each model, its coefficients behind each other, its remainder by
-the magnitudes of the weights. An expression is a series in time of which two coefficients are asked. Where a box is
-wide, the tanhs of a network are far from their tangents, and lie better between two lines.
+A network is taken step by step with a model for every entry: an affine step is a product of matrices with a row for
+each model, its coefficients behind each other, its remainder by the magnitudes of the weights. How fast its value
+changes is found with the models of the value, of which `map` and `observe` are kept. Where a box is wide, the
+functions of a network are far from their tangents, and lie better between two lines.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from flint import arb, arb_mat
 
-from .affine import Network
-from .balls import ZERO, total
-from .document import Function
-from .flow import constant
-from .layers import Layer
-from .series import along
-from .taylor import Taylor
+from . import affine
+from .balls import ZERO
+from .document import Certificate, Function
+from .expressions import Call
+from .networks import Affine, Clip, Concat, Map, Network, Observe, Sum
+from .refusal import Refused
+from .series import Coefficient, Term, along
+from .taylor import Taylor, constant
+
+Vector = list[Taylor]
+
+
+class InRows:
+    """Networks of models. `seen` has what `map` and `observe` steps have read, in their order."""
+
+    def __init__(self) -> None:
+        self.seen = list[Vector]()
+
+    def affine(self, step: Affine, v: Vector) -> Vector:
+        return [x + Taylor(b) for x, b in zip(mapped(step.W, step.magnitudes, v), step.b, strict=True)]
+
+    def map(self, step: Map, v: Vector) -> Vector:
+        self.seen.append(v)
+        return [x.function(step.function) for x in v]
+
+    def clip(self, step: Clip, v: Vector) -> Vector:
+        """Numbers alone, for a clip has no model."""
+        if not all(x.g is None and x.r.is_zero() for x in v):
+            raise Refused("ring", "leaf", "a clip has no model")
+        return [Taylor(x.c.max(arb(lo)).min(arb(hi))) for x, lo, hi in zip(v, step.lo, step.hi, strict=True)]
+
+    def sum(self, step: Sum, *vectors: Vector) -> Vector:
+        return summed(vectors)
+
+    def concat(self, step: Concat, *vectors: Vector) -> Vector:
+        return [x for v in vectors for x in v]
+
+    def observe(self, step: Observe, v: Vector) -> Vector:
+        self.seen.append(v)
+        return step.expressions.evaluate(dict(zip(step.names, v, strict=True)), constant)
+
+
+class Rates:
+    """The derivatives of the entries where those of a network's first vector are given, in the models of its values."""
+
+    def __init__(self, seen: Sequence[Vector]) -> None:
+        self.seen = iter(seen)
+
+    def affine(self, step: Affine, v: Vector) -> Vector:
+        return mapped(step.W, step.magnitudes, v)
+
+    def map(self, step: Map, v: Vector) -> Vector:
+        return [x.slope_of(step.function) * rate for x, rate in zip(next(self.seen), v, strict=True)]
+
+    def clip(self, step: Clip, v: Vector) -> Vector:
+        raise Refused("ring", "leaf", "a clip may have no derivative")
+
+    def sum(self, step: Sum, *vectors: Vector) -> Vector:
+        return summed(vectors)
+
+    def concat(self, step: Concat, *vectors: Vector) -> Vector:
+        return [x for v in vectors for x in v]
+
+    def observe(self, step: Observe, v: Vector) -> Vector:
+        values, rates = (dict(zip(step.names, each, strict=True)) for each in (next(self.seen), v))
+        return [number(rate) for _, rate in along(step.expressions, values, rates, constant)]
+
+
+def number(v: Coefficient) -> Taylor:
+    return Taylor(ZERO) if v is None else v
+
+
+def summed(vectors: Sequence[Vector]) -> Vector:
+    first, *others = vectors
+    for v in others:
+        first = [x + y for x, y in zip(first, v, strict=True)]
+    return first
+
+
+def net_at_0(c: Certificate) -> list[arb]:
+    """The value of the policy's network at x = 0."""
+    value: Vector = c.policy.network.run(InRows(), [Taylor(arb(v)) for v in c.policy.origin])
+    return [y.c for y in value]
+
+
+def called(call: Call, given: Sequence[Taylor]) -> Vector:
+    value = call.network.run(InRows(), list(given))
+    return [value[i] for i in call.entries]
+
+
+def called_along(call: Call, given: Sequence[Term]) -> list[Term]:
+    """A call of series, of which two coefficients are known."""
+    moving = MovingCall(call.network, given)
+
+    def rule(i: int) -> Callable[[int], Coefficient]:
+        return lambda k: moving.coefficient(k)[i]
+
+    return [Term(given[0].tape, rule(i)) for i in call.entries]
+
+
+class MovingCall:
+    """The value of a network along series, once for all entries that are used."""
+
+    def __init__(self, network: Network, given: Sequence[Term]) -> None:
+        self.network, self.given, self.algebra = network, given, InRows()
+        self.found = list[Vector]()
+
+    def coefficient(self, k: int) -> Vector:
+        if k == len(self.found):
+            at = [number(term.c[k]) for term in self.given]
+            algebra: Any = Rates(self.algebra.seen) if k else self.algebra
+            self.found.append(self.network.run(algebra, at))
+        return self.found[k]
 
 
 class Models:
     """The function of a claim on as many boxes as are asked for, given the models of the states there."""
 
     def __init__(self, N: Function, states: tuple[str, ...]) -> None:
-        self.N, self.states, self.level = N, states, arb(N.level)
-        self.network = Network(N.layers)
+        self.N, self.states, self.level = N.expression, states, arb(N.level)
 
     def value(self, x: Sequence[Taylor]) -> Taylor:
         """N, or a refusal where it may be undefined."""
-        if self.N.expression is not None:
-            value: Taylor = self.N.expression.evaluate(dict(zip(self.states, x, strict=True)), constant)[0]
-            return value
-        for k, layer in enumerate(self.N.layers):
-            x = self.affine(k, layer, [a.function("tanh") for a in x] if k else x)
-        return x[0]
+        value: Taylor = self.N.evaluate(dict(zip(self.states, x, strict=True)), constant, called)[0]
+        return value
 
     def is_above(self, x: Sequence[Taylor]) -> bool:
         """True if N is certainly defined, and above its level, on all of the box; x without remainders."""
-        N = self.value(x)
-        if N.is_finite() and bool(-(-N).bound() > self.level):
-            return True
-        return self.N.expression is None and self.is_above_by_lines(x)
+        if not self.N.calls:
+            return self.exceeds(self.value(x))
+        try:
+            return self.exceeds(self.value(x)) or self.exceeds(self.by_forms(x))
+        except Refused:
+            return self.exceeds(self.by_forms(x))
 
-    def is_above_by_lines(self, x: Sequence[Taylor]) -> bool:
-        """The same of a network by the least value of its affine form."""
-        symbols = max(v.symbols for v in x)
-        forms = arb_mat([[v.c, *entries(v.g, symbols)] for v in x])
-        (((mid, slopes, error),),) = self.network.outputs(forms, 1)
-        least = mid - total(abs(v) for v in slopes) - error
-        return bool(least.is_finite()) and bool(least > self.level)
+    def exceeds(self, N: Taylor) -> bool:
+        return N.is_finite() and bool(-(-N).bound() > self.level)
+
+    def by_forms(self, x: Sequence[Taylor]) -> Taylor:
+        """N with the affine forms of its calls' values, each entry with a symbol for its error."""
+        before = max(v.symbols for v in x)
+        symbols = before + self.N.entries
+
+        def of_call(call: Call, given: Sequence[Taylor]) -> Vector:
+            return affine.called(call, given, symbols, before)
+
+        wide = [Taylor(v.c, arb_mat(1, symbols, wider(v, symbols)), None, v.second + v.r) for v in x]
+        value: Taylor = self.N.evaluate(dict(zip(self.states, wide, strict=True)), constant, of_call)[0]
+        return value
 
     def moving(self, x: Sequence[Taylor], F: Sequence[Taylor]) -> tuple[Taylor, Taylor]:
         """N and N'F, or a refusal where N may be undefined."""
-        if self.N.expression is not None:
-            states, rates = dict(zip(self.states, x, strict=True)), dict(zip(self.states, F, strict=True))
-            ((value, rate),) = along(self.N.expression, states, rates, constant)
-            return value, Taylor(ZERO) if rate is None else rate
-        y = F
-        for k, (layer, W) in enumerate(zip(self.N.layers, self.network.weights, strict=True)):
-            if k:
-                y = [a.function("tanh'") * v for a, v in zip(x, y, strict=True)]
-                x = [a.function("tanh") for a in x]
-            x, y = self.affine(k, layer, x), mapped(W, self.network.absolute[k], y)
-        return x[0], y[0]
-
-    def affine(self, k: int, layer: Layer, x: Sequence[Taylor]) -> list[Taylor]:
-        """Layer k."""
-        each = zip(mapped(self.network.weights[k], self.network.absolute[k], x), layer.bias, strict=True)
-        return [v + Taylor(arb(b)) for v, b in each]
+        states, rates = (dict(zip(self.states, each, strict=True)) for each in (x, F))
+        ((value, rate),) = along(self.N, states, rates, constant, called_along)
+        return value, number(rate)
 
 
-def mapped(W: arb_mat, magnitudes: arb_mat, x: Sequence[Taylor]) -> list[Taylor]:
+def wider(v: Taylor, symbols: int) -> list[arb]:
+    return [*v.slopes(v.symbols), *([ZERO] * (symbols - v.symbols))]
+
+
+def mapped(W: arb_mat, magnitudes: arb_mat, x: Sequence[Taylor]) -> Vector:
     """W times a column of models."""
     symbols = max(v.symbols for v in x)
     square = symbols**2 if any(v.Q is not None for v in x) else 0
-    rows = (W * arb_mat([[v.c, *entries(v.g, symbols), *entries(v.Q, square)] for v in x])).tolist()
+    rows = (W * arb_mat([[v.c, *v.slopes(symbols), *squares(v, square)] for v in x])).tolist()
     rest, end = (magnitudes * arb_mat([[v.r] for v in x])).entries(), 1 + symbols
     return [
         Taylor(
@@ -88,5 +191,5 @@ def mapped(W: arb_mat, magnitudes: arb_mat, x: Sequence[Taylor]) -> list[Taylor]
     ]
 
 
-def entries(part: arb_mat | None, count: int) -> list[arb]:
-    return [ZERO] * count if part is None else list(part.entries())
+def squares(v: Taylor, count: int) -> list[arb]:
+    return [ZERO] * count if v.Q is None else list(v.Q.entries())

@@ -51,22 +51,44 @@ def coefficients(name: str, y: arb) -> Four:
     return value, first, second / 2, third / 6
 
 
+@dataclass(frozen=True)
+class Beyond:
+    """The part of a number beyond its tangent, d'Hd + C[d] within d'Rd; `lip`, if needed, is a constant of the rest."""
+
+    H: arb_mat
+    C: arb_mat
+    R: arb_mat
+    lip: arb | None
+
+
 def function_of(v: Model, name: str) -> Model:
     """The model of phi of v."""
+    if name == "abs":
+        return absolute(v)
     phi = expansion(v, name)
-    H, C, R = beyond_tangent(v, phi)
-    (value, p, half, _), moved, steepest = phi.at, phi.moved, phi.steepest
-    E = steepest * v.E + R + moved[1] * (v.shares + (v.bend + v.twist) * identity(v.a.nrows()))
-    lip = steepness(v, phi, moved[1] * (2 * v.bend + 3 * v.twist))
+    beyond, (off, slack) = beyond_tangent(v, phi), unsure(v, phi)
+    value, p, half, _ = phi.at
     B, dv = tuple(p * q for q in v.B), tuple(p * q for q in v.dv)
-    by_y = 2 * abs(half) * v.sway
     da = tuple(p * a + (2 * half * q) * v.a for q, a in zip(v.dv, v.da, strict=True))
-    square = v.doubt * v.doubt
-    off = abs(p) * v.off + phi.bent * square
+    lip = None if v.lip is None or beyond.lip is None else abs(p) * v.lip + beyond.lip
+    Q, K, E = p * v.Q + beyond.H, p * v.K + beyond.C, abs(p) * v.E + beyond.R
+    return replace(v, v=value, a=p * v.a, Q=Q, K=K, E=E, B=B, dv=dv, da=da, lip=lip, off=off, slack=slack)
+
+
+def absolute(v: Model) -> Model:
+    sign = v.sign()
+    if not sign:
+        raise Refused("local", "ball", "abs of what may vanish")
+    return v if sign > 0 else -v
+
+
+def unsure(v: Model, phi: Expansion) -> tuple[arb, arb]:
+    """off and slack of phi of v."""
+    _, p, half, _ = phi.at
+    by_y, square = 2 * abs(half) * v.sway, v.doubt * v.doubt
     slack = (2 * abs(half) * v.off + 3 * phi.twisted * square) * v.slope
     slack += (abs(p) + by_y) * v.slack + by_y * v.tilt
-    Q, K = p * v.Q + H, p * v.K + C
-    return replace(v, v=value, a=p * v.a, Q=Q, K=K, E=E, B=B, dv=dv, da=da, lip=lip, off=off, slack=slack)
+    return abs(p) * v.off + phi.bent * square, slack
 
 
 def expansion(v: Model, name: str) -> Expansion:
@@ -88,12 +110,12 @@ def expansion(v: Model, name: str) -> Expansion:
     return Expansion(at, moved, most / 24, last / 6)
 
 
-def beyond_tangent(v: Model, phi: Expansion) -> tuple[arb_mat, arb_mat, arb_mat]:
-    """H, C and R: what phi adds to its tangent is d'Hd + C[d] within d'Rd.
+def beyond_tangent(v: Model, phi: Expansion) -> Beyond:
+    """The part of phi of v beyond phi(v(0)) and phi' times what v adds to v(0); what is beyond v's K counts with phi'.
 
     With D = v - v(0), y = a.d and z = D - y, within curve and d'Wd: h D^2 is h y^2 and 2 h y d'Qd but for what is
     left of z in 2 h y z and for h z^2; g D^3 is g y^3 but for g z (3 y^2 + 3 y z + z^2); and D^4 is at most
-    radius^2 (y^2 + (2 |y| + |z|) |z|). Here h, g and a are those at y = 0: by what they differ R is larger.
+    radius^2 (y^2 + (2 |y| + |z|) |z|). Here phi', h, g and a are those at y = 0: by what they differ R is larger.
     """
     n, slope, curve, a = v.a.nrows(), v.slope, v.curve, v.a
     _, _, h, g = phi.at
@@ -102,9 +124,10 @@ def beyond_tangent(v: Model, phi: Expansion) -> tuple[arb_mat, arb_mat, arb_mat]
     quartic = phi.fourth * v.radius * v.radius
     rest = 2 * phi.bent * slope
     turned = phi.bent * curve + phi.twisted * (3 * slope * (slope + curve) + curve * curve)
-    turned += quartic * (2 * slope + curve)
+    turned += quartic * (2 * slope + curve) + phi.moved[1]
     known = rest * v.twist + turned * (v.bend + v.twist) + total(mistaken(v, phi))
-    return h * outer, C, (rest + turned) * v.whole + quartic * outer + known * identity(n)
+    R = (rest + turned) * v.whole + quartic * outer + known * identity(n)
+    return Beyond(h * outer, C, R, steepness(v, phi))
 
 
 def mistaken(v: Model, phi: Expansion) -> tuple[arb, arb, arb]:
@@ -117,16 +140,10 @@ def mistaken(v: Model, phi: Expansion) -> tuple[arb, arb, arb]:
     return of_H, of_C, quartic * square
 
 
-def steepness(v: Model, phi: Expansion, wrong: arb) -> arb | None:
-    """The Lipschitz constant of phi(v) beyond its K; `wrong` is for what phi' Q and phi' K are off by."""
-    beyond = steepness_beyond_tangent(v, phi)
-    return None if v.lip is None or beyond is None else phi.steepest * v.lip + beyond + wrong
-
-
-def steepness_beyond_tangent(v: Model, phi: Expansion) -> arb | None:
+def steepness(v: Model, phi: Expansion) -> arb | None:
     """The Lipschitz constant of phi''/2 (D^2 - y^2 - 2 y d'Qd) + phi'''/6 (D^3 - y^3) and the rest of the series.
 
-    D = y + z, y = a.d. The derivative of the rest by D is at most `last` |D|^3.
+    D = y + z, y = a.d. The derivative of the rest by D is at most `last` |D|^3. By what phi' differs z counts too.
     """
     if v.lip is None:
         return None
@@ -135,4 +152,5 @@ def steepness_beyond_tangent(v: Model, phi: Expansion) -> arb | None:
     second = 2 * phi.bent * (y * left.both + z * steep)
     third = 3 * phi.twisted * (y * y * (steep + 2 * z) + y * z * (2 * steep + z) + z * z * steep)
     of_H, of_C, _ = mistaken(v, phi)
-    return second + third + phi.last * v.radius**3 * (y + steep) + 2 * of_H + 3 * of_C
+    wrong = phi.moved[1] * steep + 2 * of_H + 3 * of_C
+    return second + third + phi.last * v.radius**3 * (y + steep) + wrong

@@ -11,23 +11,17 @@ from itertools import islice
 
 from flint import arb, arb_mat, fmpq_mat
 
-from .affine import Affine, Network, clip
-from .balls import (
-    ZERO,
-    beta,
-    bounded_by_form,
-    net_at_0,
-    origin,
-    total,
-    weights,
-    within_bounds,
-)
+from .affine import Form, OnBoxes, batch, called, clip
+from .balls import ZERO, beta, bounded_by_form, total, within_bounds
 from .document import Certificate
 from .evidence import Covering, Tree
-from .flow import Moving, constant, mean_on, reached_from
+from .expressions import Call
+from .flow import Moving, mean_on, reached_from
+from .function import net_at_0
+from .networks import Map
 from .rational import inverse_diagonal
 from .refusal import Refused, require
-from .taylor import Taylor
+from .taylor import Taylor, constant
 
 LEAF = 255
 MAX_WAITING = 4096  # boxes of the tree beside the one in hand
@@ -107,7 +101,8 @@ class Leaves:
     def __init__(self, c: Certificate, T: fmpq_mat, S: fmpq_mat) -> None:
         if not isinstance(c.evidence, Tree):
             raise TypeError("a solver's word has no leaves")
-        self.c, self.n, self.symbols = c, c.n, c.n + c.m + c.k + c.varies
+        self.c, self.n, self.calls = c, c.n, c.n + c.m + c.k  # the symbol of the first entry of a call
+        self.symbols = self.calls + c.plant.dynamics.entries + c.varies
         self.order, self.alone = c.evidence.order, c.evidence.ball is None
         self.step, self.steps = arb(c.step), c.step > 0
         self.P, self.rate = arb_mat(c.P), arb(2 * c.rate)
@@ -117,7 +112,7 @@ class Leaves:
         self.S = [arb(S[i, i]) for i in range(c.n)]
         self.cross = [(i, j, arb(2 * abs(S[i, j]))) for j in range(c.n) for i in range(j) if S[i, j] != 0]
         self.inner, self.outer = arb(c.inner), arb(c.outer)
-        self.network, self.offset = centred(c)
+        self.shifts, self.offset = centred(c)
 
     # ------------------------------------------------------------------------------------------------- which leaves
 
@@ -142,19 +137,19 @@ class Leaves:
 
     # --------------------------------------------------------------------------------------------------- the policy
 
-    def enclose(self, batch: Sequence[Box]) -> list[Leaf]:
+    def enclose(self, some: Sequence[Box]) -> list[Leaf]:
         """Each leaf with its models of x, 2 P x and the policy."""
         n, stride = self.n, self.n + 1
-        centres = [[(arb(a) + arb(b)) / 2 for a, b in zip(box.lo, box.hi, strict=True)] for box in batch]
-        radii = [[(arb(b) - arb(a)) / 2 for a, b in zip(box.lo, box.hi, strict=True)] for box in batch]
+        centres = [[(arb(a) + arb(b)) / 2 for a, b in zip(box.lo, box.hi, strict=True)] for box in some]
+        radii = [[(arb(b) - arb(a)) / 2 for a, b in zip(box.lo, box.hi, strict=True)] for box in some]
         entries = []
         for i in range(n):
             for centre, radius in zip(centres, radii, strict=True):
                 entries += [centre[i], *(radius[i] if j == i else ZERO for j in range(n))]
-        z = arb_mat(n, stride * len(batch), entries)
+        z = arb_mat(n, stride * len(some), entries)
         x = self.T * z
-        u = self.policy(x, len(batch))
-        states, gradients, at = x.tolist(), (self.PT2 * z).tolist(), range(0, stride * len(batch), stride)
+        u = self.policy(x, len(some))
+        states, gradients, at = x.tolist(), (self.PT2 * z).tolist(), range(0, stride * len(some), stride)
         return [
             Leaf(
                 box,
@@ -164,17 +159,21 @@ class Leaves:
                 [row[k : k + stride] for row in gradients],
                 [row[b] for row in u],
             )
-            for b, (box, k) in enumerate(zip(batch, at, strict=True))
+            for b, (box, k) in enumerate(zip(some, at, strict=True))
         ]
 
-    def policy(self, x: arb_mat, count: int) -> list[list[Affine]]:
-        """For each input and each leaf, given x on the leaves; the layers read x from their origin."""
-        at, further = origin(self.c).entries(), [ZERO] * self.n
-        read = x + arb_mat(self.n, x.ncols(), [v for row in at for v in (row, *further) * count])
-        return [[self.output(j, net) for net in nets] for j, nets in enumerate(self.network.outputs(read, count))]
+    def policy(self, x: arb_mat, count: int) -> list[list[Form]]:
+        """For each input and each leaf, given x on the leaves; the network reads x from its origin."""
+        policy, algebra, rows = self.c.policy, OnBoxes(count), x.tolist()
+        first = algebra.shifted(algebra.given(rows), map(arb, policy.origin))
+        net = algebra.shifted(policy.network.run(algebra, first), self.shifts)
+        if policy.squash == "tanh":
+            net = algebra.map(Map((), self.c.m, "tanh"), net)
+        inputs = range(self.c.m)
+        return [[self.output(j, form) for form in forms] for j, forms in enumerate(algebra.forms(net, inputs))]
 
-    def output(self, j: int, squashed: Affine) -> Affine:
-        """Input j from the network's output."""
+    def output(self, j: int, squashed: Form) -> Form:
+        """Input j from the squash of the network's output."""
         policy, (mid, slopes, error) = self.c.policy, squashed
         scale, limits = arb(policy.scale[j]), policy.limits(j)
         u = scale * mid + self.offset[j], [scale * v for v in slopes], abs(scale) * error
@@ -195,7 +194,10 @@ class Leaves:
             middle, half = arb((lo + hi) / 2), arb((hi - lo) / 2)
             uncertain[name] = self.moving(middle, [ZERO] * n, n + self.c.m + j, half)
             anything[name] = Taylor(middle, r=half)
-        return Moving(states, inputs, uncertain, anything, self.bounds)
+        return Moving(states, inputs, uncertain, anything, self.bounds, self.called)
+
+    def called(self, call: Call, given: Sequence[Taylor]) -> list[Taylor]:
+        return called(call, given, self.symbols, self.calls)
 
     def affine(self, row: list[arb]) -> Taylor:
         """A list [constant, coefficients of d]."""
@@ -204,8 +206,9 @@ class Leaves:
     def F(self, leaf: Leaf) -> list[Taylor]:
         """Models of f(x, pi(x), q), all of them finite."""
         known, place = self.numbers(leaf), f"leaf {leaf.box.number}"
+        names = {**known.states, **known.inputs, **known.uncertain}
         try:
-            result = self.c.plant.dynamics.evaluate({**known.states, **known.inputs, **known.uncertain}, constant)
+            result = self.c.plant.dynamics.evaluate(names, constant, self.called)
         except Refused as no:
             raise Refused(no.rule, place, no.detail) from None
         require(all(f.is_finite() for f in result), "ring", place, "F has no finite model")
@@ -292,19 +295,17 @@ class Leaves:
         return bool(self.diagonal_part(box.least()) - self.cross_part(box) >= self.inner)
 
 
-def centred(c: Certificate) -> tuple[Network, list[arb]]:
-    """The policy's layers and its offset, with the centring in the last bias or in the offset."""
-    policy, squashed = c.policy, c.policy.squash == "tanh"
-    last, offset = policy.layers[-1].bias, [arb(v) for v in policy.offset]
+def centred(c: Certificate) -> tuple[list[arb], list[arb]]:
+    """The shift by which centring changes the network's output, and the offset with what it adds to that."""
+    policy, nothing, offset = c.policy, [ZERO] * c.m, [arb(v) for v in c.policy.offset]
     if policy.centre == "none":
-        return Network(policy.layers, squashed), offset
-    at_0 = net_at_0(c, weights(policy.layers))
+        return nothing, offset
+    at_0 = net_at_0(c)
     if policy.centre == "preactivation":
-        bias = [arb(b) - v + at for b, v, at in zip(last, at_0, beta(c), strict=True)]
-        return Network(policy.layers, squashed, bias), offset
+        return [at - v for v, at in zip(at_0, beta(c), strict=True)], offset
     each = zip(policy.scale, at_0, c.plant.u_eq, strict=True)
-    offset = [arb(u_eq) - arb(s) * (v.tanh() if squashed else v) for s, v, u_eq in each]
-    return Network(policy.layers, squashed), offset
+    squashed = policy.squash == "tanh"
+    return nothing, [arb(u_eq) - arb(s) * (v.tanh() if squashed else v) for s, v, u_eq in each]
 
 
 def is_negative(D: Taylor, slacks: Sequence[Taylor]) -> bool:
@@ -329,11 +330,11 @@ def check_leaves(leaves: Leaves, evidence: Tree) -> None:
     asked, and in continuous time that F has a finite model, but where time has steps that V stays below c0.
     """
     c, bounded = leaves.c, bounded_by_form(leaves.c)
-    size = leaves.network.batch(c.n)
+    size = batch(c.policy.network, c.n)
     covered = not leaves.alone
     asked = (box for box in boxes(evidence) if not (leaves.is_outside(box) or (covered and leaves.is_inside(box))))
-    while batch := list(islice(asked, size)):
-        enclosed = leaves.enclose(batch)
+    while some := list(islice(asked, size)):
+        enclosed = leaves.enclose(some)
         for leaf in enclosed:
             good = bounded or within_bounds(c, leaf.ranges())
             require(good, "inputs", f"leaf {leaf.box.number}", "an input is not certain to stay in its bounds")

@@ -8,12 +8,13 @@ the counts were measured with, and so takes fewer operations unless it is asked 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
-from .document import Certificate, Function
+from .document import Certificate
 from .evidence import Covering, Tree
-from .layers import Layer
+from .expressions import Equations
+from .networks import Affine, Clip, Map, Network, Observe
 from .rational import bits
 from .refusal import require
 
@@ -30,16 +31,87 @@ def limits(c: Certificate, patient: bool) -> None:
     require(work <= most, "limits", "operations", f"{work} operations; {most} are allowed{more}")
 
 
+# ----------------------------------------------------------------------------------------------------------- the sizes
+
+
 @dataclass(frozen=True)
-class Size:
-    """Sizes in a file: `s` symbols on a leaf, `d` entries on a ball, `y` of what is uncertain, `a` operations."""
+class Nets:
+    """Some networks: rows and columns of each affine step with the units of its network before it.
+
+    `units` are those of all of them, `widest` is the most entries that a step makes, `steps` their number.
+    """
+
+    shapes: tuple[tuple[int, int, int], ...]
+    units: int
+    widest: int
+    steps: int
+
+    @property
+    def weights(self) -> int:
+        return sum(p * q for p, q, _ in self.shapes)
+
+    @property
+    def folding(self) -> int:
+        """Operations that are done once with the weights."""
+        return sum(p * q * (2**9 + 8 * min(p, q)) for p, q, _ in self.shapes)
+
+    @property
+    def paths(self) -> int:
+        """The ways of errors to the value, once for many leaves."""
+        return sum(p * g * (q + 3 * 2**6) for p, q, g in self.shapes) // 8
+
+    def forms(self, leaves: int, symbols: int) -> int:
+        """Affine forms on so many leaves."""
+        each = sum(p * (q * (symbols + 2) + 5 * g + 64 * symbols + 7 * 2**9) for p, q, g in self.shapes)
+        return leaves * each // 8
+
+    def models(self, symbols: int) -> int:
+        """A model for every entry, on one leaf."""
+        return sum(p * (symbols + 4) ** 2 * (2 * q + 64) for p, q, _ in self.shapes)
+
+    def tangents(self, d: int, t: int) -> int:
+        """On one ball."""
+        return sum(p * (q * (d + g) + g * t) + 2**21 for p, q, g in self.shapes) + 64 * self.units * t
+
+
+def nets(*networks: Network) -> Nets:
+    shapes, before = list[tuple[int, int, int]](), 0
+    for network in networks:
+        start = before
+        for step in network.steps:
+            if isinstance(step, Affine):
+                shapes.append((step.size, step.columns, before - start))
+            before += step.size if isinstance(step, Map | Clip | Observe) else 0
+    steps = [step for network in networks for step in network.steps]
+    return Nets(tuple(shapes), before, max((step.size for step in steps), default=0), len(steps))
+
+
+def called(expressions: Equations) -> Iterator[Network]:
+    """The network of each call."""
+    return (call.network for call in expressions.calls.values())
+
+
+def observing(*networks: Network) -> int:
+    """Operations of the expressions in networks."""
+    steps = (step for network in networks for step in network.steps)
+    return sum(len(step.expressions.steps) for step in steps if isinstance(step, Observe))
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes in a file: `s` symbols on a leaf, `d` entries on a ball, `y` of what is uncertain, `a` operations.
+
+    `z` are entries of calls, `nets` the policy's network and those of the calls.
+    """
 
     n: int
     m: int
+    z: int
     s: int
     d: int
     y: int
     a: int
+    nets: Nets
 
     @property
     def t(self) -> int:
@@ -47,60 +119,62 @@ class Size:
         return 2 * self.d**2 + self.d * (self.d + 1) * (self.d + 2) // 6
 
 
-def size_of(c: Certificate) -> Size:
-    y = c.k + c.varies
-    return Size(c.n, c.m, c.n + c.m + y, c.n + (c.claim == "reached"), y, len(c.plant.dynamics.steps))
+def sizes_of(c: Certificate) -> Sizes:
+    f, policy = c.plant.dynamics, c.policy.network
+    y, z, a = c.k + c.varies, f.entries, len(f.steps) + observing(policy, *called(f))
+    return Sizes(c.n, c.m, z, c.n + c.m + y + z, c.n + (c.claim == "reached"), y, a, nets(policy, *called(f)))
 
 
 def asked_of_leaves(c: Certificate, evidence: Tree) -> bool:
     return evidence.ball is None or c.inner != c.outer
 
 
-def before_each(layers: Sequence[Layer]) -> list[tuple[int, int, int]]:
-    """Rows and columns of each layer, and the units of all layers before it."""
-    result, units = [], 0
-    for layer in layers:
-        result.append((layer.rows, layer.columns, units))
-        units += layer.rows
-    return result
+def evaluations(c: Certificate, order: int) -> int:
+    """Evaluations of the equations for a series in time."""
+    return 1 if c.sample is None else 2 * order**3 + 8
+
+
+# --------------------------------------------------------------------------------------------------------- the numbers
 
 
 def numbers(c: Certificate) -> int:
     """An estimate of how many numbers are held at once."""
-    z, evidence, shapes = size_of(c), c.evidence, before_each(c.policy.layers)
-    count = 4 * sum(p * q for p, q, _ in shapes)
+    z, evidence = sizes_of(c), c.evidence
+    count, square = 4 * z.nets.weights, (z.s + 1) ** 2
     if not isinstance(evidence, Tree):
         return count
     order = max(evidence.order, evidence.ball.order if evidence.ball else 1)
     values = z.a * (1 if c.sample is None else 4 * order) + 2 * z.n + 8
     if asked_of_leaves(c, evidence) or c.beyond is not None:
-        count += values * (z.s + 1) ** 2 + 2**14 * (z.n + z.m + len(shapes))
+        count += values * square + 2**14 * (z.n + z.m + z.z + z.nets.steps)
     if evidence.ball or evidence.contraction or evidence.tube:
-        count += values * (z.t + z.d * z.y + z.m) + z.d**4 // 4
-        count += sum(p * (4 * before + 3 * z.t) for p, _, before in shapes)
+        count += values * (z.t + z.d * z.y + z.m + z.z) + z.d**4 // 4
+        count += sum(4 * p * g for p, _, g in z.nets.shapes) + 3 * z.nets.units * z.t
     if c.beyond is not None:
-        square = (z.s + 1) ** 2
-        count += sum(p * (4 * q + 2 * square) for p, q, _ in before_each(c.beyond.layers))
-        count += 8 * steps_of(c.beyond) * square
+        N = c.beyond.expression
+        count += sum(4 * p * q + 2 * p * square for p, q, _ in nets(*called(N)).shapes)
+        count += 8 * (len(N.steps) + observing(*called(N))) * square
     return count
+
+
+# ------------------------------------------------------------------------------------------------------ the operations
 
 
 def operations(c: Certificate) -> int:
     """Elementary operations on numbers, in all."""
-    z, evidence, shapes = size_of(c), c.evidence, before_each(c.policy.layers)
-    work = 2**15 * z.a + folding(shapes) + inverting(z.n, bits(c.P))
-    if c.policy.centre == "none" and c.ends_at_origin:
-        work += 2**12 * sum(p * q for p, q, _ in shapes)
+    z, evidence = sizes_of(c), c.evidence
+    work = 2**15 * z.a + z.nets.folding + inverting(z.n, bits(c.P))
+    if c.ends_at_origin:
+        work += 2**12 * z.nets.weights
     if not isinstance(evidence, Tree):
         return work
     of_S = min(2 * bits(evidence.T) + bits(c.P) + 16, 2**16 // z.n)
     work += inverting(z.n, of_S) + 2**8 * len(evidence.tree)
     if asked_of_leaves(c, evidence):
-        leaves, times = evidence.tree.count(LEAF), evaluations(c, evidence.order)
-        models, calls = z.a * times + z.n**2 + 4 * z.n, z.n * z.s**2 + 160 * len(shapes)
-        work += leaves * on_a_box(z.n, models, z.a * (evidence.order + 1), z.s, calls)
-        work += on_leaves(leaves, shapes, z.n, z.m)
-    return work + on_balls(c, z, evidence) + in_tube(c, z, evidence) + beyond(c, z, evidence.covering)
+        leaves, order = evidence.tree.count(LEAF), evidence.order
+        models, calls = z.a * evaluations(c, order) + z.n**2 + 4 * z.n, z.n * z.s**2 + 160 * z.nets.steps
+        work += on_boxes(leaves, z.n, models, z.a * (order + 1), z.s, calls) + on_leaves(c, z, leaves, order)
+    return work + on_balls(c, z, evidence) + in_tube(c, z, evidence) + beyond(c, z, evidence)
 
 
 def inverting(n: int, length: int) -> int:
@@ -113,91 +187,65 @@ def deciding(n: int) -> int:
     return 2**14 * n**3
 
 
-def evaluations(c: Certificate, order: int) -> int:
-    """Evaluations of the equations for a series in time."""
-    return 1 if c.sample is None else 2 * order**3 + 8
-
-
-def steps_of(N: Function) -> int:
-    return 0 if N.expression is None else len(N.expression.steps)
-
-
-# ---------------------------------------------------------------------------------------------------- leaves and balls
-
-
-def folding(shapes: Sequence[tuple[int, int, int]]) -> int:
-    """Operations that are done once with a network's weights."""
-    return sum(p * q * (2**9 + 8 * min(p, q)) for p, q, _ in shapes)
-
-
-def on_leaves(leaves: int, shapes: Sequence[tuple[int, int, int]], n: int, m: int) -> int:
-    """A network between affine forms."""
-    each = sum(p * (q * (n + m + 2) + 5 * before + 64 * (n + m) + 7 * 2**9) for p, q, before in shapes)
-    widest = max((p for p, _, _ in shapes), default=0)
-    paths = sum(p * before * (q + 3 * 2**6) for p, q, before in shapes) // 8
-    return leaves * each // 8 + (1 + leaves * widest // 2**14) * paths
-
-
-def on_a_box(n: int, models: int, values: int, symbols: int, calls: int) -> int:
-    """So many models, `values` of which are held, on a leaf in n states; `calls` are those beside the models'."""
+def on_boxes(leaves: int, n: int, models: int, values: int, symbols: int, calls: int) -> int:
+    """So many models, `values` of which are held, on leaves in n states; `calls` are those beside the models'."""
     square = (symbols + 4) ** 2
     each = 8 * square * models + square * (values + 4) * (32 * models + calls) // 2**9
-    return each + 2**11 + 2**7 * n + n**3
+    return leaves * (each + 2**11 + 2**7 * n + n**3)
 
 
-def as_models(shapes: Sequence[tuple[int, int, int]], symbols: int) -> int:
-    """A network's layers in models on a leaf."""
-    return sum(p * (symbols + 4) ** 2 * (2 * q + 64) for p, q, _ in shapes)
+def on_leaves(c: Certificate, z: Sizes, leaves: int, order: int) -> int:
+    """All networks between affine forms; those of calls as often as the equations are evaluated."""
+    once = z.nets.forms(leaves, z.s) + (1 + leaves * z.nets.widest // 2**14) * z.nets.paths
+    return once * (evaluations(c, order) if z.z else 1)
 
 
-def policy_on_a_ball(c: Certificate, z: Size) -> int:
-    shapes = before_each(c.policy.layers)
-    return sum(p * (q * (z.d + before) + (before + 64) * z.t) + 2**21 for p, q, before in shapes)
+def networks_on_a_ball(z: Sizes) -> int:
+    return z.nets.tangents(z.d, z.t)
 
 
-def equations_on_a_ball(z: Size) -> int:
-    """Once."""
-    return z.a * (2**17 + 64 * z.t + 16 * z.d**2 * (z.m + z.y))
+def equations_on_a_ball(z: Sizes) -> int:
+    """Once, with the networks that they call."""
+    calls = networks_on_a_ball(z) if z.z else 0
+    return z.a * (2**17 + 64 * z.t + 16 * z.d**2 * (z.m + z.y + z.z)) + calls
 
 
-def inequality(c: Certificate, z: Size) -> int:
-    units = sum(layer.rows for layer in c.policy.layers)
+def inequality(z: Sizes) -> int:
     rows = z.d + 1
-    return 2**23 + 2**12 * rows**4 + 8 * z.d**5 + 4 * units * z.d**3 + deciding(rows)
+    return 2**23 + 2**12 * rows**4 + 8 * z.d**5 + 4 * z.nets.units * z.d**3 + deciding(rows)
 
 
-def on_balls(c: Certificate, z: Size, evidence: Tree) -> int:
+def on_balls(c: Certificate, z: Sizes, evidence: Tree) -> int:
     cells, work = math.prod(evidence.cells), 0
-    decided = cells * 2**z.y * inequality(c, z) + deciding(z.n)
+    decided = networks_on_a_ball(z) + cells * 2**z.y * inequality(z) + deciding(z.n)
     if evidence.ball is not None:
         times = cells + (0 if c.sample is None else evaluations(c, evidence.ball.order) + 8)
-        work += policy_on_a_ball(c, z) + times * equations_on_a_ball(z) + decided
+        work += times * equations_on_a_ball(z) + decided
     if evidence.contraction is not None:
-        work += policy_on_a_ball(c, z) + cells * equations_on_a_ball(z) + decided
+        work += cells * equations_on_a_ball(z) + decided
     return work
 
 
-def in_tube(c: Certificate, z: Size, evidence: Tree) -> int:
-    each = policy_on_a_ball(c, z) + equations_on_a_ball(z) + 3 * (inequality(c, z) + deciding(z.n))
+def in_tube(c: Certificate, z: Sizes, evidence: Tree) -> int:
+    each = networks_on_a_ball(z) + equations_on_a_ball(z) + 3 * (inequality(z) + deciding(z.n))
     matrices = [P for slab in evidence.tube for P in (slab.middle, slab.end)]
     matrices += [] if c.start is None else [c.start]
     return len(evidence.tube) * each + sum(inverting(z.n, bits(P)) for P in matrices)
 
 
-def beyond(c: Certificate, z: Size, covering: Covering | None) -> int:
+def beyond(c: Certificate, z: Sizes, evidence: Tree) -> int:
     """Operations for another function N, on the faces of the domain and on its own leaves."""
-    N = c.beyond
-    if N is None or covering is None:
+    covering: Covering | None = evidence.covering
+    if c.beyond is None or covering is None:
         return 0
-    shapes, steps, policy = before_each(N.layers), steps_of(N), before_each(c.policy.layers)
+    N = c.beyond.expression
+    a, over = len(N.steps) + observing(*called(N)), nets(*called(N))
     faces, leaves = sum(face.count(LEAF) for face in covering.faces), covering.tree.count(LEAF)
-    held, calls = max([2 * steps, *(p for p, _, _ in shapes)]), 200 * len(shapes)
-    work = folding(shapes) + inverting(z.n, bits(covering.T)) + 2**8 * len(covering.tree)
-    work += 2**8 * sum(len(face) for face in covering.faces)
-    work += faces * (on_a_box(z.n, steps, held, z.n, calls) + as_models(shapes, z.n))
-    each = sum(p * (q * (z.n + 3) + 5 * before + 64 * (z.n + 1) + 7 * 2**9) for p, q, before in shapes)
-    paths = sum(p * before * (q + 3 * 2**6) for p, q, before in shapes) // 8
-    work += (faces + leaves) * each // 8 + (1 + faces + leaves) * paths
-    calls += z.n * z.s**2 + 160 * len(policy)
-    work += leaves * on_a_box(z.n, z.a + 8 * steps + 4 * z.n, max(held, z.a), z.s, calls)
-    return work + leaves * as_models(shapes, z.s) + on_leaves(leaves, policy, z.n, z.m)
+    held, calls = max(2 * a, over.widest), 200 * over.steps
+    work = over.folding + inverting(z.n, bits(covering.T))
+    work += 2**8 * (len(covering.tree) + sum(map(len, covering.faces)))
+    work += on_boxes(faces, z.n, a, held, z.n, calls) + faces * over.models(z.n)
+    work += over.forms(faces + leaves, z.n + 1) + (1 + faces + leaves) * over.paths
+    calls += z.n * z.s**2 + 160 * z.nets.steps
+    work += on_boxes(leaves, z.n, z.a + 8 * a + 4 * z.n, max(held, z.a), z.s, calls)
+    return work + leaves * over.models(z.s) + on_leaves(c, z, leaves, evidence.order)

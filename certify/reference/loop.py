@@ -14,8 +14,8 @@ from flint import arb, arb_mat, fmpq, fmpq_mat
 from .balls import ZERO, bounded_by_form, within_bounds
 from .document import Certificate, Interval
 from .model import Model
-from .network import Network, Units
 from .refusal import Refused, require
+from .tangents import Calls, Policy, Units
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,14 @@ class Known:
     names: Mapping[str, Model]
     units: Units
 
+    @property
+    def errors(self) -> tuple[arb_mat, ...]:
+        return max((v.errors for v in self.names.values()), key=len)
+
     def constant(self, value: fmpq) -> Model:
         """The model of a number that does not depend on d."""
         some = next(iter(self.names.values()))
-        return Model.affine(arb(value), [ZERO] * some.a.nrows(), some.errors, None if some.lip is None else ZERO)
+        return Model.affine(arb(value), [ZERO] * some.a.nrows(), lip=None if some.lip is None else ZERO)
 
     def anything(self, ends: Interval) -> Model:
         """A number between two others, which may be another one at each place."""
@@ -61,7 +65,7 @@ class Loop:
     """F(x) = f(x, pi(x), q) of a certificate, for as many balls and cells as it has."""
 
     def __init__(self, c: Certificate) -> None:
-        self.c, self.network, self.bounded = c, Network(c), bounded_by_form(c)
+        self.c, self.policy, self.bounded = c, Policy(c), bounded_by_form(c)
         self.symbols = c.k + c.varies
 
     def on(self, J: fmpq_mat, rule: str, at: str, centre: fmpq_mat | None = None) -> Field:
@@ -74,27 +78,37 @@ class Loop:
         Without a centre it is the origin, where the policy is u_eq, but for claims that do not ask it. J has a row for
         each state.
         """
-        u, units = self.network.on(J, centre)
+        states = self.states(J, centre)
+        u, units = self.inputs(states, centre is None, rule, at)
         bounded = self.bounded or within_bounds(self.c, [(v.v, v.radius) for v in u])
         require(bounded, "inputs", at, "an input is not certain to stay in its bounds")
-        return self.unclipped(u, units, J, rule, at, centre)
+        return self.unclipped(states, u, units, rule, at)
+
+    def states(self, J: fmpq_mat, centre: fmpq_mat | None, steady: bool = False) -> list[Model]:
+        """With Lipschitz constants where these are needed, `steady`."""
+        middle = [ZERO] * self.c.n if centre is None else list(arb_mat(centre).entries())
+        lip = ZERO if steady else None
+        return [Model.affine(v, row, lip=lip) for v, row in zip(middle, arb_mat(J).tolist(), strict=True)]
+
+    def inputs(self, states: Sequence[Model], at_origin: bool, rule: str, at: str) -> tuple[list[Model], Units]:
+        """The inputs before their clip, or a refusal where the policy has no model."""
+        try:
+            return self.policy.on(states, at_origin)
+        except Refused as no:
+            raise Refused(rule, at, no.detail) from None
 
     def steady(self, J: fmpq_mat, rule: str, at: str) -> Known:
         """The same around the origin, with Lipschitz constants; whether inputs keep their bounds is not asked."""
-        return self.unclipped(*self.network.on(J, steady=True), J, rule, at)
+        states = self.states(J, None, steady=True)
+        return self.unclipped(states, *self.inputs(states, True, rule, at), rule, at)
 
-    def unclipped(
-        self, u: Sequence[Model], units: Units, J: fmpq_mat, rule: str, at: str, centre: fmpq_mat | None = None
-    ) -> Known:
+    def unclipped(self, states: Sequence[Model], u: Sequence[Model], units: Units, rule: str, at: str) -> Known:
         """States and inputs, which no clip changes, or a refusal."""
         c = self.c
         for j, v in enumerate(u):
             limits = c.policy.limits(j)
             alone = limits is None or bool(v.v - v.radius > arb(limits[0]) and v.v + v.radius < arb(limits[1]))
             require(alone, rule, at, f"{c.plant.inputs[j]} is not certain to be left alone by the clip")
-        middle = [ZERO] * c.n if centre is None else list(arb_mat(centre).entries())
-        errors, lip = u[0].errors, None if u[0].lip is None else ZERO
-        states = [Model.affine(v, row, errors, lip) for v, row in zip(middle, arb_mat(J).tolist(), strict=True)]
         return Known(dict(zip(c.plant.states + c.plant.inputs, [*states, *u], strict=True)), units)
 
     def within(self, known: Known, cell: Sequence[Interval], rule: str, at: str) -> Field:
@@ -103,13 +117,15 @@ class Loop:
 
     def field(self, known: Known, uncertain: Mapping[str, Model], rule: str, at: str) -> Field:
         """Models of f, all of them finite."""
+        calls = Calls(known.units, known.errors)
         try:
-            F = self.c.plant.dynamics.evaluate({**known.names, **uncertain}, known.constant)
+            F = self.c.plant.dynamics.evaluate({**known.names, **uncertain}, known.constant, calls)
         except Refused as no:
             raise Refused(rule, at, no.detail) from None
-        finite = known.units.is_finite() and all(f.is_finite() for f in F)
+        F = [f.among(calls.errors) for f in F]
+        finite = calls.units.is_finite() and all(f.is_finite() for f in F)
         require(finite, rule, at, "F has no finite model")
-        return Field(F, known.units)
+        return Field(F, calls.units)
 
     def varying(self, known: Known, cell: Sequence[Interval]) -> dict[str, Model]:
         """The uncertain quantities, each with a symbol of its own that runs through the cell."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import zip_longest
 
 from flint import arb, arb_mat
 
@@ -25,8 +26,8 @@ from .symmetric import linear_times_square, no_form, squared_norm
 class Model:
     """v(0) + a'.d + d'Qd + K[d] + sum_j B_j e_j(d) + r(d) with |r(d)| <= d'Ed, for ||d|| <= 1.
 
-    a is a column, K a row with a number for each triple. e_j is what the model of input j leaves out, |e_j(d)| <= d'U_j
-    d with U_j of `errors`: these are the same in all models of a ball.
+    a is a column, K a row with a number for each triple. e_j is what the model of input j, or of an entry of a
+    call, leaves out, |e_j(d)| <= d'U_j d with U_j of `errors`: these are the same in all models of a ball.
 
     v(0) is within `off` of `v` + sum_j y_j `dv_j`, and the gradient a' within `slack`, in the 2-norm, of `a` + sum_j
     y_j `da_j`, for every y in [-1, 1]^N; without `dv` there is no y in them.
@@ -94,7 +95,7 @@ class Model:
     def shares(self) -> arb_mat:
         """d'(shares)d is a bound of the inputs' errors together."""
         result = arb_mat(self.a.nrows(), self.a.nrows())
-        for weight, U in zip(self.B, self.errors, strict=True):
+        for weight, U in zip(self.B, self.errors, strict=False):  # B may end where all that follows is 0
             result = result + abs(weight) * U
         return result
 
@@ -145,14 +146,27 @@ class Model:
         return [(ZERO, arb_mat(self.a.nrows(), 1))] * symbols
 
     def __add__(self, other: Model) -> Model:
-        B = tuple(p + q for p, q in zip(self.B, other.B, strict=True))
+        B = tuple(p + q for p, q in zip_longest(self.B, other.B, fillvalue=ZERO))
         v, a, Q, K, E = self.v + other.v, self.a + other.a, self.Q + other.Q, self.K + other.K, self.E + other.E
         dv, da = self.dv or other.dv, self.da or other.da
         if self.dv and other.dv:
             dv = tuple(p + q for p, q in zip(self.dv, other.dv, strict=True))
             da = tuple(p + q for p, q in zip(self.da, other.da, strict=True))
         lip = None if self.lip is None or other.lip is None else self.lip + other.lip
-        return Model(v, a, Q, K, E, B, self.errors, dv, da, lip, self.off + other.off, self.slack + other.slack)
+        off, slack = self.off + other.off, self.slack + other.slack
+        return Model(v, a, Q, K, E, B, self.named(other), dv, da, lip, off, slack)
+
+    def named(self, other: Model) -> tuple[arb_mat, ...]:
+        """`errors` of both: calls add to them in the order of the equations, so that one has those of the other."""
+        return max(self.errors, other.errors, key=len)
+
+    def among(self, errors: tuple[arb_mat, ...]) -> Model:
+        """The same with all the errors that there are."""
+        return replace(self, B=(*self.B, *((ZERO,) * (len(errors) - len(self.B)))), errors=errors)
+
+    def sign(self) -> int:
+        """1 or -1 where it certainly has this sign on all of the ball, else 0."""
+        return 1 if self.v > self.reach else -1 if -self.v > self.reach else 0
 
     def shifted(self, step: arb) -> Model:
         """v + step."""
@@ -178,7 +192,7 @@ class Model:
         n, outer = v.a.nrows(), v.a * w.a.transpose()
         Q = v.v * w.Q + w.v * v.Q + (outer + outer.transpose()) / 2
         K = v.v * w.K + w.v * v.K + v.times_square(w) + w.times_square(v)
-        B = tuple(v.v * q + w.v * p for p, q in zip(v.B, w.B, strict=True))
+        B = tuple(v.v * q + w.v * p for p, q in zip_longest(v.B, w.B, fillvalue=ZERO))
         known = v.slope * w.twist + w.slope * v.twist + (v.bend + v.twist) * (w.bend + w.twist)
         of_Q = v.doubt * w.bend + w.doubt * v.bend + v.turn * w.slope + w.turn * (v.slope - v.turn)
         of_K = v.doubt * w.twist + w.doubt * v.twist + v.turn * w.bend + w.turn * v.bend
@@ -193,7 +207,7 @@ class Model:
         dv = tuple(v.v * q + w.v * p for (p, _), (q, _) in each)
         da = tuple(v.v * b + w.v * a + p * w.a + q * v.a for (p, a), (q, b) in each)
         lip = lipschitz.of_product(v, w, 2 * of_Q + 3 * of_K)
-        return Model(v.v * w.v, v.v * w.a + w.v * v.a, Q, K, E, B, v.errors, dv, da, lip, off, slack)
+        return Model(v.v * w.v, v.v * w.a + w.v * v.a, Q, K, E, B, v.named(w), dv, da, lip, off, slack)
 
     def times_square(self, other: Model) -> arb_mat:
         """(a.d)(d'Qd), a of this model and Q of the other."""

@@ -13,6 +13,7 @@ from itertools import islice
 
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
+from .affine import batch
 from .balls import ZERO, bounded_by_form, total, within_bounds
 from .document import Certificate
 from .evidence import Covering, Tree
@@ -144,10 +145,10 @@ class Region:
 def check_leaves(c: Certificate, models: Models, covering: Covering) -> None:
     """In each batch of leaves on which something is asked rule `inputs` comes first."""
     region, bounded = Region(c, models, covering), bounded_by_form(c)
-    size = region.leaves.network.batch(c.n)
+    size = batch(c.policy.network, c.n)
     asked = (box for box in boxes(covering) if not region.is_free(box))
-    while batch := list(islice(asked, size)):
-        enclosed = region.leaves.enclose(batch)
+    while some := list(islice(asked, size)):
+        enclosed = region.leaves.enclose(some)
         for leaf in enclosed:
             good = bounded or within_bounds(c, leaf.ranges())
             require(good, "inputs", place(leaf), "an input is not certain to stay in its bounds")

@@ -6,14 +6,17 @@ import math
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 
 from flint import fmpq, fmpq_mat
 
-from .document import Certificate, Policy
+from .document import Certificate
 from .evidence import Tree
-from .expressions import MAX_BITS
+from .expressions import MAX_BITS, Call
 from .fields import exact
-from .refusal import require
+from .networks import Affine, Clip, Concat, Map, Observe, Sum
+from .refusal import Refused, require
 
 MAX_MATRIX_BITS = 2**16  # of a numerator over a common denominator, times rows: beyond it a decision takes minutes
 ZERO = fmpq(0)
@@ -143,10 +146,54 @@ class Exact:
             roots = math.isqrt(numerator), math.isqrt(denominator)
             square = roots[0] ** 2 == numerator and roots[1] ** 2 == denominator
             return Exact(fmpq(*roots)) if square else UNTOLD
+        if name == "abs":
+            return Exact(abs(self.value))
         return UNTOLD if self.value != 0 else Exact(fmpq(name in ("cos", "exp")))
+
+    def between(self, lo: fmpq, hi: fmpq) -> Exact:
+        """min(max(v, lo), hi)."""
+        return UNTOLD if self.value is None else Exact(min(max(self.value, lo), hi))
 
 
 UNTOLD = Exact(None)
+
+
+class Exactly:
+    """Networks of exact numbers: vectors are lists of them."""
+
+    def affine(self, step: Affine, v: list[Exact]) -> list[Exact]:
+        return [weighted(step.row(i), b, v) for i, b in enumerate(step.bias)]
+
+    def map(self, step: Map, v: list[Exact]) -> list[Exact]:
+        return [x.function(step.function) for x in v]
+
+    def clip(self, step: Clip, v: list[Exact]) -> list[Exact]:
+        return [x.between(exact(lo), exact(hi)) for x, lo, hi in zip(v, step.lo, step.hi, strict=True)]
+
+    def sum(self, step: Sum, *vectors: list[Exact]) -> list[Exact]:
+        return [reduce(add, each) for each in zip(*vectors, strict=True)]
+
+    def concat(self, step: Concat, *vectors: list[Exact]) -> list[Exact]:
+        return [x for v in vectors for x in v]
+
+    def observe(self, step: Observe, v: list[Exact]) -> list[Exact]:
+        return step.expressions.evaluate(dict(zip(step.names, v, strict=True)), Exact)
+
+
+def weighted(weights: array[float], bias: float, h: list[Exact]) -> Exact:
+    """A row of an affine step; weights of exact 0 ignore what stands behind them."""
+    result = exact(bias)
+    for w, v in zip(weights, h, strict=True):
+        if w != 0 and v.value != 0:
+            if v.value is None:
+                return UNTOLD
+            result += exact(w) * v.value
+    return Exact(result)
+
+
+def called(call: Call, given: Sequence[Exact]) -> list[Exact]:
+    value = call.network.run(Exactly(), list(given))
+    return [value[i] for i in call.entries]
 
 
 def equilibrium(c: Certificate) -> None:
@@ -154,7 +201,7 @@ def equilibrium(c: Certificate) -> None:
     names = {name: Exact(ZERO) for name in c.plant.states}
     names.update(zip(c.plant.inputs, map(Exact, c.plant.u_eq), strict=True))
     names.update(dict.fromkeys(c.plant.uncertain, UNTOLD))  # so that what is 0 here is 0 for each of their values
-    for i, component in enumerate(c.plant.dynamics.evaluate(names, Exact)):
+    for i, component in enumerate(c.plant.dynamics.evaluate(names, Exact, called)):
         zero = component.value is not None and bool(component.value == 0)
         require(zero, "equilibrium", f"dynamics.{i}", "f(0, u_eq) is not 0, or the rationals do not tell")
 
@@ -172,37 +219,22 @@ def centring(c: Certificate) -> None:
             inside = bool(limits[0] < q) and bool(q < limits[1])
             require(inside, "centring", c.plant.inputs[j], "u_eq does not lie strictly inside the clip")
     if policy.centre == "none" and c.ends_at_origin:
-        for j, (y, (q, scale, offset)) in enumerate(zip(squashed_at_0(policy), each, strict=True)):
-            holds = y is not None and bool(clip(scale * y + offset, policy.limits(j)) == q)
-            require(holds, "centring", c.plant.inputs[j], "raw(0) = u_eq does not hold by its form")
+        try:
+            values = [clipped_at_0(c, j, y) for j, y in enumerate(squashed_at_0(c))]
+        except Refused as no:
+            raise Refused("centring", "policy", no.detail) from None
+        for name, value, q in zip(c.plant.inputs, values, c.plant.u_eq, strict=True):
+            holds = value.value is not None and bool(value.value == q)
+            require(holds, "centring", name, "raw(0) = u_eq does not hold by its form")
 
 
-def clip(value: fmpq, limits: tuple[fmpq, fmpq] | None) -> fmpq:
-    if limits is None:
-        return value
-    lo, hi = limits
-    return lo if value < lo else hi if value > hi else value
+def squashed_at_0(c: Certificate) -> list[Exact]:
+    """The squash of net(0)."""
+    net: list[Exact] = c.policy.network.run(Exactly(), [Exact(ZERO)] * c.n)
+    return [y.function("tanh") for y in net] if c.policy.squash == "tanh" else net
 
 
-def squashed_at_0(policy: Policy) -> list[fmpq | None]:
-    """The squash of net(0); None is a value that is not known to be rational, and a weight of exact 0 ignores it."""
-    h: list[fmpq | None] = [ZERO] * policy.layers[0].columns
-    for k, layer in enumerate(policy.layers):
-        h = [tanh(v) for v in h] if k else h
-        h = [affine(layer.row(i), b, h) for i, b in enumerate(layer.bias)]
-    return [tanh(v) for v in h] if policy.squash == "tanh" else h
-
-
-def tanh(value: fmpq | None) -> fmpq | None:
-    """The tanh if it is rational: 0 is the only rational number with a rational tanh."""
-    return ZERO if value is not None and value == 0 else None
-
-
-def affine(weights: array[float], bias: float, h: list[fmpq | None]) -> fmpq | None:
-    result = exact(bias)
-    for w, v in zip(weights, h, strict=True):
-        if w != 0:
-            if v is None:
-                return None
-            result += exact(w) * v
-    return result
+def clipped_at_0(c: Certificate, j: int, y: Exact) -> Exact:
+    policy = c.policy
+    value, limits = Exact(exact(policy.scale[j])) * y + Exact(exact(policy.offset[j])), policy.limits(j)
+    return value if limits is None else value.between(*limits)

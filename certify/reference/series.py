@@ -16,7 +16,8 @@ from typing import Any, Protocol, Self
 
 from flint import arb, fmpq
 
-from .expressions import Equations
+from .expressions import Called, Equations
+from .refusal import Refused
 
 
 class Number(Protocol):
@@ -25,6 +26,7 @@ class Number(Protocol):
     def __neg__(self) -> Self: ...
     def scaled(self, k: arb) -> Self: ...
     def function(self, name: str) -> Self: ...
+    def sign(self) -> int: ...
 
 
 Coefficient = Any  # a Number, or None where it is 0 by the rules alone
@@ -96,7 +98,11 @@ def coefficients(
 
 
 def along(
-    expressions: Equations, states: Mapping[str, Any], rates: Mapping[str, Any], constant: Constant
+    expressions: Equations,
+    states: Mapping[str, Any],
+    rates: Mapping[str, Any],
+    constant: Constant,
+    called: Called | None = None,
 ) -> list[list[Coefficient]]:
     """The value of each expression and its derivative where the states move at these rates."""
     tape = Tape(constant)
@@ -104,7 +110,8 @@ def along(
     def moving(name: str) -> Term:
         return Term(tape, lambda k: rates[name] if k else states[name])
 
-    results = expressions.evaluate({name: moving(name) for name in states}, lambda q: tape.still(constant(q)))
+    names = {name: moving(name) for name in states}
+    results = expressions.evaluate(names, lambda q: tape.still(constant(q)), called)
     for _ in range(2):
         tape.extend()
     return [value.c for value in results]
@@ -199,6 +206,18 @@ def sqrt(v: Term) -> Term:
     return result
 
 
+def absolute(v: Term) -> Term:
+    """sign(v_0) v_k, if the sign is certain or v_k is 0."""
+
+    def beyond(k: int) -> Coefficient:
+        sign = 0 if v.c[k] is None else v.c[0].sign()
+        if v.c[k] is not None and not sign:
+            raise Refused("ring", "leaf", "abs of what may vanish")
+        return v.c[k] if sign >= 0 else negative(v.c[k])
+
+    return first(v, "abs", beyond)
+
+
 FUNCTIONS: dict[str, Callable[[Term], Term]] = {
     "sin": lambda v: sin_and_cos(v)[0],
     "cos": lambda v: sin_and_cos(v)[1],
@@ -207,4 +226,5 @@ FUNCTIONS: dict[str, Callable[[Term], Term]] = {
     "atan": atan,
     "1/": inverse,
     "sqrt": sqrt,
+    "abs": absolute,
 }

@@ -6,15 +6,15 @@ all 0: constants have no g, and what is affine has no Q.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from functools import cache
 
-from flint import arb, arb_mat
+from flint import arb, arb_mat, fmpq
 
-from .balls import ONE, SPREAD, ZERO, derivatives, third, total
+from .balls import ONE, SPREAD, ZERO, derivatives, largest_fourth, third, total
 from .refusal import Refused
 
-HALF = ONE / 2
+HALF, NOISE = ONE / 2, arb(2) ** -30
 
 
 def mix(a: arb, x: arb_mat | None, b: arb, y: arb_mat | None) -> arb_mat | None:
@@ -130,12 +130,50 @@ class Taylor:
         Q = plus(mix(p.c, q.Q, q.c, p.Q), outer + outer.transpose())
         return Taylor(p.c * q.c, q.g * p.c + p.g * q.c, Q, r)
 
+    def slopes(self, symbols: int) -> list[arb]:
+        """g, which has so many entries or none."""
+        return [ZERO] * symbols if self.g is None else list(self.g.entries())
+
+    @property
+    def reach(self) -> arb:
+        """A bound of how far the model is from c."""
+        return sum(self.reaches(), self.r)
+
+    def sign(self) -> int:
+        """1 or -1 where it certainly has this sign on all of the box, else 0."""
+        return 1 if self.c > self.reach else -1 if -self.c > self.reach else 0
+
     def function(self, name: str) -> Taylor:
-        """phi(c) + phi'(c) e + phi''(c) e^2 / 2 + phi'''(.) e^3 / 6 with e the model less its constant c."""
+        """phi of the model."""
+        if name == "abs":
+            return self.absolute()
+        at = derivatives(name, self.c)
+        return self.expanded(name, at[:3], third(name, at[3], self.c, self.reach))
+
+    def slope_of(self, name: str) -> Taylor:
+        """phi' of the model: its third derivative is the fourth of phi."""
+        at = derivatives(name, self.c)
+        return self.expanded(name, at[1:], largest_fourth(name, at[0], self.c, self.reach))
+
+    def absolute(self) -> Taylor:
+        """s v + shift within gap where the sign is not certain, s the chord's slope: |v| - s v is least at 0."""
+        sign = self.sign()
+        if sign:
+            return self if sign > 0 else -self
+        lo, hi = arb((self.c - self.reach).lower()), arb((self.c + self.reach).upper())
+        s = ((abs(hi) - abs(lo)) / (hi - lo)).mid() if hi > lo else ZERO
+        s = s.max(-ONE).min(ONE)
+        gap = (abs(lo) - s * lo).max(abs(hi) - s * hi) / 2
+        return (self.scaled(s) + Taylor(gap)).widened(gap)
+
+    def expanded(self, name: str, at: Sequence[arb], most: arb | None) -> Taylor:
+        """phi(c) + phi'(c) e + phi''(c) e^2 / 2 + phi'''(.) e^3 / 6 with e the model less its constant c.
+
+        `at` has the first three of these, `most` is a bound of |phi'''|, or None where phi may be undefined.
+        """
         first, second = self.reaches()
         rest = second + self.r
-        reach, at = first + rest, derivatives(name, self.c)
-        most = third(name, at[3], self.c, reach)
+        reach = first + rest
         if most is None:
             raise Refused(
                 "ring",
@@ -177,16 +215,16 @@ class Taylor:
         return result
 
     def from_corner(self) -> arb:
-        """The value at the corner to which g points, and a bound of what a move away from it adds.
+        """The value at a corner, that to which g points, and a bound of what a move away from it adds.
 
         With M_ij = s_i s_j Q_ij for signs s_i, of which any will do, and d_i = s_i (1 - w_i), this is sum_i w_i (sum_j
         -M_ij (2 - w_j) - s_i g_i), where w_i and 2 - w_j lie in [0, 2].
         """
         if self.g is None or self.Q is None:
             return self.c + self.r + self.first
-        g, result = self.g.entries(), self.c + self.r
-        negative = [bool(v < 0) for v in g]
-        for v, s, row in zip(g, negative, self.Q.tolist(), strict=True):
+        g, rows, result = self.g.entries(), self.Q.tolist(), self.c + self.r
+        negative = pointing_down(g, rows)
+        for v, s, row in zip(g, negative, rows, strict=True):
             lost = v if s else -v  # -s_i g_i, and what may be gained is added
             result -= lost
             for t, q in zip(negative, row, strict=True):
@@ -198,6 +236,27 @@ class Taylor:
         return result
 
 
+def pointing_down(g: Sequence[arb], rows: Sequence[Sequence[arb]]) -> list[bool]:
+    """For each symbol True if the corner is where it is -1.
+
+    A multiplier makes a coefficient of about 0, whose sign says nothing: there the terms of second order choose, with
+    the signs of all other symbols.
+    """
+    least = NOISE * sum(map(abs, g), ZERO)
+    negative, faint = [bool(v < 0) for v in g], [bool(abs(v) <= least) for v in g]
+    if not any(faint):
+        return negative
+    strong = [(j, s) for j, (s, weak) in enumerate(zip(negative, faint, strict=True)) if not weak]
+    return [
+        bool(sum((-row[j] if s else row[j] for j, s in strong), ZERO) < 0) if weak else own
+        for row, own, weak in zip(rows, negative, faint, strict=True)
+    ]
+
+
 def positive_part(v: arb) -> arb:
     """A number at or above v and 0, and the greater of both if that is certain."""
     return ZERO if v <= 0 else v if v >= 0 else abs(v)
+
+
+def constant(q: fmpq) -> Taylor:
+    return Taylor(arb(q))

@@ -22,7 +22,9 @@ from certify.checker.errors import Rejected
 from certify.reference import document as reference_document
 from certify.reference import limits as reference_limits
 from certify.reference import rules as reference_rules
+from tests.checker.test_networks import hash_of
 from tests.support.certificates import LEAF, Document, dump, edited, encode, make
+from tests.support.earlier import newer
 
 PROGRAMS = ("checker", "reference")
 FORMAT = (Path(document.__file__).parent / "FORMAT.md").read_text()
@@ -96,6 +98,33 @@ def on_a_ball(data: Document) -> Document:
     return edited(data, "evidence.local", {**ball, "edge": (0.0).hex(), "order": 1})
 
 
+def calling(base: Document) -> Document:
+    """The equations call a network of all kinds of steps, twice with the same arguments, and the policy's network,
+    which observes its last vector."""
+    data = newer(base)
+    g = [
+        {"kind": "affine", "of": [0], "shape": [3, 1], "weight": encode(np.ones(3)), "bias": encode(np.zeros(3))},
+        {"kind": "observe", "of": [1], "names": ["a", "b", "c"], "expressions": [["*", "a", ["sin", "b"]], "c"]},
+        {"kind": "concat", "of": [2, 1, 0]},
+        {"kind": "clip", "of": [3], "lo": encode(-np.ones(6)), "hi": encode(np.ones(6))},
+        {"kind": "sum", "of": [3, 4]},
+        {"kind": "affine", "of": [5], "shape": [2, 6], "weight": encode(np.ones(12)), "bias": encode(np.zeros(2))},
+    ]
+    data["networks"].append({"name": "g", "reads": 1, "steps": g})
+    own = data["networks"][0]["steps"]
+    own.append({"kind": "observe", "of": [len(own)], "names": ["v"], "expressions": [["exp", ["-", "v"]]]})
+    data["policy"]["sha256"] = hash_of(data)
+    calls = [["network", "g", 0, "x1"], ["network", "g", 1, "x1"], ["network", "g", 1, ["sin", "x0"]]]
+    data["plant"]["dynamics"][0] = ["+", ["-", "x0"], *calls, ["network", "policy", 0, "x0", "x1"]]
+    return data
+
+
+def calling_beyond(base: Document) -> Document:
+    data = calling(base)
+    data["claim"]["outer"]["expression"] = ["+", ["network", "g", 1, "x0"], ["network", "policy", 0, "x0", "x1"]]
+    return data
+
+
 SAMPLE = ("1/100", "1/50")
 BOMBS: dict[str, tuple[Callable[[], Document], str]] = {
     "operations, symbols and order": (lambda: loop(n=4, m=2, k=60, terms=600, sample=SAMPLE, order=8), "numbers"),
@@ -145,6 +174,17 @@ HONEST: dict[str, Callable[[], Document]] = {
 }  # fmt: skip
 
 
+CALLING: dict[str, Callable[[], Document]] = {
+    "calls on leaves": lambda: calling(loop(leaves=7, hidden=(5,))),
+    "calls on a ball": lambda: calling(loop(k=1, cells=[3], levels=(0.25, 0.5, 1.0))),
+    "calls in periods": lambda: calling(loop(leaves=3, sample=SAMPLE, hidden=(4,))),
+    "calls in periods on a ball": lambda: calling(loop(sample=("1/100", "1/100"), levels=(0.25, 0.5, 1.0))),
+    "calls nearby": lambda: calling(nearby()),
+    "calls in a tube": lambda: calling(with_tube("reached")),
+    "calls beyond": lambda: calling_beyond(with_outer()),
+}  # fmt: skip
+
+
 def counts(data: Document, folder: Path) -> tuple[int, int]:
     """Numbers and operations, as both programs count them."""
     raw, path = dump(data), folder / "certificate.json"
@@ -161,8 +201,14 @@ def test_both_programs_count_the_same(name: str, tmp_path: Path) -> None:
     assert numbers < limits.MOST_NUMBERS / 100 and work < reference_limits.MAX_OPERATIONS / 20
 
 
+@pytest.mark.parametrize("name", CALLING)
+def test_both_programs_count_calls_the_same(name: str, tmp_path: Path) -> None:
+    numbers, work = counts(CALLING[name](), tmp_path)
+    assert numbers < limits.MOST_NUMBERS / 20 and work < reference_limits.MAX_OPERATIONS
+
+
 def test_the_numbers_are_those_of_the_page() -> None:
-    found = re.findall(r"(?:(\d+) )?2\^(\d+)", FORMAT[FORMAT.index("**limits.**") :][:900])
+    found = re.findall(r"(?:(\d+) )?2\^(\d+)", FORMAT.split("## Chapter limits")[1].split("Divisions")[0])
     stated = [int(factor or 1) * 2 ** int(power) for factor, power in found]
     assert stated == [limits.MOST_NUMBERS, limits.MOST_WORK, reference_limits.MAX_OPERATIONS, limits.MOST_IN_PATIENCE]
     assert limits.MOST_NUMBERS == reference_limits.MAX_NUMBERS
@@ -174,15 +220,15 @@ def test_the_counts_are_those_of_the_page(tmp_path: Path) -> None:
     data = loop(k=1, leaves=5, hidden=(3,), cells=[2], levels=(0.25, 0.5, 1.0))
     n, m, y, s, d, a, t = 2, 1, 1, 4, 2, 4, 2 * 4 + 2 * 3 * 4 // 6
     layers = [(3, 2, 0), (1, 3, 3)]
-    H, W = 4, 3
-    numbers = 4 * 9 + (a + 2 * n + 8) * (s + 1) ** 2 + 2**14 * (n + m + 2)
+    H, W, steps = 3, 3, 3
+    numbers = 4 * 9 + (a + 2 * n + 8) * (s + 1) ** 2 + 2**14 * (n + m + steps)
     numbers += (a + 2 * n + 8) * (t + d * y + m) + d**4 // 4 + sum(4 * p * g for p, _, g in layers) + 3 * H * t
     X = n**5 * 1 // 2**13 + 2**10 * n**3
     of_S = n**5 * (2 + 1 + 16) ** 2 // 2**13 + 2**10 * n**3
     F = sum(p * q * (2**9 + 8 * min(p, q)) for p, q, _ in layers)
-    M, V, C, A = a + n**2 + 4 * n, 2 * a, n * s**2 + 320, (s + 4) ** 2
+    M, V, C, A = a + n**2 + 4 * n, 2 * a, n * s**2 + 160 * steps, (s + 4) ** 2
     B = 5 * (8 * A * M + A * (V + 4) * (32 * M + C) // 2**9 + 2**11 + 2**7 * n + n**3)
-    R = 5 * sum(p * (q * (n + m + 2) + 5 * g + 64 * (n + m) + 7 * 2**9) for p, q, g in layers) // 8
+    R = 5 * sum(p * (q * (s + 2) + 5 * g + 64 * s + 7 * 2**9) for p, q, g in layers) // 8
     R += (1 + 5 * W // 2**14) * (sum(p * g * (q + 3 * 2**6) for p, q, g in layers) // 8)
     K = sum(p * (q * (d + g) + g * t) + 2**21 for p, q, g in layers) + 64 * H * t
     Z = a * (2**17 + 64 * t + 16 * d**2 * (m + y))

@@ -506,7 +506,9 @@ def called_in_part(data: Document) -> None:
 
 
 def saturated(data: Document) -> None:
-    data["plant"]["dynamics"] = [["+", ["/", "x", "2"], ["clip", "u", "-5/2", "5/2"], ["*", "0", ["abs", ["+", "u", "3"]]]]]
+    data["plant"]["dynamics"] = [
+        ["+", ["/", "x", "2"], ["clip", "u", "-5/2", "5/2"], ["*", "0", ["abs", ["+", "u", "3"]]]]
+    ]
 
 
 REWRITTEN = [split_in_two, skipping, observed, clipped_far_out, called, called_in_part, saturated]

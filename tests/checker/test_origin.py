@@ -27,11 +27,11 @@ from certify.checker.rules import check
 from certify.reference import rules as reference
 from certify.reference.document import read
 from certify.reference.leaves import Leaves
-from certify.reference.network import Network
 from tests.support.certificates import LEAF, Document, decode, dump, encode
 from tests.support.certificates import make as stated
 from tests.support.earlier import newer
 from tests.support.jets import seen
+from tests.support.models import inputs_on
 from tests.support.oracle import value_of
 from tests.support.plain import enclose_on_boxes
 
@@ -227,7 +227,7 @@ def test_both_checkers_model_a_moved_policy_on_balls(data: Document, radius: flo
     jets = seen(Ball(Case(document.certificate(newer(data), "")), J, "").inputs)
     with ctx.workprec(128):
         exact = fmpq_mat(n, n, [fmpq(*float(v).as_integer_ratio()) for v in J.ravel()])
-        models, _ = Network(read(dump(data))).on(exact)
+        models = inputs_on(read(dump(data)), exact)
     with ctx.workprec(EXACTLY):
         for corner in points(n, seed):
             d = corner / max(1.0, float(np.linalg.norm(corner)) * (1 + 1e-9))

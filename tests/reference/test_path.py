@@ -44,7 +44,7 @@ from tests.support.balls import TINY, around, ball, centred, exactly, slab_of, s
 from tests.support.certificates import Document, decode, dump, edited, encode, make, write
 from tests.support.certificates import verdict as verdict_of_the_checker
 from tests.support.marks import slow_after
-from tests.support.models import curves, field, model, numbers, units
+from tests.support.models import curves, field, inputs_on, model, numbers, units
 from tests.support.paths import along, follow
 from tests.support.reference import CONTINUOUS, judge
 
@@ -410,7 +410,7 @@ def models_of(data: Document) -> list[tuple[list[Model], list[Model]]]:
         w = (after - before) / (2 * fmpq(*each.path.share.as_integer_ratio()))  # type: ignore[union-attr,operator]
         wide = fmpq_mat([[*a, b] for a, b in zip(each.ball.J.tolist(), w.entries(), strict=True)])
         m = (before + after) / 2  # type: ignore[operator]
-        result.append((loop.network.on(wide, m)[0], loop.on(wide, "tube", "slab", m).components))
+        result.append((inputs_on(c, wide, m), loop.on(wide, "tube", "slab", m).components))
     return result
 
 
@@ -489,14 +489,14 @@ def test_the_policy_away_from_the_origin(squash: str, centring: str, u_eq: str) 
         raw = scale * squashed(net(x)) + offset
         return raw - scale * squashed(at_0) - offset + rest if centring == "output" else raw
 
-    network = Loop(read(dump(data))).network
+    c = read(dump(data))
     assert abs(policy(np.zeros((2, 1)))[0] - rest) < 1e-14
     J = exactly(np.array([[0.05, 0.01, 0.02], [0.0, 0.04, -0.03]]))
     wide = np.array([[float(v) for v in each] for each in arb_mat(J).tolist()])
-    ((u,), _) = network.on(J)
+    (u,) = inputs_on(c, J)
     assert u.v == arb(fmpq(*Fraction(u_eq).as_integer_ratio()))
     for centre in generator.uniform(-2, 2, (20, 2)):
-        ((u,), _) = network.on(J, fmpq_mat(2, 1, [fmpq(*float(v).as_integer_ratio()) for v in centre]))
+        (u,) = inputs_on(c, J, fmpq_mat(2, 1, [fmpq(*float(v).as_integer_ratio()) for v in centre]))
         assert abs(float(u.v) - policy(centre[:, None])[0]) < 1e-13
         d = generator.standard_normal((3, 300))
         d *= (1 - 1e-12) / np.linalg.norm(d, axis=0)

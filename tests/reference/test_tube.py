@@ -24,9 +24,9 @@ from scipy.linalg import expm
 
 from certify.reference import __main__ as command
 from certify.reference import decrease, rules, tube
-from certify.reference.loop import Loop
 from tests.support.balls import around, ball, enlarge, slab_of, square, with_ball
 from tests.support.certificates import Document, decode, dump, edited, encode, grow, make, write
+from tests.support.models import inputs_on
 from tests.support.reference import CONTINUOUS, judge, judge_bytes
 
 Edit = Callable[[Document], Document]
@@ -371,8 +371,7 @@ def test_the_inputs_on_a_slab() -> None:
 def inputs_of(data: Document) -> list[Any]:
     """The model of the input on each slab."""
     c = rules.read(dump(data))
-    network = Loop(c).network
-    return [network.on(each.ball.J)[0][0] for each in c.evidence.tube]  # type: ignore[union-attr]
+    return [inputs_on(c, each.ball.J)[0] for each in c.evidence.tube]  # type: ignore[union-attr]
 
 
 def test_by_form_the_inputs_need_no_model() -> None:

@@ -7,11 +7,12 @@ from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
-from flint import arb, arb_mat
+from flint import arb, arb_mat, fmpq_mat
 
-from certify.reference.loop import Field
+from certify.reference.document import Certificate
+from certify.reference.loop import Field, Loop
 from certify.reference.model import Model
-from certify.reference.network import Units
+from certify.reference.tangents import Units
 
 ORDERS = {1: 1, 2: 3, 3: 6}  # of three indices, by how many of them differ
 
@@ -45,6 +46,12 @@ def field(F: Sequence[Model], behind: Units | None = None) -> Field:
     inputs = max(1, len(F[0].B))
     none = units(np.zeros((inputs, 0)), np.zeros((0, len(F[0].a.entries()), len(F[0].a.entries()))))
     return Field(list(F), none if behind is None else behind)
+
+
+def inputs_on(c: Certificate, J: fmpq_mat, centre: fmpq_mat | None = None) -> list[Model]:
+    """The policy's models on a ball, before its clip; without a centre it is the origin."""
+    loop = Loop(c)
+    return loop.policy.on(loop.states(J, centre), centre is None)[0]
 
 
 def form(A: arb_mat, d: Sequence[Any]) -> arb:

@@ -1,0 +1,383 @@
+"""Networks on a ball x = centre + J d, ||d|| <= 1: the policy as models of the inputs before their clip, and calls.
+
+A vector is y(d) = y(0) + G A d + L U(d). A has the gradients of *roots*: arguments, and results of `observe`. U stacks
+*units*: what each entry of a `map`, and each root, adds to its tangent at d = 0. Of these y(0), G and L depend on the
+ball's centre alone, and L is most of the work; so they are found once for all balls around the origin. There the policy
+is u_eq, by its form or because rule `centring` has shown it; at any other centre it is a number like others, and so it
+is at the origin with centring `none` where nothing is asked of it.
+
+What the models of units leave out is an error of its own, which reaches every entry through L.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+from flint import arb, arb_mat, fmpq
+
+from .balls import ONE, ZERO, absolute, beta, columns_scaled, finite
+from .document import Certificate
+from .expressions import Call
+from .function import net_at_0
+from .functions import Beyond, beyond_tangent, expansion, unsure
+from .model import Model
+from .networks import Affine, Clip, Concat, Map, Observe, Sum
+from .refusal import Refused
+from .symmetric import half, whole
+
+
+@dataclass(frozen=True)
+class Units:
+    """The errors of all units: e_q, |e_q| <= d'R_q d, of which input or entry j sees sum_q L_jq e_q.
+
+    Each row of R has half of a symmetric matrix, for n variables.
+    """
+
+    n: int
+    L: arb_mat
+    R: list[list[arb]]
+
+    @cached_property
+    def wholes(self) -> list[arb_mat]:
+        return [whole(row, self.n) for row in self.R]
+
+    @cached_property
+    def squares(self) -> arb_mat:
+        """R_q'R_q, a row for each unit."""
+        return arb_mat(len(self.R), self.n**2, [v for R in self.wholes for v in (R.transpose() * R).entries()])
+
+    def errors(self) -> tuple[arb_mat, ...]:
+        """U_j of each input: sum_q |L_jq| R_q."""
+        if not self.R:
+            return tuple(arb_mat(self.n, self.n) for _ in range(self.L.nrows()))
+        sums: list[list[arb]] = (absolute(self.L) * arb_mat(self.R)).tolist()
+        return tuple(whole(row, self.n) for row in sums)
+
+    def is_finite(self) -> bool:
+        return finite(self.L.entries()) and all(finite(row) for row in self.R)
+
+    def beside(self, other: Units) -> Units:
+        """The units of both, each seen by its own entries."""
+        ours, theirs = [ZERO] * len(self.R), [ZERO] * len(other.R)
+        rows = [[*row, *theirs] for row in self.L.tolist()] + [[*ours, *row] for row in other.L.tolist()]
+        return Units(self.n, arb_mat(len(rows), len(ours + theirs), [v for row in rows for v in row]), self.R + other.R)
+
+
+@dataclass
+class Stack:
+    """H, C and R of the units so far, a row for each, halves of H and R; their Lipschitz constants, if needed."""
+
+    n: int
+    steady: bool
+    H: list[list[arb]] = field(default_factory=list)
+    C: list[list[arb]] = field(default_factory=list)
+    R: list[list[arb]] = field(default_factory=list)
+    lip: list[arb] = field(default_factory=list)
+
+    def append(self, unit: Beyond) -> None:
+        self.H.append(half(unit.H))
+        self.C.append(unit.C.entries())
+        self.R.append(half(unit.R))
+        if unit.lip is not None:
+            self.lip.append(unit.lip)
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """Values at the centre, G and L of a vector; L may have fewer columns than there are units by now.
+
+    With `own` entry i has besides the unit number own + i, with which L goes on.
+    """
+
+    at_0: list[arb]
+    G: arb_mat
+    L: arb_mat
+    own: bool = False
+
+    @cached_property
+    def ways(self) -> arb_mat:
+        """All of L."""
+        return beside(self.L, unit_matrix(len(self.at_0))) if self.own else self.L
+
+    @cached_property
+    def magnitudes(self) -> arb_mat:
+        return absolute(self.ways)
+
+    def scaled(self, factors: Sequence[arb], at_0: list[arb], own: bool) -> Tangent:
+        """Every entry times a factor, but for the values, and then units for each."""
+        G, L = (columns_scaled(A.transpose(), factors).transpose() for A in (self.G, self.ways))
+        return Tangent(at_0, G, L, own)
+
+
+@dataclass(frozen=True)
+class Vector:
+    """A value at the centre lies within `off` of its tangent's, a gradient within `slack`; None is 0."""
+
+    tangent: Tangent
+    off: list[arb] | None = None
+    slack: list[arb] | None = None
+
+    def doubts(self) -> list[tuple[arb, arb]]:
+        """off and slack of each entry."""
+        nothing = [ZERO] * len(self.tangent.at_0)
+        return list(zip(self.off or nothing, self.slack or nothing, strict=True))
+
+
+class OnBall:
+    """Networks between tangents. A `memo` has those of all balls around the same centre.
+
+    `changes` counts what has been made of vectors, in the same order on each ball.
+    """
+
+    def __init__(self, given: Sequence[Model], memo: dict[int, Tangent] | None = None) -> None:
+        n = given[0].a.nrows()
+        self.memo, self.changes = memo, 0
+        self.roots = list[list[arb]]()
+        self.stack = Stack(n, given[0].lip is not None)
+        self.first = self.rooted(given, [not bends(v) for v in given])
+
+    def rooted(self, given: Sequence[Model], straight: Sequence[bool]) -> Vector:
+        """A vector of models, each a root with a unit unless it is straight; without what they say of y."""
+        before, count = len(self.stack.R), len(given)
+        at = [k for k, each in enumerate(straight) if not each]
+        for k in at:
+            v = given[k]
+            lip = v.lip if self.stack.steady else None
+            self.stack.append(Beyond(v.Q, v.K, v.whole, lip))
+        earlier = len(self.roots)
+        self.roots += [list(v.a.entries()) for v in given]
+
+        def make() -> Tangent:
+            G = beside(arb_mat(count, earlier), unit_matrix(count))
+            own = [[ONE if k == q else ZERO for q in at] for k in range(count)]
+            L = beside(arb_mat(count, before), arb_mat(count, len(at), [v for row in own for v in row]))
+            return Tangent([v.v for v in given], G, L)
+
+        return self.made(make, *([f(v) for v in given] for f in (doubt_of, turn_of)))
+
+    def made(self, make: Callable[[], Tangent], off: list[arb] | None = None, slack: list[arb] | None = None) -> Vector:
+        self.changes += 1
+        certain = all(v.is_zero() for v in (off or []) + (slack or []))
+        doubts = (None, None) if certain else (off, slack)
+        if self.memo is None:
+            return Vector(make(), *doubts)
+        if self.changes not in self.memo:
+            self.memo[self.changes] = make()
+        return Vector(self.memo[self.changes], *doubts)
+
+    # --------------------------------------------------------------------------------------------------- the steps
+
+    def affine(self, step: Affine, v: Vector) -> Vector:
+        def make() -> Tangent:
+            W, y = step.W, v.tangent
+            at_0 = (W * arb_mat(len(y.at_0), 1, y.at_0)).entries()
+            L = beside(W * y.L, W) if y.own else W * y.ways
+            return Tangent([x + b for x, b in zip(at_0, step.b, strict=True)], W * y.G, L)
+
+        return self.made(make, *(through(step, part) for part in (v.off, v.slack)))
+
+    def map(self, step: Map, v: Vector) -> Vector:
+        models = self.models(v)
+        each = [expansion(y, step.function) for y in models]
+        for y, phi in zip(models, each, strict=True):
+            self.stack.append(beyond_tangent(y, phi))
+        off, slack = (
+            [*part] for part in zip(*(unsure(y, phi) for y, phi in zip(models, each, strict=True)), strict=True)
+        )
+        values, slopes = [phi.at[0] for phi in each], [phi.at[1] for phi in each]
+        return self.made(lambda: self.widened(v.tangent).scaled(slopes, values, True), off, slack)
+
+    def widened(self, y: Tangent) -> Tangent:
+        """The same with a column for each unit before those of a map."""
+        missing = len(self.stack.R) - len(y.at_0) - y.ways.ncols()
+        return y if missing == 0 else replace(y, L=beside(y.ways, arb_mat(len(y.at_0), missing)), own=False)
+
+    def clip(self, step: Clip, v: Vector) -> Vector:
+        """Each entry as it is or as an end, if one of both is certain."""
+        factors, values = list[arb](), list[arb]()
+        for y, lo, hi in zip(self.models(v), map(arb, step.lo), map(arb, step.hi), strict=True):
+            below, above = y.v - y.reach, y.v + y.reach
+            if below > lo and above < hi:
+                factors.append(ONE)
+                values.append(y.v)
+            elif above < lo or below > hi:
+                factors.append(ZERO)
+                values.append(lo if above < lo else hi)
+            else:
+                raise Refused("local", "ball", "a clip in a network may begin to act")
+        doubts = [(k * off, k * slack) for k, (off, slack) in zip(factors, v.doubts(), strict=True)]
+        return self.made(
+            lambda: v.tangent.scaled(factors, values, False), *([*part] for part in zip(*doubts, strict=True))
+        )
+
+    def sum(self, step: Sum, *vectors: Vector) -> Vector:
+        def make() -> Tangent:
+            at_0 = [sum(each, ZERO) for each in zip(*(v.tangent.at_0 for v in vectors), strict=True)]
+            first, *others = (self.aligned(v.tangent) for v in vectors)
+            G, L = first
+            for more_G, more_L in others:
+                G, L = G + more_G, L + more_L
+            return Tangent(at_0, G, L)
+
+        each = [sum_of(pairs) for pairs in zip(*(v.doubts() for v in vectors), strict=True)]
+        return self.made(make, *([*part] for part in zip(*each, strict=True)))
+
+    def concat(self, step: Concat, *vectors: Vector) -> Vector:
+        def make() -> Tangent:
+            parts = [self.aligned(v.tangent) for v in vectors]
+            G, L = (stacked([part[k] for part in parts]) for k in range(2))
+            return Tangent([x for v in vectors for x in v.tangent.at_0], G, L)
+
+        each = [doubts for v in vectors for doubts in v.doubts()]
+        return self.made(make, *([*part] for part in zip(*each, strict=True)))
+
+    def aligned(self, y: Tangent) -> tuple[arb_mat, arb_mat]:
+        """G and L with a column for each root and each unit so far."""
+        rows, L = len(y.at_0), y.ways
+        G = beside(y.G, arb_mat(rows, len(self.roots) - y.G.ncols()))
+        return G, beside(L, arb_mat(rows, len(self.stack.R) - L.ncols()))
+
+    def observe(self, step: Observe, v: Vector) -> Vector:
+        """The expressions of models of the entries, whose errors are those of the units."""
+        units = Units(self.stack.n, arb_mat(0, 0), list(self.stack.R))
+        errors, rows = tuple(units.wholes), self.aligned(v.tangent)[1].tolist()
+        nothing = arb_mat(self.stack.n, self.stack.n)
+        models = [
+            replace(y, E=nothing, B=tuple(row), errors=errors) for y, row in zip(self.models(v), rows, strict=True)
+        ]
+        some = models[0]
+
+        def constant(q: fmpq) -> Model:
+            return Model.affine(arb(q), [ZERO] * self.stack.n, errors, None if some.lip is None else ZERO)
+
+        results = step.expressions.evaluate(dict(zip(step.names, models, strict=True)), constant)
+        return self.rooted(results, [False] * step.size)
+
+    def weighted(self, v: Vector, factors: Sequence[arb], at_0: list[arb]) -> Vector:
+        """Every entry times a factor, with these values."""
+        doubts = [(abs(k) * off, abs(k) * slack) for k, (off, slack) in zip(factors, v.doubts(), strict=True)]
+        return self.made(
+            lambda: v.tangent.scaled(factors, at_0, False), *([*part] for part in zip(*doubts, strict=True))
+        )
+
+    # ------------------------------------------------------------------------------------------------- the results
+
+    def models(self, v: Vector) -> list[Model]:
+        """Sums over the units with L, and of their bounds with its magnitudes."""
+        n, y, stack = self.stack.n, v.tangent, self.stack
+        a, seen = (y.G * arb_mat(self.roots[: y.G.ncols()])).tolist(), y.ways.ncols()
+        each = list(zip(y.at_0, a, v.doubts(), strict=True))
+        if not seen:
+            lip = ZERO if stack.steady else None
+            return [replace(Model.affine(x, row, lip=lip), off=off, slack=slack) for x, row, (off, slack) in each]
+        parts = ((y.ways, stack.H), (y.ways, stack.C), (y.magnitudes, stack.R))
+        Q, K, E = ((W * arb_mat(rows[:seen])).tolist() for W, rows in parts)
+        lips: list[arb | None] = [None] * len(a)
+        if stack.steady:
+            lips = list((y.magnitudes * arb_mat(seen, 1, stack.lip[:seen])).entries())
+        return [
+            Model(x, arb_mat(n, 1, row), whole(q, n), arb_mat(1, len(k), k), whole(e, n), lip=lip, off=off, slack=slack)
+            for (x, row, (off, slack)), q, k, e, lip in zip(each, Q, K, E, lips, strict=True)
+        ]
+
+    def results(self, v: Vector, wanted: Sequence[int], before: Sequence[arb_mat] = ()) -> tuple[list[Model], Units]:
+        """Some entries, each with an error of its own, B = 1, behind those `before`; and the units behind these."""
+        models, (_, L) = self.models(v), self.aligned(v.tangent)
+        rows = L.tolist()
+        units = Units(self.stack.n, arb_mat(len(wanted), L.ncols(), [x for i in wanted for x in rows[i]]), self.stack.R)
+        errors, nothing = (*before, *units.errors()), arb_mat(self.stack.n, self.stack.n)
+        own = range(len(before), len(errors))
+        return [
+            replace(models[i], E=nothing, B=tuple(ONE if q == k else ZERO for q in range(len(errors))), errors=errors)
+            for i, k in zip(wanted, own, strict=True)
+        ], units
+
+
+class Calls:
+    """The calls of one evaluation of the equations: their units stand beside the policy's."""
+
+    def __init__(self, units: Units, errors: Sequence[arb_mat]) -> None:
+        self.units, self.errors = units, tuple(errors)
+
+    def __call__(self, call: Call, given: Sequence[Model]) -> list[Model]:
+        algebra = OnBall(given)
+        models, units = algebra.results(call.network.run(algebra, algebra.first), call.entries, self.errors)
+        self.units, self.errors = self.units.beside(units), models[0].errors
+        return models
+
+
+class Policy:
+    """The policy of a certificate. At the origin it is u_eq, but for claims with a floor, with centring `none`."""
+
+    def __init__(self, c: Certificate) -> None:
+        self.c, self.memo, self.net_at_0 = c, dict[int, Tangent](), net_at_0(c)
+        self.beta = beta(c) if c.policy.centre == "preactivation" else []
+
+    def on(self, states: Sequence[Model], at_origin: bool) -> tuple[list[Model], Units]:
+        """The inputs before their clip, given models of the states on the ball."""
+        policy = self.c.policy
+        read = [x.shifted(arb(v)) for x, v in zip(states, policy.origin, strict=True)]
+        algebra = OnBall(read, self.memo if at_origin else None)
+        net = policy.network.run(algebra, algebra.first)
+        before = [self.before_squash(j, v, at_origin) for j, v in enumerate(net.tangent.at_0)]
+        y = replace(net, tangent=replace(net.tangent, at_0=before))
+        if policy.squash == "tanh":
+            y = algebra.map(Map((), self.c.m, "tanh"), y)
+        values = [self.input_at(j, v, at_origin) for j, v in enumerate(y.tangent.at_0)]
+        u = algebra.weighted(y, [arb(s) for s in policy.scale], values)
+        return algebra.results(u, range(self.c.m))
+
+    def before_squash(self, j: int, net: arb, at_origin: bool) -> arb:
+        """The value before the squash at the centre, where the network is `net`; `preactivation` gives beta at 0."""
+        if self.c.policy.centre != "preactivation":
+            return net
+        return self.beta[j] if at_origin else net - self.net_at_0[j] + self.beta[j]
+
+    def input_at(self, j: int, squashed: arb, at_origin: bool) -> arb:
+        """Input j at the centre, before its clip."""
+        policy, u_eq = self.c.policy, arb(self.c.plant.u_eq[j])
+        if at_origin and (self.c.ends_at_origin or policy.centre != "none"):
+            return u_eq
+        scale, at_0 = arb(policy.scale[j]), self.net_at_0[j]
+        if policy.centre != "output":
+            return scale * squashed + arb(policy.offset[j])
+        return scale * (squashed - (at_0.tanh() if policy.squash == "tanh" else at_0)) + u_eq
+
+
+def bends(v: Model) -> bool:
+    """True if it is not certain to be its tangent."""
+    parts = (v.Q, v.K, v.whole)
+    return not all(x.is_zero() for part in parts for x in part.entries()) or not (v.lip is None or v.lip.is_zero())
+
+
+def doubt_of(v: Model) -> arb:
+    return v.doubt
+
+
+def turn_of(v: Model) -> arb:
+    return v.turn
+
+
+def sum_of(pairs: Sequence[tuple[arb, arb]]) -> tuple[arb, arb]:
+    return sum((a for a, _ in pairs), ZERO), sum((b for _, b in pairs), ZERO)
+
+
+def through(step: Affine, part: list[arb] | None) -> list[arb] | None:
+    return None if part is None else list((step.magnitudes * arb_mat(len(part), 1, part)).entries())
+
+
+def unit_matrix(n: int) -> arb_mat:
+    return arb_mat([[ONE if i == j else ZERO for j in range(n)] for i in range(n)])
+
+
+def beside(A: arb_mat, B: arb_mat) -> arb_mat:
+    if A.ncols() == 0 or B.ncols() == 0:
+        return A if B.ncols() == 0 else B
+    return arb_mat([[*a, *b] for a, b in zip(A.tolist(), B.tolist(), strict=True)])
+
+
+def stacked(parts: Sequence[arb_mat]) -> arb_mat:
+    rows = [row for part in parts for row in part.tolist()]
+    return arb_mat(len(rows), parts[0].ncols(), [v for row in rows for v in row])
