@@ -98,7 +98,7 @@ class Clerk:
                 raise SoundnessError(
                     f"the checker rejects what the engine proved: {answer}. The certificate {reproduces} reproduces it."
                 )
-            mended = f"the checker refused {answer.get('at')} (rule {answer.get('rule')}): " + (
+            mended = f"the {answer.get('by', 'checker')} refused {answer.get('at')} (rule {answer.get('rule')}): " + (
                 _what_is_lower(first, certificate) if lowerings else "split again, it is accepted"
             )
             if self.cluster is not None and lowerings:
@@ -123,16 +123,22 @@ class Clerk:
             with self.stage("check"):
                 answer = self.check(unchecked)
             if answer["result"] == _wanted(certificate):
-                for what, said, meant in (
-                    ("bytes", answer["certificate_sha256"], hashlib.sha256(data).hexdigest()),
-                    ("levels", answer["levels"], dict(certificate.claim.levels)),
-                ):
-                    if said != meant:
-                        raise SoundnessError(f"the checker's answer is about other {what} than {meant}: {answer}.")
+                for one in (answer, answer.get("reference", answer)):
+                    _require_about(one, data, certificate)
                 unchecked.replace(self.path)
         finally:
             unchecked.unlink(missing_ok=True)
         return data, answer
+
+
+def _require_about(answer: Mapping[str, Any], data: bytes, certificate: Certificate) -> None:
+    """Raise SoundnessError unless an answer is about these bytes and levels."""
+    for what, said, meant in (
+        ("bytes", answer["certificate_sha256"], hashlib.sha256(data).hexdigest()),
+        ("levels", answer["levels"], dict(certificate.claim.levels)),
+    ):
+        if said != meant:
+            raise SoundnessError(f"the checker's answer is about other {what} than {meant}: {answer}.")
 
 
 def _what_is_lower(first: Certificate, certificate: Certificate) -> str:

@@ -61,6 +61,7 @@ def to_dict(result: RoaResult) -> dict[str, Any]:
         "search": None if result.search is None else str(result.search),
         "certificate_sha256": None if result.checker is None else result.checker.get("certificate_sha256"),
         "checked": None if result.checker is None else result.checker.get("result"),
+        "reference": None if result.checker is None else result.checker.get("reference", {}).get("result"),
         "contains": None,  # the answer to `certify roa --contains`
     }
 

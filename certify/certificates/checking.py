@@ -37,6 +37,7 @@ def ask(
     program: Program = "checker",
     jobs: int = 1,
     patient: bool = False,
+    operations: int | None = None,
 ) -> tuple[int, dict[str, Any]]:
     """Run a checker on a file in a separate process; return its exit status and its JSON answer.
 
@@ -46,6 +47,7 @@ def ask(
     program : the checker or the reference.
     jobs : number of processes that examine the leaves; the reference has only one.
     patient : True to accept a file that needs hours, which its rule `limits` refuses otherwise.
+    operations : the most that rule `limits` of the reference allows; None for its own limit.
 
     Raises
     ------
@@ -56,6 +58,7 @@ def ask(
         raise InputError("the reference must be asked for one process; leave out `jobs`.")
     options = [] if jobs == 1 else ["--jobs", str(jobs)]
     options += ["--patient"] if patient else []
+    options += [] if operations is None else ["--operations", str(operations)]
     line = command(program, ["--json", *options, "--", str(path)])
     done = subprocess.run(line, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
     try:
@@ -68,15 +71,20 @@ def ask(
     return done.returncode, answer
 
 
-def run_checker(path: Path, program: Program = "checker", jobs: int = 1, patient: bool = False) -> dict[str, Any]:
-    """The JSON answer of a checker that reached a verdict, with so many processes for the leaves; `patient` allows a
-    file that needs hours.
+def run_checker(
+    path: Path,
+    program: Program = "checker",
+    jobs: int = 1,
+    patient: bool = False,
+    operations: int | None = None,
+) -> dict[str, Any]:
+    """The JSON answer of a checker that reached a verdict; the parameters are those of `ask`.
 
     Raises
     ------
     BackendError : it ended with neither ACCEPTED, nor TRUSTED, nor REJECTED.
     """
-    status, answer = ask(path, program, jobs, patient)
+    status, answer = ask(path, program, jobs, patient, operations)
     if "error" in answer:
         raise BackendError(f"the {program} ended with status {status} and no verdict: {answer['error']}")
     return answer

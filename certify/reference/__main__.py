@@ -1,4 +1,4 @@
-"""The command line: `python -I -m certify.reference FILE [--json] [--patient]`.
+"""The command line: `python -I -m certify.reference FILE [--json] [--patient] [--operations N]`.
 
 The claim in words and the verdict. Exit status 0 accepted, 1 rejected, 2 usage or an unreadable file, 3 trusted,
 70 an error of this program.
@@ -19,6 +19,7 @@ from typing import Any
 
 from .document import MAX_BYTES, Certificate
 from .evidence import Trusted
+from .limits import MAX_IN_PATIENCE, MAX_OPERATIONS
 from .rules import Verdict, judge
 
 STATUS = {"ACCEPTED": 0, "REJECTED": 1, "TRUSTED": 3}
@@ -200,6 +201,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("file", metavar="FILE")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--patient", action="store_true", help="take files that may keep this program for hours")
+    parser.add_argument("--operations", type=int, default=MAX_OPERATIONS, help="reject files that ask for more")
     options = parser.parse_args(given)
 
     def failed(message: str, status: int) -> int:
@@ -215,7 +217,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (OSError, ValueError) as error:
         return failed(f"{options.file} cannot be read: {getattr(error, 'strerror', None) or error}", UNUSABLE)
     try:
-        verdict = judge(raw, options.patient)
+        verdict = judge(raw, MAX_IN_PATIENCE if options.patient else options.operations)
     except Exception as error:  # whatever it is, it must not look like a verdict
         return failed(f"internal error: {type(error).__name__}: {error}", INTERNAL)
     seconds = time.perf_counter() - start

@@ -23,9 +23,8 @@ MAX_OPERATIONS, MAX_IN_PATIENCE = 2**34, 2**46  # the second where somebody has 
 LEAF = 255
 
 
-def limits(c: Certificate, patient: bool) -> None:
+def limits(c: Certificate, most: int) -> None:
     count, work = numbers(c), operations(c)
-    most = MAX_IN_PATIENCE if patient else MAX_OPERATIONS
     require(count <= MAX_NUMBERS, "limits", "numbers", f"{count} numbers at once; {MAX_NUMBERS} are allowed")
     more = f"; with --patient {MAX_IN_PATIENCE}" if most < work <= MAX_IN_PATIENCE else ""
     require(work <= most, "limits", "operations", f"{work} operations; {most} are allowed{more}")

@@ -13,7 +13,7 @@ from .contraction import contraction
 from .document import Certificate, read
 from .evidence import WITH_TUBE, Trusted
 from .leaves import Leaves, check_leaves, structure
-from .limits import limits
+from .limits import MAX_OPERATIONS, limits
 from .local import local
 from .loop import Loop
 from .outer import outer
@@ -34,16 +34,13 @@ class Verdict:
     leaves: int | None = None
 
 
-def judge(raw: bytes, patient: bool = False) -> Verdict:
-    """The verdict on a file; its hash is taken over the very bytes that are judged.
-
-    A `patient` reader allows it operations that take days.
-    """
+def judge(raw: bytes, operations: int = MAX_OPERATIONS) -> Verdict:
+    """The verdict on a file that asks for no more operations; its hash is taken over the very bytes that are judged."""
     sha256, c, leaves = hashlib.sha256(raw).hexdigest(), None, None
     try:
         with ctx.workprec(PRECISION):
             c = read(raw)
-            limits(c, patient)
+            limits(c, operations)
             leaves = check(c)
     except Refused as no:
         return Verdict("REJECTED", sha256, no.rule, no.at, no.detail, c)

@@ -155,7 +155,8 @@ def _work_rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     if is_missed(result):
         beyond = result.get("stop") == "beyond"
         about = ", about a smaller set" if beyond else ", about {V <= c2} alone, in which the state does not lie"
-    rows.append(("checker", f"{result['checked'] or 'not reached'}{about}"))
+    both = " BY BOTH" if result["checked"] == result.get("reference") == "ACCEPTED" else ""
+    rows.append(("checker", f"{result['checked'] or 'not reached'}{both}{about}"))
     return rows
 
 

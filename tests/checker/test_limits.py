@@ -246,7 +246,7 @@ def refusal(data: Document, folder: Path, patient: bool = False) -> tuple[str | 
         own = None
     except Rejected as no:
         own = no.rule
-    return own, reference_rules.judge(dump(data), patient).rule
+    return own, reference_rules.judge(dump(data), *([MAX_IN_PATIENCE] if patient else [])).rule
 
 
 @pytest.mark.parametrize("what", ["NUMBERS", "WORK"])

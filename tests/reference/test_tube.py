@@ -500,7 +500,7 @@ def test_odd_values(path: str, value: Any) -> None:
 def test_ten_thousand_slabs_are_read() -> None:
     """With patience, which so many need. They are refused later: the same slab does not begin where it ends."""
     data = of_tube(lambda slabs: [slabs[0] | {"end": encode([-1.0])}, *(slabs * 5000)[1:10_000]])(honest("decay"))
-    assert judge(data) == "limits" and rules.judge(dump(data), patient=True).rule == "tube"
+    assert judge(data) == "limits" and rules.judge(dump(data), MAX_IN_PATIENCE).rule == "tube"
 
 
 # ----------------------------------------------------------------------------------------------------- what is true

@@ -24,6 +24,7 @@ from certify.loop.closed_loop import ClosedLoop
 
 _LONG = 1_000_000  # bytes of a certificate, from which on several processes check it
 _MOST_JOBS = 64
+_QUICK = 2**27  # operations of the reference, as FORMAT.md counts them: at most some five seconds
 _CHECK = 2.0  # the checker's work for a leaf, relative to the operations that bound a box
 
 
@@ -77,7 +78,11 @@ class _Desk:
         )
 
     def _checked(self, path: Path) -> Mapping[str, Any]:
-        """The checker's answer about a file, patient if the file needs more work than the checker allows otherwise."""
+        """The checker's answer about a file, patient if the file needs more work than the checker allows otherwise.
+
+        Where the checker accepts and the reference is quick, the reference is asked too: the answer then has its own as
+        `reference`, or is its refusal, and says so.
+        """
         answer = self._answered(path, patient=False)
         if (answer.get("rule"), answer.get("at")) == ("limits", "operations"):
             answer = self._answered(path, patient=True)
@@ -85,7 +90,12 @@ class _Desk:
                 self.tools.remarks.append(
                     "its check takes more than ten minutes: type `certify check --patient` for another"
                 )
-        return answer
+        if answer["result"] != "ACCEPTED":
+            return answer
+        second = run_checker(path, "reference", operations=_QUICK)
+        if (second.get("rule"), second.get("at")) == ("limits", "operations"):
+            return answer
+        return {**answer, "reference": second} if second["result"] == "ACCEPTED" else {**second, "by": "reference"}
 
     def _answered(self, path: Path, patient: bool) -> Mapping[str, Any]:
         """The checker's answer; where many leaves make a long file, several processes share them."""

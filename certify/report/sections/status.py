@@ -73,7 +73,10 @@ def status_of(certificate: Certificate, sha256: str, answer: Mapping[str, Any] |
             f"The checker checked what is exact: {_checked(certificate.kind)}. All else, above all that V̇ "
             f"is negative, is the word of {solver}, which nothing here can check. It is not a proof.",
         )
-    return Status("ACCEPTED", "The independent checker accepted the certificate.")
+    second = answer.get("reference") or {}
+    both = (second.get("result"), second.get("certificate_sha256")) == ("ACCEPTED", sha256)
+    also = " So did the reference, a second checker that shares no line with it." if both else ""
+    return Status("ACCEPTED", f"The independent checker accepted the certificate.{also}")
 
 
 def _checked(kind: str) -> str:
