@@ -227,6 +227,11 @@ class Jet:
         fourth = (5 * s**2 + 4 * s * w + w**2) / (16 * s**5 * (s + w) ** 4)  # the remainder of a root w, over D^4
         return self.compose(s, 1 / (2 * s), -1 / (4 * s**3), 3 / (8 * s**5), fourth)
 
+    def abs(self) -> Jet:
+        if not np.all(abs(self.c) > self.radius):
+            return self._nowhere()
+        return self.compose(abs(self.c), math.copysign(1.0, self.c), 0.0, 0.0, np.zeros(1))
+
     def exp(self) -> Jet:
         end = self.c + self.radius
         if not np.all(end < EXP_END):

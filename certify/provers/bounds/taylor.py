@@ -98,6 +98,20 @@ class Taylor:
         third = p * p * q * q * (2 * q + p) / 8
         return self.compose(s, p / 2, -p * p * p / 8, third * (1 + 32 * EPS) + TINY)
 
+    def abs(self) -> Taylor:
+        """|v|, on a range c +- R that holds 0 by its chord's slope s: |v| - s v lies between 0 and what it is at an
+        end, whatever s in [-1, 1]."""
+        c, R = self.c, self.radius()
+        s = np.where(c >= R, 1.0, np.where(c <= -R, -1.0, c / (R + TINY)))
+        half = np.where(np.abs(c) >= R, 0.0, np.maximum((R - c) * (1 + s), (R + c) * (1 - s)) / 2 * (1 + EPS))
+        line = self.compose(s * c + half, s, np.zeros_like(s), np.zeros_like(s))
+        return Taylor(line.c, line.g, line.Q, (line.r + half) * (1 + EPS))
+
+    def sign(self) -> Taylor:
+        """1 or -1; the remainder is NaN where the range of v may contain 0."""
+        r = np.where(np.abs(self.c) > self.radius(), 0.0, np.nan)
+        return Taylor(np.where(self.c < 0, -1.0, 1.0), np.zeros_like(self.g), np.zeros_like(self.Q), r)
+
     def exp(self) -> Taylor:
         e, most = np.exp(self.c), self.c + self.radius()
         third = np.where(most < EXP_END, np.exp(most) / 6 * (1 + 128 * EPS) + TINY, np.nan)
