@@ -137,7 +137,8 @@ class PowerSeries(Algebra[Series[V]]):
         return rule
 
     def _magnitude(self, value: Series[V]) -> Callable[[int], V | None]:
-        """Times the sign of v_0, which nobody asks for if v is constant in time."""
+        """Times the sign of v_0, which has to be certain unless v is constant in time: where v passes 0 there is no
+        series, though all its later coefficients be 0."""
         v, sign = value.coefficients, list[V]()
 
         def rule(k: int) -> V | None:
@@ -145,7 +146,9 @@ class PowerSeries(Algebra[Series[V]]):
                 return self.inner.function("abs", self._first(v))
             if v[k] is not None and not sign:
                 sign.append(self.inner.function("sign", self._first(v)))
-            return None if v[k] is None else self._product(None, sign[0], v[k])
+            if v[k] is None and sign:
+                return self.inner.product(Fraction(0), sign)
+            return self._product(None, *sign, v[k])
 
         return rule
 

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from certify.loop.expressions import Algebra
 from certify.provers.ball.jets import (
     ATAN4,
+    CERTAIN,
     TANH4,
     TANH5,
     Sizes,
@@ -234,7 +235,7 @@ def _sign(v: RangedJet) -> RangedJet:
 
 def _is_certain(v: RangedJet) -> bool:
     """True if v has one sign on all balls, whatever is uncertain."""
-    return bool(np.all(abs(v.c) > v.away + v.radius))
+    return bool(np.all(abs(v.c) > CERTAIN * (v.away + v.radius)))
 
 
 def _exp(v: RangedJet) -> RangedJet:

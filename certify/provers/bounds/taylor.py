@@ -20,6 +20,7 @@ from certify.provers.bounds.arrays import Array, Index, chosen, product
 
 EPS = 2.0**-50
 TINY = 2.0**-900
+CERTAIN = 1 + 2.0**-30  # share of its range by which a number must be away from 0 for its sign, beyond all rounding
 EXP_END = 64.0  # the exponent beyond which the checker knows nothing of exp
 
 
@@ -109,7 +110,7 @@ class Taylor:
 
     def sign(self) -> Taylor:
         """1 or -1; the remainder is NaN where the range of v may contain 0."""
-        r = np.where(np.abs(self.c) > self.radius(), 0.0, np.nan)
+        r = np.where(np.abs(self.c) > self.radius() * CERTAIN, 0.0, np.nan)
         return Taylor(np.where(self.c < 0, -1.0, 1.0), np.zeros_like(self.g), np.zeros_like(self.Q), r)
 
     def exp(self) -> Taylor:

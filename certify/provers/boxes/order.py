@@ -4,6 +4,9 @@ A longer series costs more for each box and leaves a smaller remainder, which no
 D' from 0 by the bound at a point counts, because boxes must be as small as it allows: their number grows about as its
 power -n/2. Most boxes lie where that is worst, and so those places are looked for. Costs are fixed numbers and not
 measured, so that a run gives the same certificate each time.
+
+A state that passes a corner of abs, min, max or clip within a period has no series: there the mean of f on all of the
+period, order 1, is all that is known, and it is taken if that suffices.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates.claims import Problem
+from certify.loop.expressions import cornered
 from certify.provers.boxes.rule import VdotBound
 
 Array = NDArray[np.float64]
@@ -29,10 +33,12 @@ def choose_order(problem: Problem, T: Array, inner: float, outer: float) -> int:
     rules = {order: VdotBound(problem, T, order=order) for order in _COSTS}
     z = generator.standard_normal((n, _POINTS))
     z *= np.sqrt(inner * (outer / inner) ** generator.random(_POINTS)) / np.linalg.norm(z, axis=0)
+    tried = list[Array]()
     shares: dict[int, list[Array]] = {order: [] for order in _COSTS}
     for k in range(_ROUNDS):
         bounds = {order: rule.at_points(z, outer) for order, rule in rules.items()}
         longest = bounds[max(_COSTS)]
+        tried.append(z)
         for order, bound in bounds.items():
             shares[order].append((np.minimum(bound, 0.0) / longest)[longest < 0].clip(_LEAST, 1.0))
         worst = np.argsort(-bounds[min(_COSTS)] / (z * z).sum(0), kind="stable")[:_WORST]
@@ -45,4 +51,12 @@ def choose_order(problem: Problem, T: Array, inner: float, outer: float) -> int:
         found = np.concatenate(shares[order])
         return _COSTS[order] * float(np.mean(found ** (-n / 2))) if len(found) else _COSTS[order]
 
+    if any(cornered(*problem.loop.system.dynamics)) and _needs_the_mean(problem, T, np.hstack(tried), outer):
+        return 1
     return min(_COSTS, key=cost)
+
+
+def _needs_the_mean(problem: Problem, T: Array, z: Array, outer: float) -> bool:
+    """True if the mean of f shows more points z (n, B) than the shortest series does."""
+    mean, series = (VdotBound(problem, T, order=order).at_points(z, outer) < 0 for order in (1, min(_COSTS)))
+    return int(mean.sum()) > int(series.sum())
