@@ -107,8 +107,9 @@ _PLAIN: Mapping[str, Callable[..., float]] = {
 def _extreme(library: Any, name: str, a: Any, b: Any) -> Any:
     """The lesser or larger of two, of which torch takes tensors only."""
     if library.__name__ == "torch":
-        like = a if isinstance(a, library.Tensor) else b
-        a, b = (library.as_tensor(v, dtype=like.dtype, device=like.device) for v in (a, b))
+        tensors = [v for v in (a, b) if isinstance(v, library.Tensor)]
+        kind = {"dtype": tensors[0].dtype, "device": tensors[0].device} if tensors else {"dtype": library.float64}
+        a, b = (library.as_tensor(v, **kind) for v in (a, b))
     return getattr(library, name)(a, b)
 
 

@@ -21,6 +21,7 @@ from certify.provers.boxes.rule import VdotBound
 Array = NDArray[np.float64]
 _COSTS = {2: 1.0, 3: 1.5, 4: 2.1}  # cost of a box relative to order 2, by the order
 _POINTS, _WORST, _ROUNDS = 64, 8, 4  # points of a round, and how many of them the next one starts from
+_MANY = 2000  # points that are looked at for corners, which few points may miss
 _LEAST = 1e-2  # share of the decay by the longest series: below it a point cannot be had at any price
 
 
@@ -33,12 +34,10 @@ def choose_order(problem: Problem, T: Array, inner: float, outer: float) -> int:
     rules = {order: VdotBound(problem, T, order=order) for order in _COSTS}
     z = generator.standard_normal((n, _POINTS))
     z *= np.sqrt(inner * (outer / inner) ** generator.random(_POINTS)) / np.linalg.norm(z, axis=0)
-    tried = list[Array]()
     shares: dict[int, list[Array]] = {order: [] for order in _COSTS}
     for k in range(_ROUNDS):
         bounds = {order: rule.at_points(z, outer) for order, rule in rules.items()}
         longest = bounds[max(_COSTS)]
-        tried.append(z)
         for order, bound in bounds.items():
             shares[order].append((np.minimum(bound, 0.0) / longest)[longest < 0].clip(_LEAST, 1.0))
         worst = np.argsort(-bounds[min(_COSTS)] / (z * z).sum(0), kind="stable")[:_WORST]
@@ -51,12 +50,15 @@ def choose_order(problem: Problem, T: Array, inner: float, outer: float) -> int:
         found = np.concatenate(shares[order])
         return _COSTS[order] * float(np.mean(found ** (-n / 2))) if len(found) else _COSTS[order]
 
-    if any(cornered(*problem.loop.system.dynamics)) and _needs_the_mean(problem, T, np.hstack(tried), outer):
+    if any(cornered(*problem.loop.system.dynamics)) and _needs_the_mean(problem, T, inner, outer):
         return 1
     return min(_COSTS, key=cost)
 
 
-def _needs_the_mean(problem: Problem, T: Array, z: Array, outer: float) -> bool:
-    """True if the mean of f shows more points z (n, B) than the shortest series does."""
+def _needs_the_mean(problem: Problem, T: Array, inner: float, outer: float) -> bool:
+    """True if the mean of f shows more points of the ring than the shortest series does."""
+    n, generator = problem.loop.system.n, np.random.default_rng(1)
+    z = generator.standard_normal((n, _MANY))
+    z *= np.sqrt(inner + (outer - inner) * generator.random(_MANY)) / np.linalg.norm(z, axis=0)
     mean, series = (VdotBound(problem, T, order=order).at_points(z, outer) < 0 for order in (1, min(_COSTS)))
     return int(mean.sum()) > int(series.sum())
