@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.errors import CertificateFormatError
+
 Array = NDArray[np.float64]
 
 
@@ -20,12 +22,49 @@ def decode(text: str, shape: tuple[int, ...]) -> Array:
     return np.frombuffer(base64.b64decode(text), dtype="<f8").reshape(shape).astype(np.float64)
 
 
-def encode_layers(weights: Sequence[Array], biases: Sequence[Array]) -> list[dict[str, Any]]:
-    return [
-        {"shape": list(W.shape), "weight": encode(W), "bias": encode(b)} for W, b in zip(weights, biases, strict=True)
-    ]
+def network_section(name: str, weights: Sequence[Array], biases: Sequence[Array]) -> dict[str, Any]:
+    """A network of affine layers with tanh between them, as steps, each of the vector just before."""
+    steps: list[dict[str, Any]] = []
+    for W, b in zip(weights, biases, strict=True):
+        if steps:
+            steps.append({"kind": "map", "of": [len(steps)], "function": "tanh"})
+        array = {"shape": list(W.shape), "weight": encode(W), "bias": encode(b)}
+        steps.append({"kind": "affine", "of": [len(steps)], **array})
+    return {"name": name, "reads": int(weights[0].shape[1]), "steps": steps}
 
 
-def decode_layers(layers: Sequence[Mapping[str, Any]]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+def layers_of(network: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The affine steps of a network that has tanh between them, each of the vector just before.
+
+    Raises
+    ------
+    CertificateFormatError : the network has other steps.
+    """
+    kinds = [(step["kind"], step["of"], step.get("function", "tanh")) for step in network["steps"]]
+    expected = [(("affine", "map")[k % 2], [k], "tanh") for k in range(len(kinds))]
+    if kinds != expected or len(kinds) % 2 == 0:
+        raise CertificateFormatError(
+            f"the network {network['name']} must be of affine steps with tanh between them, each of the vector just "
+            "before; found others, which the checkers read but reports and Coq do not yet."
+        )
+    return list(network["steps"][::2])
+
+
+def decode_layers(network: Mapping[str, Any]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """The weights and biases of such a network."""
+    layers = layers_of(network)
     weights = tuple(decode(x["weight"], tuple(x["shape"])) for x in layers)
     return weights, tuple(decode(x["bias"], (x["shape"][0],)) for x in layers)
+
+
+def network_named(networks: Sequence[Mapping[str, Any]], name: str) -> Mapping[str, Any]:
+    """The network of this name.
+
+    Raises
+    ------
+    CertificateFormatError : there is none.
+    """
+    for network in networks:
+        if network["name"] == name:
+            return network
+    raise CertificateFormatError(f"`networks` must have one named {str(name)[:60]!r}; found none.")

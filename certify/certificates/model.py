@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates.claims import Claim, Outer
-from certify.certificates.encoding import encode, encode_layers
+from certify.certificates.encoding import encode, network_section
 from certify.certificates.evidence import PartitionTree, TrustedSolver, evidence_section
 from certify.certificates.formats import SCHEMA
 from certify.errors import InputError
@@ -24,6 +24,8 @@ from certify.lyapunov.function import Quadratic
 from certify.lyapunov.neural import Neural
 
 Array = NDArray[np.float64]
+POLICY, N_NAME = "policy", "N"
+"""Names of networks in a file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +87,10 @@ class Certificate:
                 "kind": self.claim.kind,
                 "rate": float(self.claim.rate).hex(),
                 "sample": None if system.sample is None else [str(h) for h in system.sample],
-                "outer": None if self.claim.outer is None else _outer(self.claim.outer),
+                "outer": None if self.claim.outer is None else _outer(self.claim.outer, system),
             }
             | _start(self.claim),
+            "networks": [network_section(POLICY, network.weights, network.biases), *_networks(self.claim.outer)],
             **loop_sections(system, network),
             "lyapunov": {"kind": "quadratic", "P": encode(self.V.P)},
             "levels": {name: float(level).hex() for name, level in self.claim.levels.items()},
@@ -113,7 +116,7 @@ def loop_sections(system: System, network: TanhNetwork) -> dict[str, Any]:
             "input_bounds": [[str(lo), str(hi)] for lo, hi in system.input_bounds],
         },
         "policy": {
-            "layers": encode_layers(network.weights, network.biases),
+            "network": POLICY,
             "squash": network.squash,
             "centre": network.centre,
             "scale": encode(network.scale),
@@ -131,13 +134,17 @@ def _start(claim: Claim) -> dict[str, str]:
     return start if claim.centre is None else {**start, "centre": encode(np.array(claim.centre))}
 
 
-def _outer(outer: Outer) -> dict[str, Any]:
+def _networks(outer: Outer | None) -> list[dict[str, Any]]:
+    """The networks that N calls."""
+    if outer is None or not isinstance(outer.function, Neural):
+        return []
+    return [network_section(N_NAME, outer.function.weights, outer.function.biases)]
+
+
+def _outer(outer: Outer, system: System) -> dict[str, Any]:
     N = outer.function
-    if isinstance(N, Neural):
-        stated: dict[str, Any] = {"kind": "network", "layers": encode_layers(N.weights, N.biases)}
-    else:
-        stated = {"kind": "expression", "expression": to_tree(N.expression)}
-    return {**stated, "level": float(outer.level).hex()}
+    called: list[Any] = ["network", N_NAME, 0, *(s.name for s in system.states)]
+    return {"expression": called if isinstance(N, Neural) else to_tree(N.expression), "level": float(outer.level).hex()}
 
 
 def _for_people(system: System) -> dict[str, dict[str, str]]:

@@ -11,7 +11,7 @@ import json
 import os
 import re
 import stat
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from fractions import Fraction
 from pathlib import Path
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates.claims import CLAIMS, Claim, Outer
-from certify.certificates.encoding import decode, decode_layers
+from certify.certificates.encoding import decode, decode_layers, network_named
 from certify.certificates.evidence import read_evidence
 from certify.certificates.formats import SCHEMA, other_version
 from certify.certificates.model import Certificate
@@ -103,7 +103,7 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
         provenance, people = _read_provenance(data["provenance"], data["plant"])
         return Certificate(
             system=_read_system(data["plant"], data["claim"]["sample"], people),
-            network=_read_network(data["policy"], n, len(data["plant"]["inputs"])),
+            network=_read_network(data["policy"], data["networks"], n, len(data["plant"]["inputs"])),
             V=Quadratic(decode(data["lyapunov"]["P"], (n, n))),
             claim=_read_claim(data, states),
             evidence=read_evidence(data["evidence"], n),
@@ -137,9 +137,9 @@ def _read_system(plant: Mapping[str, Any], sample: Any, people: Mapping[str, Map
     )
 
 
-def _read_network(policy: Mapping[str, Any], n: int, m: int) -> TanhNetwork:
+def _read_network(policy: Mapping[str, Any], networks: Sequence[Mapping[str, Any]], n: int, m: int) -> TanhNetwork:
     return TanhNetwork(
-        *decode_layers(policy["layers"]),
+        *decode_layers(network_named(networks, policy["network"])),
         scale=decode(policy["scale"], (m,)),
         offset=decode(policy["offset"], (m,)),
         squash=policy["squash"],
@@ -169,7 +169,7 @@ def _read_claim(data: Mapping[str, Any], states: tuple[Symbol, ...]) -> Claim:
     levels: dict[str, Any] = {k: float.fromhex(v) for k, v in data["levels"].items()}
     levels["rate"] = float.fromhex(stated["rate"])
     if stated["outer"] is not None:  # never with a tube
-        return claim(**levels, outer=_read_outer(stated["outer"], states))
+        return claim(**levels, outer=_read_outer(stated["outer"], data["networks"], states))
     own, tube = {f.name for f in fields(claim)}, dict[str, Any]()
     if "start" in own:
         tube["start"] = Quadratic(decode(stated["start"], (n, n)))
@@ -178,11 +178,11 @@ def _read_claim(data: Mapping[str, Any], states: tuple[Symbol, ...]) -> Claim:
     return claim(**levels, **tube)
 
 
-def _read_outer(data: Mapping[str, Any], states: tuple[Symbol, ...]) -> Outer:
-    level = float.fromhex(data["level"])
-    if data["kind"] == "network":
-        return Outer(Neural(*decode_layers(data["layers"])), level)
-    return Outer(Symbolic(from_tree(data["expression"], {s.name: s for s in states}), states), level)
+def _read_outer(data: Mapping[str, Any], networks: Sequence[Mapping[str, Any]], states: tuple[Symbol, ...]) -> Outer:
+    level, tree = float.fromhex(data["level"]), data["expression"]
+    if tree[:1] == ["network"] and tree[2:] == [0, *(s.name for s in states)]:
+        return Outer(Neural(*decode_layers(network_named(networks, tree[1]))), level)
+    return Outer(Symbolic(from_tree(tree, {s.name: s for s in states}), states), level)
 
 
 def _nominal(interval: Interval, said: str | None) -> Fraction:

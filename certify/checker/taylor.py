@@ -21,6 +21,9 @@ from .functions import FUNCTIONS, Derivative, Expansion
 from .near import ZERO, Above, Array, Form, Near, combined, near, products, size
 
 
+_NOISE = 2.0**-30  # of all coefficients
+
+
 @cache
 def pairs(N: int) -> tuple[Array, Array]:
     """i and j of the terms of second order, i <= j."""
@@ -158,20 +161,11 @@ def constants(like: Taylor) -> Callable[[Fraction], Taylor]:
 
 
 def upper_bound(model: Taylor) -> Array:
-    """An upper bound of the model over the box, (B,); the least of three."""
+    """An upper bound of the model over the box, (B,); the lesser of two."""
     bound = _separately(model)
     left = np.flatnonzero(np.logical_not(bound < 0))
     if len(left):
-        few = model.at(left)
-        first = np.where(few.g < 0, -1.0, 1.0)
-        # a coefficient of about 0, as multipliers make them, says nothing of its sign: ask the gradient at that corner
-        i, j = pairs(few.symbols)
-        mixed = np.where((i == j)[:, None], 0.0, few.q)
-        gradient = few.g.copy()
-        np.add.at(gradient, i, mixed * first[j])
-        np.add.at(gradient, j, mixed * first[i])
-        for corner in (first, np.where(gradient < 0, -1.0, 1.0)):
-            bound[left] = np.fmin(bound[left], _at_a_corner(few, corner))
+        bound[left] = np.fmin(bound[left], _at_a_corner(model.at(left)))
     return bound
 
 
@@ -191,14 +185,25 @@ def _separately(model: Taylor) -> Array:
     return found
 
 
-def _at_a_corner(model: Taylor, s: Array) -> Array:
+def _corner(model: Taylor) -> Array:
+    """The corner to which the gradient points, of 1 and -1. Multipliers make coefficients of about 0, whose signs are
+    noise: there the terms of second order decide, with the other signs."""
+    g, (i, j) = model.g, pairs(model.symbols)
+    s = np.where(np.abs(g) <= _NOISE * np.sum(np.abs(g), axis=0), 0.0, np.where(g < 0, -1.0, 1.0))
+    mixed, slope = np.where((i == j)[:, None], 0.0, model.q), np.zeros_like(g)
+    np.add.at(slope, i, mixed * s[j])
+    np.add.at(slope, j, mixed * s[i])
+    return np.where(s == 0, np.where(slope < 0, -1.0, 1.0), s)
+
+
+def _at_a_corner(model: Taylor) -> Array:
     """The value at a corner s, of 1 and -1, and what the other terms may add elsewhere.
 
     With d_i = s_i (1 - w_i), 0 <= w_i <= 2, and R_ij = s_i s_j Q_ij, Q symmetric, `g.d + d'Q d` is
     `s.g + s'Q s - sum_i w_i (s_i g_i + 2 sum_j R_ij) + w'R w`; and `w'R w <= 2 sum_i w_i sum_j max(R_ij, 0)`, since
     `w_i w_j <= w_i + w_j`. So the two sums add at most `2 sum_i max(0, 2 sum_j max(-R_ij, 0) - s_i g_i)`.
     """
-    i, j = pairs(model.symbols)
+    (i, j), s = pairs(model.symbols), _corner(model)
     R = s[i] * s[j] * model.q  # R_ii, and 2 R_ij
     down = np.where((i == j)[:, None], 2.0, 1.0) * np.maximum(-R, 0.0)
     meets = np.zeros((model.symbols, len(i)))

@@ -20,13 +20,14 @@ from flint import arb, ctx
 
 from certify.checker.boxes import batches, middle
 from certify.checker.case import Case
-from certify.checker.document import Network
-from certify.checker.outer import Beyond, Layers, _above, _below
+from certify.checker.networks import Affine, Network
+from certify.checker.outer import Beyond, Dual, InRows, _above, _below
 from tests.checker.test_cubic_attack import sizes
 from tests.support.certificates import LEAF, Document, edited, encode, make, parse, verdict
+from tests.support.leaves import least
 from tests.support.outer import expression, stated
 from tests.support.outer_loops import PLAIN, scalar
-from tests.support.plain import Taylor, affine, form, slope_of_tanh
+from tests.support.plain import Taylor, affine, chain, form, function_of, layers, slope_of_tanh
 
 Array = np.ndarray
 Generator = np.random.Generator
@@ -224,7 +225,7 @@ def test_leaves_of_any_tree_cover_its_box(count: int) -> None:
 # --------------------------------------------------------------------------------------------------------- the networks
 
 
-def network_of_chance(generator: Generator) -> tuple[Layers, Array, Array]:
+def network_of_chance(generator: Generator) -> tuple[Network, Array, Array]:
     """A network and a box of its n states, centre and radius; half of the boxes reach where its tanhs bend."""
     n, depth = (int(v) for v in generator.integers(1, 4, 2))
     widths = [n, *generator.integers(1, 4, depth - 1).tolist(), 1]
@@ -242,7 +243,19 @@ def network_of_chance(generator: Generator) -> tuple[Layers, Array, Array]:
         centre = centre / (np.max(np.abs(weights[0] @ centre)) + 1e-300)
         radius = radius / (np.max(np.abs(weights[0]) @ radius) + 1e-300) * generator.choice([1e-12, 1e-3, 1, 10])
         biases[0] = generator.choice([0, 1, 2]) * generator.normal(size=len(biases[0]))
-    return Layers(Network(tuple(weights), tuple(biases))), centre, radius
+    return chain(weights, biases), centre, radius
+
+
+class Kept(InRows):
+    """Keeps the models of all layers."""
+
+    def __init__(self) -> None:
+        self.layers: list[Taylor] = []
+
+    def affine(self, step: Affine, v: Dual) -> Dual:
+        made = super().affine(step, v)
+        self.layers.append(Taylor.of(made.value))
+        return made
 
 
 def value_of_model(model: Taylor, d: Sequence[arb], row: int | None = None) -> arb | None:
@@ -264,21 +277,26 @@ def test_networks_of_any_size_lie_in_their_models(count: int) -> None:
     closest = 0.0
     for seed in range(count):
         generator = np.random.default_rng([4, seed])
-        function, centre, radius = network_of_chance(generator)
+        network, centre, radius = network_of_chance(generator)
+        function = function_of(network)
         n = len(centre)
         error = np.abs(of_any_size(generator, n)) * generator.choice([0, 0, 1e-16, 1e-3])
         if not is_finite(centre, radius, error):
             continue
         all_symbols = n + int(generator.integers(1, 3))
         x = np.concatenate([centre[:, None], np.diag(radius)], axis=1)[:, :, None]
-        least = float(function.least(form(x, error[:, None]))[0])
+        box = form(x, error[:, None])
+        lowest = float(least(function, box)[0])
         states = [affine(own[0], own[1:], e) for own, e in zip(x, error[:, None], strict=True)]
-        plain = function.models([v.model for v in states])
-        models = [Taylor.of(v) for v in plain]
         sized = [of_any_size(generator, n, *shape, 1, widest=(-20, 20))
                  for shape in ((), (all_symbols,), (all_symbols, all_symbols))]  # fmt: skip
         F = [Taylor(c, g, Q, np.zeros(1)) for c, g, Q in zip(*sized, strict=True)]
-        rise = Taylor.of(function.along(plain, [f.model for f in F]))
+        both = function.along([v.model for v in states], [f.model for f in F])
+        assert both.rate is not None
+        rise, kept = Taylor.of(both.rate), Kept()
+        (last,) = kept.entries(*[*function.tape.calls.values()], [Dual(v.model) for v in states])
+        models = kept.layers
+        assert np.array_equal(last.value.p, both.value.p, equal_nan=True)
         for corner in (True, True, False):
             d = [arb(v) for v in symbols(generator, all_symbols, corner)]
             off = [arb(v) for v in generator.choice([-1.0, 0.0, 1.0], n).tolist()]
@@ -286,7 +304,7 @@ def test_networks_of_any_size_lie_in_their_models(count: int) -> None:
                  zip(centre.tolist(), radius.tolist(), error.tolist(), d[:n], off, strict=True)]  # fmt: skip
             y = [value_of_model(f, d) for f in F]
             checked = []
-            for k, (W, b) in enumerate(zip(function.net.weights, function.net.biases, strict=True)):
+            for k, (W, b) in enumerate(layers(network)):
                 if k:
                     h = [v.tanh() for v in h]
                     y = [(1 - t * t) * v for t, v in zip(h, y, strict=True)]
@@ -301,10 +319,12 @@ def test_networks_of_any_size_lie_in_their_models(count: int) -> None:
                     most = arb(float(model.r[0] if row is None else model.r[row, 0]))
                     assert abs(value - said) <= most, seed
                     closest = max(closest, float(abs(value - said) / most)) if most > 0 else closest
-            assert least < np.inf or np.isnan(least)
-            if np.isfinite(least):
+            assert lowest < np.inf or np.isnan(lowest)
+            if np.isfinite(lowest):
                 met["least"] += 1
-                assert h[0] >= arb(least), seed
+                assert h[0] >= arb(lowest), seed
+                assert function.is_above(box, float(np.nextafter(lowest, -np.inf)))[0], seed
+            assert not function.is_above(box, float(np.nextafter(float(h[0]), np.inf)))[0], seed
     assert 0.9 < closest <= 1 and all(met[what] > count / 2 for what in ("layer", "rise", "least"))
 
 

@@ -17,21 +17,20 @@ import pytest
 from flint import arb, ctx, fmpq, fmpq_mat
 
 from certify.checker import decrease, local, tube
-from certify.checker.ball import Ball, too_large
+from certify.checker.ball import Ball, fits
 from certify.checker.case import Case
 from certify.checker.decrease import Models
 from certify.checker.document import Certificate, Multipliers
 from certify.checker.exact import exactly
 from certify.checker.jets import Jet as Batch
-from certify.checker.jets import unpacked
+from certify.checker.jets import Units, unpacked
 from certify.checker.near import Above, Cubic, Near, Square, Vector, symmetric
-from certify.checker.network import fold
 from certify.checker.pairs import in_binary64
 from tests.checker.test_ball import curved as every_function
 from tests.checker.test_path import linear as along
 from tests.checker.test_path import placed
 from tests.checker.test_rules import honest
-from tests.support.balls import with_ball
+from tests.support.balls import sized, with_ball
 from tests.support.certificates import Document, edited, encode, make, parse, verdict
 from tests.support.jets import (
     Jet,
@@ -48,7 +47,7 @@ from tests.support.jets import (
 )
 from tests.support.marks import slow_after
 from tests.support.oracle import policy_in_arb, quadratic, value_of
-from tests.support.plain import elementary
+from tests.support.plain import chain, elementary, layers
 
 Generator = np.random.Generator
 JUST = 1 - 2.0**-40
@@ -376,7 +375,7 @@ def layers_in_arb(c: Certificate, x: list[arb]) -> list[list[arb]]:
 
 def _layers(c: Certificate, x: list[arb]) -> list[list[arb]]:
     h, result = x, []
-    for number, (W, b) in enumerate(zip(c.policy.weights, c.policy.biases, strict=True)):
+    for number, (W, b) in enumerate(layers(c.policy.network)):
         h = [v.tanh() for v in h] if number else h
         rows = zip(W.tolist(), b.tolist(), strict=True)
         h = [sum((arb(w) * v for w, v in zip(row, h, strict=True)), arb(p)) for row, p in rows]
@@ -427,8 +426,8 @@ def test_units_carry_all_that_their_inputs_leave_out(
                 beyond = [v - p - linear(jet, d) - curved(jet, d) for v, p, jet in zip(u, u_0, inputs, strict=True)]
                 slacks = [arb(float(jet.slack)) * length for jet in inputs]
                 for j, (jet, left, slack) in enumerate(zip(inputs, beyond, slacks, strict=True)):
-                    carried = zip(units.L[j].tolist(), errors[:hidden], strict=False)
-                    own = arb(abs(float(units.L[j, hidden + j]))) * bounds[hidden + j]
+                    carried = zip(units.reach[j].tolist(), errors[:hidden], strict=False)
+                    own = arb(abs(float(units.reach[j, hidden + j]))) * bounds[hidden + j]
                     rest = left - sum((arb(p) * e for p, e in carried), arb(0))
                     assert abs(rest) <= slack + quadratic(jet.E, d) + own
                     assert abs(left) <= slack + quadratic(jet.whole, d)
@@ -482,25 +481,21 @@ def test_a_subnormal_scale_of_an_input_that_bends_much_contains(scale: float) ->
     no_y = Near(np.zeros((0, 2))), Vector(np.zeros((2, 0, 2)))
     found.__dict__["outputs"] = Batch(
         Near(np.zeros(2)), Vector(np.zeros((2, 2))), Square(Q), Cubic(np.zeros((4, 2))), Square(flat),
-        Near(np.full((1, 2), 2.0**-20)), np.full((2, 2, 1), 2.0**400), *no_y, Above(np.zeros(2)),
+        Near(np.full((1, 2), 2.0**-20)), Units(np.full((2, 2, 1), 2.0**400)), *no_y, Above(np.zeros(2)),
     )  # fmt: skip
     with np.errstate(all="ignore"):
         u = seen(found.inputs)[0]
     least = abs(quotient(scale)) * (quotient(2.0**-53) * quotient(Q[0, 0, 0]))
     assert quotient(u.E[0, 0]) >= least
-    assert quotient(u.E[0, 0]) >= abs(quotient(found.units.L[0, 0]) - quotient(scale) * quotient(2.0**-20)) * quotient(
-        2.0**400
-    )
+    off = abs(quotient(found.units.reach[0, 0]) - quotient(scale) * quotient(2.0**-20))
+    assert quotient(u.E[0, 0]) >= off * quotient(2.0**400)
 
 
 def test_the_largest_network_of_the_tables_is_not_too_large() -> None:
     weights = [np.zeros((out, into)) for into, out in itertools.pairwise([12, *[256] * 5, 4])]
-    policy = parse(by_hand("tanh", "output", [2, 2], 0)).policy
-    wide = replace(policy, weights=tuple(weights), biases=tuple(np.zeros(len(W)) for W in weights),
-                   scale=np.ones(4), offset=np.zeros(4))  # fmt: skip
-    net = fold(wide, parse(by_hand("tanh", "output", [2, 2], 0)).u_eq * 2)
-    assert not list(too_large(net, 10_000, 13))
-    assert next(too_large(net, 10**6, 13))[0] == "plant.dynamics"
+    net = chain(weights, [np.zeros(len(W)) for W in weights])
+    assert not list(fits(sized(net, 10_000, 13)))
+    assert next(fits(sized(net, 10**6, 13)))[0] == "plant.dynamics"
 
 
 # ---------------------------------------------------------------------------------------------------------------- pairs
@@ -597,7 +592,7 @@ def test_the_two_new_sums_bound_what_they_stand_for(n: int, kind: str) -> None:
         with np.errstate(all="ignore"):
             by = Multipliers(apart, apart, apart, weight)
             sums = decrease.cubic(models, b, by), decrease.of_units(models, b, weight)
-        L, R = exactly(models.units.L), [exactly(part) for part in remainders(models.units)]
+        L, R = exactly(models.units.reach), [exactly(part) for part in remainders(models.units)]
         p = b.transpose() * models.B * L
         whole = [unpacked(K, k) for K in models.K.T]
         for d in points(generator, k):

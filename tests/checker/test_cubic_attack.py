@@ -286,14 +286,14 @@ def test_no_point_of_a_ball_crosses_the_inequality(count: int) -> None:
         generator = np.random.default_rng([1, seed])
         _, found = random_loop(generator)
         n, moving = len(found.J), found.motion is not None
-        if not are_finite(found.F(), found.units):
+        if not are_finite(found.F()):
             continue
         known += 1
         truth, A, B = Truth(found), generator.standard_normal((n, n)), generator.standard_normal((n, n))
         P, R = A + A.T if seed % 2 else A @ A.T, 10.0 ** generator.uniform(-3, 3) * (B + B.T)
         by, path = random_hints(generator, found.J, P, seen(found.F()), n + moving)
         v = [fmpq(int(q), 7) for q in generator.integers(-9, 10, n)]
-        models = Models(found.J, found.F(), found.units, not moving, v if moving else ())
+        models = Models(found.J, found.F(), not moving, v if moving else ())
         decay, rest = sides(models, exactly(P), exactly(R), by, path if moving else None)
         inputs = len(found.inputs)
         moved = [arb(q) for q in v] if moving else truth.centre[inputs:]

@@ -259,7 +259,7 @@ def test_a_negative_multiplier_would_show_what_is_false(monkeypatch: pytest.Monk
 @pytest.mark.parametrize("part", ["a", "slack", "Q", "E"])
 def test_what_is_not_finite_is_no_model(bad: float, part: str) -> None:
     parts: dict[str, Any] = {"a": [1.0, 2.0], "slack": 0.0, "Q": np.eye(2), "E": np.eye(2)}
-    assert are_finite([jet(**parts).model], no_units(2))
+    assert are_finite([jet(**parts).model])
     spoilt = np.array(parts[part], float)
     spoilt[(-1,) * spoilt.ndim] = bad
-    assert not are_finite([jet(**parts).model, jet(**parts | {part: spoilt}).model], no_units(2))
+    assert not are_finite([jet(**parts).model, jet(**parts | {part: spoilt}).model])

@@ -19,13 +19,15 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from certify.checker import near
-from certify.checker.ball import enclose_on_ball, too_large
+from certify.checker.ball import fits
 from certify.checker.document import Policy
 from certify.checker.exact import contains_ball, gershgorin_lower, inverse_diagonal, is_definite, root_above
 from certify.checker.near import ZERO, Above, self_test
-from certify.checker.network import Folded, fold
+from certify.checker.network import fold
+from certify.checker.networks import Network
 from certify.checker.ring import Ring
-from tests.support.jets import Jet, changed, curved, members, plain
+from tests.support.balls import sized
+from tests.support.jets import Jet, changed, curved, enclose_on_ball, members, plain
 from tests.support.jets import constant as constant_jet
 from tests.support.marks import slow_after
 from tests.support.oracle import awkward, ball, certainly_within, policy_in_arb, quadratic
@@ -35,6 +37,7 @@ from tests.support.plain import (
     arb_with_error,
     atan,
     atanh_with_error,
+    chain,
     elementary,
     enclose_on_boxes,
     exp,
@@ -848,7 +851,7 @@ def random_policy(
     m = widths[-1]
     scale, offset = generator.choice([-1.0, 1.0], m) * generator.uniform(0.5, 3, m), 0.2 * generator.standard_normal(m)
     offset = np.clip(offset, -0.29, 0.29)  # so that u_eq lies inside offset +- scale
-    return Policy(weights, biases, scale, offset, squash, centre), tuple(Fraction(1, 5 + j) for j in range(m))
+    return Policy(chain(weights, biases), scale, offset, squash, centre), tuple(Fraction(1, 5 + j) for j in range(m))
 
 
 POLICIES = list(
@@ -916,12 +919,11 @@ def test_errors_of_earlier_layers_widen_the_range_of_later_ones(second: float, t
     cancel = np.tanh(3.0) / np.tanh(0.5)
     W2 = 3 * np.array([[1.0, -cancel], [0.0, 0.0]])
     weights = (W1, W2, np.array([[3.0, 0.0]]))
-    policy = Policy(
-        weights, (np.zeros(2), np.array([second, 20.0]), np.array([third])), np.ones(1), np.zeros(1), "tanh", "output"
-    )
+    biases = (np.zeros(2), np.array([second, 20.0]), np.array([third]))
+    policy = Policy(chain(weights, biases), np.ones(1), np.zeros(1), "tanh", "output")
     x = np.array([[[0.0], [1.0]]])
     assert_policy_enclosed(policy, (Fraction(0),), x, [[t] for t in np.linspace(-1, 1, 81).tolist()])
-    wide = Policy((W1, W2[:1]), (*policy.biases[:1], policy.biases[1][:1]), np.ones(1), np.zeros(1), "tanh", "output")
+    wide = Policy(chain((W1, W2[:1]), (biases[0], biases[1][:1])), np.ones(1), np.zeros(1), "tanh", "output")
     assert_policy_enclosed(wide, (Fraction(0),), x, [[t] for t in np.linspace(-1, 1, 81).tolist()])
 
 
@@ -936,15 +938,13 @@ def test_rounding_is_bounded_where_numbers_cancel(seed: int) -> None:
     origin = [[0.0] * 16]
     for squash, centre in (("identity", "none"), ("identity", "output"), ("tanh", "output"), ("tanh", "preactivation")):
         offset = 0.0 if centre == "none" else 0.1
-        policy = Policy((W,), (np.zeros(1),), np.ones(1), np.full(1, offset), squash, centre)
+        policy = Policy(chain((W,), (np.zeros(1),)), np.ones(1), np.full(1, offset), squash, centre)
         assert_policy_enclosed(policy, (Fraction(0),), x, origin)
-    shifted = Policy(
-        (1e-9 * W,), (np.array([-1e7 / 3]),), np.array([0.7]), np.array([0.7 * 1e7 / 3]), "identity", "output"
-    )
+    far = chain((1e-9 * W,), (np.array([-1e7 / 3]),))
+    shifted = Policy(far, np.array([0.7]), np.array([0.7 * 1e7 / 3]), "identity", "output")
     assert_policy_enclosed(shifted, (Fraction(10**8, 3),), x, origin)
-    deep = Policy(
-        (W, np.array([[1e6]])), (np.full(1, 1e-9), np.zeros(1)), np.ones(1), np.zeros(1), "identity", "output"
-    )
+    two = chain((W, np.array([[1e6]])), (np.full(1, 1e-9), np.zeros(1)))
+    deep = Policy(two, np.ones(1), np.zeros(1), "identity", "output")
     assert_policy_enclosed(deep, (Fraction(1, 3),), 1e-9 * x, origin)
 
 
@@ -1002,53 +1002,54 @@ def test_the_policy_at_the_origin(radius: float) -> None:
 def test_what_is_too_large_for_the_local_rule_is_refused_at_once() -> None:
     """Files of some hundred KiB whose bounds would take gigabytes; a network a little smaller is enclosed."""
 
-    def folded(widths: list[int]) -> Folded:
+    def network(widths: list[int]) -> Network:
         weights = tuple(np.full((out, into), 1e-9) for into, out in itertools.pairwise(widths))
-        biases = tuple(np.zeros(out) for out in widths[1:])
-        policy = Policy(weights, biases, np.ones(1), np.zeros(1), "tanh", "preactivation")
-        return fold(policy, (Fraction(0),))
+        return chain(weights, tuple(np.zeros(out) for out in widths[1:]))
 
     wide = 6000
     for widths in ([1, wide, 1, wide, 1], [64, *[1] * 9000, 1]):
-        assert next(too_large(folded(widths), 1, widths[0]))[0] == "policy.layers"
-    assert next(too_large(folded([64, 1]), 10_000, 64))[0] == "plant.dynamics"
-    small = folded([1, wide // 12, 1, wide // 12, 1])
-    assert not list(too_large(small, 1, 1))
-    enclose_on_ball(small, [v.model for v in at_rest(np.ones((1, 1)))])
+        assert next(fits(sized(network(widths), 1, widths[0])))[0] == "networks"
+    assert next(fits(sized(network([64, 1]), 10_000, 64)))[0] == "plant.dynamics"
+    small = network([1, wide // 12, 1, wide // 12, 1])
+    assert not list(fits(sized(small, 1, 1)))
+    policy = Policy(small, np.ones(1), np.zeros(1), "tanh", "preactivation")
+    enclose_on_ball(fold(policy, (Fraction(0),)), [v.model for v in at_rest(np.ones((1, 1)))])
 
 
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize(("squash", "centre"), [("identity", "output"), ("tanh", "output"), ("tanh", "preactivation")])
 def test_folded_numbers_are_enclosed(squash: str, centre: str, seed: int) -> None:
-    """Offset and last bias against Arb, where the last layer's terms cancel to 12 digits less."""
+    """Offset and shift against Arb, where the last layer's terms cancel to 12 digits less."""
     generator = np.random.default_rng(seed + 80)
     half, bias = generator.standard_normal((1, 8)) * 1e6, generator.standard_normal(8)
     W = np.concatenate([half, -half], 1)
     b1 = np.concatenate([bias, bias * (1 + 2.0**-40 * generator.standard_normal(8))])
-    policy = Policy((np.ones((16, 1)), W), (b1, np.full(1, 1e-7)), np.full(1, -3e5), np.full(1, 1e4), squash, centre)
+    network = chain((np.ones((16, 1)), W), (b1, np.full(1, 1e-7)))
+    policy = Policy(network, np.full(1, -3e5), np.full(1, 1e4), squash, centre)
     u_eq = (Fraction(1, 3),)
     folded = fold(policy, u_eq)
     with ctx.workprec(400):
         product = sum((arb(w) * arb(b).tanh() for w, b in zip(W[0].tolist(), b1.tolist(), strict=True)), arb(0))
+        y = product + arb(1e-7)
+        assert folded.network is policy.network and not folded.origin.any()
         if centre == "preactivation":
             beta = ((ball(u_eq[0]) - arb(1e4)) / arb(-3e5)).atanh()
-            b = folded.layers[1].b
-            assert certainly_within(beta - product, b.value[0], b.error.top[0])
+            assert folded.shift is not None
+            assert certainly_within(beta - y, folded.shift.value[0], folded.shift.error.top[0])
             assert folded.offset.value is policy.offset and folded.offset.error is ZERO
         else:
-            y = product + arb(1e-7)
             h = y.tanh() if squash == "tanh" else y
             assert certainly_within(ball(u_eq[0]) + arb(3e5) * h, folded.offset.value[0], folded.offset.error.top[0])
-            exact = zip(folded.layers, policy.biases, strict=True)
-            assert all(f.b.value is b and f.b.error is ZERO for f, b in exact)
+            assert folded.shift is None
 
 
 @pytest.mark.parametrize("squash", ["tanh", "identity"])
 def test_without_centring_nothing_is_folded(squash: str) -> None:
-    policy = Policy((np.array([[2.0, -1.0]]),), (np.zeros(1),), np.array([3.0]), np.array([0.5]), squash, "none")
+    network = chain((np.array([[2.0, -1.0]]),), (np.zeros(1),))
+    policy = Policy(network, np.array([3.0]), np.array([0.5]), squash, "none")
     folded = fold(policy, (Fraction(1, 2),))
-    assert folded.layers[0].b.error is ZERO and folded.offset.error is ZERO
-    assert folded.layers[0].b.value is policy.biases[0] and folded.offset.value is policy.offset
+    assert folded.shift is None and not folded.origin.any() and folded.offset.error is ZERO
+    assert folded.network is policy.network and folded.offset.value is policy.offset
 
 
 # --------------------------------------------------------------- what underflows and is multiplied by much afterwards

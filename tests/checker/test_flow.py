@@ -15,12 +15,12 @@ import pytest
 from flint import arb, ctx, fmpq, fmpq_mat
 from numpy.random import Generator
 
-from certify.checker.ball import Units
 from certify.checker.case import Case
 from certify.checker.decrease import Level, sides, size_beyond
 from certify.checker.document import Multipliers
 from certify.checker.exact import exactly
 from certify.checker.flow import Series
+from certify.checker.jets import Units
 from certify.checker.local import Local
 from certify.checker.ring import Ring
 from tests.checker.test_ball import points
@@ -43,7 +43,7 @@ from tests.support.jets import (
 )
 from tests.support.leaves import on_boxes
 from tests.support.marks import slow_after
-from tests.support.plain import Taylor
+from tests.support.plain import Taylor, layers
 from tests.support.stepped_loops import fitted
 
 # ------------------------------------------------------------------------------------------ jets with what is uncertain
@@ -145,9 +145,9 @@ def field(x: np.ndarray, u: np.ndarray, w: np.ndarray, disturbed: bool) -> np.nd
 def policy(data: Document, x: np.ndarray) -> np.ndarray:
     c = parse(data)
     h, h0 = x, np.zeros_like(x)
-    for W, bias in zip(c.policy.weights[:-1], c.policy.biases[:-1], strict=True):
-        h, h0 = np.tanh(W @ h + bias), np.tanh(W @ h0 + bias)
-    last, bias = c.policy.weights[-1], c.policy.biases[-1]
+    *hidden, (last, bias) = layers(c.policy.network)
+    for W, b in hidden:
+        h, h0 = np.tanh(W @ h + b), np.tanh(W @ h0 + b)
     return np.asarray(c.policy.scale * (np.tanh(last @ h + bias) - np.tanh(last @ h0 + bias)))
 
 

@@ -428,9 +428,9 @@ def test_accepted_prints_the_claim(tmp_path: Path) -> None:
     assert done.returncode == 0 and done.stderr == ""
     assert lines[0] == "plant plant: xdot = f(x, u), states (x), inputs (u)"
     assert lines[1:4] == ["  x' = ((x / 2) + u)", "  domain x in [-3, 3]", "  input u in [-1, 1], u_eq = 0"]
-    assert good()["policy"]["sha256"] in lines[4] and "1-1 tanh" in lines[4] and "preactivation" in lines[4]
-    assert lines[5].endswith("P = 1.0") and "V <= 3.5 " in lines[6]
-    assert lines[-1].startswith("ACCEPTED c1=0.01 c2=3.5 sha256=") and len(lines) == 11
+    assert "1-1 tanh" in lines[4] and good()["policy"]["sha256"] in lines[5] and "preactivation" in lines[5]
+    assert lines[6].endswith("P = 1.0") and "V <= 3.5 " in lines[7]
+    assert lines[-1].startswith("ACCEPTED c1=0.01 c2=3.5 sha256=") and len(lines) == 12
 
 
 def test_accepted_as_json_is_one_strict_object(tmp_path: Path) -> None:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import json
+import struct
 from collections.abc import Callable
 from fractions import Fraction
 from typing import Any
@@ -9,7 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from certify.checker import ball, network
+from certify.checker import ball, document, network, rules
+from certify.checker.errors import Rejected
 from certify.checker.exact import Exact, Exactly
 from certify.checker.expression import Tape, evaluate, parse
 from certify.checker.functions import Undecided
@@ -19,6 +24,9 @@ from certify.checker.networks import Affine, Algebra, Clip, Concat, Map, Network
 from certify.checker.outer import Dual, InRows
 from certify.checker.taylor import Taylor, constants
 from certify.checker.taylor import affine as form_of
+from tests.support.certificates import Document, decode, encode, grow, make
+from tests.support.earlier import newer
+from tests.support.reference import judge_bytes
 
 Array = Any
 SEEDS = range(60)
@@ -298,3 +306,261 @@ def test_corners_of_equations_lie_in_their_models(seed: int) -> None:
             assert not abs(value[0] - known) > off + 1e-12 * (1 + abs(value[0]))
     if radius < 1e-5:
         assert all(np.isfinite(v.v0.size.top) for v in on_ball)
+
+
+# -------------------------------------------------------------------------------------------------------- the documents
+
+
+def checked(raw: bytes) -> str | None:
+    """None if the checker accepts a file, or the name of the first rule that fails."""
+    try:
+        rules.check(document.certificate(json.loads(raw), ""))
+    except Rejected as no:
+        return no.rule
+    return None
+
+
+def a_document() -> Document:
+    """An accepted certificate of format 9, of a policy with a hidden layer and no centring."""
+    return newer(odd_loop())
+
+
+def odd_loop() -> Document:
+    """x' = x/2 + u, u = -2 tanh(x) by a hidden layer, so that the origin is an equilibrium exactly."""
+    data = make(
+        [["+", ["/", "x", "2"], "u"]],
+        [([[1.0]], [0.0]), ([[-2.0]], [0.0])],
+        [[1.0]],
+        (0.25, 1.0),
+        squash="identity",
+        centre="none",
+        scale=[1.0],
+        input_bounds=(("-3", "3"),),
+    )
+    return grow(data)
+
+
+def step(k: int, **changes: Any) -> Callable[[Document], None]:
+    def change(data: Document) -> None:
+        own = data["networks"][0]["steps"][k]
+        own.update(changes)
+        for key in [key for key, value in changes.items() if value is GONE]:
+            del own[key]
+
+    return change
+
+
+GONE = object()
+AFFINE = {"kind": "affine", "of": [1], "shape": [1, 1], "weight": encode([1.0]), "bias": encode([0.0])}
+
+
+def more(*steps: Document) -> Callable[[Document], None]:
+    """Further steps before the last, which reads the last of them."""
+
+    def change(data: Document) -> None:
+        own = data["networks"][0]["steps"]
+        own[-1:] = [*steps, {**own[-1], "of": [len(own) - 1 + len(steps)]}]
+
+    return change
+
+
+def dynamics(tree: Any) -> Callable[[Document], None]:
+    def change(data: Document) -> None:
+        data["plant"]["dynamics"] = [tree]
+
+    return change
+
+
+def networks(change: Callable[[list[Document]], Any]) -> Callable[[Document], None]:
+    def apply(data: Document) -> None:
+        data["networks"] = change(data["networks"])
+
+    return apply
+
+
+def sampled(data: Document) -> None:
+    data["claim"]["sample"] = ["1/100", "1/50"]
+    data["evidence"]["order"] = data["evidence"]["local"]["order"] = 2
+
+
+MALFORMED: dict[str, Callable[[Document], None]] = {
+    "no networks": networks(lambda old: []),
+    "networks null": networks(lambda old: None),
+    "65 networks": networks(lambda old: [old[0], *({**old[0], "name": f"n{k}"} for k in range(64))]),
+    "two of one name": networks(lambda old: old * 2),
+    "a network without steps": networks(lambda old: [{**old[0], "steps": []}]),
+    "a network of 257 steps": more(*[{"kind": "map", "of": [k], "function": "sin"} for k in range(2, 256)]),
+    "a name with a space": networks(lambda old: [{**old[0], "name": "the policy"}]),
+    "reads 2": networks(lambda old: [{**old[0], "reads": 2}]),
+    "reads true": networks(lambda old: [{**old[0], "reads": True}]),
+    "reads 0": networks(lambda old: [{**old[0], "reads": 0}]),
+    "a key more": networks(lambda old: [{**old[0], "scale": encode([1.0])}]),
+    "another policy": lambda d: d["policy"].update(network="nobody"),
+    "a policy null": lambda d: d["policy"].update(network=None),
+    "kind of step": step(1, kind="relu"),
+    "kind null": step(1, kind=None),
+    "of nothing": step(1, of=[]),
+    "of itself": step(1, of=[2]),
+    "of a later one": step(0, of=[1]),
+    "of minus one": step(1, of=[-1]),
+    "of true": step(1, of=[True]),
+    "of a number": step(1, of=1),
+    "of two": step(1, of=[1, 1]),
+    "without of": step(1, of=GONE),
+    "another function": step(1, function="relu"),
+    "a tangent": step(1, function="tan"),
+    "without a function": step(1, function=GONE),
+    "a function more": step(0, function="tanh"),
+    "shape of two columns": step(0, shape=[1, 2]),
+    "shape of two rows": step(0, shape=[2, 1]),
+    "shape of true": step(0, shape=[True, 1]),
+    "a bias of two": step(0, bias=encode([0.0, 0.0])),
+    "a weight that is no number": step(0, weight=encode([np.nan])),
+    "two outputs": step(2, shape=[2, 1], weight=encode([1.0, 1.0]), bias=encode([0.0, 0.0])),
+    "a sum of one": more({"kind": "sum", "of": [1]}),
+    "a sum of unequal ones": more({"kind": "concat", "of": [1, 1]}, {"kind": "sum", "of": [1, 3]}),
+    "a concat of one": more({"kind": "concat", "of": [1]}),
+    "a clip the wrong way": more({"kind": "clip", "of": [2], "lo": encode([1.0]), "hi": encode([-1.0])}),
+    "a clip of one number": more({"kind": "clip", "of": [2], "lo": encode([1.0]), "hi": encode([1.0])}),
+    "a clip of two": more({"kind": "clip", "of": [2], "lo": encode([-1.0] * 2), "hi": encode([1.0] * 2)}),
+    "an infinite clip": more({"kind": "clip", "of": [2], "lo": encode([-np.inf]), "hi": encode([1.0])}),
+    "two names for one": more({"kind": "observe", "of": [2], "names": ["a", "b"], "expressions": ["a"]}),
+    "no name": more({"kind": "observe", "of": [2], "names": [], "expressions": ["1"]}),
+    "one name twice": more(
+        {"kind": "concat", "of": [1, 1]}, {"kind": "observe", "of": [3], "names": ["a", "a"], "expressions": ["a"]}
+    ),
+    "no expression": more({"kind": "observe", "of": [2], "names": ["a"], "expressions": []}),
+    "an expression of a state": more({"kind": "observe", "of": [2], "names": ["a"], "expressions": ["x"]}),
+    "a call in a network": more(
+        {"kind": "observe", "of": [2], "names": ["a"], "expressions": [["network", "policy", 0, "a"]]}
+    ),
+    "a call of nobody": dynamics(["+", ["/", "x", "2"], ["network", "nobody", 0, "x"]]),
+    "a call of entry 1": dynamics(["+", ["/", "x", "2"], ["network", "policy", 1, "x"]]),
+    "a call of entry -1": dynamics(["+", ["/", "x", "2"], ["network", "policy", -1, "x"]]),
+    "a call of entry true": dynamics(["+", ["/", "x", "2"], ["network", "policy", False, "x"]]),
+    "a call of an entry in words": dynamics(["+", ["/", "x", "2"], ["network", "policy", "0", "x"]]),
+    "a call without arguments": dynamics(["+", ["/", "x", "2"], ["network", "policy", 0]]),
+    "a call with two arguments": dynamics(["+", ["/", "x", "2"], ["network", "policy", 0, "x", "x"]]),
+    "a call of a name alone": dynamics(["network", "policy"]),
+    "a call of a list": dynamics(["+", ["/", "x", "2"], ["network", ["policy"], 0, "x"]]),
+    "order 2 of a call": lambda d: (dynamics(["+", ["/", "x", "2"], ["network", "policy", 0, "x"]])(d), sampled(d))[0],
+}
+
+
+@pytest.mark.parametrize("program", [checked, judge_bytes], ids=["checker", "reference"])
+@pytest.mark.parametrize("name", MALFORMED)
+def test_what_is_no_network_is_refused(name: str, program: Callable[[bytes], str | None]) -> None:
+    data = a_document()
+    MALFORMED[name](data)
+    assert program(json.dumps(data).encode()) == "format"
+
+
+def split_in_two(data: Document) -> None:
+    """W h as a sum of two halves."""
+    first = data["networks"][0]["steps"][0]
+    half = {**first, "weight": encode(decode(first["weight"]) / 2), "bias": encode(decode(first["bias"]) / 2)}
+    data["networks"][0]["steps"] = [
+        half,
+        half,
+        {"kind": "sum", "of": [1, 2]},
+        {"kind": "map", "of": [3], "function": "tanh"},
+        {**data["networks"][0]["steps"][-1], "of": [4]},
+    ]
+
+
+def skipping(data: Document) -> None:
+    """-2 tanh(x) as -tanh(x) - (x + (tanh(x) - x)): a skip connection that cancels."""
+    tanh = {"kind": "map", "of": [0], "function": "tanh"}
+    data["networks"][0]["steps"] = [
+        tanh,
+        {"kind": "affine", "of": [0], "shape": [1, 1], "weight": encode([-1.0]), "bias": encode([0.0])},
+        {"kind": "sum", "of": [1, 2]},
+        {"kind": "sum", "of": [0, 1, 3]},
+        {"kind": "affine", "of": [4], "shape": [1, 1], "weight": encode([-1.0]), "bias": encode([0.0])},
+    ]
+
+
+def observed(data: Document) -> None:
+    """The state through an observation of it twice, one of which counts for nothing."""
+    first, tanh, last = data["networks"][0]["steps"]
+    data["networks"][0]["steps"] = [
+        {"kind": "observe", "of": [0], "names": ["x"], "expressions": ["x", ["sin", "x"]]},
+        {**first, "of": [1], "shape": [1, 2], "weight": encode([1.0, 0.0])},
+        {**tanh, "of": [2]},
+        {**last, "of": [3]},
+    ]
+
+
+def clipped_far_out(data: Document) -> None:
+    more({"kind": "clip", "of": [2], "lo": encode([-2.0]), "hi": encode([2.0])})(data)
+
+
+def called(data: Document) -> None:
+    """The equations call the network; the input is of no use."""
+    data["plant"]["dynamics"] = [["+", ["/", "x", "2"], ["network", "policy", 0, "x"], ["*", "0", "u"]]]
+
+
+def called_in_part(data: Document) -> None:
+    half = ["*", "1/2", ["network", "policy", 0, "x"]]
+    data["plant"]["dynamics"] = [["+", ["/", "x", "2"], half, ["*", "1/2", "u"]]]
+
+
+def saturated(data: Document) -> None:
+    data["plant"]["dynamics"] = [["+", ["/", "x", "2"], ["clip", "u", "-5/2", "5/2"], ["*", "0", ["abs", ["+", "u", "3"]]]]]
+
+
+REWRITTEN = [split_in_two, skipping, observed, clipped_far_out, called, called_in_part, saturated]
+
+
+@pytest.mark.parametrize("program", [checked, judge_bytes], ids=["checker", "reference"])
+@pytest.mark.parametrize("rewrite", REWRITTEN)
+def test_the_same_loop_in_other_words_is_proved(
+    rewrite: Callable[[Document], None], program: Callable[[bytes], str | None]
+) -> None:
+    data = a_document()
+    assert program(json.dumps(data).encode()) is None
+    rewrite(data)
+    data["policy"]["sha256"] = hash_of(data)
+    kept = program(json.dumps(data).encode())
+    assert kept is None
+    data["networks"][0]["steps"][-1]["weight"] = encode(-decode(data["networks"][0]["steps"][-1]["weight"]))
+    data["policy"]["sha256"] = hash_of(data)
+    assert program(json.dumps(data).encode()) in ("local", "ring")
+
+
+def hash_of(data: Document) -> str:
+    """The hash that FORMAT.md defines, written down once more."""
+    policy, words = data["policy"], ""
+    digest = hashlib.sha256(f"certify-policy/1\0{policy['squash']}\0{policy['centre']}\0".encode())
+    steps = data["networks"][0]["steps"]
+    for each in steps:
+        for key in ("weight", "bias", "lo", "hi"):
+            if key in each:
+                raw = base64.b64decode(each[key])
+                shape = each["shape"] if key == "weight" else [len(raw) // 8]
+                digest.update(struct.pack(f"<{1 + len(shape)}Q", len(shape), *shape) + raw)
+        words += " ".join([each["kind"], *map(str, each["of"])])
+        words += f" {each['function']}\0" if "function" in each else "\0"
+        if each["kind"] == "observe":
+            words += "".join(f"{name}\0" for name in each["names"])
+            words += json.dumps(each["expressions"], separators=(",", ":")) + "\0"
+    for text in (policy["scale"], policy["offset"], *(policy["clip"] or ())):
+        raw = base64.b64decode(text)
+        digest.update(struct.pack("<2Q", 1, len(raw) // 8) + raw)
+    chain = [(each["kind"], each["of"]) for each in steps]
+    plain = chain == [(("affine", "map")[k % 2], [k]) for k in range(len(steps))] and len(steps) % 2 == 1
+    if not (plain and all(each.get("function", "tanh") == "tanh" for each in steps)):
+        digest.update(words.encode())
+    return digest.hexdigest()
+
+
+@pytest.mark.parametrize("program", [checked, judge_bytes], ids=["checker", "reference"])
+def test_steps_in_another_order_have_another_hash(program: Callable[[bytes], str | None]) -> None:
+    data = a_document()
+    split_in_two(data)
+    own = data["networks"][0]["steps"]
+    own[2] = {"kind": "sum", "of": [2, 1]}
+    with_first = hash_of(data)
+    data["policy"]["sha256"] = with_first
+    own[2] = {"kind": "sum", "of": [1, 2]}
+    assert hash_of(data) != with_first and program(json.dumps(data).encode()) == "hash"

@@ -30,6 +30,7 @@ from certify.reference.leaves import Leaves
 from certify.reference.network import Network
 from tests.support.certificates import LEAF, Document, decode, dump, encode
 from tests.support.certificates import make as stated
+from tests.support.earlier import newer
 from tests.support.jets import seen
 from tests.support.oracle import value_of
 from tests.support.plain import enclose_on_boxes
@@ -169,7 +170,7 @@ ROUNDS = looked_at([([[0.1, 0.7, 1 / 3]], [0.0])], [0.1, 0.3, 1e15], squash="ide
 @example(ROUNDS, (0.0, 2.0**-1074, 0))
 def test_the_checker_encloses_a_moved_policy_on_boxes(data: Document, box: tuple[float, float, int]) -> None:
     at, radius, seed = box
-    c = document.certificate(data, "")
+    c = document.certificate(newer(data), "")
     n = len(c.states)
     x = np.zeros((n, n + 1, 1))
     x[:, 0, 0], x[:, 1:, 0] = at, radius * np.eye(n)
@@ -223,7 +224,7 @@ def test_both_checkers_model_a_moved_policy_on_balls(data: Document, radius: flo
     """|u - v(0) - a.d| is at most curve ||d||^2 at points x = radius d of the ball."""
     n = len(decode(data["policy"]["origin"]))
     J = radius * np.eye(n)
-    jets = seen(Ball(Case(document.certificate(data, "")), J, "").inputs)
+    jets = seen(Ball(Case(document.certificate(newer(data), "")), J, "").inputs)
     with ctx.workprec(128):
         exact = fmpq_mat(n, n, [fmpq(*float(v).as_integer_ratio()) for v in J.ravel()])
         models, _ = Network(read(dump(data))).on(exact)

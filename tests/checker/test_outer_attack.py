@@ -20,8 +20,8 @@ from flint import acb, arb, ctx
 
 from certify.checker.boxes import middle
 from certify.checker.case import Case
-from certify.checker.document import Certificate, Network
-from certify.checker.outer import Beyond, Layers
+from certify.checker.document import Certificate
+from certify.checker.outer import Beyond
 from tests.checker.test_cubic_attack import climb, random_loop, random_tree, sizes
 from tests.support.certificates import LEAF, Document, edited, encode, parse, verdict
 from tests.support.leaves import beyond_on_boxes
@@ -42,7 +42,7 @@ from tests.support.outer import (
 )
 from tests.support.outer_forgeries import stripped
 from tests.support.outer_loops import SQUARE, UNUSED, base, of_chance, planar, saturated, scalar
-from tests.support.plain import Taylor, affine, slope_of_tanh
+from tests.support.plain import Taylor, affine, chain, function_of, slope_of_tanh
 from tests.support.reached import dot
 from tests.support.uncertain import random_plant
 
@@ -196,18 +196,18 @@ def test_layers_that_cancel_leave_roundings_alone(width: int) -> None:
     for size in (1e-200, 1e-3, 1.0, 1e9, 1e150):
         x, W = generator.normal(size=(width, 50)), size * generator.normal(size=(1, width))
         x[-1] = -(W[0, :-1] @ x[:-1]) / W[0, -1]
-        states = [affine(v, np.zeros((1, 50))) for v in x]
-        model = Taylor.of(Layers(Network((W,), (np.zeros(1),))).models([v.model for v in states])[-1])
+        states = [affine(v, np.zeros((1, 50))).model for v in x]
+        model = Taylor.of(function_of(chain((W,), (np.zeros(1),))).along(states, [None] * width).value)
         for k in range(50):
             each = zip(W[0].tolist(), x[:, k].tolist(), strict=True)
-            off = abs(Fraction(float(model.c[0, k])) - sum(Fraction(a) * Fraction(b) for a, b in each))
-            assert off <= Fraction(float(model.r[0, k]))
-            closest = max(closest, float(off / Fraction(float(model.r[0, k]))))
+            off = abs(Fraction(float(model.c[k])) - sum(Fraction(a) * Fraction(b) for a, b in each))
+            assert off <= Fraction(float(model.r[k]))
+            closest = max(closest, float(off / Fraction(float(model.r[k]))))
     assert closest > 1e-3
 
 
 def test_networks_of_more_numbers_than_there_is_room_for() -> None:
-    many, few = (Layers(Network((np.ones((k, 1)), np.ones((1, k))), (np.zeros(k), np.zeros(1)))) for k in (1000, 9))
+    many, few = (function_of(chain((np.ones((k, 1)), np.ones((1, k))), (np.zeros(k), np.zeros(1)))) for k in (1000, 9))
     assert few.is_small(66) and not many.is_small(66) and many.is_small(3)
 
 

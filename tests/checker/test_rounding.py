@@ -404,11 +404,12 @@ def random_policy(
             weights[k][half : 2 * half], biases[k][half : 2 * half] = weights[k][:half], biases[k][:half]
             nearly = 1 + 2.0**-40 * generator.standard_normal(half)
             weights[k + 1][:, half : 2 * half] = -weights[k + 1][:, :half] * nearly
-    return Policy(tuple(weights), tuple(biases), scale, offset, squash, centre)
+    return Policy(plain.chain(weights, biases), scale, offset, squash, centre)
 
 
 def network_of(policy: Policy, squash: Squash, centre: Centre) -> TanhNetwork:
-    return TanhNetwork(policy.weights, policy.biases, policy.scale, policy.offset, squash, centre)
+    weights, biases = zip(*plain.layers(policy.network), strict=True)
+    return TanhNetwork(weights, biases, policy.scale, policy.offset, squash, centre)
 
 
 def still_system(n: int, u_eq: tuple[Fraction, ...]) -> System:
@@ -493,8 +494,8 @@ def situation(generator: Generator, squash: Squash, centre: Centre, wide: bool, 
     x_error = np.abs(generator.standard_normal((n, count))) * size * generator.choice([0.0, 1e-15, 1e-3], count)
     policy = random_policy(generator, n, scale, offset, squash, centre, wide)
     if generator.random() < 0.25:
-        half = n // 2
-        policy.weights[0][:, half : 2 * half] = -policy.weights[0][:, :half]
+        half, W = n // 2, plain.layers(policy.network)[0][0]
+        W[:, half : 2 * half] = -W[:, :half]
         x[half : 2 * half, 0] = x[:half, 0] * (1 + 2.0**-40 * generator.standard_normal((half, count)))
     return Situation(
         policy,
@@ -542,7 +543,7 @@ def test_errors_of_folding_are_enclosed(who: str, squash: Squash, centre: Centre
         weights.append(np.full((1, 1), magnified))
         biases.append(np.full(1, 0.3 - magnified * h))  # net(0) stays where tanh is steep
     tally, x = Tally(), np.array([[[5.0, 20.0, -7.0], [0.0, 0.0, 0.0]]])
-    policy = Policy(tuple(weights), tuple(biases), np.ones(1), np.zeros(1), squash, centre)
+    policy = Policy(plain.chain(weights, biases), np.ones(1), np.zeros(1), squash, centre)
     s = Situation(policy, (Fraction(0),), x, np.zeros((1, 3)), np.zeros((1, EACH, 3)), np.ones((1, 3)))
     truth = policies_in_arb(policy, s.u_eq, [s.state(k, b) for k in range(EACH) for b in range(3)])
     if who == "checker":
@@ -630,7 +631,7 @@ def random_ring(generator: Generator, name: str, squash: Squash, centre: Centre)
         T[:, -1] = 2.0**-30 * T[:, -1] - T[:, :-1].sum(1)
     c = parse(make(
         trees,
-        list(zip(policy.weights, policy.biases, strict=True)),
+        plain.layers(policy.network),
         P + P.T + np.diag(np.diag(P)) / 8,
         (1e-3, 1.0),
         states=[s.name for s in system.states],

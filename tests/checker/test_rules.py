@@ -35,8 +35,9 @@ from certify.checker.boxes import batches
 from certify.checker.case import Case
 from certify.checker.document import Policy
 from certify.checker.errors import Rejected
-from certify.checker.exact import raw_at_origin
+from certify.checker.exact import policy_at_origin
 from certify.checker.near import Above, Near, within
+from certify.checker.networks import Affine, Map, Network
 from certify.checker.ring import Ring, is_partition
 from certify.checker.rules import Tally
 from tests.support import outer_loops
@@ -952,16 +953,18 @@ def test_every_rule_is_disabled_once() -> None:
 def test_without_centring_the_equilibrium_is_decided_exactly(
     hidden: float, weight: float, last: float, squash: str, offset: float, u_eq: Fraction, known: bool
 ) -> None:
-    policy = Policy(
-        (np.ones((1, 1)), np.full((1, 1), weight)), (np.full(1, hidden), np.full(1, last)), np.full(1, 3.0),
-        np.full(1, offset), squash, "none",
-    )  # fmt: skip
+    steps = (
+        Affine((0,), 1, np.ones((1, 1)), np.full(1, hidden)),
+        Map((1,), 1, "tanh"),
+        Affine((2,), 1, np.full((1, 1), weight), np.full(1, last)),
+    )
+    policy = Policy(Network("policy", 1, steps), np.full(1, 3.0), np.full(1, offset), squash, "none")
     case = Case(replace(parse(scalar_claim()), policy=policy, u_eq=(u_eq,)))
     failures = list(dict(rules.STATED)["centring"](case))
     if known:
         assert not failures and network.fold(policy, (u_eq,)).offset.value is policy.offset
     else:
-        assert [at for at, _ in failures] == ["policy.centre"] and raw_at_origin(policy) != [u_eq]
+        assert [at for at, _ in failures] == ["policy.centre"] and policy_at_origin(policy) != [u_eq]
 
 
 def test_a_leaf_that_overflows_is_never_accepted() -> None:

@@ -38,7 +38,7 @@ def value(tree: object, names: dict[str, np.ndarray]) -> np.ndarray:
 
 def policy(c: Certificate, x: np.ndarray) -> np.ndarray:
     """Of one layer, x (n, B)."""
-    [W], [bias], p = c.policy.weights, c.policy.biases, c.policy
+    [[W, bias]], p = [step.arrays for step in c.policy.network.steps], c.policy
     squash = np.tanh if p.squash == "tanh" else lambda v: v
     u = W @ x + (bias[:, None] if p.centre == "none" else 0.0)
     return np.asarray(p.scale[:, None] * squash(u) + p.offset[:, None])

@@ -46,6 +46,7 @@ from tests.support.certificates import (
     verdict,
     write,
 )
+from tests.support.earlier import earlier
 from tests.support.jets import curved, models_of, no_units, plain, seen
 from tests.support.marks import slow_after
 from tests.support.oracle import policy_in_arb, quadratic, value_of
@@ -87,7 +88,7 @@ def pendulum() -> Document:
         command += ["--level", "0.3", "--enlarge", "--effort", "0.6", "--out", folder, "--quiet"]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
-        data: Document = json.loads((Path(folder) / "certificate.json").read_text())
+        data: Document = earlier(json.loads((Path(folder) / "certificate.json").read_text()))
     return data
 
 
@@ -482,7 +483,7 @@ def test_runs_of_the_pendulum_stay_in_its_tube() -> None:
     assert (policy.squash, policy.centre, policy.clip) == ("tanh", "preactivation", None)
 
     def net(x: np.ndarray) -> np.ndarray:
-        for W, b in zip(policy.weights, policy.biases, strict=True):
+        for W, b in (step.arrays for step in policy.network.steps if step.arrays):
             y = W @ x + b[:, None]
             x = np.tanh(y)
         return y

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from flint import fmpq, fmpq_mat
 from certify.checker.ball import Ball
 from certify.checker.case import Case
 from certify.checker.errors import Rejected
+from certify.checker.networks import Network
 from tests.support.certificates import ASYMPTOTIC, Document, decode, edited, encode, parse
 from tests.support.jets import seen
 
@@ -29,6 +31,13 @@ def with_ball(data: Document) -> Document:
     if "floor" in data["levels"] and data["levels"]["floor"] == data["levels"]["local"]:
         return data
     return edited(data, "evidence.local", local_ball(data))
+
+
+def sized(network: Network, operations: int, symbols: int) -> Any:
+    """A ball of which the sizes are known and nothing else: those that rule `fits` asks for."""
+    dynamics = SimpleNamespace(size=operations, calls={})
+    c = SimpleNamespace(dynamics=dynamics, policy=SimpleNamespace(network=network))
+    return SimpleNamespace(case=SimpleNamespace(c=c), J=np.eye(symbols), motion=None, order=1, count=0)
 
 
 def square(text: str) -> np.ndarray:

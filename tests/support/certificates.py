@@ -26,6 +26,7 @@ from certify.checker.errors import Rejected
 from certify.checker.near import within
 from certify.checker.outer import Beyond
 from certify.checker.ring import Ring
+from tests.support.earlier import newer
 
 Document = dict[str, Any]
 LEAF = 255
@@ -164,7 +165,8 @@ def least_root(P: np.ndarray, T: np.ndarray, level: float) -> np.ndarray:
 
 
 def dump(data: Document) -> bytes:
-    return json.dumps(data).encode("ascii")
+    """The file's bytes; documents are written in format 8 here, and become ones of today."""
+    return json.dumps(newer(data)).encode("ascii")
 
 
 def parse(data: Document) -> Certificate:

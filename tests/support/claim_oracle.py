@@ -28,6 +28,8 @@ import numpy as np
 from flint import arb, arb_mat, ctx, fmpq
 from numpy.typing import NDArray
 
+from tests.support.earlier import strictly_earlier
+
 Array = NDArray[np.float64]
 Document = dict[str, Any]
 Points = Sequence[tuple[float, ...]]
@@ -78,7 +80,7 @@ def read(path: Path) -> Document:
             path.read_bytes().decode("utf-8"), object_pairs_hook=_Pairs, parse_int=number, parse_float=refuse,
             parse_constant=refuse,
         )  # fmt: skip
-        data = _plain(value)
+        data = strictly_earlier(_plain(value))
     except (ValueError, RecursionError) as error:
         raise Malformed(type(error).__name__) from error
     _shape(data)

@@ -4,18 +4,21 @@ ball arithmetic."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from itertools import combinations_with_replacement
 from types import SimpleNamespace
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 from flint import arb
 
-from certify.checker import jets, pairs
-from certify.checker.ball import Units
+from certify.checker import ball, jets, pairs
 from certify.checker.decrease import Models
+from certify.checker.jets import Units
 from certify.checker.near import ZERO, Above, Cubic, Near, Square, Tensor, Vector
+from certify.checker.network import Folded
 from tests.support.oracle import quadratic
 from tests.support.plain import top
 
@@ -25,19 +28,30 @@ def bound(x: Any) -> Above:
     return ZERO if np.all(np.asarray(x) == 0) else Above(np.asarray(x, dtype=np.float64))
 
 
+_FAMILIES: WeakValueDictionary[tuple[Any, ...], Units] = WeakValueDictionary()
+
+
+def family(U: Any) -> Units:
+    """The errors within U (m, k, k): those of one family for equal bounds, as long as some jet has them."""
+    if isinstance(U, Units):
+        return U
+    U = np.ascontiguousarray(U, dtype=np.float64)
+    return _FAMILIES.setdefault((U.shape, U.tobytes()), Units(np.moveaxis(U, 0, -1)))
+
+
 class Jet:
     """A jet of the checker as numbers: `c` +- `error`, `a` (k,) +- `slack`, `Q` (k, k), `K` as triples, remainder `E`
-    (k, k), `B` (m,) of the errors within `U` (m, k, k), `c_y` (N,) and `a_y` (N, k), and `lip`."""
+    (k, k), `B` (m,) of the errors within `U` (m, k, k), or of a family, `c_y` (N,) and `a_y` (N, k), and `lip`."""
 
     def __init__(
         self, c: Any, error: Any, a: Any, slack: Any, Q: Any, K: Any, E: Any, B: Any, U: Any, c_y: Any, a_y: Any,
         lip: Any = 0.0,
     ) -> None:  # fmt: skip
-        Q, E, U, a_y = (np.asarray(v, dtype=np.float64) for v in (Q, E, U, a_y))
+        Q, E, a_y = (np.asarray(v, dtype=np.float64) for v in (Q, E, a_y))
         self.model = jets.Jet(
             Near(np.float64(c), bound(error)), Vector(np.asarray(a, dtype=np.float64), bound(slack)), Square(Q),
             Cubic(np.asarray(K, dtype=np.float64)), Square(E), Near(np.asarray(B, dtype=np.float64)),
-            np.moveaxis(U, 0, -1), Near(np.asarray(c_y, dtype=np.float64)), Vector(a_y.T), bound(lip),
+            family(U), Near(np.asarray(c_y, dtype=np.float64)), Vector(a_y.T), bound(lip),
         )  # fmt: skip
 
     @classmethod
@@ -76,7 +90,7 @@ class Jet:
 
     @property
     def U(self) -> Any:
-        return np.moveaxis(self.model.U, -1, 0)
+        return np.moveaxis(self.model.units.U, -1, 0)
 
     @property
     def c_y(self) -> Any:
@@ -126,22 +140,30 @@ def members(batch: jets.Jet) -> list[Jet]:
     y = [(batch.c_y[:, j], Vector(batch.a_y.value[..., j])) for j in range(count)]
     return [
         Jet.of(
-            jets.Jet(*(part[..., j] if part is batch.B else part[j] for part in parts), batch.U, *y[j], batch.lip[j])
+            jets.Jet(
+                *(part[..., j] if part is batch.B else part[j] for part in parts), batch.units, *y[j], batch.lip[j]
+            )
         )
         for j in range(count)
     ]
 
 
+def enclose_on_ball(net: Folded, states: Sequence[jets.Jet]) -> jets.Jet:
+    """The network's value on a ball, centred, and squashed if the policy is, as a batch of jets."""
+    h = ball.OnBall(len(states[0].a.value)).value(net.network, states, net.origin, net.shift)
+    return h.function("tanh") if net.squash else h
+
+
 def constant(q: Fraction, U: Any, count: int) -> Jet:
-    return Jet.of(jets.constant(q, np.moveaxis(U, 0, -1), count))
+    return Jet.of(jets.constant(q, family(U), count))
 
 
 def uncertain(lo: Fraction, hi: Fraction, U: Any, number: int, count: int) -> Jet:
-    return Jet.of(jets.uncertain(lo, hi, np.moveaxis(U, 0, -1), number, count))
+    return Jet.of(jets.uncertain(lo, hi, family(U), number, count))
 
 
 def between(lo: Fraction, hi: Fraction, U: Any, count: int) -> Jet:
-    return Jet.of(jets.between(lo, hi, np.moveaxis(U, 0, -1), count))
+    return Jet.of(jets.between(lo, hi, family(U), count))
 
 
 def plain(c: Any, error: Any, a: Any, slack: Any, Q: Any, E: Any, K: Any = None) -> Jet:
@@ -158,12 +180,13 @@ def given(jet: Jet, y: Sequence[Any]) -> Jet:
     lost = (len(y) + 4) * 2.0**-50
     error = jet.error + lost * (abs(jet.c) + np.abs(jet.c_y).sum())
     slack = jet.slack + lost * (np.linalg.norm(jet.a) + np.linalg.norm(jet.a_y))
-    return Jet(c, error, a, slack, jet.Q, jet.K, jet.E, jet.B, jet.U, np.zeros(0), np.zeros((0, len(a))), jet.lip)
+    nothing = np.zeros(0), np.zeros((0, len(a)))
+    return Jet(c, error, a, slack, jet.Q, jet.K, jet.E, jet.B, jet.model.units, *nothing, jet.lip)
 
 
 def units_of(L: Any, R: Any) -> Units:
     """Remainders R (N, k, k), and how they reach the inputs."""
-    return Units(np.asarray(L), np.moveaxis(np.asarray(R), 0, -1))
+    return Units(np.moveaxis(np.asarray(R), 0, -1), np.asarray(L))
 
 
 def no_units(k: int) -> Units:
@@ -182,13 +205,14 @@ def curved(jet: Jet, d: Sequence[Any]) -> arb:
 
 def changed(jet: Jet, **parts: Any) -> Jet:
     """The same jet but for these parts."""
+    parts.setdefault("U", jet.model.units)
     names = ("c", "error", "a", "slack", "Q", "K", "E", "B", "U", "c_y", "a_y", "lip")
     return Jet(*(parts.get(name, getattr(jet, name)) for name in names))
 
 
 def models_of(J: Any, F: Iterable[Jet], units: Units, rest: bool, velocity: Sequence[Any] = ()) -> Models:
-    """The models of these jets in the inequality."""
-    return Models(J, [f.model for f in F], units, rest, velocity)
+    """The models of these jets in the inequality, their errors being sums over these units."""
+    return Models(J, [replace(f.model, units=units) for f in F], rest, velocity)
 
 
 def remainders(units: Units) -> Any:

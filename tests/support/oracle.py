@@ -15,6 +15,7 @@ from flint import arb, arb_mat, fmpq
 from numpy.typing import NDArray
 
 from certify.checker.document import Policy
+from certify.checker.networks import Affine, Map, Network
 
 Array = NDArray[np.float64]
 
@@ -69,14 +70,12 @@ def policy_in_arb(policy: Policy, u_eq: Sequence[Fraction], x: Sequence[arb]) ->
 
 
 def policies_in_arb(policy: Policy, u_eq: Sequence[Fraction], states: Sequence[Sequence[arb]]) -> list[list[arb]]:
-    """pi at each of the states; the origin goes through the layers as one more column."""
+    """pi at each of the states; the origin goes through the network as one more column."""
     columns = [*states, [arb(0)] * len(states[0])]
     origin = [0.0] * len(states[0]) if policy.origin is None else policy.origin.tolist()
-    h = arb_mat([[arb(at) + column[i] for column in columns] for i, at in enumerate(origin)])
-    for k, (W, b) in enumerate(zip(policy.weights, policy.biases, strict=True)):
-        h = _tanh(h) if k else h
-        bias = arb_mat([[arb(v)] * len(columns) for v in b.tolist()])
-        h = arb_mat([[arb(w) for w in row] for row in W.tolist()]) * h + bias
+    h = network_in_arb(
+        policy.network, arb_mat([[arb(at) + column[i] for column in columns] for i, at in enumerate(origin)])
+    )
     net = h.tolist()
     if policy.squash == "tanh" and policy.centre != "preactivation":
         net = _tanh(h).tolist()
@@ -95,6 +94,24 @@ def policies_in_arb(policy: Policy, u_eq: Sequence[Fraction], states: Sequence[S
             lo, hi = (arb(float(end[j])) for end in policy.clip)
             result[-1] = [u.max(lo).min(hi) for u in result[-1]]
     return [list(u) for u in zip(*result, strict=True)]
+
+
+def network_in_arb(network: Network, h: arb_mat) -> arb_mat:
+    """The network's values at the columns of h."""
+    vectors = [h]
+    for step in network.steps:
+        vectors.append(step_in_arb(step, vectors[step.of[0]]))
+    return vectors[-1]
+
+
+def step_in_arb(step: Any, h: arb_mat) -> arb_mat:
+    """What a step makes of a vector, column by column."""
+    if isinstance(step, Affine):
+        bias = arb_mat([[arb(v)] * h.ncols() for v in step.bias.tolist()])
+        return arb_mat([[arb(w) for w in row] for row in step.weight.tolist()]) * h + bias
+    if isinstance(step, Map):
+        return arb_mat(h.nrows(), h.ncols(), [getattr(v, step.function)() for v in h.entries()])
+    raise TypeError(f"no oracle for a step of this kind: {type(step).__name__}")
 
 
 def _tanh(h: arb_mat) -> arb_mat:

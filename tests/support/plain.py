@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from fractions import Fraction
 from types import SimpleNamespace
 from typing import Any
@@ -11,8 +12,11 @@ from flint import arb
 from numpy.typing import NDArray
 
 from certify.checker import near, network, taylor
+from certify.checker.expression import parse
 from certify.checker.functions import FUNCTIONS
 from certify.checker.near import Above, Form, Near
+from certify.checker.networks import Affine, Map, Network, Step
+from certify.checker.outer import Function
 
 Array = NDArray[np.float64]
 Pair = tuple[Any, Any]
@@ -173,8 +177,33 @@ def enclose_on_boxes(net: network.Folded, x: Array, x_error: Array) -> tuple[Arr
 
 
 def clipped(mid: Array, slopes: Array, error: Array, least: Array, most: Array) -> tuple[Array, Array, Array]:
-    x = np.concatenate([mid[:, None], slopes], axis=1)
-    return shown(network.clipped(form(x, error), least, most))
+    """Forms within `error` of numbers, clipped as `enclose_on_boxes` does it."""
+    v = form(np.concatenate([mid[:, None], slopes], axis=1), error)
+    cut, slope, gap = network.clipped(Form(v.value), v.range.error, least, most)
+    return shown(cut.wider(v.error * slope + gap))
+
+
+def chain(weights: Sequence[Array], biases: Sequence[Array], name: str = "policy") -> Network:
+    """A network of these layers, with tanh between them."""
+    steps: list[Step] = []
+    for W, b in zip(weights, biases, strict=True):
+        if steps:
+            steps.append(Map((len(steps),), steps[-1].size, "tanh"))
+        steps.append(Affine((len(steps),), len(W), W, b))
+    return Network(name, weights[0].shape[1], tuple(steps))
+
+
+def layers(network: Network) -> list[tuple[Array, Array]]:
+    """W and b of the affine steps of a chain."""
+    if not network.is_chain:
+        raise ValueError(f"{network.name} is no chain of layers")
+    return [(step.weight, step.bias) for step in network.steps if isinstance(step, Affine)]
+
+
+def function_of(network: Network) -> Function:
+    """N = the network's first number, of a rule about boxes beyond the ellipsoid."""
+    names = [f"x{i}" for i in range(network.reads)]
+    return Function(parse([["network", network.name, 0, *names]], names, "N", {network.name: network}))
 
 
 def expansion(phi: Any) -> SimpleNamespace:

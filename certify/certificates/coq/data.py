@@ -22,20 +22,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates.coq.expression import Expression, from_tree, rational
+from certify.certificates.encoding import layers_of, network_named
 from certify.certificates.formats import SCHEMA, other_version
 from certify.errors import CertificateFormatError, InputError
 from certify.loop.policies import TanhNetwork
 
 Array = NDArray[np.float64]
 Interval = tuple[Fraction, Fraction]
-_MOST = 64  # states, inputs, layers
+_MOST = 64  # states, inputs
 _MOST_ROWS = 2**14  # of a layer
 _LONGEST = 10  # characters of an integer
 _KEYS = {
-    "certificate": ("schema", "claim", "plant", "policy", "lyapunov", "levels", "evidence", "provenance"),
+    "certificate": ("schema", "claim", "networks", "plant", "policy", "lyapunov", "levels", "evidence", "provenance"),
     "claim": ("kind", "rate", "sample", "outer"),
     "plant": ("name", "time", "states", "inputs", "uncertain", "dynamics", "u_eq", "domain", "input_bounds"),
-    "policy": ("layers", "squash", "centre", "scale", "offset", "clip", "origin", "sha256"),
+    "policy": ("network", "squash", "centre", "scale", "offset", "clip", "origin", "sha256"),
     "lyapunov": ("kind", "P"),
     "levels": ("local", "roa"),
 }
@@ -126,8 +127,8 @@ def _claimed(data: Any, sha256: str) -> Claimed:
         raise CertificateFormatError(f"names must differ; found {sorted(states.keys() & inputs.keys())[0]} twice.")
     n, m = len(states), len(inputs)
     if np.any(_array(policy["origin"], (n,), "origin") != 0):
-        raise InputError(f"the policy's layers must read x itself; found another origin. {_WHAT_IS}.")
-    network = _network(policy, n, m)
+        raise InputError(f"the policy's network must read x itself; found another origin. {_WHAT_IS}.")
+    network = _network(policy, network_named(data["networks"], policy["network"]), n, m)
     if policy["sha256"] != network.sha256():
         raise CertificateFormatError(f"the policy's sha256 must be {network.sha256()}; found {policy['sha256']!r}.")
     P = _array(lyapunov["P"], (n, n), "P")
@@ -167,14 +168,14 @@ def _require_supported(claim: Any, plant: Any, policy: Any, lyapunov: Any) -> No
             raise InputError(f"the certificate must be one that Coq's statement covers; found {what[:80]}. {_WHAT_IS}.")
 
 
-def _network(policy: Mapping[str, Any], n: int, m: int) -> TanhNetwork:
-    layers = policy["layers"]
-    if not isinstance(layers, list) or not 1 <= len(layers) <= _MOST:
-        raise CertificateFormatError(f"the policy must have 1 to {_MOST} layers; found another count.")
+def _network(policy: Mapping[str, Any], stated: Mapping[str, Any], n: int, m: int) -> TanhNetwork:
+    layers = layers_of(stated)
+    if set(stated) != {"name", "reads", "steps"} or stated["reads"] != n or type(stated["reads"]) is not int:
+        raise CertificateFormatError(f"the policy's network must have a name, steps, and read {n} states.")
     shapes = [tuple(layer["shape"]) for layer in layers]
     for layer, shape in zip(layers, shapes, strict=True):
         if (
-            set(layer) != {"shape", "weight", "bias"}
+            set(layer) != {"kind", "of", "shape", "weight", "bias"}
             or len(shape) != 2
             or any(type(k) is not int or k < 1 for k in shape)
         ):
