@@ -15,7 +15,20 @@ if TYPE_CHECKING:
     from certify.certificates.verdict import Verdict
     from certify.errors import CertifyError, InputError
     from certify.loop.closed_loop import ClosedLoop
-    from certify.loop.expressions import atan, cos, exp, from_sympy, sin, sqrt, symbols, tan, tanh
+    from certify.loop.expressions import (
+        atan,
+        clip,
+        cos,
+        exp,
+        from_sympy,
+        maximum,
+        minimum,
+        sin,
+        sqrt,
+        symbols,
+        tan,
+        tanh,
+    )
     from certify.loop.plants import System, get_system
     from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
     from certify.loop.policies.importers import ImportOptions
@@ -35,6 +48,9 @@ _PUBLIC = {
     "exp": "certify.loop.expressions",
     "atan": "certify.loop.expressions",
     "sqrt": "certify.loop.expressions",
+    "minimum": "certify.loop.expressions",
+    "maximum": "certify.loop.expressions",
+    "clip": "certify.loop.expressions",
     "from_sympy": "certify.loop.expressions",
     "TanhNetwork": "certify.loop.policies",
     "Policy": "certify.loop.policies",
@@ -68,12 +84,15 @@ __all__ = [
     "__version__",
     "atan",
     "certify_roa",
+    "clip",
     "cos",
     "exp",
     "from_sympy",
     "get_system",
     "load_lyapunov",
     "load_policy",
+    "maximum",
+    "minimum",
     "save_lyapunov",
     "save_policy",
     "sin",

@@ -103,7 +103,9 @@ def _operations(node: Expression) -> int:
         return len(node.operands) - 1
     if node.operator == "**":
         return 2 * abs(node.exponent).bit_length()
-    return {"/": 2, "tan": 4}.get(node.operator, 1)
+    if node.operator in ("min", "max"):
+        return 7 * (len(node.operands) - 1)
+    return {"/": 2, "tan": 4, "clip": 13}.get(node.operator, 1)
 
 
 def _nodes(tree: Tree, depth: int) -> Iterator[tuple[Tree, int]]:

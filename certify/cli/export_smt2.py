@@ -33,7 +33,7 @@ def export_smt2(
     """Prove an asymptotic claim with the bounds engine and write its conditions as SMT-LIB 2 for another solver."""
     from certify.analysis.run import certify_roa
     from certify.certificates.claims import Asymptotic, conditions
-    from certify.certificates.claims.queries import query
+    from certify.certificates.claims.queries import query, require_no_corners
     from certify.certificates.verdict import Verdict
     from certify.loop.policies import load_policy
     from certify.provers.dreal.backend import to_smt2
@@ -49,6 +49,7 @@ def export_smt2(
         raise InputError(
             f"export-smt2 must have a plant in continuous time; found {plant.name}, whose time is discrete."
         )
+    require_no_corners(plant)
     options = options_of(typed | {"claim": "asymptotic"}, plant, tell)  # its conditions are written
     result = certify_roa(plant, stored.network, out, options)
     inner, outer = result.levels.local, result.levels.roa

@@ -34,6 +34,15 @@ class BallAlgebra(Algebra[flint.arb]):
     def inverse(self, value: flint.arb) -> flint.arb:
         return 1 / value
 
+    def function(self, name: str, value: flint.arb) -> flint.arb:
+        if name == "sign":
+            return flint.arb(1) if value > 0 else flint.arb(-1) if value < 0 else flint.arb.nan()
+        return abs(value) if name == "abs" else super().function(name, value)
+
+    def extreme(self, name: str, a: flint.arb | Fraction, b: flint.arb | Fraction) -> flint.arb | Fraction:
+        v, w = (ball(q) if isinstance(q, Fraction) else q for q in (a, b))
+        return v.max(w) if name == "max" else v.min(w)
+
 
 @contextmanager
 def precision(bits: int = _PRECISION) -> Iterator[None]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.loop.expressions import Expression, Number, Symbol, differentiate, numerical, symbols_of, total
+from certify.loop.expressions import Expression, Number, Symbol, cornered, differentiate, numerical, symbols_of, total
 from certify.lyapunov.polynomial import Polynomial
 
 Array = NDArray[np.float64]
@@ -33,7 +33,7 @@ class Symbolic:
 
     Raises
     ------
-    InputError : the expression has another symbol.
+    InputError : the expression has another symbol; or abs, min, max or clip, with which it has no derivative somewhere.
 
     Examples
     --------
@@ -51,6 +51,12 @@ class Symbolic:
         others = sorted(s.name for s in symbols_of(self.expression) - set(self.states))
         if others:
             raise InputError(f"a Lyapunov function must be one of the states {self.states}; found {', '.join(others)}.")
+
+        for term in cornered(self.expression):
+            raise InputError(
+                f"a Lyapunov function must be continuously differentiable; {term} has a corner. Round it off, as "
+                "sqrt(x**2 + 1e-6) does with abs(x)."
+            )
 
     @property
     def n(self) -> int:

@@ -98,8 +98,11 @@ def _written(node: Expression) -> str:
             return f"<msup>{_row(first, ATOM)}<mrow>{_written(Number(node.exponent))}</mrow></msup>"
         case "sqrt":
             return f"<msqrt>{_row(first, SUM)}</msqrt>"
+        case "abs":
+            return f"<mo>|</mo>{_row(first, SUM)}<mo>|</mo>"
     still = ' stretchy="false"' if isinstance(first, Symbol) else ""  # or brackets grow beyond a letter
-    return f"<mi>{node.operator}</mi><mo{still}>(</mo>{_row(first, SUM)}<mo{still}>)</mo>"
+    given = "<mo>,</mo>".join(_row(e, SUM) for e in node.operands)
+    return f"<mi>{node.operator}</mi><mo{still}>(</mo>{given}<mo{still}>)</mo>"
 
 
 def _term(node: Expression) -> str:

@@ -282,14 +282,14 @@ def test_a_short_search_does_not_import_numba() -> None:
 @pytest.mark.parametrize("way", WAYS)
 def test_a_tape_knows_every_function_of_the_grammar(way: Way) -> None:
     """A new one that only models know would end a search in an error, once loops are compiled."""
-    for name in FUNCTIONS:
+    for name in (*FUNCTIONS, "abs"):
         found = tape.recorded(1, lambda values, algebra, name=name: algebra.function(name, values[0]))
         assert len(found.steps) == (4 if name == "tan" else 1)
         given = [np.array([[[0.5], [0.25]]]), np.zeros((1, 1)), np.zeros((0, 1)), np.zeros((0, 1, 1)), np.zeros((0, 1))]
         result = [np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1, 1)), np.zeros(1)]
         with bounded(way):
             compiled.loops(1).play(found.steps, found.k, found.places, *given, np.zeros((0, 3)), *result)
-        at_half = getattr(math, name)(0.5)
+        at_half = abs(0.5) if name == "abs" else getattr(math, name)(0.5)
         assert abs(result[0][0] - at_half) < 1e-15 and np.isfinite(result[3]).all()
 
 

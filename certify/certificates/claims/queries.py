@@ -17,7 +17,8 @@ from certify.certificates.claims.claim import Problem
 from certify.certificates.claims.conditions import BeforeClip, Condition, OfState, Radicand, Vdot, radicands
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import Tree, differentiate, to_tree
+from certify.loop.expressions import Tree, cornered, differentiate, to_tree
+from certify.loop.plants import System
 
 Array = NDArray[np.float64]
 BEFORE_CLIP = "b."  # and the input's number
@@ -44,9 +45,11 @@ def query(condition: Condition, problem: Problem) -> Query:
     Raises
     ------
     InputError : the local condition, where -(A'P + PA) is not positive definite; a plant with uncertain
-    quantities, because the query would be about nominal values alone; time in steps, or a rate.
+    quantities, because the query would be about nominal values alone; time in steps, or a rate; an equation with
+    abs, min, max or clip.
     """
     system = problem.loop.system
+    require_no_corners(system)
     if system.ranges:
         raise InputError(
             f"queries for solvers of formulas must be about exact equations; {system.name} has ranges of "
@@ -79,6 +82,20 @@ def query(condition: Condition, problem: Problem) -> Query:
         constraints.append((name, fails[margin.side, condition.strict], exact(margin.bound)))
     variables = tuple((s.name, lo, hi) for s, (lo, hi) in zip(system.states, system.domain, strict=True))
     return Query(condition.name, variables, tuple(definitions), tuple(constraints))
+
+
+def require_no_corners(system: System) -> None:
+    """Refuse a plant whose equations are not differentiable, as the local condition's query must know them.
+
+    Raises
+    ------
+    InputError : one has abs, min, max or clip.
+    """
+    for term in cornered(*system.dynamics):
+        raise InputError(
+            f"queries for solvers of formulas must be about smooth equations; {system.name} has {term}. "
+            "Use the engine bounds, whose certificates the checker reads."
+        )
 
 
 def _local(problem: Problem) -> tuple[list[tuple[str, Tree]], tuple[Tree, str, Tree]]:

@@ -13,7 +13,7 @@ from functools import reduce
 from math import isqrt
 from typing import Any
 
-from certify.errors import CertificateFormatError
+from certify.errors import CertificateFormatError, InputError
 
 FUNCTIONS = ("sin", "cos", "tanh", "exp", "atan", "sqrt")  # tan is sin over cos
 _MOST_NODES = 20_000
@@ -62,6 +62,7 @@ def from_tree(tree: Any, states: Mapping[str, int], inputs: Mapping[str, int]) -
     Raises
     ------
     CertificateFormatError : the tree is none of FORMAT.md's, or too large.
+    InputError : it has abs, min, max or clip.
     """
     names = {name: Expression("input", index=j) for name, j in inputs.items()}
     names |= {name: Expression("state", index=i) for name, i in states.items()}
@@ -146,6 +147,10 @@ class _Reader:
                 return Expression("mul", (Expression("sin", (values[0],)), inverse))
             case (name, 1) if name in FUNCTIONS:
                 return Expression(name, (values[0],))
+            case (("abs" | "min" | "max" | "clip"), _):
+                raise InputError(
+                    f"Coq's statement is about smooth equations; found {operator}. The checker reads such certificates."
+                )
         raise CertificateFormatError(
             f"an equation's operators must be those of FORMAT.md; found {str(operator)[:40]!r}."
         )

@@ -1,12 +1,23 @@
 """Derivatives of expressions, as expressions.
 
 A derivative has a value wherever the expression has one and is differentiable. Nothing is cancelled, so that its bounds
-are bounds of a Jacobian.
+are bounds of a Jacobian. That of abs(v) is `sign(v)` times that of v, an operator which no equation has: in floats 1 at
+v = 0, and elsewhere no number where the sign is not certain.
 """
 
 from __future__ import annotations
 
-from certify.loop.expressions.tree import Expression, Number, Operation, Symbol, cos, nodes, sin, total
+from certify.loop.expressions.tree import (
+    Expression,
+    Number,
+    Operation,
+    Symbol,
+    cos,
+    in_absolute_values,
+    nodes,
+    sin,
+    total,
+)
 
 
 def differentiate(expression: Expression, by: Symbol) -> Expression:
@@ -17,6 +28,7 @@ def differentiate(expression: Expression, by: Symbol) -> Expression:
     >>> differentiate(x * sin(x) + y / x, x)
     sin(x) + cos(x)*x - y/x**2
     """
+    expression = in_absolute_values(expression)
     slopes: dict[Expression, Expression | None] = {}  # None stands for what does not depend on x
     for node in nodes(expression):
         slopes[node] = Number(1) if node is by else None
@@ -63,6 +75,8 @@ def _of_function(node: Operation, at: Expression) -> Expression:
             return node
         case "atan":
             return one / (one + at**2)
+        case "abs":
+            return Operation("sign", at)
     return one / (2 * node)  # sqrt
 
 

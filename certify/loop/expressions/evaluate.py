@@ -10,12 +10,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
-from functools import reduce
+from functools import partial, reduce
 from typing import Generic, TypeVar
 
 from certify.errors import InputError
 from certify.loop.expressions.gathering import gathered
 from certify.loop.expressions.tree import FUNCTIONS, GRAMMAR, Expression, Number, Operation, Symbol, nodes
+
+OF_ONE = (*FUNCTIONS, "abs", "sign")
 
 V = TypeVar("V")
 
@@ -46,10 +48,22 @@ class Algebra(ABC, Generic[V]):
         return value.inverse()  # type: ignore[attr-defined, no-any-return]
 
     def function(self, name: str, value: V) -> V:
-        """One of `FUNCTIONS` by its name."""
+        """One of `FUNCTIONS`, abs or sign, by its name; a sign that is not certain is no number."""
         if name == "tan":
             return self.product(None, [self.function("sin", value), self.inverse(self.function("cos", value))])
         return getattr(value, name)()  # type: ignore[no-any-return]
+
+    def extreme(self, name: str, a: V | Fraction, b: V | Fraction) -> V | Fraction:
+        """The larger of two, `(a + b + abs(a - b))/2`, or the lesser one (`min`), with `-abs`; of exact numbers the
+        exact one."""
+        if isinstance(a, Fraction) and isinstance(b, Fraction):
+            return max(a, b) if name == "max" else min(a, b)
+        q = next((v for v in (a, b) if isinstance(v, Fraction)), Fraction(0))
+        values = [v for v in (a, b) if not isinstance(v, Fraction)]
+        other = [self.product(Fraction(-1), [v]) for v in values[1:]]
+        apart = self.function("abs", self.total(-q or None, [values[0], *other]))
+        apart = apart if name == "max" else self.product(Fraction(-1), [apart])
+        return self.product(Fraction(1, 2), [self.total(q or None, [*values, apart])])
 
     def power(self, base: V, exponent: int) -> V:
         """`base ** exponent`, exponent >= 1."""
@@ -101,7 +115,19 @@ def _value(node: Expression, variables: Mapping[Symbol, V], algebra: Algebra[V],
         if node.operator == "**":
             result = algebra.power(values[0], abs(node.exponent))
             return result if node.exponent > 0 else algebra.inverse(result)
-        if node.operator in FUNCTIONS:
+        if node.operator in OF_ONE:
             (at,) = node.operands
             return algebra.function(node.operator, algebra.constant(at.value) if isinstance(at, Number) else values[0])
+        if node.operator in ("min", "max", "clip"):
+            given = [e.value if isinstance(e, Number) else known[e] for e in node.operands]
+            value = _extreme(node.operator, given, algebra)
+            return algebra.constant(value) if isinstance(value, Fraction) else value
     raise InputError(f"{node!r} is outside the grammar; allowed are {GRAMMAR}.")
+
+
+def _extreme(name: str, given: Sequence[V | Fraction], algebra: Algebra[V]) -> V | Fraction:
+    """min, max or clip, of two after the other."""
+    if name == "clip":
+        v, lo, hi = given
+        return algebra.extreme("min", algebra.extreme("max", v, lo), hi)
+    return reduce(partial(algebra.extreme, name), given)

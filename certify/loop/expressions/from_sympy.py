@@ -11,7 +11,20 @@ from functools import reduce
 from typing import Any
 
 from certify.errors import InputError
-from certify.loop.expressions.tree import FUNCTIONS, GRAMMAR, Expression, Number, Operation, Symbol, atan, exp, sqrt
+from certify.loop.expressions.tree import (
+    FUNCTIONS,
+    GRAMMAR,
+    Expression,
+    Number,
+    Operation,
+    Symbol,
+    atan,
+    exp,
+    function,
+    sqrt,
+)
+
+_CORNERS = {"Abs": "abs", "Min": "min", "Max": "max"}
 
 
 def from_sympy(expression: Any) -> Expression:
@@ -44,6 +57,8 @@ def from_sympy(expression: Any) -> Expression:
         roots = reduce(lambda a, _: sqrt(a), range(int(e.exp.q).bit_length() - 1), from_sympy(e.base))
         return roots if e.exp.p == 1 else roots ** int(e.exp.p)
     name = type(e).__name__
+    if name in _CORNERS:
+        return function(_CORNERS[name], *map(from_sympy, e.args))
     if e.is_Function and name in FUNCTIONS:
         return Operation(name, from_sympy(e.args[0]))
     if e.is_Float:

@@ -56,10 +56,10 @@ def _split(node: Expression) -> tuple[Fraction, Expression | None]:
         return _product([_parts(first), _power(*_parts(node.operands[1]), -1)])
     if operator == "**":
         return _power(*_parts(first), node.exponent)
-    inner = gathered(first)
-    if operator == "sqrt" and isinstance(inner, Number) and inner.value < 0:
-        raise InputError(f"it takes the square root of {inner.value}")
-    return Fraction(1), Operation(operator, inner)
+    inner = [gathered(e) for e in node.operands]
+    if operator == "sqrt" and isinstance(inner[0], Number) and inner[0].value < 0:
+        raise InputError(f"it takes the square root of {inner[0].value}")
+    return Fraction(1), Operation(operator, *inner)
 
 
 def _parts(node: Expression) -> tuple[Fraction, Expression | None]:

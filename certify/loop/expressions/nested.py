@@ -7,7 +7,7 @@ from fractions import Fraction
 from typing import Any
 
 from certify.errors import CertificateFormatError, InputError
-from certify.loop.expressions.tree import FUNCTIONS, Expression, Number, Operation, Symbol
+from certify.loop.expressions.tree import CORNERS, FUNCTIONS, Expression, Number, Operation, Symbol
 
 Tree = Any  # nested lists: a name, an exact fraction as text, or an operator with its operands
 
@@ -25,7 +25,11 @@ def to_tree(expression: Expression) -> Tree:
     return [expression.operator, *map(to_tree, expression.operands)]
 
 
-_OPERANDS = {"+": (1, None), "*": (1, None), "-": (1, 2), "/": (2, 2), "**": (2, 2), **dict.fromkeys(FUNCTIONS, (1, 1))}
+_OPERANDS = {
+    **{"+": (1, None), "*": (1, None), "-": (1, 2), "/": (2, 2), "**": (2, 2)},
+    **dict.fromkeys(FUNCTIONS, (1, 1)),
+    **CORNERS,
+}
 
 
 def from_tree(tree: Tree, names: Mapping[str, Symbol]) -> Expression:

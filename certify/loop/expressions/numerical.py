@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
+from functools import partial, reduce
 from typing import Any, Literal
 
 from certify.errors import InputError
@@ -13,6 +14,7 @@ from certify.loop.expressions.tree import FUNCTIONS, Expression, Number, Operati
 
 Module = Literal["numpy", "torch"]
 _NAMES = {"numpy": {"atan": "arctan"}, "torch": {}}
+_EXTREMES = {"min": "minimum", "max": "maximum"}
 
 
 def numerical(
@@ -50,6 +52,7 @@ def numerical(
         lines.append(f"    {code[node]} = {_code(node, [code[e] for e in node.operands], module)}")
     lines.append(f"    return ({', '.join([*(code[e] for e in plain), ''])})")
     space: dict[str, Any] = {"math": math, module: __import__(module)}
+    space |= {name: partial(_extreme, space[module], name) for name in _EXTREMES.values()}
     exec("\n".join(lines), space)  # of nothing but names, numbers and operators that stand above
     made: Callable[..., tuple[Any, ...]] = space["f"]
     return made
@@ -62,7 +65,14 @@ def _code(node: Expression, operands: Sequence[str], module: Module) -> str:
         if node.operator == "**":
             power = operands[0] if abs(node.exponent) == 1 else f"{operands[0]} ** {abs(node.exponent)}"
             return power if node.exponent > 0 else f"1.0 / ({power})"
-        if node.operator in FUNCTIONS:
+        if node.operator in _EXTREMES:
+            return reduce(lambda a, b: f"{_EXTREMES[node.operator]}({a}, {b})", operands)
+        if node.operator == "clip":
+            v, lo, hi = operands
+            return f"minimum(maximum({v}, {lo}), {hi})"
+        if node.operator == "sign":
+            return f"{module}.where({operands[0]} < 0, -1.0, 1.0)"
+        if node.operator in (*FUNCTIONS, "abs"):
             return f"{module}.{_NAMES[module].get(node.operator, node.operator)}({operands[0]})"
     raise InputError(f"{node!r} is no expression.")
 
@@ -78,11 +88,29 @@ def _constant(node: Expression, operands: Sequence[float]) -> float:
             return float(operands[0] ** node.exponent)
         if isinstance(node, Operation) and node.operator in FUNCTIONS:
             return float(getattr(math, node.operator)(operands[0]))
+        if isinstance(node, Operation) and node.operator in _PLAIN:
+            return float(_PLAIN[node.operator](*operands))
     except OverflowError:
         return math.inf
     except (ValueError, ZeroDivisionError):
         return math.nan
     raise InputError(f"{node!r} is no expression.")
+
+
+_PLAIN: Mapping[str, Callable[..., float]] = {
+    **{"abs": abs, "min": min, "max": max},
+    "clip": lambda v, lo, hi: min(max(v, lo), hi),
+    "sign": lambda v: -1.0 if v < 0 else 1.0,
+}
+
+
+def _extreme(library: Any, name: str, a: Any, b: Any) -> Any:
+    """The lesser or larger of two, of which torch takes tensors only."""
+    if library.__name__ == "torch":
+        tensors = [v for v in (a, b) if isinstance(v, library.Tensor)]
+        kind = {"dtype": tensors[0].dtype, "device": tensors[0].device} if tensors else {"dtype": library.float64}
+        a, b = (library.as_tensor(v, **kind) for v in (a, b))
+    return getattr(library, name)(a, b)
 
 
 def _rounded(q: Fraction) -> float:

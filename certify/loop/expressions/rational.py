@@ -26,7 +26,7 @@ _Number = Fraction | _Unnamed
 
 
 class _Rational(Algebra[_Number]):
-    """Functions have a rational value at exact 0 only, square roots at squares of rationals.
+    """Functions have a rational value at exact 0 only, square roots at squares of rationals, abs everywhere.
 
     Exact 0 times an unknown number is 0: the checkers' rule `local` shows that the number exists.
     """
@@ -61,6 +61,12 @@ class _Rational(Algebra[_Number]):
     def function(self, name: str, value: _Number) -> _Number:
         if isinstance(value, _Unnamed):
             return value
+        if name == "abs":
+            return abs(value)
+        if name == "sign":
+            if value == 0:
+                raise InputError("it has a corner")
+            return Fraction(1 if value > 0 else -1)
         if name == "sqrt":
             if value <= 0:
                 raise InputError(
@@ -78,7 +84,8 @@ def value_if_rational(
 
     Raises
     ------
-    InputError : it divides by 0, takes the root of a number that is not positive, or a number grows too long.
+    InputError : it divides by 0, takes the root of a number that is not positive, is a derivative at a corner, or a
+        number grows too long.
     """
     numbers: dict[Symbol, _Number] = {**values, **{s: _Unnamed(f"{s}, which is uncertain,") for s in unknown}}
     value = evaluate(expression, numbers, _Rational())

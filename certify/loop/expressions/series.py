@@ -77,12 +77,14 @@ class PowerSeries(Algebra[Series[V]]):
         return self._follow(rule, y)
 
     def function(self, name: str, value: Series[V]) -> Series[V]:
-        """One of `FUNCTIONS`: by `k w_k = sum_(j>=1) j v_j s_(k-j)`, s the series of the derivative phi'(v)."""
+        """One of `FUNCTIONS`, by `k w_k = sum_(j>=1) j v_j s_(k-j)`, s the series of the derivative phi'(v); or abs."""
         if name == "tan":
             return super().function(name, value)
         if name in ("sin", "cos"):
             return self._circle(value)[name == "cos"]
         result: Series[V] = Series()
+        if name == "abs":
+            return self._follow(self._magnitude(value), result)
         if name == "sqrt":
             return self._follow(self._root(value, result), result)
         if name == "exp":
@@ -131,6 +133,22 @@ class PowerSeries(Algebra[Series[V]]):
                 inverse.append(self.inner.inverse(self._first(w)))
             terms = [self._product(Fraction(-1), w[j], w[k - j]) for j in range(1, k)]
             return self._product(Fraction(1, 2), self._sum(None, [v[k], *terms]), inverse[0])
+
+        return rule
+
+    def _magnitude(self, value: Series[V]) -> Callable[[int], V | None]:
+        """Times the sign of v_0, which has to be certain unless v is constant in time: where v passes 0 there is no
+        series, though all its later coefficients be 0."""
+        v, sign = value.coefficients, list[V]()
+
+        def rule(k: int) -> V | None:
+            if not k:
+                return self.inner.function("abs", self._first(v))
+            if v[k] is not None and not sign:
+                sign.append(self.inner.function("sign", self._first(v)))
+            if v[k] is None and sign:
+                return self.inner.product(Fraction(0), sign)
+            return self._product(None, *sign, v[k])
 
         return rule
 

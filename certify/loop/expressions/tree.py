@@ -12,13 +12,18 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from decimal import Decimal
 from fractions import Fraction
+from functools import reduce
 from typing import Any, TypeVar
 from weakref import WeakValueDictionary
 
 from certify.errors import InputError
 
 FUNCTIONS = ("sin", "cos", "tan", "tanh", "exp", "atan", "sqrt")
-GRAMMAR = f"+ - * /, integer powers, {', '.join(FUNCTIONS)}"
+"""The smooth functions, of one operand."""
+CORNERS: Mapping[str, tuple[int, int | None]] = {"abs": (1, 1), "min": (2, None), "max": (2, None), "clip": (3, 3)}
+"""The functions with corners, and the least and largest number of their operands."""
+NAMED = (*FUNCTIONS, *CORNERS)
+GRAMMAR = f"+ - * /, integer powers, {', '.join(NAMED)}"
 MOST_EXPONENT = 64
 MOST_DEPTH = 800  # of a tree; a certificate holds less
 E = TypeVar("E", bound="Expression")
@@ -73,6 +78,17 @@ class Expression:
     def __pos__(self) -> Expression:
         return self
 
+    def __abs__(self) -> Expression:
+        return function("abs", self)
+
+    def __lt__(self, other: object) -> bool:
+        raise InputError(
+            "expressions have no order, and equations no cases; instead of Python's min and max take certify.minimum "
+            "and certify.maximum, and certify.clip for bounds."
+        )
+
+    __gt__ = __le__ = __ge__ = __lt__
+
     def __pow__(self, exponent: object) -> Expression:
         return Operation("**", self, as_expression(exponent))
 
@@ -118,11 +134,12 @@ class Number(Expression):
 
 class Operation(Expression):
     """An operator on its operands: `+` and `*` of two or more, `-` of one, `/` of two, `**` of an expression and an
-    integer, or a function of one.
+    integer, or one of the functions.
 
     Raises
     ------
-    InputError : an exponent is not an integer from 1 to 64 in magnitude, or the tree is too deep.
+    InputError : an exponent is not an integer from 1 to 64 in magnitude, a function has too few operands or too many,
+        or the tree is too deep.
     """
 
     __slots__ = ("operator",)
@@ -132,6 +149,7 @@ class Operation(Expression):
         def make() -> Operation:
             if operator == "**":
                 _require_exponent(*operands)
+            _require_operands(operator, len(operands))
             made = object.__new__(cls)
             made.operator, made.operands, made.gathered = operator, operands, None
             made.depth = 1 + max(e.depth for e in operands)
@@ -190,9 +208,9 @@ def symbols(names: str | Iterable[str]) -> tuple[Symbol, ...]:
     return tuple(map(Symbol, names.split() if isinstance(names, str) else names))
 
 
-def function(name: str, argument: object) -> Expression:
-    """One of `FUNCTIONS`, by its name."""
-    return Operation(name, as_expression(argument))
+def function(name: str, *arguments: object) -> Expression:
+    """One of `NAMED`, by its name."""
+    return Operation(name, *map(as_expression, arguments))
 
 
 def sin(x: object) -> Expression:
@@ -230,6 +248,51 @@ def sqrt(x: object) -> Expression:
     return function("sqrt", x)
 
 
+def minimum(*values: object) -> Expression:
+    """The least of two or more."""
+    return function("min", *values)
+
+
+def maximum(*values: object) -> Expression:
+    """The largest of two or more."""
+    return function("max", *values)
+
+
+def clip(value: object, lo: object, hi: object) -> Expression:
+    """The value, or the nearer of the ends where it lies beyond them: `min(max(value, lo), hi)`.
+
+    >>> clip(2 * Symbol("u"), -1, 1), abs(Symbol("x"))
+    (clip(2*u, -1, 1), abs(x))
+    """
+    return function("clip", value, lo, hi)
+
+
+def in_absolute_values(expression: Expression) -> Expression:
+    """The tree with each min, max and clip written with abs, as FORMAT.md says; it has the same values.
+
+    >>> in_absolute_values(maximum(Symbol("x"), 1))
+    0.5*(x + 1 + abs(x - 1))
+    """
+    found: dict[Expression, Expression] = {}
+    for node in nodes(expression):
+        operands = [found[e] for e in node.operands]
+        match node:
+            case Operation(operator="min" | "max" as name):
+                found[node] = reduce(lambda a, b: _extreme(name, a, b), operands)
+            case Operation(operator="clip"):
+                found[node] = _extreme("min", _extreme("max", *operands[:2]), operands[2])
+            case Operation(operator=name):
+                found[node] = Operation(name, *operands) if (*operands,) != node.operands else node
+            case _:
+                found[node] = node
+    return found[expression]
+
+
+def _extreme(name: str, a: Expression, b: Expression) -> Expression:
+    apart = abs(a - b)
+    return Number(Fraction(1, 2)) * Operation("+", a, b, apart if name == "max" else -apart)
+
+
 def total(terms: Iterable[Expression]) -> Expression:
     """The sum of these; 0 if there are none."""
     found = tuple(terms)
@@ -255,6 +318,11 @@ def symbols_of(*expressions: Expression) -> set[Symbol]:
     return {node for node in nodes(*expressions) if isinstance(node, Symbol)}
 
 
+def cornered(*expressions: Expression) -> Iterator[Operation]:
+    """The parts that are abs, min, max or clip of others."""
+    return (node for node in nodes(*expressions) if isinstance(node, Operation) and node.operator in CORNERS)
+
+
 def substitute(expression: Expression, values: Mapping[Any, Expression]) -> Expression:
     """The tree with some of its nodes replaced, all at once, and nothing simplified: a replacement stays whole."""
     found: dict[Expression, Expression] = {}
@@ -278,6 +346,13 @@ def _require_exponent(base: Expression, exponent: Expression) -> None:
         raise InputError(f"{base} to the power 0 is 1 wherever it has a value; write 1.")
     if k is None or k.denominator != 1 or abs(k) > MOST_EXPONENT:
         raise InputError(f"an exponent must be an integer of at most {MOST_EXPONENT} in magnitude; found {exponent}.")
+
+
+def _require_operands(name: str, found: int) -> None:
+    least, most = CORNERS.get(name, (1, 1 if name in FUNCTIONS else None))
+    if found < least or (most is not None and found > most):
+        wanted = str(most) if least == most else f"at least {least}"
+        raise InputError(f"{name} must have {wanted} operand{'s' if wanted[-1] != '1' else ''}; found {found}.")
 
 
 SUM, PRODUCT, MINUS, POWER, ATOM = range(5)
@@ -331,7 +406,7 @@ class _Text:
             return f"-{self(first, POWER)}"
         if node.operator == "**":
             return f"{self(first, ATOM)}**{node.exponent if node.exponent > 0 else f'({node.exponent})'}"
-        return f"{node.operator}({self(first, SUM)})"
+        return f"{node.operator}({', '.join(self(e, SUM) for e in node.operands)})"
 
     def _term(self, node: Expression) -> str:
         """` + b`, or ` - b` for a term that begins with a minus."""

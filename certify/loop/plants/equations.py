@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from fractions import Fraction
 
 from certify.errors import InputError
-from certify.loop.expressions import FUNCTIONS, MOST_EXPONENT, Expression, Number, constant_of, function, nodes
+from certify.loop.expressions import CORNERS, MOST_EXPONENT, NAMED, Expression, Number, constant_of, function, nodes
 from certify.loop.plants.spelling import instead_of, instead_of_call, instead_of_name
 from certify.loop.plants.system import exact
 
@@ -119,14 +119,17 @@ class _Reader:
         raise self._refuse(
             instead_of(node, self._text(node))
             or f"{self._text(node)!r} is not allowed; allowed are the plant's names, numbers, {_OPERATORS}, "
-            f"and the functions {', '.join(FUNCTIONS)}"
+            f"and the functions {', '.join(NAMED)}"
         )
 
     def _name(self, name: str) -> Expression:
         if name in self.names:
             return self.names[name]
-        if name in FUNCTIONS:
-            raise self._refuse(f"the function {name} must have its argument in brackets, as in {name}(x)")
+        if name in NAMED:
+            what, example = {1: ("argument", "x"), 2: ("arguments", "x, y"), 3: ("arguments", "x, -1, 1")}[
+                CORNERS.get(name, (1, 1))[0]
+            ]
+            raise self._refuse(f"the function {name} must have its {what} in brackets, as in {name}({example})")
         instead = instead_of_name(name)
         if instead is not None:
             raise self._refuse(f"{name!r} is no {self.known}; {instead}")
@@ -135,16 +138,19 @@ class _Reader:
 
     def _call(self, node: ast.Call) -> Expression:
         name = self._text(node.func)
-        if not isinstance(node.func, ast.Name) or name not in FUNCTIONS:
-            instead = instead_of_call(name, [self._text(a) for a in node.args], FUNCTIONS)
+        if not isinstance(node.func, ast.Name) or name not in NAMED:
+            given = [*node.args, *(keyword.value for keyword in node.keywords)]
+            instead = instead_of_call(name, [self._text(a) for a in given], NAMED)
             if instead is not None and name not in self.names:
                 raise self._refuse(instead)
             product = name in self.names or not isinstance(node.func, ast.Name | ast.Attribute)
             what = f"{name} is no function; for a product write {name}*(...)" if product else ""
-            raise self._refuse(what or f"the function {name} is not supported; supported are {', '.join(FUNCTIONS)}")
-        if node.keywords or len(node.args) != 1:
-            raise self._refuse(f"{name} takes one argument; found {self._text(node)!r}")
-        return function(name, self.read(node.args[0]))
+            raise self._refuse(what or f"the function {name} is not supported; supported are {', '.join(NAMED)}")
+        least, most = CORNERS.get(name, (1, 1))
+        if node.keywords or len(node.args) < least or (most is not None and len(node.args) > most):
+            takes = {1: "one argument", 2: "two arguments or more", 3: "three arguments, a value and two ends"}[least]
+            raise self._refuse(f"{name} takes {takes}; found {self._text(node)!r}")
+        return function(name, *map(self.read, node.args))
 
     def _operation(self, node: ast.BinOp) -> Expression:
         left, right = self.read(node.left), self.read(node.right)
@@ -160,7 +166,10 @@ class _Reader:
             return left / right
         if isinstance(node.op, ast.Pow):
             return self._power(left, self._number(right), node)
-        raise self._refuse(f"the operator of {self._text(node)!r} is not allowed; allowed are {_OPERATORS}")
+        raise self._refuse(
+            instead_of(node, self._text(node))
+            or f"the operator of {self._text(node)!r} is not allowed; allowed are {_OPERATORS}"
+        )
 
     def _power(self, base: Expression, exponent: Fraction | None, node: ast.BinOp) -> Expression:
         if exponent is None or exponent.denominator != 1 or not abs(exponent) <= MOST_EXPONENT:

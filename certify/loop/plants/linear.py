@@ -5,6 +5,7 @@ The rank is exact if A and B are rational: a rank computed in floats depends on 
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -13,7 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.loop.expressions import Expression, Number, Symbol, differentiate, numerical, substitute, value_if_rational
+from certify.loop.expressions import (
+    Expression,
+    Number,
+    Operation,
+    Symbol,
+    cornered,
+    differentiate,
+    in_absolute_values,
+    nodes,
+    numerical,
+    substitute,
+    value_if_rational,
+)
 from certify.loop.plants.system import System
 
 Matrix = tuple[tuple[Expression, ...], ...]
@@ -25,9 +38,15 @@ def linearise(system: System) -> tuple[Matrix, Matrix]:
 
     Raises
     ------
-    InputError : a derivative divides by 0 there, or takes the root of a number that is not positive.
+    InputError : a derivative divides by 0 there, or takes the root of a number that is not positive; or a corner of
+        abs, min, max or clip lies there.
     """
     at = dict.fromkeys(system.states, Fraction(0)) | dict(zip(system.inputs, system.exact_u_eq(), strict=True))
+    for term in _corners(system, at):
+        raise InputError(
+            f"the equations of {system.name} must be differentiable at the operating point; {term} has a corner there. "
+            "Move the operating point or the corner, or round it off, as sqrt(x**2 + 1e-6) does with abs(x)."
+        )
     try:
         A, B = (
             tuple(tuple(_constant(differentiate(e, s), at) for s in by) for e in system.exact_dynamics())
@@ -36,6 +55,23 @@ def linearise(system: System) -> tuple[Matrix, Matrix]:
     except InputError as error:
         raise InputError(f"the equations of {system.name} have no derivative at the origin: {error}.") from error
     return A, B
+
+
+def _corners(system: System, at: Mapping[Symbol, Fraction]) -> Iterator[Expression]:
+    """The terms with a corner at that point, as they were written."""
+    values = {Symbol(name): q for name, q in system.parameters.items()}
+    values |= dict.fromkeys(system.disturbances, Fraction(0)) | dict(at)
+    for term in cornered(*system.dynamics):
+        inner = nodes(in_absolute_values(term))
+        if any(isinstance(v, Operation) and v.operator == "abs" and _is_zero(v.operands[0], values) for v in inner):
+            yield term
+
+
+def _is_zero(expression: Expression, values: Mapping[Symbol, Fraction]) -> bool:
+    try:
+        return value_if_rational(expression, values) == 0
+    except InputError:  # it has no value, which is refused as well
+        return False
 
 
 def in_floats(matrix: Matrix) -> NDArray[np.float64]:

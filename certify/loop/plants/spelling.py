@@ -9,9 +9,10 @@ import ast
 from collections.abc import Collection, Sequence
 
 _MODULES = ("np", "numpy", "math", "cmath", "sympy", "sp", "torch", "jnp", "jax", "scipy", "casadi", "ca", "tf")
-_SMOOTH = "equations must be smooth"
-_STEP = f"{_SMOOTH}; a step from 0 to 1 where y changes its sign is (1 + tanh(50*y))/2, as steep as its factor says"
-_BOUNDS = f"{_SMOOTH}; what limits an input belongs in [input_bounds]"
+_NO_JUMPS = "equations must have no jumps"
+_STEP = f"{_NO_JUMPS}; a step from 0 to 1 where y changes its sign is (1 + tanh(50*y))/2, as steep as its factor says"
+_ANGLE = "an angle needs no wrapping, since sin and cos repeat"
+_TABLE = "a table with lines between its points is a sum such as y0 + k0*(x - x0) + (k1 - k0)*max(x - x1, 0) + ..."
 # {x} and {y} are the arguments, {X} and {Y} the same in brackets where they need some.
 _FORMULAS = {
     "arctan": "atan({x})",
@@ -32,12 +33,23 @@ _FORMULAS = {
     "sec": "1/cos({x})",
     "radians": "{X}*3.141592653589793/180",
     "deg2rad": "{X}*3.141592653589793/180",
-    "abs": f"sqrt({{X}}**2 + 1e-6): {_SMOOTH}, and the absolute value is not at 0",
-    "sign": f"tanh(50*{{X}}), as steep as its factor says: {_SMOOTH}, and the sign is not at 0",
+    "sign": f"tanh(50*{{X}}), as steep as its factor says: {_NO_JUMPS}, and the sign jumps at 0",
+    "sat": "clip({x}, -1, 1)",
+    "saturate": "clip({x}, -1, 1)",
+    "relu": "max({x}, 0)",
+    "hypot": "sqrt({X}**2 + {Y}**2)",
 }
-_SAME = {"fabs": "abs", "absolute": "abs", "Abs": "abs", "sgn": "sign"}
-_KINKS = ("min", "max", "minimum", "maximum", "clip", "clamp", "Min", "Max", "sat", "saturate", "relu")
-_STEPS = ("heaviside", "Heaviside", "step", "where", "Piecewise", "piecewise")
+_SAME = {
+    **dict.fromkeys(("fabs", "absolute", "Abs"), "abs"),
+    **{"sgn": "sign", "fmin": "min", "fmax": "max", "Min": "min", "Max": "max"},
+    **{"minimum": "min", "maximum": "max", "clamp": "clip"},
+}
+_NOT_ALLOWED = {
+    **dict.fromkeys(("heaviside", "Heaviside", "step", "where", "Piecewise", "piecewise"), _STEP),
+    **dict.fromkeys(("floor", "ceil", "ceiling", "round", "trunc", "fix", "int"), _STEP),
+    **dict.fromkeys(("mod", "fmod", "remainder", "Mod", "wrap", "angle_normalize"), f"{_NO_JUMPS}; {_ANGLE}"),
+    **dict.fromkeys(("interp", "interp1d", "interpolate", "lookup", "table"), f"there are no tables; {_TABLE}"),
+}
 _CONSTANTS = {"pi": "3.141592653589793", "e": "exp(1)", "E": "exp(1)", "tau": "6.283185307179586"}
 
 
@@ -53,7 +65,7 @@ def instead_of_call(name: str, arguments: Sequence[str], functions: Collection[s
     if module and module.partition(".")[0] not in _MODULES:
         return None
     bare, call = _SAME.get(bare, bare), f"{name}({', '.join(arguments)})"
-    if module and bare in functions:
+    if bare in functions and bare != name:
         return f"for {call} write {bare}({', '.join(arguments)})"
     formula = _FORMULAS.get(bare)
     if formula is not None and len(arguments) == 1 + ("{Y}" in formula):
@@ -62,9 +74,7 @@ def instead_of_call(name: str, arguments: Sequence[str], functions: Collection[s
             name.upper(): text if text.isidentifier() or text.isalnum() else f"({text})" for name, text in each.items()
         }
         return f"for {call} write {formula.format(**each)}"
-    if bare in _KINKS:
-        return f"{call} is not allowed: {_BOUNDS}"
-    return f"{call} is not allowed: {_STEP}" if bare in _STEPS else None
+    return f"{call} is not allowed: {_NOT_ALLOWED[bare]}" if bare in _NOT_ALLOWED else None
 
 
 def instead_of_name(name: str) -> str | None:
@@ -88,4 +98,6 @@ def instead_of(node: ast.expr, text: str) -> str | None:
         return instead_of_name(text)
     if isinstance(node, ast.IfExp | ast.Compare | ast.BoolOp):
         return f"{text!r} is not allowed, because there are no cases: {_STEP}"
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mod | ast.FloorDiv):
+        return f"{text!r} is not allowed: {_NO_JUMPS}; {_ANGLE if isinstance(node.op, ast.Mod) else _STEP}"
     return None

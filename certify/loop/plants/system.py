@@ -69,7 +69,7 @@ class System:
     inputs : m symbols, in the order of u.
     parameters : exact value of each parameter symbol.
     dynamics : n expressions in states, inputs and parameters, built from `+ - * /`, integer constant
-        powers, sin, cos, tan, tanh, exp, atan and sqrt.
+        powers, sin, cos, tan, tanh, exp, atan, sqrt, abs, min, max and clip.
     u_eq : m expressions in the parameters; `f(0, u_eq) = 0` is proved later, not assumed.
     domain : n intervals `(lo, hi)` with `lo < 0 < hi`, in the units of the states.
     input_bounds : m intervals `(lo, hi)` with `lo < hi`, in the units of the inputs.

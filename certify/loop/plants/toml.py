@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, cast, get_args
 
 from certify.errors import InputError
-from certify.loop.expressions import FUNCTIONS, Expression, Number, Symbol, substitute, symbols, value_if_rational
+from certify.loop.expressions import NAMED, Expression, Number, Symbol, substitute, symbols, value_if_rational
 from certify.loop.plants.deviations import in_deviations
 from certify.loop.plants.equations import nearest, parse_expression
 from certify.loop.plants.operating_point import require_equilibrium
@@ -131,7 +131,7 @@ def _shorthand(file: PlantFile, symbol: Mapping[str, Symbol]) -> dict[str, Expre
     """The table `where`: names for expressions that equations share, each over the plant's names and those above."""
     found: dict[str, Expression] = {}
     for name in file.table("where"):
-        if name in symbol or name in FUNCTIONS or not name.isidentifier():
+        if name in symbol or name in NAMED or not name.isidentifier():
             raise file.refuse("must be a new name, and no state, input, parameter or function.", "where", name)
         found[name] = _equation(file, "where", name, {**symbol, **found}, "name of the plant or of a line above")
     return found

@@ -23,6 +23,7 @@ from certify.loop.expressions import Algebra
 from certify.provers.bounds.taylor import EXP_END
 
 Array = NDArray[np.float64]
+CERTAIN = 1 + 1e-3  # share of its range by which a number must be away from 0 for its sign, beyond all rounding
 TANH4, TANH5, ATAN4 = 4.1, 16.0, 4.7  # no derivative of this order is larger
 
 
@@ -226,6 +227,11 @@ class Jet:
         s, w = math.sqrt(self.c), np.sqrt(least)
         fourth = (5 * s**2 + 4 * s * w + w**2) / (16 * s**5 * (s + w) ** 4)  # the remainder of a root w, over D^4
         return self.compose(s, 1 / (2 * s), -1 / (4 * s**3), 3 / (8 * s**5), fourth)
+
+    def abs(self) -> Jet:
+        if not np.all(abs(self.c) > CERTAIN * self.radius):
+            return self._nowhere()
+        return self.compose(abs(self.c), math.copysign(1.0, self.c), 0.0, 0.0, np.zeros(1))
 
     def exp(self) -> Jet:
         end = self.c + self.radius

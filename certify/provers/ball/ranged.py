@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from certify.loop.expressions import Algebra
 from certify.provers.ball.jets import (
     ATAN4,
+    CERTAIN,
     TANH4,
     TANH5,
     Sizes,
@@ -224,6 +225,19 @@ def _sqrt(v: RangedJet) -> RangedJet:
     return v.compose(f, e, (5 * s**2 + 4 * s * w + w**2) / (16 * s**5 * (s + w) ** 4))
 
 
+def _abs(v: RangedJet) -> RangedJet:
+    return v.scaled(math.copysign(1.0, v.c)) if _is_certain(v) else _nowhere(v)
+
+
+def _sign(v: RangedJet) -> RangedJet:
+    return v.scaled(0.0).shifted(math.copysign(1.0, v.c)) if _is_certain(v) else _nowhere(v)
+
+
+def _is_certain(v: RangedJet) -> bool:
+    """True if v has one sign on all balls, whatever is uncertain."""
+    return bool(np.all(abs(v.c) > CERTAIN * (v.away + v.radius)))
+
+
 def _exp(v: RangedJet) -> RangedJet:
     end = v.c + v.away + v.radius
     if not np.all(end < EXP_END):
@@ -263,7 +277,10 @@ def _wave(v: RangedJet, value: float, slope: float) -> RangedJet:
     return v.compose((value, slope, -value / 2, -slope / 6), (far, far, far, far), fourth)
 
 
-_FUNCTIONS = {"sqrt": _sqrt, "exp": _exp, "tanh": _tanh, "atan": _atan, "sin": _sin, "cos": _cos}
+_FUNCTIONS = {
+    **{"abs": _abs, "sign": _sign},
+    **{"sqrt": _sqrt, "exp": _exp, "tanh": _tanh, "atan": _atan, "sin": _sin, "cos": _cos},
+}
 
 
 class RangedJets(Algebra[RangedJet]):

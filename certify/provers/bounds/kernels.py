@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.provers.bounds.tape import (
+    ABS,
     ADD,
     ATAN,
     CONSTANT,
@@ -172,6 +173,13 @@ def expansion(operation: int, c: Real, reach: Real) -> Four:
     return np.nan, np.nan, np.nan, np.nan
 
 
+def corner(c: Real, reach: Real) -> Two:
+    """|v| within `reach` of c, as `Taylor` has it: a slope s, and a number that |v| - s v is within that of."""
+    s = choose(c >= reach, 1.0, choose(c <= -reach, -1.0, c / (reach + TINY)))
+    half = larger((reach - c) * (1 + s), (reach + c) * (1 - s)) / 2 * (1 + EPS)
+    return s, choose(abs(c) >= reach, 0.0, half)
+
+
 def coefficients(operation: int, k: float, u: Four, v: Four) -> Five:
     """`alpha`, `beta`, `gamma`, the constant term and the remainder of an operation, as `Taylor` has them; of its
     operands are given c, sum |g_i|, sum |Q_ij| and r."""
@@ -190,6 +198,11 @@ def coefficients(operation: int, k: float, u: Four, v: Four) -> Five:
         return vc, c, 1.0, c * vc, rest + EPS * (whole * other + rest) + TINY
     q = S + r
     rho = G + q
+    if operation == ABS:
+        s, half = corner(c, rho * (1 + EPS))
+        start = s * c + half
+        rest = abs(s) * r + half
+        return s, 0.0, 0.0, start, rest + 2 * EPS * (abs(start) + abs(s) * (1 + rho) + rest) + TINY
     f0, f1, f2, third = expansion(operation, c, rho * (1 + EPS))
     rest = abs(f1) * r + abs(f2) * (2 * G * q + q * q) + third * (rho * rho * rho)
     rest = rest + 2 * EPS * (abs(f0) + abs(f1) * (1 + rho) + abs(f2) * (1 + rho * rho) + rest)

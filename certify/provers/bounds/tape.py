@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from certify.provers.bounds.taylor import ConstantsLast
 
-ADD, SCALED, SHIFTED, CONSTANT, MULTIPLY, INVERSE, SQRT, EXP, TANH, ATAN, SIN, COS = range(12)
+ADD, SCALED, SHIFTED, CONSTANT, ABS, MULTIPLY, INVERSE, SQRT, EXP, TANH, ATAN, SIN, COS = range(13)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +51,9 @@ class Value:
 
     def shifted(self, k: float) -> Value:
         return self._then(SHIFTED, k=k)
+
+    def abs(self) -> Value:
+        return self._then(ABS)
 
     def inverse(self) -> Value:
         return self._then(INVERSE)

@@ -20,6 +20,7 @@ from certify.provers.bounds.arrays import Array, Index, chosen, product
 
 EPS = 2.0**-50
 TINY = 2.0**-900
+CERTAIN = 1 + 2.0**-30  # share of its range by which a number must be away from 0 for its sign, beyond all rounding
 NOISE = 2.0**-30  # of all coefficients of first order
 EXP_END = 64.0  # the exponent beyond which the checker knows nothing of exp
 
@@ -98,6 +99,20 @@ class Taylor:
         p, q = 1 / s, 1 / (s + w)
         third = p * p * q * q * (2 * q + p) / 8
         return self.compose(s, p / 2, -p * p * p / 8, third * (1 + 32 * EPS) + TINY)
+
+    def abs(self) -> Taylor:
+        """|v|, on a range c +- R that holds 0 by its chord's slope s: |v| - s v lies between 0 and what it is at an
+        end, whatever s in [-1, 1]."""
+        c, R = self.c, self.radius()
+        s = np.where(c >= R, 1.0, np.where(c <= -R, -1.0, c / (R + TINY)))
+        half = np.where(np.abs(c) >= R, 0.0, np.maximum((R - c) * (1 + s), (R + c) * (1 - s)) / 2 * (1 + EPS))
+        line = self.compose(s * c + half, s, np.zeros_like(s), np.zeros_like(s))
+        return Taylor(line.c, line.g, line.Q, (line.r + half) * (1 + EPS))
+
+    def sign(self) -> Taylor:
+        """1 or -1; the remainder is NaN where the range of v may contain 0."""
+        r = np.where(np.abs(self.c) > self.radius() * CERTAIN, 0.0, np.nan)
+        return Taylor(np.where(self.c < 0, -1.0, 1.0), np.zeros_like(self.g), np.zeros_like(self.Q), r)
 
     def exp(self) -> Taylor:
         e, most = np.exp(self.c), self.c + self.radius()
