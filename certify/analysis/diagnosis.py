@@ -42,6 +42,7 @@ _LONGER, _LOOK = 1.1, 2 * UNIT  # a tube's start relative to the proved set; ope
 _LITTLE = 25.0  # per cent of the volume that sampling allows, below which the bounds are to blame
 _BENT = 1.0  # bends of the hidden units, as a share of the linear part, that are worth flattening
 _TELLING = 1000  # boxes: a limit below it is what ended the search, and says nothing of the policy
+_SAME, _BELOW = 1e-6, 0.99  # relative: rates that are as good as equal; a rate that is safely below another
 _FEW = 3  # states, for which a function beyond the ellipsoid is suggested
 _ENDED = (Stop.EFFORT, Stop.BOXES, Stop.LOCAL)
 
@@ -292,6 +293,8 @@ def _correction(result: RoaResult, options: RoaOptions, plant: System) -> Step |
         if result.verdict is Verdict.REFUTED:
             return Step((), f"{other}: no V can prove the claim for this one")
         return Step((), f"{other}; for this one no Lyapunov equation has a solution, so that you must give P yourself")
+    if (slower := _slower(result, options)) is not None:
+        return slower
     if options.level is not None and result.verdict is Verdict.REFUTED:
         return Step((), "leave --level out for the largest level that can be proved")
     if result.levels.roa is None:
@@ -300,6 +303,20 @@ def _correction(result: RoaResult, options: RoaOptions, plant: System) -> Step |
         except InputError as error:
             return Step((), str(error))
     return None
+
+
+def _slower(result: RoaResult, options: RoaOptions) -> Step | None:
+    """A rate below the one at which V falls near the origin, if that is no faster than was asked for; else None."""
+    if not options.rate or result.P is None or result.levels.roa is not None or result.claim != "asymptotic":
+        return None
+    loop, P = ClosedLoop(result.system, result.network), result.P
+    L = loop.mean_rate()
+    falls = -float(np.max(np.linalg.eigvals(np.linalg.solve(P, L.T @ P + P @ L + loop.step * L.T @ P @ L)).real)) / 2
+    if not 0 < falls <= (1 + _SAME) * options.rate:
+        return None
+    fastest = f"{number(falls, 4)} {TimingInWords.of(result.system).per_time}"
+    why = f"near the origin this V falls at the rate {fastest} at most, and equality is not enough"
+    return Step((("--rate", f"{_BELOW * falls:.3g}"),), why)
 
 
 def _centring(system: System, network: TanhNetwork) -> str | None:
