@@ -26,7 +26,7 @@ from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, require_equilibrium
 from certify.loop.policies import Centre, TanhNetwork
-from certify.lyapunov import extents, volume
+from certify.lyapunov import domain_limit, extents, volume
 from certify.provers.ball.models import paths
 from certify.provers.base import FEW, Proof
 from certify.provers.tube.tube import find_tube
@@ -369,13 +369,15 @@ def _wider_domain(result: RoaResult, options: RoaOptions, effort: Effort) -> Ste
     free = options.P is None and options.engine != "dreal"
     kinds = [(_WIDER, False)] + [(factor, True) for factor in (_WIDER, _SLIGHTLY_WIDER) if free]
     share, look = _shares(system, problem.V.P), effort.part(_LOOK, even_if_over=True)
+    proved = volume(problem.V.P, level)
     binding = [int(i) for i in np.argsort(-share, kind="stable") if share[i] >= _BINDS * np.max(share)]
     for i in binding:
         found = list[tuple[float, Fraction, bool]]()
         for factor, stretched in kinds:
-            reach = _reach(result, options, i, factor, stretched, look)
+            least = max((grown for grown, _, _ in found), default=0.0)
+            reach = _reach(result, options, i, factor, stretched, look, max(least, _WORTH) * proved)
             if reach is not None:
-                found.append((reach / volume(problem.V.P, level), factor, stretched))
+                found.append((reach / proved, factor, stretched))
         grown, factor, stretched = max(found, key=lambda one: one[0], default=(0.0, _WIDER, False))
         if grown >= _WORTH:
             which = "a V that is stretched along with the domain" if stretched else "this V"
@@ -397,9 +399,12 @@ def _shares(system: System, P: Array) -> Array:
 
 
 def _reach(
-    result: RoaResult, options: RoaOptions, i: int, factor: Fraction, stretched: bool, effort: Effort
+    result: RoaResult, options: RoaOptions, i: int, factor: Fraction, stretched: bool, effort: Effort, least: float
 ) -> float | None:
-    """The volume that V reaches in samples where state i has a domain wider by this factor; None if that is unknown."""
+    """The volume that V reaches in samples where state i has a domain wider by this factor; None if that is unknown.
+
+    Where the domain allows less than `least`, the volume that it allows: samples could only lower it.
+    """
     system, problem = result.system, result.problem
     if problem is None or (result.claim in ("practical", "nearby") and system.n > FEW):
         return None
@@ -407,8 +412,12 @@ def _reach(
     wider = system.with_domain({system.states[i].name: (factor * lo, factor * hi)})
     scale = np.ones(system.n)
     scale[i] = 1 / float(factor) if stretched else 1.0
+    P = scale[:, None] * problem.V.P * scale
     try:
-        found = trial(ClosedLoop(wider, result.network), scale[:, None] * problem.V.P * scale, "", options, effort)
+        allowed = volume(P, domain_limit(P, wider.domain))
+        if allowed < least:
+            return allowed
+        found = trial(ClosedLoop(wider, result.network), P, "", options, effort)
     except InputError:
         return 0.0
     return None if effort.over else found.volume
