@@ -19,10 +19,14 @@ from certify.report.words import point
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """A certificate's status: kind is ACCEPTED, TRUSTED, REJECTED or NOT CHECKED; note says why."""
+    """A certificate's status: kind is ACCEPTED, TRUSTED, REJECTED or NOT CHECKED; note says why.
+
+    `modules` are those of the checker's files that were used, if it accepted or trusted; empty if its answer has none.
+    """
 
     kind: str
     note: str
+    modules: tuple[str, ...] = ()
 
     @property
     def accepted(self) -> bool:
@@ -72,8 +76,14 @@ def status_of(certificate: Certificate, sha256: str, answer: Mapping[str, Any] |
             "TRUSTED",
             f"The checker checked what is exact: {_checked(certificate.kind)}. All else, above all that V̇ "
             f"is negative, is the word of {solver}, which nothing here can check. It is not a proof.",
+            _modules(answer),
         )
-    return Status("ACCEPTED", "The independent checker accepted the certificate.")
+    return Status("ACCEPTED", "The independent checker accepted the certificate.", _modules(answer))
+
+
+def _modules(answer: Mapping[str, Any]) -> tuple[str, ...]:
+    """The checker's files that were used, by name."""
+    return tuple(map(str, answer.get("modules") or ()))
 
 
 def _checked(kind: str) -> str:
