@@ -34,10 +34,10 @@ def page_of(
 
 def figures_if_accepted(raw: bytes, path: Path) -> Figures | None:
     """The figures of a page for accepted bytes, drawn before the checker answers; None if there are none."""
-    from certify.report.page import figures_of
+    from certify.report.figures import draw
 
     try:
-        return figures_of(parse_certificate(raw, str(path)), True)
+        return draw(parse_certificate(raw, str(path)), accepted=True)
     except (CertifyError, ValueError, ArithmeticError):  # the page comes upon it again, and says so
         return None
 

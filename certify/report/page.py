@@ -59,7 +59,7 @@ def render_html(
     certificate_path : the path, for its name only; nothing is read from it.
     sha256, size : hash and size of the bytes that the certificate was parsed from. By default those of the bytes that
         `write_certificate` writes for it: the answer must then be about exactly such a file.
-    figures : `figures_of` this certificate as accepted, if they are there already.
+    figures : those that `draw` makes of this certificate as accepted, if they are there already.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def render_html(
     roa, trouble = None, ""
     try:
         if figures is None or not status.accepted:
-            figures = figures_of(certificate, status.accepted)
+            figures = draw(certificate, status.accepted)
         pictures, roa = figures
     except np.linalg.LinAlgError as error:
         trouble = f"There are no figures: floating point cannot draw them: {error}"
@@ -112,16 +112,6 @@ def render_html(
         file=certificate_path.name,
         not_proved=not_proved_of(certificate, words),
     )
-
-
-def figures_of(certificate: Certificate, accepted: bool) -> Figures:
-    """The figures.
-
-    Raises
-    ------
-    CertifyError, ValueError, ArithmeticError : the certificate makes no sense, which cannot happen for an accepted one.
-    """
-    return draw(certificate, accepted)
 
 
 def _contents(status: Status, limits: Mapping[str, Any] | None) -> list[tuple[str, str]]:

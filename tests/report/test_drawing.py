@@ -40,13 +40,14 @@ def expected(result: RoaResult) -> str:
 @pytest.fixture
 def figures(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     """Grows whenever figures are drawn."""
-    found, figures_of = list[bool](), page.figures_of
+    found, draw = list[bool](), page.draw
 
-    def noted(*given: Any) -> Any:
+    def noted(*given: Any, **named: Any) -> Any:
         found.append(True)
-        return figures_of(*given)
+        return draw(*given, **named)
 
-    monkeypatch.setattr(page, "figures_of", noted)
+    monkeypatch.setattr(page, "draw", noted)
+    monkeypatch.setattr("certify.report.figures.draw", noted)
     return found
 
 

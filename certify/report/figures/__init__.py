@@ -40,6 +40,10 @@ def draw(
     pairs : states that are drawn against each other, by index; None for the default pairs.
     effort : counted work for simulation; by default some seconds of it. Sets are always drawn; where the effort is over
         less is simulated, and the captions say so.
+
+    Raises
+    ------
+    CertifyError, ValueError, ArithmeticError : the certificate makes no sense, which cannot happen for an accepted one.
     """
     import matplotlib
 
