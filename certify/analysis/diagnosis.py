@@ -26,7 +26,7 @@ from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, require_equilibrium
 from certify.loop.policies import Centre, TanhNetwork
-from certify.lyapunov import domain_limit, extents, volume
+from certify.lyapunov import domain_limit, extents, increment_matrix, volume
 from certify.provers.ball.models import paths
 from certify.provers.base import FEW, Proof
 from certify.provers.tube.tube import find_tube
@@ -310,8 +310,8 @@ def _slower(result: RoaResult, options: RoaOptions) -> Step | None:
     if not options.rate or result.P is None or result.levels.roa is not None or result.claim != "asymptotic":
         return None
     loop, P = ClosedLoop(result.system, result.network), result.P
-    L = loop.mean_rate()
-    falls = -float(np.max(np.linalg.eigvals(np.linalg.solve(P, L.T @ P + P @ L + loop.step * L.T @ P @ L)).real)) / 2
+    D = increment_matrix(P, loop.mean_rate(), loop.step)
+    falls = -float(np.max(np.linalg.eigvals(np.linalg.solve(P, D)).real)) / 2
     if not 0 < falls <= (1 + _SAME) * options.rate:
         return None
     fastest = f"{number(falls, 4)} {TimingInWords.of(result.system).per_time}"
