@@ -19,6 +19,8 @@ import numpy as np
 from .functions import FUNCTIONS, Derivative, Expansion
 from .near import ZERO, Above, Array, Form, Near, combined, near, products, size
 
+_NOISE = 2.0**-30  # of all coefficients of first order
+
 
 @cache
 def pairs(N: int) -> tuple[Array, Array]:
@@ -176,20 +178,30 @@ def _separately(model: Taylor) -> Array:
     return found
 
 
+def _corner(model: Taylor) -> Array:
+    """The corner to which the gradient points, of 1 and -1. Multipliers make coefficients of about 0, whose signs are
+    noise: there the terms of second order decide, with the other signs."""
+    g, (i, j) = model.g, pairs(model.symbols)
+    s = np.where(np.abs(g) <= _NOISE * np.sum(np.abs(g), axis=0), 0.0, np.where(g < 0, -1.0, 1.0))
+    mixed, slope = np.where((i == j)[:, None], 0.0, model.q), np.zeros_like(g)
+    np.add.at(slope, i, mixed * s[j])
+    np.add.at(slope, j, mixed * s[i])
+    return np.where(s == 0, np.where(slope < 0, -1.0, 1.0), s)
+
+
 def _at_a_corner(model: Taylor) -> Array:
-    """The value at the corner s to which the gradient points, and what the terms of second order may add elsewhere.
+    """The value at a corner s, of 1 and -1, and what the other terms may add elsewhere.
 
     With d_i = s_i (1 - w_i), 0 <= w_i <= 2, and R_ij = s_i s_j Q_ij, Q symmetric, `g.d + d'Q d` is
-    `sum |g_i| + s'Q s - sum_i w_i (|g_i| + 2 sum_j R_ij) + w'R w`; and `w'R w <= 2 sum_i w_i sum_j max(R_ij, 0)`, since
-    `w_i w_j <= w_i + w_j`. So the two sums add at most `2 sum_i max(0, 2 sum_j max(-R_ij, 0) - |g_i|)`.
+    `s.g + s'Q s - sum_i w_i (s_i g_i + 2 sum_j R_ij) + w'R w`; and `w'R w <= 2 sum_i w_i sum_j max(R_ij, 0)`, since
+    `w_i w_j <= w_i + w_j`. So the two sums add at most `2 sum_i max(0, 2 sum_j max(-R_ij, 0) - s_i g_i)`.
     """
-    i, j = pairs(model.symbols)
-    s = np.where(model.g < 0, -1.0, 1.0)
+    (i, j), s = pairs(model.symbols), _corner(model)
     R = s[i] * s[j] * model.q  # R_ii, and 2 R_ij
     down = np.where((i == j)[:, None], 2.0, 1.0) * np.maximum(-R, 0.0)
     meets = np.zeros((model.symbols, len(i)))
     meets[i, np.arange(len(i))] = meets[j, np.arange(len(j))] = 1.0
-    more = Above(down).through(meets).less(np.abs(model.g)).sum() * 2
-    at = Near(model.c) + Near(np.abs(model.g)).sum() + Near(R).sum()
+    more = Above(down).through(meets).less(s * model.g).sum() * 2
+    at = Near(model.c) + Near(s * model.g).sum() + Near(R).sum()
     found: Array = (at + Near(0 * model.c, more + model.r)).ends[1]
     return found

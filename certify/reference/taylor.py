@@ -15,6 +15,7 @@ from .balls import ONE, SPREAD, ZERO, derivatives, third, total
 from .refusal import Refused
 
 HALF = ONE / 2
+LITTLE = ONE / 2**30
 
 
 def mix(a: arb, x: arb_mat | None, b: arb, y: arb_mat | None) -> arb_mat | None:
@@ -184,9 +185,9 @@ class Taylor:
         """
         if self.g is None or self.Q is None:
             return self.c + self.r + self.first
-        g, result = self.g.entries(), self.c + self.r
-        negative = [bool(v < 0) for v in g]
-        for v, s, row in zip(g, negative, self.Q.tolist(), strict=True):
+        g, result, rows = self.g.entries(), self.c + self.r, self.Q.tolist()
+        negative = directions(g, rows)
+        for v, s, row in zip(g, negative, rows, strict=True):
             lost = v if s else -v  # -s_i g_i, and what may be gained is added
             result -= lost
             for t, q in zip(negative, row, strict=True):
@@ -196,6 +197,19 @@ class Taylor:
                     lost += 2 * positive_part(-M)
             result += 2 * positive_part(lost)
         return result
+
+
+def directions(g: list[arb], rows: list[list[arb]]) -> list[bool]:
+    """True where a corner's entry is -1: by the sign of g_i or, where |g_i| <= 2^-30 sum |g| is what multipliers may
+    have left of 0, by that of sum_j Q_ij s_j over the other entries."""
+    least = sum(map(abs, g), ZERO) * LITTLE
+    told = [None if not abs(v) > least else bool(v < 0) for v in g]
+    return [
+        bool(sum((-q if t else q for t, q in zip(told, row, strict=True) if t is not None), ZERO).mid() < 0)
+        if s is None
+        else s
+        for s, row in zip(told, rows, strict=True)
+    ]
 
 
 def positive_part(v: arb) -> arb:

@@ -20,6 +20,7 @@ from certify.provers.bounds.arrays import Array, Index, chosen, product
 
 EPS = 2.0**-50
 TINY = 2.0**-900
+NOISE = 2.0**-30  # of all coefficients of first order
 EXP_END = 64.0  # the exponent beyond which the checker knows nothing of exp
 
 
@@ -194,12 +195,16 @@ def upper_bound(model: Taylor) -> tuple[Array, Array]:
 def at_a_corner(model: Taylor) -> Array:
     """Upper bounds (B,) from the corner s to which the gradient points, d_i = s_i (1 - w_i) with 0 <= w_i <= 2.
 
-    With R_ij = s_i s_j Q_ij the model is `c + sum |g_i| + s'Q s - sum_i w_i (|g_i| + 2 sum_j R_ij) + w'R w`, and
-    `w'R w <= 2 sum_i w_i sum_j max(R_ij, 0)`, since `w_i w_j <= w_i + w_j`.
+    With R_ij = s_i s_j Q_ij the model is `c + s.g + s'Q s - sum_i w_i (s_i g_i + 2 sum_j R_ij) + w'R w`, and
+    `w'R w <= 2 sum_i w_i sum_j max(R_ij, 0)`, since `w_i w_j <= w_i + w_j`. Multipliers make coefficients of about 0,
+    whose signs are noise, and other ones in the checker: there the terms of second order decide, with the other signs.
     """
-    g, s = np.abs(model.g), np.where(model.g < 0, -1.0, 1.0)
-    R = (model.Q + model.Q.swapaxes(0, 1)) * (s[:, None] * s)
+    Q, g = model.Q + model.Q.swapaxes(0, 1), model.g
+    s = np.where(np.abs(g) <= NOISE * np.abs(g).sum(0), 0.0, np.where(g < 0, -1.0, 1.0))
+    slope = np.einsum("ijb,jb->ib", Q, s)  # where s is 0, the diagonal adds nothing
+    s = np.where(s == 0, np.where(slope < 0, -1.0, 1.0), s)
+    g, R = s * g, Q * (s[:, None] * s)
     more = np.maximum(np.maximum(-R, 0.0).sum(1) - g, 0.0).sum(0)
-    size = np.abs(model.c) + g.sum(0) + np.abs(R).sum((0, 1)) + model.r
+    size = np.abs(model.c) + np.abs(g).sum(0) + np.abs(R).sum((0, 1)) + model.r
     bound: Array = model.c + g.sum(0) + R.sum((0, 1)) / 2 + 2 * more + model.r + 1e-11 * size + TINY
     return bound
