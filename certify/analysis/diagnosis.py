@@ -26,7 +26,7 @@ from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, require_equilibrium
 from certify.loop.policies import Centre, TanhNetwork
-from certify.lyapunov import extents, volume
+from certify.lyapunov import domain_limit, extents, increment_matrix, volume
 from certify.provers.ball.models import paths
 from certify.provers.base import FEW, Proof
 from certify.provers.tube.tube import find_tube
@@ -42,6 +42,7 @@ _LONGER, _LOOK = 1.1, 2 * UNIT  # a tube's start relative to the proved set; ope
 _LITTLE = 25.0  # per cent of the volume that sampling allows, below which the bounds are to blame
 _BENT = 1.0  # bends of the hidden units, as a share of the linear part, that are worth flattening
 _TELLING = 1000  # boxes: a limit below it is what ended the search, and says nothing of the policy
+_SAME, _BELOW = 1e-6, 0.99  # relative: rates that are as good as equal; a rate that is safely below another
 _FEW = 3  # states, for which a function beyond the ellipsoid is suggested
 _ENDED = (Stop.EFFORT, Stop.BOXES, Stop.LOCAL)
 
@@ -292,6 +293,8 @@ def _correction(result: RoaResult, options: RoaOptions, plant: System) -> Step |
         if result.verdict is Verdict.REFUTED:
             return Step((), f"{other}: no V can prove the claim for this one")
         return Step((), f"{other}; for this one no Lyapunov equation has a solution, so that you must give P yourself")
+    if (slower := _slower(result, options)) is not None:
+        return slower
     if options.level is not None and result.verdict is Verdict.REFUTED:
         return Step((), "leave --level out for the largest level that can be proved")
     if result.levels.roa is None:
@@ -300,6 +303,20 @@ def _correction(result: RoaResult, options: RoaOptions, plant: System) -> Step |
         except InputError as error:
             return Step((), str(error))
     return None
+
+
+def _slower(result: RoaResult, options: RoaOptions) -> Step | None:
+    """A rate below the one at which V falls near the origin, if that is no faster than was asked for; else None."""
+    if not options.rate or result.P is None or result.levels.roa is not None or result.claim != "asymptotic":
+        return None
+    loop, P = ClosedLoop(result.system, result.network), result.P
+    D = increment_matrix(P, loop.mean_rate(), loop.step)
+    falls = -float(np.max(np.linalg.eigvals(np.linalg.solve(P, D)).real)) / 2
+    if not 0 < falls <= (1 + _SAME) * options.rate:
+        return None
+    fastest = f"{number(falls, 4)} {TimingInWords.of(result.system).per_time}"
+    why = f"near the origin this V falls at the rate {fastest} at most, and equality is not enough"
+    return Step((("--rate", f"{_BELOW * falls:.3g}"),), why)
 
 
 def _centring(system: System, network: TanhNetwork) -> str | None:
@@ -352,13 +369,15 @@ def _wider_domain(result: RoaResult, options: RoaOptions, effort: Effort) -> Ste
     free = options.P is None and options.engine != "dreal"
     kinds = [(_WIDER, False)] + [(factor, True) for factor in (_WIDER, _SLIGHTLY_WIDER) if free]
     share, look = _shares(system, problem.V.P), effort.part(_LOOK, even_if_over=True)
+    proved = volume(problem.V.P, level)
     binding = [int(i) for i in np.argsort(-share, kind="stable") if share[i] >= _BINDS * np.max(share)]
     for i in binding:
         found = list[tuple[float, Fraction, bool]]()
         for factor, stretched in kinds:
-            reach = _reach(result, options, i, factor, stretched, look)
+            least = max((grown for grown, _, _ in found), default=0.0)
+            reach = _reach(result, options, i, factor, stretched, look, max(least, _WORTH) * proved)
             if reach is not None:
-                found.append((reach / volume(problem.V.P, level), factor, stretched))
+                found.append((reach / proved, factor, stretched))
         grown, factor, stretched = max(found, key=lambda one: one[0], default=(0.0, _WIDER, False))
         if grown >= _WORTH:
             which = "a V that is stretched along with the domain" if stretched else "this V"
@@ -380,9 +399,12 @@ def _shares(system: System, P: Array) -> Array:
 
 
 def _reach(
-    result: RoaResult, options: RoaOptions, i: int, factor: Fraction, stretched: bool, effort: Effort
+    result: RoaResult, options: RoaOptions, i: int, factor: Fraction, stretched: bool, effort: Effort, least: float
 ) -> float | None:
-    """The volume that V reaches in samples where state i has a domain wider by this factor; None if that is unknown."""
+    """The volume that V reaches in samples where state i has a domain wider by this factor; None if that is unknown.
+
+    Where the domain allows less than `least`, the volume that it allows: samples could only lower it.
+    """
     system, problem = result.system, result.problem
     if problem is None or (result.claim in ("practical", "nearby") and system.n > FEW):
         return None
@@ -390,8 +412,12 @@ def _reach(
     wider = system.with_domain({system.states[i].name: (factor * lo, factor * hi)})
     scale = np.ones(system.n)
     scale[i] = 1 / float(factor) if stretched else 1.0
+    P = scale[:, None] * problem.V.P * scale
     try:
-        found = trial(ClosedLoop(wider, result.network), scale[:, None] * problem.V.P * scale, "", options, effort)
+        allowed = volume(P, domain_limit(P, wider.domain))
+        if allowed < least:
+            return allowed
+        found = trial(ClosedLoop(wider, result.network), P, "", options, effort)
     except InputError:
         return 0.0
     return None if effort.over else found.volume

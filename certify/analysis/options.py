@@ -47,7 +47,8 @@ class RoaOptions:
     level: float | None = option(None, "claim", "number", _POSITIVE, first=True, help=(
         "Prove exactly V <= LEVEL; a smaller set counts as UNKNOWN. By default the largest level is looked for."))
     rate: float = option(0.0, "claim", "number", _FROM_0, help=(
-        "Prove that V falls at least as exp(-2 RATE t), in discrete time by the share 2 RATE at each step."),
+        "Prove that V falls at least as exp(-2 RATE t), in discrete time by the share 2 RATE at each step. The "
+        "condition is strict: of a V that falls exactly so, only smaller rates are proved."),
         written="max: the largest rate for which the set that is proved without one is still proved.")
     enlarge: bool = option(False, "claim", "flag", help=(
         "Look for a tube that leads from a larger set into the proved one."))

@@ -63,7 +63,7 @@ def certified(
     folder = out if out is not None else Path("out") / policy.stem
 
     def draw(raw: bytes) -> None:
-        drawing.begin(raw, folder / "certificate.json", time.perf_counter() - start)
+        drawing.begin(raw, folder / "certificate.json")
 
     run = _run_for(largest, draw)
     progress, later = None if quiet else ProgressLine(), list[str]()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certify.lyapunov.candidates import slowest_decay, solve_lyapunov
+from certify.lyapunov.candidates import increment_matrix, slowest_decay, solve_lyapunov
 from certify.lyapunov.choice import BEYOND, SOLVED, Beyond, Candidate, Chosen, Named, choose_candidate
 from certify.lyapunov.file import StoredLyapunov, load_lyapunov, save_lyapunov
 from certify.lyapunov.function import LyapunovFunction, Quadratic
@@ -44,6 +44,7 @@ __all__ = [
     "domain_limit",
     "extents",
     "import_lyapunov",
+    "increment_matrix",
     "inverse",
     "is_positive_definite",
     "leaves_domain",

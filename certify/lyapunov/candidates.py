@@ -64,3 +64,12 @@ def slowest_decay(A: Array, step: float = 0.0) -> float:
     if step == 0:
         return -float(np.max(eigenvalues.real))
     return float(np.min(1 - np.abs(1 + step * eigenvalues) ** 2)) / (2 * step)
+
+
+def increment_matrix(P: Array, A: Array, step: float = 0.0) -> Array:
+    """The matrix M of x'Mx, the increment of x'Px over a step of a linear loop, per unit of time.
+
+    The loop is x' = A x, or where the step h is not 0 x+ = x + h A x.
+    """
+    M: Array = A.T @ P + P @ A
+    return M + step * A.T @ P @ A if step else M

@@ -23,7 +23,7 @@ from certify.effort import UNLIMITED, Effort
 from certify.errors import BackendError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import mean_rate
-from certify.lyapunov.candidates import slowest_decay, solve_lyapunov
+from certify.lyapunov.candidates import increment_matrix, slowest_decay, solve_lyapunov
 from certify.lyapunov.level_sets import domain_limit, volume
 from certify.lyapunov.programs import Inequality, smallest_trace
 
@@ -92,7 +92,7 @@ def _optimise(
         if known is not None:
             samples.remember(known)
         P = _enlarge(samples, A, start, decay * slowest)
-        if not (np.all(np.linalg.eigvalsh(P) > 0) and np.all(np.linalg.eigvalsh(_linear(P, A, h)) < 0)):
+        if not (np.all(np.linalg.eigvalsh(P) > 0) and np.all(np.linalg.eigvalsh(increment_matrix(P, A, h)) < 0)):
             raise BackendError(
                 "the optimised P must satisfy P > 0 and A'P + PA + h A'PA < 0; it does not. Use 'lyapunov'."
             )
@@ -142,7 +142,7 @@ def largest_sampled(loop: ClosedLoop, candidates: Sequence[Array], seed: int = 0
 def _enlarge(samples: _Samples, A: Array, start: Array, alpha: float) -> Array:
     """Rounds of sampling and solving, from `start` to P with its margin."""
     h = samples.loop.step
-    Q = -_linear(start, A, h)
+    Q = -increment_matrix(start, A, h)
     # The linearisation of this P keeps `D <= -2 lambda V`: its equation is the one of A + lambda I.
     P = solve_lyapunov(A, (Q + Q.T) / 2, h, _LINEAR * alpha)
     P = samples.fit(P, _SCORED * alpha)
@@ -332,12 +332,6 @@ def _g(P: Array, x: Array, F: Array, alpha: float, step: float) -> Array:
     """`D + 2 alpha V`."""
     value = 2 * _form(P, x, F + alpha * x)
     return value + step * _form(P, F, F) if step else value
-
-
-def _linear(P: Array, A: Array, step: float) -> Array:
-    """The matrix of D for G = A x."""
-    M: Array = A.T @ P + P @ A
-    return M + step * A.T @ P @ A if step else M
 
 
 def _log_det(P: Array) -> float:

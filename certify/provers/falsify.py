@@ -50,7 +50,7 @@ class Witness:
         names += "".join(f", {name} = {float(q):.6g}" for name, q in self.values.items())
         names += ", in deviations from x_eq," if system.operating_point() else ""
         what = "the input leaves its bounds" if self.kind == "input" else "Vdot >= 0"
-        at_rate = f" at the rate {rate:g}" if rate else ""
+        at_rate = f" faster than at the rate {rate:g}" if rate else ""
         if self.kind == "vdot" and rate:
             what = f"V does not fall{at_rate}"
         if self.kind == "vdot" and (system.time == "discrete" or self.period):

@@ -25,13 +25,13 @@ class Drawing:
         self._thread: Thread | None = None
         self._drawn: dict[bytes, Figures | None] = {}
 
-    def begin(self, raw: bytes, path: Path, spent: float) -> None:
-        """Start drawing the figures of a certificate that is about to be checked, `spent` seconds after the run began.
+    def begin(self, raw: bytes, path: Path) -> None:
+        """Start drawing the figures of a certificate that is about to be checked.
 
         The first call counts: what follows a refusal is drawn with the page. So is a large certificate.
         """
         if self._thread is None and len(raw) <= _MOST:
-            self._thread = Thread(target=self._draw, args=(raw, path, spent), daemon=True)
+            self._thread = Thread(target=self._draw, args=(raw, path), daemon=True)
             self._thread.start()
 
     def page_of(self, raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[str, Any] | None) -> str:
@@ -42,8 +42,8 @@ class Drawing:
             self._thread.join()
         return drawn.page_of(raw, path, answer, data, self._drawn.get(raw))
 
-    def _draw(self, raw: bytes, path: Path, spent: float) -> None:
+    def _draw(self, raw: bytes, path: Path) -> None:
         from certify.report import drawn
 
         with suppress(Exception):  # the page comes upon it again
-            self._drawn[raw] = drawn.figures_if_accepted(raw, path, spent)
+            self._drawn[raw] = drawn.figures_if_accepted(raw, path)

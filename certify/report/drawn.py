@@ -32,15 +32,12 @@ def page_of(
     return render_html(read, answer, data, path, sha256=sha256, size=len(raw), figures=figures)
 
 
-def figures_if_accepted(raw: bytes, path: Path, spent: float) -> Figures | None:
-    """The figures of a page for accepted bytes, drawn before the checker answers; None if there are none.
-
-    `spent` is the time of the run so far, in seconds.
-    """
-    from certify.report.page import figures_of
+def figures_if_accepted(raw: bytes, path: Path) -> Figures | None:
+    """The figures of a page for accepted bytes, drawn before the checker answers; None if there are none."""
+    from certify.report.figures import draw
 
     try:
-        return figures_of(parse_certificate(raw, str(path)), True, {"seconds": {"total": spent}})
+        return draw(parse_certificate(raw, str(path)), accepted=True)
     except (CertifyError, ValueError, ArithmeticError):  # the page comes upon it again, and says so
         return None
 

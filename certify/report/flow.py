@@ -8,13 +8,13 @@ beginning, in steps that divide it. A loop in discrete time takes its own steps.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
 from certify.loop.plants import System
 from certify.loop.plants.ode import eigenvalues_of, rk4_step
@@ -25,7 +25,11 @@ Field = Callable[[Array], Array]
 _STEP = 1.0  # of the time constant of the fastest eigenvalue
 _HORIZON = 15.0  # time constants of the slowest eigenvalue
 _MAX_STEPS = 3000
+_STAGES = 4  # evaluations in a step of Runge and Kutta
 _RATE_SAMPLES = 200
+_TANH = 30  # multiplications' worth
+_EQUATIONS = 500  # multiplications' worth of one evaluation, and of what surrounds it
+_AROUND = 1_000_000  # multiplications' worth of what surrounds a step, of however many states
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +45,7 @@ class Flow:
     plant : f, shapes (..., n) and (..., m) to (..., n).
     period : over which the input is held, the longest that is allowed, in seconds; 0 if it follows the state at once.
     discrete : whether F(x) is the state one step later, and not the rate of change.
+    cost : of F at one state, in multiplications' worth.
     """
 
     field: Field
@@ -50,6 +55,7 @@ class Flow:
     plant: Callable[[Array, Array], Array]
     period: float = 0.0
     discrete: bool = False
+    cost: float = 0.0
 
     @classmethod
     def of(cls, system: System, network: TanhNetwork) -> Flow:
@@ -77,7 +83,7 @@ class Flow:
             return np.asarray(f(x, u))
 
         period = 0.0 if system.sample is None else float(system.sample[1])
-        return cls(field, policy, *domain_bounds(system), plant, period, system.time == "discrete")
+        return cls(field, policy, *domain_bounds(system), plant, period, system.time == "discrete", cost_of(network))
 
     def fitting(self, step: float) -> float:
         """The largest step of a simulation up to `step`, in seconds, that divides the period; in discrete time 1."""
@@ -95,11 +101,20 @@ class Flow:
             return None
         return self.policy(x) if held is None or k % self.steps_between(step) == 0 else held
 
+    def operations(self, states: int) -> float:
+        """Multiplications' worth of a step of so many states."""
+        return (1 if self.discrete else _STAGES) * self.cost * states + _AROUND
+
     def advance(self, x: Array, u: Array | None, step: float) -> Array:
         """States one step later, (..., n), with the input held at u if there is one."""
         if self.discrete:
             return self.field(x)
         return rk4_step(self.field if u is None else lambda y: self.plant(y, u), x, step)
+
+
+def cost_of(network: TanhNetwork) -> float:
+    """Multiplications' worth of one evaluation of a loop with this policy."""
+    return _EQUATIONS + sum(w.size for w in network.weights) + _TANH * sum(b.size for b in network.biases)
 
 
 def time_scales(flow: Flow, samples: int = _RATE_SAMPLES, reach: Array | None = None) -> tuple[float, float]:
@@ -124,11 +139,11 @@ def time_scales(flow: Flow, samples: int = _RATE_SAMPLES, reach: Array | None = 
     return step, min(_HORIZON / slowest if slowest > 0 else math.inf, _MAX_STEPS * flow.fitting(step))
 
 
-def simulate(flow: Flow, starts: Array, step: float, steps: int, deadline: float = math.inf) -> Array:
+def simulate(flow: Flow, starts: Array, step: float, steps: int, effort: Effort = UNLIMITED) -> Array:
     """Trajectories from `starts` (N, n), shape (steps + 1, N, n); NaN from the first step outside the domain on.
 
-    At `deadline`, a reading of `time.monotonic`, the trajectories end where they are, in fewer steps. Where the input
-    is held `step` must divide the period (Flow.fitting); the first period begins at the start.
+    Where the effort is over the trajectories end, in fewer steps. Where the input is held `step` must divide the period
+    (Flow.fitting); the first period begins at the start.
     """
     u: Array | None = None
     x = np.array(starts, dtype=np.float64)
@@ -139,8 +154,9 @@ def simulate(flow: Flow, starts: Array, step: float, steps: int, deadline: float
         for k in range(1, steps + 1):
             if not alive.size:
                 break
-            if k > 1 and time.monotonic() > deadline:
+            if k > 1 and effort.over:
                 return path[:k]
+            effort.charge(flow.operations(len(x)))
             u = flow.input(x, u, k - 1, step)
             x = flow.advance(x, u, step)
             inside = np.all((x >= flow.lo) & (x <= flow.hi), axis=-1)

@@ -4,7 +4,7 @@ The page states a proof only if the checker's answer says ACCEPTED *and* is abou
 drawn from, by their hash, and also by the policy and the levels (sections/status.py). An answer about anything else is
 an error, not a page. Every text from a file passes through jinja2's escaping.
 
-This module has the code for the whole page: its parts, the list of its contents, and the time for its figures.
+This module has the code for the whole page: its parts and the list of its contents.
 `sections/` makes the sections' data, `template.html` their looks.
 """
 
@@ -34,7 +34,6 @@ from certify.report.sheet import filled
 
 Figures = tuple[list[Picture], SimulatedRoa | None]
 TEMPLATE = "certify.report", "template.html"
-_SECONDS, _SHARE = 10.0, 0.1  # the drawing takes no longer than the one, or than this share of the run
 
 
 def render_html(
@@ -60,7 +59,7 @@ def render_html(
     certificate_path : the path, for its name only; nothing is read from it.
     sha256, size : hash and size of the bytes that the certificate was parsed from. By default those of the bytes that
         `write_certificate` writes for it: the answer must then be about exactly such a file.
-    figures : `figures_of` this certificate as accepted, if they are there already.
+    figures : those that `draw` makes of this certificate as accepted, if they are there already.
 
     Raises
     ------
@@ -83,7 +82,7 @@ def render_html(
     roa, trouble = None, ""
     try:
         if figures is None or not status.accepted:
-            figures = figures_of(certificate, status.accepted, result)
+            figures = draw(certificate, status.accepted)
         pictures, roa = figures
     except np.linalg.LinAlgError as error:
         trouble = f"There are no figures: floating point cannot draw them: {error}"
@@ -113,22 +112,6 @@ def render_html(
         file=certificate_path.name,
         not_proved=not_proved_of(certificate, words),
     )
-
-
-def figures_of(certificate: Certificate, accepted: bool, result: Mapping[str, Any] | None) -> Figures:
-    """The figures, in the time that remains for them after the run of `result`.
-
-    Raises
-    ------
-    CertifyError, ValueError, ArithmeticError : the certificate makes no sense, which cannot happen for an accepted one.
-    """
-    return draw(certificate, accepted, seconds=_time_for(result))
-
-
-def _time_for(result: Mapping[str, Any] | None) -> float:
-    """Seconds that the figures may take."""
-    total = None if result is None else result["seconds"].get("total")
-    return max(_SECONDS, _SHARE * (total or 0.0))
 
 
 def _contents(status: Status, limits: Mapping[str, Any] | None) -> list[tuple[str, str]]:

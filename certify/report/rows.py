@@ -28,6 +28,7 @@ from certify.report.words import (
     pretty_unit,
     quantity,
     seconds,
+    shortest,
     symbol,
     volume_name,
     volume_unit,
@@ -65,7 +66,8 @@ def _claim_rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]
     else:
         rows.append(("reason", str(result["reason"])))
     if timing.rate:
-        rows.append(("rate", _rate(result, timing) if shown else f"asked for {timing.shown_rate}"))
+        asked = f"asked for {shortest(timing.rate)} {timing.per_time}"
+        rows.append(("rate", _rate(result, timing) if shown else asked))
     return rows
 
 

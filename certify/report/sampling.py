@@ -10,13 +10,13 @@ no sign of leaving.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
 from certify.loop.plants import System
 from certify.loop.policies import TanhNetwork
@@ -45,7 +45,7 @@ class SimulatedRoa:
     left : runs that left the domain; shape of the grid. The others had not settled within the horizon, and count as
         not attracted.
     certified : grid points in the proved set; shape of the grid.
-    step, horizon : of the integration, in seconds; the horizon is how far it came if it ran out of time.
+    step, horizon : of the integration, in seconds; the horizon is how far it came if the effort was over.
     """
 
     axes: tuple[Array, ...]
@@ -118,7 +118,7 @@ class Runs:
 
 
 def runs_of(flow: Flow, starts: Array, P: Array, level: float, target: float, step: float, steps: int,
-            deadline: float = math.inf, start: Array | None = None,
+            effort: Effort = UNLIMITED, start: Array | None = None,
             centre: Array | None = None, beyond: Holds | None = None) -> Runs:  # fmt: skip
     """Simulate and tell the fates.
 
@@ -127,12 +127,12 @@ def runs_of(flow: Flow, starts: Array, P: Array, level: float, target: float, st
     from a set `beyond`, that seem to leave are simulated again in much smaller steps: the first suspect is the
     integration.
     """
-    path, apart = simulate(flow, starts, step, steps, deadline), flow.steps_between(step)
+    path, apart = simulate(flow, starts, step, steps, effort), flow.steps_between(step)
     begins = quadratic(P, path[0]) <= level
     settled, left = _fates(path, begins, P, level, target, apart)
     suspects = np.flatnonzero(left & _in_sets(path[0], P, level, start, centre, beyond))
-    if suspects.size and not flow.discrete and time.monotonic() < deadline:
-        finer = simulate(flow, path[0, suspects], step / _FINER, _FINER * (len(path) - 1), deadline)[::_FINER]
+    if suspects.size and not flow.discrete and not effort.over:
+        finer = simulate(flow, path[0, suspects], step / _FINER, _FINER * (len(path) - 1), effort)[::_FINER]
         if len(finer) == len(path):
             path[:, suspects] = finer
             settled, left = _fates(path, begins, P, level, target, apart)
@@ -166,7 +166,7 @@ def simulated_roa_fraction(
     step: float | None = None,
     horizon: float | None = None,
     settled: float | None = None,
-    deadline: float = math.inf,
+    effort: Effort = UNLIMITED,
     start: Array | None = None,
     centre: Array | None = None,
     beyond: Holds | None = None,
@@ -183,7 +183,7 @@ def simulated_roa_fraction(
     points : grid points along each state; default 401 for one state, 35 for two.
     step, horizon : in seconds; defaults from the eigenvalues, see `time_scales`.
     settled : the level that a run has to reach; default `SETTLED * level`, near the origin.
-    deadline : a reading of `time.monotonic` at which the simulation ends wherever it is.
+    effort : counted work; where it is over the simulation ends wherever it is.
     start, centre : (n, n) and (n,), of the ellipsoid {(x - c)'P(x - c) <= 1} that belongs to the proved set too,
         where a tube leads from it; c = 0 without a centre.
     beyond : which states (N, n) of the domain belong to it besides, (N,).
@@ -207,17 +207,17 @@ def simulated_roa_fraction(
     x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, system.n)
     certified = _in_sets(x, P, level, start, centre, beyond)
     target = SETTLED * level if settled is None else settled
-    attracted, left, reached = _run(flow, x, P, target, step, horizon, deadline)
+    attracted, left, reached = _run(flow, x, P, target, step, horizon, effort)
     suspects = np.flatnonzero(certified & left)
     if suspects.size and not flow.discrete:
-        again, gone, _ = _run(flow, x[suspects], P, target, step / _FINER, reached, deadline)
+        again, gone, _ = _run(flow, x[suspects], P, target, step / _FINER, reached, effort)
         attracted[suspects], left[suspects] = again, gone
     shape = (points,) * system.n
     return SimulatedRoa(axes, attracted.reshape(shape), left.reshape(shape), certified.reshape(shape), step, reached)
 
 
 def _run(
-    flow: Flow, x: Array, P: Array, target: float, step: float, horizon: float, deadline: float = math.inf
+    flow: Flow, x: Array, P: Array, target: float, step: float, horizon: float, effort: Effort = UNLIMITED
 ) -> tuple[Mask, Mask, float]:
     """Simulate; return the runs that reached `V <= target`, those that left the domain, and the simulated seconds."""
     attracted, left = np.zeros((2, len(x)), dtype=np.bool_)
@@ -231,9 +231,10 @@ def _run(
                 x, alive, u = x[~near], alive[~near], None
             if not alive.size:
                 break
-            if time.monotonic() > deadline:
+            if effort.over:
                 reached = k * step
                 break
+            effort.charge(flow.operations(len(x)))
             u = flow.input(x, u, k, step)
             x = flow.advance(x, u, step)
             inside = np.all((x >= flow.lo) & (x <= flow.hi), axis=-1)  # False for NaN
@@ -245,7 +246,7 @@ def _run(
 
 
 def edge_of(
-    flow: Flow, roa: SimulatedRoa, P: Array, target: float, deadline: float = math.inf
+    flow: Flow, roa: SimulatedRoa, P: Array, target: float, effort: Effort = UNLIMITED
 ) -> tuple[Array, Array, Array]:
     """The simulated region of a plane, four times finer along its boundary: axes (K,), (L,), a share in [0, 1], (K, L).
 
@@ -260,7 +261,7 @@ def edge_of(
         raise InputError(f"the boundary of a region is drawn in a plane; the grid has {len(roa.axes)} axes.")
     (a, b), mask = roa.axes, roa.attracted
     for _ in range(_HALVINGS):
-        if min(mask.shape) < 2 or time.monotonic() > deadline:
+        if min(mask.shape) < 2 or effort.over:
             break
         # A new point takes a neighbour's answer, and is asked where the points around it differ.
         near = np.minimum((np.arange(2 * mask.shape[0] - 1) + 1) // 2, mask.shape[0] - 1)
@@ -273,7 +274,7 @@ def edge_of(
         ask = ~known & (around.any((2, 3)) != around.all((2, 3)))
         a, b = _halved(a), _halved(b)
         points = np.stack(np.meshgrid(a, b, indexing="ij"), -1)[ask]
-        fine[ask] = _run(flow, points, P, target, roa.step, roa.horizon, deadline)[0]
+        fine[ask] = _run(flow, points, P, target, roa.step, roa.horizon, effort)[0]
         mask = fine
     return a, b, _smoothed(_smoothed(mask.astype(np.float64)).T).T
 

@@ -110,7 +110,12 @@ class TimingInWords(Timing):
     @property
     def shown_rate(self) -> str:
         """The rate, rounded down: V is claimed to fall at least as fast."""
-        return f"{below(self.rate)} per {'step' if self.discrete else 's'}"
+        return f"{below(self.rate)} {self.per_time}"
+
+    @property
+    def per_time(self) -> str:
+        """The unit of a rate, after a number."""
+        return "per step" if self.discrete else "per s"
 
     def each(self, *, proper: bool = False) -> str:
         """For which periods a condition on D holds; one on what is reached is not asked of a `proper` period of 0."""

@@ -22,7 +22,6 @@ from certify.report.words import above, below, pretty_unit, symbol
 ROOT = Path(__file__).parents[2]
 PAGE = Path(__file__).parent
 LARGEST = 80_000  # bytes of a picture
-UNHURRIED = 3600.0  # seconds of drawing, so that a picture does not depend on the load
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ def light(svg: str) -> str:
 
 def picture(entry: Entry, certificate: Certificate) -> None:
     """The first figure of the report, as a file."""
-    pictures, _ = draw(certificate, accepted=True, seconds=UNHURRIED)
+    pictures, _ = draw(certificate, accepted=True)
     svg = light(pictures[0].svg)
     if len(svg.encode("utf-8")) > LARGEST:
         raise SystemExit(f"the picture of {entry.name} must be below {LARGEST} bytes; it has {len(svg)}. Draw less.")

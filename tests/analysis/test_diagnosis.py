@@ -5,17 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 
+from certify.analysis.candidates.trials import Trial, trial
 from certify.analysis.diagnosis import diagnose
 from certify.analysis.facts import Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
 from certify.analysis.run import certify_roa
 from certify.certificates.verdict import Verdict
+from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, get_system
 from certify.loop.policies import load_policy
 from tests.support.loops import chain
@@ -50,6 +52,23 @@ def test_a_wider_domain_that_is_suggested_gives_a_larger_set(pendulum_result: Ro
     wider = certify_roa(widened(pendulum_result.system, step), pendulum_result.network, tmp_path, LITTLE)
     assert wider.volume is not None and pendulum_result.volume is not None
     assert wider.volume > 1.2 * pendulum_result.volume
+
+
+def test_a_domain_that_allows_no_more_is_not_sampled(
+    pendulum_result: RoaResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both sides of the domain bind, so that this V is not sampled where one is wider: only what is stretched is."""
+    sampled, of = list[float](), trial
+
+    def noted(loop: ClosedLoop, P: np.ndarray, *given: Any) -> Trial:
+        sampled.append(float(P[1, 1]))
+        return of(loop, P, *given)
+
+    monkeypatch.setattr("certify.analysis.diagnosis.trial", noted)
+    step = step_of(pendulum_result, LITTLE)
+    assert dict(step.options) == {"--domain": "theta_dot=25"}
+    assert pendulum_result.P is not None and len(sampled) == 2
+    assert all(entry < 0.9 * pendulum_result.P[1, 1] for entry in sampled)
 
 
 def test_a_wider_domain_is_suggested_for_this_v_where_it_alone_reaches_further(tmp_path: Path) -> None:

@@ -5,13 +5,17 @@ from __future__ import annotations
 import inspect
 import json
 import typing
+from collections.abc import Mapping
 from fractions import Fraction
+from itertools import cycle
 from pathlib import Path
+from types import UnionType
 from typing import Any
 
+import numpy as np
 import pytest
 
-from certify import InputError, RoaOptions, certify_roa, get_system
+from certify import InputError, RoaOptions, certify_roa, get_system, lyapunov
 from certify.analysis.api import Keywords, in_python
 from certify.analysis.arguments import changes_of, options_of
 from certify.analysis.changes import PlantChanges
@@ -21,6 +25,8 @@ from certify.analysis.studies.study import KNOWN, read_study
 from certify.analysis.values import changes_in
 from certify.cli.main import _run, command_line
 from certify.cli.options import FIRST
+from certify.loop.plants import System
+from certify.loop.plants.system import Interval
 from docs.hooks import on_page_markdown
 
 ROOT = Path(__file__).parent.parent.parent
@@ -63,6 +69,46 @@ def test_python_is_made_of_the_declarations() -> None:
         assert signature.parameters[keyword].default == option.default
         assert f"{keyword} : {in_python(option.help)}" in said
     assert "<options>" not in doc and "`--" not in doc
+
+
+NAMED = {
+    **{name: getattr(lyapunov, name) for name in ("Candidate", "Neural", "Polynomial", "Symbolic")},
+    "Interval": Interval,
+    "Changes": Mapping[str, Fraction | Interval],
+    "Array": np.ndarray,
+    "System": System,
+}
+"""Types that the fields name for type checkers alone."""
+WIDER = {"reach_from", "lyapunov", "Q", "R", "hidden", "disturbances", "input_error", "sample_time"}
+"""Options that Python takes in more forms than their fields hold."""
+APART = {"P", "ranges"}
+"""Options whose forms no rule compares: all that numpy makes an array of; and ranges without the plant's values."""
+
+
+def accepts(wide: Any, narrow: Any) -> bool:
+    """True if each value of the second type is one of the first."""
+    if wide == narrow:
+        return True
+    if typing.get_origin(narrow) in (UnionType, typing.Union):
+        return all(accepts(wide, one) for one in typing.get_args(narrow))
+    if typing.get_origin(wide) in (UnionType, typing.Union):
+        return any(accepts(one, narrow) for one in typing.get_args(wide))
+    outer, inner = typing.get_origin(wide), typing.get_origin(narrow)
+    if not (isinstance(outer, type) and isinstance(inner, type) and issubclass(inner, outer)):
+        return False
+    given = [one for one in typing.get_args(narrow) if one is not ...]
+    return all(map(accepts, cycle(typing.get_args(wide)), given))
+
+
+@pytest.mark.parametrize("of", [RoaOptions, PlantChanges])
+def test_pythons_keywords_have_the_types_of_the_fields(of: type) -> None:
+    """Type checkers read `Keywords` as it is written, so that it cannot be made of the fields."""
+    keywords, fields = typing.get_type_hints(Keywords), typing.get_type_hints(of, localns=NAMED)
+    for name, one in declared(of).items():
+        if one.keyword and one.keyword not in APART:
+            asked, held = keywords[one.keyword], fields[name] | None
+            assert accepts(asked, held), name
+            assert accepts(held, asked) == (name not in WIDER), name
 
 
 def test_a_study_is_made_of_the_declarations() -> None:

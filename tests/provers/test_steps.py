@@ -419,8 +419,8 @@ def test_the_order_is_chosen_once_and_the_same_each_time() -> None:
 @pytest.mark.parametrize(
     ("dynamics", "time", "rate", "words"),
     [
-        ("-x", "continuous", 1.0, "V does not fall at the rate 1 at x"),
-        ("x/2", "discrete", 0.375, "V does not fall at the rate 0.375 over a step at x"),
+        ("-x", "continuous", 1.0, "V does not fall faster than at the rate 1 at x"),
+        ("x/2", "discrete", 0.375, "V does not fall faster than at the rate 0.375 over a step at x"),
         ("3*x/2", "discrete", 0.0, "V does not fall over a step at x"),
         ("x", "continuous", 0.0, "Vdot >= 0 at x"),
     ],
@@ -439,4 +439,23 @@ def test_a_refuted_rate_is_told_as_such(tmp_path: Path) -> None:
     system, network = alone("-x + u", "continuous")
     result = certify_roa(system, dataclasses.replace(network, centre="output"), tmp_path, options)
     assert result.verdict is Verdict.REFUTED
-    assert "V does not fall at the rate 1 " in result.reason and "Vdot" not in result.reason
+    assert "V does not fall faster than at the rate 1 at x" in result.reason and "Vdot" not in result.reason
+
+
+@pytest.mark.parametrize(("dynamics", "time", "falls"), [("-x + u", "continuous", 1.0), ("x/2 + u", "discrete", 0.375)])
+@pytest.mark.parametrize("level", [0.25, None])
+@pytest.mark.parametrize("factor", [1.0, 1.2])
+def test_of_a_rate_that_is_met_exactly_a_smaller_one_is_suggested(
+    dynamics: str, time: str, falls: float, level: float | None, factor: float, tmp_path: Path
+) -> None:
+    system, network = alone(dynamics, time)
+    network = dataclasses.replace(network, centre="output")
+    options = RoaOptions(P=np.eye(1), level=level, rate=factor * falls, claim="asymptotic", effort=0.1)
+    result = certify_roa(system, network, tmp_path, options)
+    assert result.verdict is (Verdict.UNKNOWN if level is None else Verdict.REFUTED)
+    assert result.diagnosis is not None and "equality is not enough" in result.diagnosis.next.why
+    assert f"falls at the rate {falls:g} per " in result.diagnosis.next.why
+    lower = float(dict(result.diagnosis.next.options)["--rate"])
+    assert 0.98 * falls < lower < falls
+    again = certify_roa(system, network, tmp_path, dataclasses.replace(options, rate=lower))
+    assert again.verdict is Verdict.PROVED

@@ -40,13 +40,14 @@ def expected(result: RoaResult) -> str:
 @pytest.fixture
 def figures(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     """Grows whenever figures are drawn."""
-    found, figures_of = list[bool](), page.figures_of
+    found, draw = list[bool](), page.draw
 
-    def noted(*given: Any) -> Any:
+    def noted(*given: Any, **named: Any) -> Any:
         found.append(True)
-        return figures_of(*given)
+        return draw(*given, **named)
 
-    monkeypatch.setattr(page, "figures_of", noted)
+    monkeypatch.setattr(page, "draw", noted)
+    monkeypatch.setattr("certify.report.figures.draw", noted)
     return found
 
 
@@ -54,14 +55,14 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
 def test_the_page_is_the_same_and_drawn_once(begun: bool, asked: Asked, expected: str, figures: list[bool]) -> None:
     one = Drawing()
     if begun:
-        one.begin(asked[0], asked[1], 1.0)
+        one.begin(asked[0], asked[1])
     assert one.page_of(*asked) == expected and len(figures) == 1
 
 
 def test_a_certificate_that_came_later_is_drawn_with_the_page(asked: Asked, expected: str, figures: list[bool]) -> None:
     one = Drawing()
-    one.begin(asked[0].replace(b"provenance", b"provisions"), asked[1], 1.0)
-    one.begin(asked[0], asked[1], 1.0)
+    one.begin(asked[0].replace(b"provenance", b"provisions"), asked[1])
+    one.begin(asked[0], asked[1])
     assert one.page_of(*asked) == expected and len(figures) == 1  # the first is no certificate, and has no figures
 
 
@@ -70,7 +71,7 @@ def test_figures_begun_early_say_nothing_before_the_checker_does(asked: Asked) -
     raw, path, _answer, data = asked
     refused = {"result": "REJECTED", "rule": "ring", "at": "leaf 3", "detail": "positive"}
     one = Drawing()
-    one.begin(raw, path, 1.0)
+    one.begin(raw, path)
     page = one.page_of(raw, path, refused, data)
     assert page == drawn.page_of(raw, path, refused, data)
     assert "Nothing here is proved" in page and "The independent checker accepted" not in page
@@ -79,7 +80,7 @@ def test_figures_begun_early_say_nothing_before_the_checker_does(asked: Asked) -
 def test_an_answer_about_other_bytes_is_an_error_and_no_page(asked: Asked) -> None:
     raw, path, answer, data = asked
     one = Drawing()
-    one.begin(raw, path, 1.0)
+    one.begin(raw, path)
     with pytest.raises(SoundnessError, match="must be about the certificate"):
         one.page_of(raw, path, {**answer, "certificate_sha256": "0" * 64}, data)
 
@@ -97,7 +98,7 @@ def test_figures_that_fail_are_drawn_again_with_the_page(
     one = Drawing()
     with monkeypatch.context() as patched:
         patched.setattr(drawn, "figures_if_accepted", fail)
-        one.begin(asked[0], asked[1], 1.0)
+        one.begin(asked[0], asked[1])
         assert one._thread is not None
         one._thread.join()
     assert one.page_of(*asked) == expected and len(figures) == 1
@@ -106,7 +107,7 @@ def test_figures_that_fail_are_drawn_again_with_the_page(
 
 def test_nothing_is_drawn_early_of_a_large_certificate(asked: Asked) -> None:
     one = Drawing()
-    one.begin(asked[0] + b" " * drawing._MOST, asked[1], 1.0)
+    one.begin(asked[0] + b" " * drawing._MOST, asked[1])
     assert one._thread is None
 
 

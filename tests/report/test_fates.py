@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import count, pairwise
 
 import numpy as np
 import pytest
 
 from certify.certificates import Certificate, PartitionTree
 from certify.certificates.claims import Asymptotic
+from certify.effort import Effort
 from certify.errors import InputError
 from certify.loop.expressions import Number, symbols
 from certify.loop.plants import System
@@ -22,7 +22,7 @@ from certify.lyapunov.function import Quadratic
 from certify.report import simulated_roa_fraction
 from certify.report.figures import draw
 from certify.report.figures.portrait import keys
-from certify.report.figures.scene import Effort, Scene
+from certify.report.figures.scene import Detail, Scene
 from certify.report.figures.style import LEAVING, UNSETTLED
 from certify.report.figures.trajectories import runs_from, starts
 from certify.report.flow import Flow, simulate
@@ -144,12 +144,12 @@ def test_a_curved_edge_is_found_as_if_the_whole_grid_were_fine() -> None:
     assert np.all(share[radius < 1 - 3 * cell] > 0.5) and np.all(share[radius > 1 + 3 * cell] < 0.5)
 
 
-# Time
+# Effort
 
 
-def test_without_time_the_sets_are_drawn_and_nothing_is_called_leaving() -> None:
+def test_without_effort_the_sets_are_drawn_and_nothing_is_called_leaving() -> None:
     claimed = certificate(plane("-x/10", "-y*50"), 0.9)
-    pictures, roa = draw(claimed, accepted=True, seconds=1e-9)
+    pictures, roa = draw(claimed, accepted=True, effort=Effort(0.0))
     texts = [key.text for key in pictures[0].legend]
     assert texts[0].startswith("proved set") and any("not settled in" in text for text in texts)
     assert not any("leave" in text for text in texts)
@@ -158,11 +158,23 @@ def test_without_time_the_sets_are_drawn_and_nothing_is_called_leaving() -> None
     assert [p.title for p in full] == [p.title for p in pictures] and whole is not None and whole.attracted.all()
 
 
-def test_a_deadline_ends_runs_early_and_keeps_what_there_is() -> None:
-    flow = Flow.of(plane("-x", "-y"), QUIET)
-    path = simulate(flow, np.array([[0.5, 0.5]]), 0.01, 10_000, time.monotonic() - 1)
+def test_counted_work_ends_runs_early_and_keeps_what_there_is() -> None:
+    flow, begin = Flow.of(plane("-x", "-y"), QUIET), np.array([[0.5, 0.5]])
+    path = simulate(flow, begin, 0.01, 10_000, Effort(0.0))
     assert len(path) == 2 and np.all(np.isfinite(path))
-    assert len(simulate(flow, np.array([[0.5, 0.5]]), 0.01, 100, math.inf)) == 101
+    effort = Effort(20 * flow.operations(1))
+    assert len(simulate(flow, begin, 0.01, 100, effort)) == 21 and effort.over
+    assert len(simulate(flow, begin, 0.01, 100)) == 101
+
+
+def test_a_picture_is_the_same_on_a_machine_that_is_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seconds pass between two readings of the clock, as on a machine where other programs run."""
+    claimed = certificate(plane("-x/10", "-y*50"), 0.9)
+    quiet, readings = draw(claimed, accepted=True), count(0.0, 7.0)
+    monkeypatch.setattr(time, "monotonic", lambda: next(readings))
+    busy = draw(claimed, accepted=True)
+    assert busy[0] == quiet[0]
+    assert busy[1] is not None and quiet[1] is not None and busy[1].horizon == quiet[1].horizon
 
 
 def test_how_much_is_simulated_follows_from_the_policy_alone() -> None:
@@ -171,9 +183,9 @@ def test_how_much_is_simulated_follows_from_the_policy_alone() -> None:
         weights = tuple(np.zeros((b, a)) for a, b in pairwise(sizes))
         return TanhNetwork(weights, tuple(np.zeros(b) for b in sizes[1:]), np.ones(1), np.zeros(1), "tanh", "none")
 
-    small, large, huge = Effort.of(policy(16, 2), 3), Effort.of(policy(256, 5), 3), Effort.of(policy(2048, 4), 3)
-    assert small == Effort(grid=101, starts=8, steps=500, rates=200)
+    small, large, huge = Detail.of(policy(16, 2), 3), Detail.of(policy(256, 5), 3), Detail.of(policy(2048, 4), 3)
+    assert small == Detail(grid=101, starts=8, steps=500, rates=200)
     for a, b in ((small, large), (large, huge)):
         assert a.grid >= b.grid and a.starts >= b.starts and a.steps >= b.steps and a.rates >= b.rates
-    assert huge == Effort(grid=25, starts=4, steps=120, rates=24)  # what is left of a picture at the least
-    assert Effort.of(policy(256, 5), 6).grid <= large.grid
+    assert huge == Detail(grid=25, starts=4, steps=120, rates=24)  # what is left of a picture at the least
+    assert Detail.of(policy(256, 5), 6).grid <= large.grid

@@ -127,6 +127,16 @@ def test_a_full_bar_reaches_the_end_of_its_frame(browser: Browser, pages: dict[s
     assert browser.evaluate("getComputedStyle(document.querySelector('.bar')).outlineStyle") == "solid"
 
 
+def test_every_section_stands_on_the_pages_paper(browser: Browser, pages: dict[str, Path]) -> None:
+    for page in pages.values():
+        browser.show(page, 800)
+        bottoms = browser.evaluate(
+            "JSON.stringify([...document.querySelectorAll('main, main *')].map(e => e.getBoundingClientRect().bottom))"
+        )
+        paper, *inside = json.loads(bottoms)
+        assert max(inside) <= paper
+
+
 def test_drawings_turn_dark_with_the_page(browser: Browser, pages: dict[str, Path]) -> None:
     """The corner of a drawing, read back through a canvas, is as dark as the page says: its text would not be seen."""
     brightest = (

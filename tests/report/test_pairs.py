@@ -28,7 +28,6 @@ from certify.report.figures import draw
 from certify.report.figures.geometry import circle, over_level
 from certify.report.figures.pairs import MOST, coupling, named_pairs, pairs_of, rates
 from certify.report.figures.paper import PaperOptions, paper_figure
-from certify.report.page import _time_for
 from certify.report.sampling import quadratic
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
 from tests.support.marks import slow_after
@@ -186,11 +185,6 @@ def test_bars_are_the_certificates_own_shares(proved: Any) -> None:
         assert found == pytest.approx(100 * shares, abs=0.06) and max(found) > 99
         assert ("next thing to try" in html) == (given_result is not None)
     assert ">Share of the domain</h2>" in render_html(certificate, answer, None, path)
-
-
-def test_the_drawing_may_take_a_tenth_of_the_run_or_ten_seconds() -> None:
-    assert _time_for(None) == 10.0 and _time_for({"seconds": {"total": 3.0}}) == 10.0
-    assert _time_for({"seconds": {"total": 500.0}}) == 50.0 and _time_for({"seconds": {}}) == 10.0
 
 
 # The figure for a paper

@@ -268,7 +268,7 @@ def test_simulated_trajectories_stay_in_the_bands(proved: RoaResult) -> None:
     certificate = certificate_of(proved)
     scene, claim, band = Scene(certificate, accepted=True), claim_of(certificate), band_in(certificate)
     runs = runs_from(scene, starts(scene))
-    inside = scene.effort.starts
+    inside = scene.detail.starts
     begins = runs.path[0, :inside] - np.array(claim.centre)
     assert np.all(quadratic(claim.start.P, begins) == pytest.approx(0.999, rel=1e-9))
     assert not np.any(runs.left[:inside]) and np.all(runs.settled[:inside])

@@ -416,6 +416,17 @@ def test_what_was_proved_and_what_was_not(pendulum_case: Case) -> None:
     assert "python -I -m certify.checker certificate.json" in text
 
 
+def test_the_checkers_modules_are_named_where_it_answered(pendulum_case: Case) -> None:
+    used = ", ".join(pendulum_case.answer["modules"])
+    assert "ring" in used and f"modules of the checker that were used {used}" in Page(pendulum_case.page()).text
+    refused = {"result": "REJECTED", "rule": "ring", "at": "leaf 31", "modules": ["ring"]}
+    silent = {name: value for name, value in pendulum_case.answer.items() if name != "modules"}
+    for answer in (None, refused, silent):
+        sha256 = pendulum_case.sha256
+        html = render_html(pendulum_case.certificate, answer, None, pendulum_case.path, sha256=sha256)
+        assert "modules of the checker" not in Page(html).text
+
+
 def test_every_simulated_figure_says_so(pendulum_case: Case, scalar_case: Case, chain_case: Case) -> None:
     for case in (pendulum_case, scalar_case, chain_case):
         pictures, _ = draw(case.certificate, accepted=True)

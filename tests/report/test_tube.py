@@ -237,7 +237,7 @@ def test_simulated_trajectories_from_the_start_stay_in_the_shadow(proved: RoaRes
     certificate = certificate_of(proved)
     scene = Scene(certificate, accepted=True)
     runs = runs_from(scene, starts(scene))
-    inside = scene.effort.starts
+    inside = scene.detail.starts
     assert np.all(quadratic(start_of(certificate), runs.path[0, :inside]) == pytest.approx(0.999, rel=1e-9))
     time, half = shadow(start_of(certificate), slabs_of(certificate))
     at = runs.step * np.arange(len(runs.path))
@@ -314,7 +314,7 @@ def test_a_claimed_start_that_runs_leave_is_not_spared() -> None:
     certificate = enlarged(plane("x**3 - x", "-y", 2), QUIET, np.eye(2) / 2.0, [slab(np.eye(2), 4 * np.eye(2))])
     scene = Scene(certificate, accepted=False)
     runs = runs_from(scene, starts(scene))
-    assert np.any(runs.left[: scene.effort.starts])
+    assert np.any(runs.left[: scene.detail.starts])
     assert "trajectories that leave the domain*" in {key.text for key in keys(scene, runs, None, True)}
     pictures, roa = draw(certificate, accepted=False)
     assert roa is not None and roa.contradictions > 0

@@ -223,7 +223,8 @@ class _Outwards:
         if self.hurried:
             return Proof(None, None, Stop.EFFORT, "it ended before a local level was found", seconds=self.seconds)
         if self.inner is None:
-            why = "the linearisation does not dominate on any ball; try another --Q"
+            smaller = ", or a smaller --rate" if self.task.problem.rate else ""
+            why = f"the linearisation does not dominate on any ball; try another --Q{smaller}"
             return Proof(None, None, Stop.LOCAL, why, seconds=self.seconds)
         if self.ring is None:
             ring = empty_ring(self.task.problem, self.engine.T, self.inner)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from certify.certificates import Certificate
+from certify.effort import Effort
 from certify.report.figures.decay import decay
 from certify.report.figures.line import line_figure
 from certify.report.figures.near_origin import near_origin
@@ -25,10 +26,11 @@ from certify.report.figures.tube import tube
 from certify.report.sampling import SimulatedRoa, edge_of, simulated_roa_fraction
 
 __all__ = ["Picture", "draw"]
+_GRID = 0.5  # of the effort, at most, for the simulated region of attraction: the rest is for trajectories
 
 
 def draw(
-    certificate: Certificate, accepted: bool, *, pairs: Sequence[Pair] | None = None, seconds: float = 10.0
+    certificate: Certificate, accepted: bool, *, pairs: Sequence[Pair] | None = None, effort: Effort | None = None
 ) -> tuple[list[Picture], SimulatedRoa | None]:
     """All figures of a certificate, and the simulated region of attraction where there is one (n <= 2).
 
@@ -36,13 +38,17 @@ def draw(
     ----------
     accepted : True if the checker accepted it; if not, the captions speak of claims.
     pairs : states that are drawn against each other, by index; None for the default pairs.
-    seconds : the time for all figures. Sets are always drawn; if the time runs out, less is simulated, and the captions
-    say so.
+    effort : counted work for simulation; by default some seconds of it. Sets are always drawn; where the effort is over
+        less is simulated, and the captions say so.
+
+    Raises
+    ------
+    CertifyError, ValueError, ArithmeticError : the certificate makes no sense, which cannot happen for an accepted one.
     """
     import matplotlib
 
     with matplotlib.rc_context(RC):
-        scene = Scene(certificate, accepted, pairs, seconds)
+        scene = Scene(certificate, accepted, pairs, effort)
         roa = simulated_roa(scene)
         pictures = _on_the_line(scene, roa) if scene.n == 1 else _in_planes(scene, roa)
     return pictures, roa
@@ -53,14 +59,13 @@ def simulated_roa(scene: Scene) -> SimulatedRoa | None:
     if scene.n > 2:
         return None
     network = scene.certificate.network
-    settled, deadline = scene.settling_level, scene.deadline
     return simulated_roa_fraction(
         scene.system,
         network,
         scene.P,
         scene.outer,
-        settled=settled,
-        deadline=deadline,
+        settled=scene.settling_level,
+        effort=scene.effort.share(_GRID),
         start=scene.start,
         centre=scene.centre,
         beyond=scene.in_outer,
@@ -71,7 +76,7 @@ def region_of(scene: Scene, roa: SimulatedRoa | None) -> Region | None:
     """The simulated region of a plane, if it has a boundary in the domain."""
     if roa is None or len(roa.axes) != 2 or roa.attracted.all() or not roa.attracted.any():
         return None
-    return edge_of(scene.flow, roa, scene.P, scene.settling_level, scene.deadline)
+    return edge_of(scene.flow, roa, scene.P, scene.settling_level, scene.effort)
 
 
 def _on_the_line(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
@@ -83,7 +88,7 @@ def _on_the_line(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
 
 def _in_planes(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
     runs, region = runs_from(scene, starts(scene)), region_of(scene, roa)
-    inside = len(scene.pairs) * scene.effort.starts  # starts along the domain's boundary come after these
+    inside = len(scene.pairs) * scene.detail.starts  # starts along the domain's boundary come after these
     from_set = replace(runs, path=runs.path[:, :inside], settled=runs.settled[:inside], left=runs.left[:inside])
     pictures = [*portraits(scene, runs, region), *tube(scene, from_set)]
     if scene.n == 2 and scene.shows_inner:

@@ -19,7 +19,7 @@ def near_origin(scene: Scene) -> Picture:
     leaves = None if scene.local_is_enough else scene.leaves
     if leaves is not None:
         add_leaves(axes, scene, leaves, (0, 1), within=reach)
-    begin = on_level(scene.P, circle(scene.effort.starts), min(9 * scene.inner, 0.999 * scene.outer))
+    begin = on_level(scene.P, circle(scene.detail.starts), min(9 * scene.inner, 0.999 * scene.outer))
     paths = runs_from(scene, begin, steps=60).path
     lines = [thin(paths[:, k], 2 * reach) for k in range(paths.shape[1])]
     axes.add_collection(LineCollection(lines, colors=SIMULATED, linewidths=0.8, zorder=3))

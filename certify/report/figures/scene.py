@@ -1,13 +1,12 @@
 """Shared by the figures of one certificate: sets, labels, the flow, trajectories, and the effort for simulation.
 
-The number of simulated points follows from the cost of one, counted in operations, so that equal certificates give
-equal pages on fast and slow machines. The clock is the last resort: if it runs out, runs end early and say so.
+The number of simulated points follows from the cost of one, and the work of all is counted, so that equal certificates
+give equal pictures on fast, slow and busy machines. Where the effort is over runs end early, and say so.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates import Certificate, PartitionTree, leaves
+from certify.effort import Effort
 from certify.errors import CertificateFormatError
 from certify.loop.policies import TanhNetwork
 from certify.lyapunov import extents
@@ -32,7 +32,7 @@ from certify.report.figures.sets import (
     slabs_of,
     start_of,
 )
-from certify.report.flow import Flow, time_scales
+from certify.report.flow import Flow, cost_of, time_scales
 from certify.report.phrases import phrases_of
 from certify.report.sampling import SETTLED, growth, quadratic
 from certify.report.timing import TimingInWords
@@ -45,10 +45,8 @@ ON_BOUNDARY = 14  # trajectories that start on the proved set's boundary, in eac
 PATH_STEP = 0.6  # of the step of `time_scales`
 _MOST_LEAVES = 400_000
 _MOST_STEPS = 500
-_TANH = 30  # multiplications' worth
-_EQUATIONS = 500  # multiplications' worth of one evaluation, and of what surrounds it
 _GRIDS, _RUNS, _RATES = 2e9, 1e10, 5e8  # operations for grids, trajectories and the time scales
-_SHARE = 0.45  # of the time, after which nothing is simulated any more: the rest is for drawing
+_SIMULATED = 3e10  # operations for all that is simulated, a few seconds on a quiet core
 _LEAST = 25  # points along a grid
 _FINE, _SEVERAL = 241, 121  # points along a grid for the outline of an outer set, in one plane and in each
 _SEEN = 1 / 200  # of a picture's width: less is no more than a dot
@@ -56,8 +54,8 @@ _VIEW = 1.3  # of the set's reach, in pictures of more than two states
 
 
 @dataclass(frozen=True, slots=True)
-class Effort:
-    """The effort for simulation.
+class Detail:
+    """Amounts that are simulated.
 
     Parameters
     ----------
@@ -73,9 +71,9 @@ class Effort:
     rates: int
 
     @classmethod
-    def of(cls, network: TanhNetwork, planes: int) -> Effort:
-        """The effort that a policy's cost allows in so many planes."""
-        cost = _EQUATIONS + sum(w.size for w in network.weights) + _TANH * sum(b.size for b in network.biases)
+    def of(cls, network: TanhNetwork, planes: int) -> Detail:
+        """The amounts that a policy's cost allows in so many planes."""
+        cost = cost_of(network)
         steps = _RUNS / (4 * cost)  # of all trajectories together
         starts = int(min(max(steps / (_MOST_STEPS * planes), 4), ON_BOUNDARY if planes == 1 else 8))
         return cls(
@@ -93,7 +91,7 @@ class Scene:
     ----------
     accepted : True if the checker accepted it; if not, the captions speak of claims.
     pairs : states that are drawn against each other; a function of system, P and shares chooses them.
-    seconds : for all figures.
+    effort : counted work for simulation; by default some seconds of it.
 
     Raises
     ------
@@ -101,9 +99,13 @@ class Scene:
     """
 
     def __init__(
-        self, certificate: Certificate, accepted: bool, pairs: Sequence[Pair] | None = None, seconds: float = 10.0
+        self,
+        certificate: Certificate,
+        accepted: bool,
+        pairs: Sequence[Pair] | None = None,
+        effort: Effort | None = None,
     ) -> None:
-        self.deadline = time.monotonic() + _SHARE * seconds
+        self.effort = Effort(_SIMULATED) if effort is None else effort
         if not is_ellipsoid(certificate):
             raise CertificateFormatError("P must be positive definite and the levels positive and in order.")
         self.timing = TimingInWords.of(certificate.system, certificate.claim.rate)
@@ -132,9 +134,9 @@ class Scene:
         self.shares = self.reach / side
         self.start_shares = None if self.start_reach is None or self.centre is not None else self.start_reach / side
         self.pairs = list(pairs) if pairs is not None else pairs_of(self.system, self.P, self.far / side)
-        self.effort = Effort.of(certificate.network, len(self.pairs))
+        self.detail = Detail.of(certificate.network, len(self.pairs))
         # With more than two states nothing is simulated from outside the sets.
-        self.step, self.horizon = time_scales(self.flow, self.effort.rates, None if self.n <= 2 else self.far)
+        self.step, self.horizon = time_scales(self.flow, self.detail.rates, None if self.n <= 2 else self.far)
         units = self.system.units
         points = zip(self.system.states, self.system.exact_x_eq(), strict=True)
         self.labels = [deviation(s.name, q, units.get(s.name, "")) for s, q in points]
@@ -268,7 +270,7 @@ class Scene:
     def plane(self, pair: Pair) -> tuple[Array, Array, Array]:
         """Grid coordinates along two states within the view and the domain, and the states (all others 0)."""
         box, (i, j) = self.view(pair), pair
-        points = self.effort.grid if time.monotonic() < self.deadline else _LEAST
+        points = _LEAST if self.effort.over else self.detail.grid
         lo, hi = np.maximum(box.lo, self.lo[[i, j]]), np.minimum(box.hi, self.hi[[i, j]])
         a, b = np.linspace(lo[0], hi[0], points), np.linspace(lo[1], hi[1], points)
         x = np.zeros((points, points, self.n))

@@ -20,10 +20,10 @@ def runs_from(scene: Scene, begin: ArrayLike, steps: int | None = None) -> Runs:
     wanted = PATH_STEP * scene.step
     step = scene.flow.fitting(wanted)
     every = min(max(int(wanted / step), 1), _MOST_SHORT) if scene.flow.period else 1  # of short periods some are kept
-    count = steps or min(int((scene.duration + 0.5 * scene.horizon) / step) + 1, every * scene.effort.steps)
+    count = steps or min(int((scene.duration + 0.5 * scene.horizon) / step) + 1, every * scene.detail.steps)
     starts, target = np.asarray(begin, dtype=np.float64), scene.settling_level
     begins = scene.start, scene.centre, scene.in_outer
-    runs = runs_of(scene.flow, starts, scene.P, scene.outer, target, step, count, scene.deadline, *begins)
+    runs = runs_of(scene.flow, starts, scene.P, scene.outer, target, step, count, scene.effort, *begins)
     if not scene.timing.is_plain:  # the rate of change jumps where the input does
         return Runs(runs.path[::every], every * step, runs.settled, runs.left)
     return Runs(refine(runs.path, scene.flow.field, step), step / PARTS, runs.settled, runs.left)
@@ -35,7 +35,7 @@ def starts(scene: Scene) -> Array:
     The set is that of a tube's start if there is one, wherever it lies, else {V <= c2}; with an outer set it is the
     union of the two, and its outline that in the plane through the origin.
     """
-    count = scene.effort.starts
+    count = scene.detail.starts
     P, level = (scene.P, scene.outer) if scene.start is None else (scene.start, 1.0)
     middle = 0.0 if scene.centre is None else scene.centre
     blocks = [middle + over_level(P, pair, circle(count), 0.999 * level) for pair in scene.pairs]

@@ -19,10 +19,14 @@ from certify.report.words import point
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """A certificate's status: kind is ACCEPTED, TRUSTED, REJECTED or NOT CHECKED; note says why."""
+    """A certificate's status: kind is ACCEPTED, TRUSTED, REJECTED or NOT CHECKED; note says why.
+
+    `modules` are those of the checker's files that were used, if it accepted or trusted; empty if its answer has none.
+    """
 
     kind: str
     note: str
+    modules: tuple[str, ...] = ()
 
     @property
     def accepted(self) -> bool:
@@ -72,11 +76,17 @@ def status_of(certificate: Certificate, sha256: str, answer: Mapping[str, Any] |
             "TRUSTED",
             f"The checker checked what is exact: {_checked(certificate.kind)}. All else, above all that V̇ "
             f"is negative, is the word of {solver}, which nothing here can check. It is not a proof.",
+            _modules(answer),
         )
     second = answer.get("reference") or {}
     both = (second.get("result"), second.get("certificate_sha256")) == ("ACCEPTED", sha256)
     also = " So did the reference, a second checker that shares no line with it." if both else ""
-    return Status("ACCEPTED", f"The independent checker accepted the certificate.{also}")
+    return Status("ACCEPTED", f"The independent checker accepted the certificate.{also}", _modules(answer))
+
+
+def _modules(answer: Mapping[str, Any]) -> tuple[str, ...]:
+    """The checker's files that were used, by name."""
+    return tuple(map(str, answer.get("modules") or ()))
 
 
 def _checked(kind: str) -> str:
