@@ -19,7 +19,7 @@ from typing import Any
 
 from .document import MAX_BYTES, Certificate
 from .evidence import Trusted
-from .limits import MAX_IN_PATIENCE, MAX_OPERATIONS
+from .limits import MAX_IN_PATIENCE
 from .rules import Verdict, judge
 
 STATUS = {"ACCEPTED": 0, "REJECTED": 1, "TRUSTED": 3}
@@ -201,7 +201,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("file", metavar="FILE")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--patient", action="store_true", help="take files that may keep this program for hours")
-    parser.add_argument("--operations", type=int, default=MAX_OPERATIONS, help="reject files that ask for more")
+    parser.add_argument("--operations", type=int, metavar="N", help="reject files that ask for more")
     options = parser.parse_args(given)
 
     def failed(message: str, status: int) -> int:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from .document import Certificate
 from .evidence import Covering, Tree
 from .expressions import Equations
-from .networks import Affine, Clip, Map, Network, Observe
+from .networks import Affine, Clip, Map, Network, Observe, Step
 from .rational import bits
 from .refusal import require
 
@@ -23,8 +23,10 @@ MAX_OPERATIONS, MAX_IN_PATIENCE = 2**34, 2**46  # the second where somebody has 
 LEAF = 255
 
 
-def limits(c: Certificate, most: int) -> None:
+def limits(c: Certificate, most: int | None = None) -> None:
+    """Neither too many numbers at once, nor more operations than these (None: than this program takes)."""
     count, work = numbers(c), operations(c)
+    most = MAX_OPERATIONS if most is None else most
     require(count <= MAX_NUMBERS, "limits", "numbers", f"{count} numbers at once; {MAX_NUMBERS} are allowed")
     more = f"; with --patient {MAX_IN_PATIENCE}" if most < work <= MAX_IN_PATIENCE else ""
     require(work <= most, "limits", "operations", f"{work} operations; {most} are allowed{more}")
@@ -35,15 +37,17 @@ def limits(c: Certificate, most: int) -> None:
 
 @dataclass(frozen=True)
 class Nets:
-    """Some networks: rows and columns of each affine step with the units of its network before it.
+    """Some networks: rows and columns of their steps with the units of the network before each.
 
-    `units` are those of all of them, `widest` is the most entries that a step makes, `steps` their number.
+    `units` are those of all of them, `widest` is the most entries that a step makes, `read` counts the vectors that
+    steps read, `waiting` those that a step reads which is not the next.
     """
 
     shapes: tuple[tuple[int, int, int], ...]
     units: int
     widest: int
-    steps: int
+    read: int
+    waiting: int
 
     @property
     def weights(self) -> int:
@@ -74,15 +78,28 @@ class Nets:
 
 
 def nets(*networks: Network) -> Nets:
-    shapes, before = list[tuple[int, int, int]](), 0
-    for network in networks:
-        start = before
-        for step in network.steps:
-            if isinstance(step, Affine):
-                shapes.append((step.size, step.columns, before - start))
-            before += step.size if isinstance(step, Map | Clip | Observe) else 0
-    steps = [step for network in networks for step in network.steps]
-    return Nets(tuple(shapes), before, max((step.size for step in steps), default=0), len(steps))
+    shapes = [shape for network in networks for shape in shapes_of(network)]
+    steps = [(k, step) for network in networks for k, step in enumerate(network.steps)]
+    units = sum(units_of(step) for _, step in steps)
+    waiting = sum(len({i for k, step in enumerate(network.steps) for i in step.of if i != k}) for network in networks)
+    widest, read = max((step.size for _, step in steps), default=0), sum(len(step.of) for _, step in steps)
+    return Nets(tuple(shapes), units, widest, read, waiting)
+
+
+def units_of(step: Step) -> int:
+    return step.size if isinstance(step, Map | Clip | Observe) else 0
+
+
+def shapes_of(network: Network) -> Iterator[tuple[int, int, int]]:
+    """Entries and columns of each step, where another than `affine` has the vectors that it reads as columns, and the
+    units before it. A map of what an affine step has just made belongs to that one."""
+    units = 0
+    for k, step in enumerate(network.steps):
+        if isinstance(step, Affine):
+            yield step.size, step.columns, units
+        elif k == 0 or not isinstance(step, Map) or step.of[0] != k or not isinstance(network.steps[k - 1], Affine):
+            yield step.size, len(step.of), units
+        units += units_of(step)
 
 
 def called(expressions: Equations) -> Iterator[Network]:
@@ -145,13 +162,15 @@ def numbers(c: Certificate) -> int:
     order = max(evidence.order, evidence.ball.order if evidence.ball else 1)
     values = z.a * (1 if c.sample is None else 4 * order) + 2 * z.n + 8
     if asked_of_leaves(c, evidence) or c.beyond is not None:
-        count += values * square + 2**14 * (z.n + z.m + z.z + z.nets.steps)
+        count += values * square + 2**14 * (z.n + z.m + z.z + z.nets.read + z.nets.waiting * (z.s + z.m + z.z))
     if evidence.ball or evidence.contraction or evidence.tube:
         count += values * (z.t + z.d * z.y + z.m + z.z) + z.d**4 // 4
-        count += sum(4 * p * g for p, _, g in z.nets.shapes) + 3 * z.nets.units * z.t
+        count += sum(4 * p * (z.d + g) for p, _, g in z.nets.shapes) + 3 * z.nets.units * z.t
     if c.beyond is not None:
         N = c.beyond.expression
-        count += sum(4 * p * q + 2 * p * square for p, q, _ in nets(*called(N)).shapes)
+        over = nets(*called(N))
+        count += sum(4 * p * q + 2 * p * square for p, q, _ in over.shapes)
+        count += 2**14 * (over.read + over.waiting * (z.s + 1))
         count += 8 * (len(N.steps) + observing(*called(N))) * square
     return count
 
@@ -171,7 +190,7 @@ def operations(c: Certificate) -> int:
     work += inverting(z.n, of_S) + 2**8 * len(evidence.tree)
     if asked_of_leaves(c, evidence):
         leaves, order = evidence.tree.count(LEAF), evidence.order
-        models, calls = z.a * evaluations(c, order) + z.n**2 + 4 * z.n, z.n * z.s**2 + 160 * z.nets.steps
+        models, calls = z.a * evaluations(c, order) + z.n**2 + 4 * z.n, z.n * z.s**2 + 160 * z.nets.read
         work += on_boxes(leaves, z.n, models, z.a * (order + 1), z.s, calls) + on_leaves(c, z, leaves, order)
     return work + on_balls(c, z, evidence) + in_tube(c, z, evidence) + beyond(c, z, evidence)
 
@@ -240,11 +259,11 @@ def beyond(c: Certificate, z: Sizes, evidence: Tree) -> int:
     N = c.beyond.expression
     a, over = len(N.steps) + observing(*called(N)), nets(*called(N))
     faces, leaves = sum(face.count(LEAF) for face in covering.faces), covering.tree.count(LEAF)
-    held, calls = max(2 * a, over.widest), 200 * over.steps
+    held, calls = max(2 * a, over.widest), 200 * over.read
     work = over.folding + inverting(z.n, bits(covering.T))
     work += 2**8 * (len(covering.tree) + sum(map(len, covering.faces)))
     work += on_boxes(faces, z.n, a, held, z.n, calls) + faces * over.models(z.n)
     work += over.forms(faces + leaves, z.n + 1) + (1 + faces + leaves) * over.paths
-    calls += z.n * z.s**2 + 160 * z.nets.steps
+    calls += z.n * z.s**2 + 160 * z.nets.read
     work += on_boxes(leaves, z.n, z.a + 8 * a + 4 * z.n, max(held, z.a), z.s, calls)
     return work + leaves * over.models(z.s) + on_leaves(c, z, leaves, evidence.order)

@@ -24,6 +24,7 @@ from scipy.linalg import expm
 
 from certify.reference import __main__ as command
 from certify.reference import decrease, rules, tube
+from certify.reference.limits import MAX_IN_PATIENCE
 from tests.support.balls import around, ball, enlarge, slab_of, square, with_ball
 from tests.support.certificates import Document, decode, dump, edited, encode, grow, make, write
 from tests.support.models import inputs_on
