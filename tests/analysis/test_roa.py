@@ -35,6 +35,7 @@ from certify.lyapunov.function import Quadratic
 from certify.provers.base import Progress
 from certify.provers.boxes.rule import BoxBounds, VdotBound
 from certify.provers.falsify import Witness, refutes
+from certify.report.rows import rows_of
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
 from tests.support.marks import slow_after
 
@@ -311,6 +312,50 @@ def test_an_answer_about_other_bytes_is_no_proof(tmp_path: Path, monkeypatch: py
     with pytest.raises(SoundnessError, match="other bytes"):
         certify_roa(*scalar_tanh(), tmp_path / "mine", RoaOptions(level=2.0))
     assert not (tmp_path / "mine" / "certificate.json").exists()
+
+
+def test_the_reference_is_asked_where_it_is_quick(tmp_path: Path) -> None:
+    result = certify_roa(*scalar_tanh(), tmp_path)
+    assert result.checker is not None and result.to_dict()["reference"] == "ACCEPTED"
+    assert result.checker["reference"]["certificate_sha256"] == result.checker["certificate_sha256"]
+    assert "ACCEPTED BY BOTH" in dict(rows_of(result.to_dict(), True))["checker"] and "So did the reference" in result.report().read_text()
+
+
+def test_what_the_reference_refuses_is_mended_or_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its refusal counts as the checker's does: the leaf is split, then the level lowered."""
+    told = list[int]()
+
+    def refusing(path: Path, program: str = "checker", **given: Any) -> dict[str, Any]:
+        if program == "checker":
+            return run_checker(path, **given)
+        told.append(len(path.read_bytes()))
+        level = float.fromhex(json.loads(path.read_bytes())["levels"]["roa"])
+        return {"result": "REJECTED", "rule": "ring", "at": "leaf 0", "detail": f"{level}"}
+
+    monkeypatch.setattr("certify.analysis.stages.acceptance.run_checker", refusing)
+    with pytest.raises(SoundnessError, match="rejects what the engine proved.*reference"):
+        certify_roa(*scalar_tanh(), tmp_path)
+    assert len(told) > 3 and told[1] > told[0]  # the first leaf was split
+
+
+@pytest.mark.parametrize("wrong", ["certificate_sha256", "levels"])
+def test_a_reference_s_answer_about_something_else_is_no_proof(
+    wrong: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def other(path: Path, program: str = "checker", **given: Any) -> dict[str, Any]:
+        answer = run_checker(path, program, **given)
+        return answer if program == "checker" else {**answer, wrong: {}}
+
+    monkeypatch.setattr("certify.analysis.stages.acceptance.run_checker", other)
+    with pytest.raises(SoundnessError, match="is about other"):
+        certify_roa(*scalar_tanh(), tmp_path)
+
+
+def test_a_reference_that_needs_long_is_not_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("certify.analysis.stages.acceptance._QUICK", 2)
+    result = certify_roa(*scalar_tanh(), tmp_path)
+    assert result.verdict is Verdict.PROVED and result.to_dict()["reference"] is None
+    assert "ACCEPTED BY BOTH" not in dict(rows_of(result.to_dict(), True))["checker"]
 
 
 def test_the_checker_beside_the_running_package_is_meant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

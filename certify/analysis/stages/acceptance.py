@@ -90,9 +90,13 @@ class _Desk:
                 self.tools.remarks.append(
                     "its check takes more than ten minutes: type `certify check --patient` for another"
                 )
-        if answer["result"] != "ACCEPTED":
-            return answer
-        second = run_checker(path, "reference", operations=_QUICK)
+        elif answer["result"] == "ACCEPTED":
+            return self._twice(path, answer)
+        return answer
+
+    def _twice(self, path: Path, answer: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The checker's answer with the reference's, or that alone if it refuses; the checker's if it needs long."""
+        second = run_checker(path, program="reference", operations=_QUICK)
         if (second.get("rule"), second.get("at")) == ("limits", "operations"):
             return answer
         return {**answer, "reference": second} if second["result"] == "ACCEPTED" else {**second, "by": "reference"}
