@@ -15,15 +15,32 @@ from operator import add
 from typing import Any
 
 import numpy as np
+from flint import arb, arb_series
 
-from .near import ZERO, Above, Array, Near, atan, exp, inverse, lines_around_tanh, lower, near, sin_cos, sqrt, tanh
+from .near import (
+    ZERO,
+    Above,
+    Array,
+    Near,
+    Polynomials,
+    atan,
+    exp,
+    inverse,
+    lines_around_tanh,
+    lower,
+    near,
+    sin_cos,
+    sqrt,
+    tanh,
+)
 
 Three = tuple[Near, Near, Near]
 Four = tuple[Near, Near, Near, Near]
 Constant = Callable[[Fraction], Any]
 Lines = tuple[Array, Array, Above]
 FourBounds = tuple[Above, Above, Above, Above]
-_ONE, _TWO, _THIRD, _UNIT = Near(np.float64(1)), Near(np.float64(2)), near(Fraction(1, 3)), Above(1.0)
+_NONE, _ONE, _TWO, _THIRD = Near(np.float64(0)), Near(np.float64(1)), Near(np.float64(2)), near(Fraction(1, 3))
+_UNIT = Above(1.0)
 _TANH_FOURTH, _ATAN_FOURTH, _STEEPEST = Above(4.1).over(24.0), Above(4.7).over(24.0), Above(16.0).over(24.0)
 
 
@@ -175,6 +192,93 @@ class _Tanh(Function):
             slope.append(constant(Fraction(1)) + -square if k == 1 else -square)
             y.append(_step(v, slope, k, constant))
         return y
+
+
+class _Sigmoid(Function):
+    """1/(1 + exp(-v)), which is (1 + tanh(v/2))/2: all is known of tanh."""
+
+    name = "sigmoid"
+
+    def exact(self, q: Fraction) -> Fraction | None:
+        return Fraction(1, 2) if q == 0 else None
+
+    def lines(self, centre: Array, radius: Above) -> Lines:
+        s, m, gap = lines_around_tanh(0.5 * centre, radius * 0.5)
+        shift = Near(m) * 0.5 + Near(np.float64(0.5))
+        return 0.25 * s, shift.value, gap * 0.5 + shift.error
+
+    def at(self, c: Near) -> Three:
+        t, slope, bend = FUNCTIONS["tanh"].at(c * 0.5)
+        return t * 0.5 + Near(np.float64(0.5)), slope * 0.25, bend * 0.125
+
+    def sixth(self, c: Near, f: Three) -> Near:
+        half = c * 0.5
+        return FUNCTIONS["tanh"].sixth(half, FUNCTIONS["tanh"].at(half)) * 0.0625
+
+    def slopes(self, v0: Near) -> FourBounds:
+        a, b, c, d = FUNCTIONS["tanh"].slopes(v0)
+        return a * 0.25, b * 0.125, c * 0.0625, d * 0.03125
+
+    def third(self, e: Expansion) -> Above:
+        return self._of_tanh(e).third * 0.0625
+
+    def fourth(self, e: Expansion) -> Above:
+        return self._of_tanh(e).fourth * 0.03125
+
+    def _of_tanh(self, e: Expansion) -> Expansion:
+        return Expansion(FUNCTIONS["tanh"], e.v0 * 0.5, e.radius * 0.5)
+
+    def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
+        raise Undecided("equations have no sigmoid")
+
+
+class _Tabulated(Function):
+    """A smooth function from Arb's formula of it, by polynomials. Each is 0 at 0, or has no rational value there."""
+
+    def __init__(self, name: str, formula: Callable[[arb_series], arb_series], at_0: Fraction | None) -> None:
+        self.name, self.formula, self.at_0 = name, formula, at_0
+
+    @cached_property
+    def polynomials(self) -> Polynomials:
+        return Polynomials(self.formula)
+
+    def exact(self, q: Fraction) -> Fraction | None:
+        return self.at_0 if q == 0 else None
+
+    def lines(self, centre: Array, radius: Above) -> Lines:
+        return _lines_by_parts(lambda y: (self._at(y, 0), self._at(y, 1)), self._sup(2), centre, radius)
+
+    def at(self, c: Near) -> Three:
+        return self._near(c, 0), self._near(c, 1), self._near(c, 2)
+
+    def sixth(self, c: Near, f: Three) -> Near:
+        return self._near(c, 3)
+
+    def slopes(self, v0: Near) -> FourBounds:
+        return self._sup(1), self._sup(2) * 2, self._sup(3) * 3, self._sup(4) * 4
+
+    def third(self, e: Expansion) -> Above:
+        return self._around(e, 3)
+
+    def fourth(self, e: Expansion) -> Above:
+        return self._around(e, 4)
+
+    def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
+        raise Undecided(f"equations have no {self.name}")
+
+    def _at(self, y: Array, j: int) -> Near:
+        return self.polynomials.at(y, j)
+
+    def _sup(self, j: int) -> Above:
+        return self.polynomials.sup[j]
+
+    def _near(self, c: Near, j: int) -> Near:
+        """phi^(j)/j! at numbers near others: it changes by (j + 1) times the next."""
+        return self._at(c.value, j).wider(c.error * self._sup(j + 1) * float(j + 1))
+
+    def _around(self, e: Expansion, j: int) -> Above:
+        """The largest |phi^(j)/j!| at all that v may be."""
+        return self._near(e.v, j).size.least(self._sup(j) + 0 * e.radius.v)
 
 
 class _Inverse(Function):
@@ -407,17 +511,29 @@ class _Sign(Function):
         return [v[0].function("sign"), *[constant(Fraction(0))] * (count - 1)]
 
 
-class _Abs(Function):
-    """|v|: smooth where v is certainly not 0; elsewhere it lies between two lines."""
+class _Bent(Function):
+    """A function that is smooth but at 0: it has derivatives where the sign of v is certain, elsewhere lines alone."""
 
-    name = "abs"
+    def expansion(self, v0: Near, radius: Above) -> Expansion:
+        return _Corner(self, v0, radius)
+
+
+class _Kink(_Bent):
+    """Two half lines that meet at 0, of slopes -1, 0 or 1: |v|, and relu."""
+
+    def __init__(self, name: str, left: int, right: int) -> None:
+        self.name, self.left, self.right = name, left, right
+
+    def value(self, y: Array) -> Array:
+        """Exactly."""
+        return np.where(y < 0, self.left * y, self.right * y)
 
     def exact(self, q: Fraction) -> Fraction | None:
-        return abs(q)
+        return (self.left if q < 0 else self.right) * q
 
     def at(self, c: Near) -> Three:
-        sign, none = np.where(c.value < 0, -1.0, 1.0), np.zeros_like(c.value)
-        return Near(np.abs(c.value)), Near(sign), Near(none)
+        slope, none = np.where(c.value < 0, float(self.left), float(self.right)), np.zeros_like(c.value)
+        return Near(self.value(c.value)), Near(slope), Near(none)
 
     def sixth(self, c: Near, f: Three) -> Near:
         return f[2]
@@ -426,50 +542,154 @@ class _Abs(Function):
         return _UNIT, _no_more(v0), _no_more(v0), _no_more(v0)
 
     def third(self, e: Expansion) -> Above:
-        return _no_more(e.v)
+        return ZERO
 
     def fourth(self, e: Expansion) -> Above:
         return _no_more(e.v)
 
     def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
+        """That of |v|; equations have no other."""
         sign = v[0].function("sign") if count > 1 else None
         return [v[0].function("abs"), *(sign * v[k] if k < len(v) else constant(Fraction(0)) for k in range(1, count))]
 
-    def expansion(self, v0: Near, radius: Above) -> Expansion:
-        return _Corner(self, v0, radius)
+    def lines(self, centre: Array, radius: Above) -> Lines:
+        """Of slopes near the chord's; phi(v) - s v is linear to both sides of 0, and so is extreme at ends, or at 0."""
+        lo, hi = Near(centre, radius).ends
+        s = np.clip((self.value(hi) - self.value(lo)) / (hi - lo), self.left, self.right)
+        s = np.where(lo >= 0, self.right, np.where(hi <= 0, self.left, s))
+        at = np.array([lo, hi, np.clip(0.0, lo, hi)])
+        lows, highs = (Near(self.value(at)) - Near(at) * Near(s)).ends
+        return _between(np.min(lows, axis=0), np.max(highs, axis=0), s)
+
+
+class _Elu(_Bent):
+    """v, and exp(v) - 1 for v < 0; slopes are within 1 of each other across 0 as well."""
+
+    name = "elu"
+
+    def exact(self, q: Fraction) -> Fraction | None:
+        return q if q >= 0 else None
+
+    def at(self, c: Near) -> Three:
+        below, e = c.value < 0, exp(_up_to_0(c))
+        return _either(below, e - _ONE, c), _either(below, e, _ONE), _either(below, e * 0.5, _NONE)
+
+    def sixth(self, c: Near, f: Three) -> Near:
+        return f[2] * _THIRD
+
+    def slopes(self, v0: Near) -> FourBounds:
+        return _UNIT, _UNIT, Above(0.5) + _no_more(v0), Above(0.25) + _no_more(v0)
+
+    def third(self, e: Expansion) -> Above:
+        return exp(_up_to_0(Near(e.v.ends[1]))).size.over(6.0)
+
+    def fourth(self, e: Expansion) -> Above:
+        return e.third.over(4.0) + _no_more(e.v)
 
     def lines(self, centre: Array, radius: Above) -> Lines:
-        """Slopes are near the chord's; |v| - s v is linear to both sides of 0, and so is extreme at ends, or at 0."""
-        lo, hi = Near(centre, radius).ends
-        s = np.clip((np.abs(hi) - np.abs(lo)) / (hi - lo), -1.0, 1.0)
-        s = np.where(lo >= 0, 1.0, np.where(hi <= 0, -1.0, s))
-        at = np.array([lo, hi, np.clip(0.0, lo, hi)])
-        lows, highs = (Near(np.abs(at)) - Near(at) * Near(s)).ends
-        upper, lower_end = np.max(highs, axis=0), np.min(lows, axis=0)
-        m = 0.5 * (upper + lower_end)
-        return s, m, (Near(upper) - Near(m)).size.most((Near(lower_end) - Near(m)).size)
+        return _lines_by_parts(lambda y: self.at(Near(y))[:2], Above(0.5), centre, radius)
+
+    def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
+        raise Undecided("equations have no elu")
+
+
+class _Softsign(_Bent):
+    """v / (1 + |v|), with the derivatives 1, -2 sign(v), 6, -24 sign(v), by (1 + |v|)^2, ^3, ^4, ^5."""
+
+    name = "softsign"
+
+    def exact(self, q: Fraction) -> Fraction | None:
+        return q / (1 + abs(q))
+
+    def at(self, c: Near) -> Three:
+        r, sign = self._inverse(c), Near(np.where(c.value < 0, -1.0, 1.0))
+        return c * r, r * r, -(r * r * r * sign)
+
+    def sixth(self, c: Near, f: Three) -> Near:
+        return f[1] * f[1]
+
+    def slopes(self, v0: Near) -> FourBounds:
+        return _UNIT, _UNIT * 2, Above(3.0) + _no_more(v0), Above(4.0) + _no_more(v0)
+
+    def third(self, e: Expansion) -> Above:
+        r = self._inverse(Near(np.maximum(lower(e.v), 0.0))).size
+        return r * r * (r * r)
+
+    def fourth(self, e: Expansion) -> Above:
+        return e.third * self._inverse(Near(lower(e.v))).size
+
+    def lines(self, centre: Array, radius: Above) -> Lines:
+        return _lines_by_parts(lambda y: self.at(Near(y))[:2], _UNIT, centre, radius)
+
+    def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
+        raise Undecided("equations have no softsign")
+
+    def _inverse(self, c: Near) -> Near:
+        return inverse(Near(np.abs(c.value), c.error) + _ONE)
 
 
 class _Corner(Expansion):
-    """|v| around v0. On boxes the lines around it will do where the sign of v is not certain, with an error of the
-    value; a derivative it has only where that is certain."""
+    """A function that is smooth but at 0, around v0. On boxes the lines around it will do where the sign of v is not
+    certain, with an error of the value; derivatives it has only where that is certain."""
+
+    @cached_property
+    def certain(self) -> Array:
+        return np.isfinite(lower(self.v))
 
     @cached_property
     def stored(self) -> Three:
-        c, none = self.v0.value, np.zeros_like(self.v0.value)
+        c = self.v0.value
         s, m, gap = self.phi.lines(c, self.v0.error + self.radius)
-        return Near(c) * Near(s) + Near(m, gap), Near(s), Near(none)
+        of_lines = Near(c) * Near(s) + Near(m, gap), Near(s), Near(np.zeros_like(c))
+        f0, f1, f2 = (_either(self.certain, v, w) for v, w in zip(self.phi.at(Near(c)), of_lines, strict=True))
+        return f0, f1, f2
 
     @cached_property
     def f(self) -> Four:
-        smooth = Above(0 * self.fourth.v)  # NaN where the sign is not certain
-        f0, f1, f2 = self.phi.at(Near(self.v0.value))
-        return f0.wider(self.v0.error + smooth), f1.wider(smooth), f2.wider(smooth), f2.wider(smooth)
+        smooth = Above(np.where(self.certain, 0.0, np.nan))
+        f0, f1, f2, f3 = (v.wider(smooth) for v in super().f)
+        return f0, f1, f2, f3
 
     @cached_property
     def third(self) -> Above:
         """Lines leave nothing."""
-        return ZERO
+        third = self.phi.third(self)
+        return third if third is ZERO else Above(np.where(self.certain, third.top, 0.0))
+
+
+def _either(condition: Array, a: Near, b: Near) -> Near:
+    """a where the condition holds, else b."""
+    return Near(np.where(condition, a.value, b.value), Above(np.where(condition, a.error.top, b.error.top)))
+
+
+def _up_to_0(c: Near) -> Near:
+    """min(c, 0)."""
+    return Near(np.minimum(c.value, 0.0), c.error)
+
+
+def _lines_by_parts(at: Callable[[Array], tuple[Near, Near]], bend: Above, centre: Array, radius: Above) -> Lines:
+    """Parallel lines around a function whose second derivative is at most 2 `bend`, from its values and slopes `at`
+    eight points of the range: (s, m, gap) with |phi(v) - s v - m| <= gap for all |v - centre| <= radius.
+
+    Every v is within `half` of a point p, and there phi(v) - s v is within |phi'(p) - s| half + bend half^2 of its
+    value at p. s is any number, here near the chord's slope.
+    """
+    lo, hi = Near(centre, radius).ends
+    p = np.stack([lo + (hi - lo) * ((2 * i + 1) / 16) for i in range(8)])
+    apart = (Near(p[1:]) - Near(p[:-1])).size * 0.5
+    half = apart.max().most((Near(p[0]) - Near(lo)).size).most((Near(hi) - Near(p[-1])).size)
+    f, slopes = at(p)
+    s = (f.value[-1] - f.value[0]) / np.where(p[-1] > p[0], p[-1] - p[0], np.nan)
+    s = np.where(np.isnan(s), slopes.value[0], s)
+    away = (f - Near(p) * Near(s)).wider(((slopes - Near(s)).size + bend * half) * half)
+    lows, highs = away.ends
+    return _between(np.min(lows, axis=0), np.max(highs, axis=0), s)
+
+
+def _between(lower: Array, upper: Array, s: Array) -> Lines:
+    """Lines of the slopes s, from the ends of phi(v) - s v."""
+    m = 0.5 * (upper + lower)
+    return s, m, (Near(upper) - Near(m)).size.most((Near(lower) - Near(m)).size)
 
 
 def _no_more(x: Near) -> Above:
@@ -488,10 +708,30 @@ def _step(v: list[Any], w: list[Any], k: int, constant: Constant) -> Any:
     return reduce(add, terms) if terms else constant(Fraction(0))
 
 
+def _silu(v: arb_series) -> arb_series:
+    return v / ((-v).exp() + 1)
+
+
+def _gelu(v: arb_series) -> arb_series:
+    return v * ((v * (arb(1) / 2).sqrt()).erf() + 1) / 2
+
+
+def _softplus(v: arb_series) -> arb_series:
+    return (v.exp() + 1).log()
+
+
+def _mish(v: arb_series) -> arb_series:
+    """v tanh(softplus(v)), and tanh(log w) = 1 - 2/(1 + w^2)."""
+    w = v.exp() + 1
+    return v * (1 - 2 / (w * w + 1))
+
+
 FUNCTIONS: dict[str, Function] = {
     row.name: row
     for row in (
         *(_Inverse(), _Tanh(), _Exp(), _Atan(), _Sqrt()),
-        *(_Sine("sin", "cos"), _Sine("cos", "sin"), _Abs(), _Sign()),
+        *(_Sine("sin", "cos"), _Sine("cos", "sin"), _Kink("abs", -1, 1), _Sign()),
+        *(_Kink("relu", 0, 1), _Elu(), _Sigmoid(), _Softsign(), _Tabulated("softplus", _softplus, None)),
+        *(_Tabulated(name, phi, Fraction(0)) for name, phi in (("silu", _silu), ("gelu", _gelu), ("mish", _mish))),
     )
 }

@@ -25,15 +25,16 @@ addition theorem, and Taylor polynomials on |d| <= h/2 = 2^-6. No libm value is 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from functools import cache, cached_property, reduce
 from itertools import combinations_with_replacement, permutations
+from math import comb
 from operator import add
 from typing import Any, Self
 
 import numpy as np
-from flint import arb, ctx, fmpq
+from flint import arb, arb_series, ctx, fmpq
 
 Array = Any  # of binary64; numpy's own types say nothing of shapes
 U = 2.0**-53
@@ -44,6 +45,7 @@ _STEP = 2.0**-5
 _TANH_END = 20.0  # 1 - tanh(20) < 2^-56
 _ANGLE_END = 64.0  # beyond, sin and cos are only known to lie in [-1, 1]
 _EXP_END = 64.0  # beyond, nothing is known of exp; below -64 it lies between 0 and 2^-92
+_FAR, _FAR_POINTS, _FAR_ERROR, _DEGREE = 40.0, 1280, 2.0**-48, 9
 
 
 # -------------------------------------------------------------------------------------------------------- upper bounds
@@ -626,6 +628,66 @@ def _atan(y: Array) -> Near:
     v = np.copysign(np.where(large, _RIGHT_ANGLE - v, v), y)
     error = (error + 6 * U).where(large, error)
     return Near(np.where(finite, v, np.nan), Above(np.where(finite, error.v, np.nan), error.k))
+
+
+class Polynomials:
+    """A function phi whose coefficients `phi^(j)(y)/j!` come from Taylor polynomials around the points of the grid.
+
+    Parameters
+    ----------
+    formula : phi of a power series, in Arb. Beyond |y| = _FAR phi must be within 2^-48 of 0 on the left and of y on the
+        right, its derivative of 0 and 1, and `phi^(j)/j!` of 0 for 2 <= j <= 4.
+
+    `sup[j]` bounds `|phi^(j)/j!|` on all numbers, j from 1 to 5.
+    """
+
+    def __init__(self, formula: Callable[[arb_series], arb_series]) -> None:
+        points = [arb(k) * _STEP for k in range(-_FAR_POINTS, _FAR_POINTS + 1)]
+        cells = [_coefficients(formula, arb(g, _STEP / 2)) for g in points]
+        largest = [max(near_ball(abs(cell[j])).ends[1] for cell in cells) for j in range(_DEGREE + 1)]
+        self.sup = [Above(max(v, _FAR_ERROR, (1 + _FAR_ERROR) * (j == 1))) for j, v in enumerate(largest)]
+        each = [_coefficients(formula, g)[:_DEGREE] for g in points]
+        self.tables = [
+            np.array([[_entry(comb(i, j) * at[i]) for at in each] for i in range(j, _DEGREE)]) for j in range(5)
+        ]
+        powers = 2.0 ** (-6 * np.arange(_DEGREE))
+        self.sizes = [(size(t[1:]) * powers[: len(t) - 1, None]).sum().top for t in self.tables]
+        self.rests = [
+            self.sup[_DEGREE] * float(comb(_DEGREE, j)) * 2.0 ** (-6 * (_DEGREE - j)) + 2.0**-80 for j in range(5)
+        ]
+
+    def at(self, y: Array, j: int) -> Near:
+        """`phi^(j)(y)/j!` for every finite y; NaN where y is not finite.
+
+        y = kh + d with |d| <= h/2, exactly: k = rint(y/h), and y - kh has no rounding, by `_split` where |y| >= h, by
+        Sterbenz' lemma for h/2 <= |y| < h, and for k = 0. Lagrange's remainder is at most C(K, j) |d|^(K-j) times the
+        largest |phi^(K)/K!| between grid points. Entries of the tables come with u and 2^-90 each, which `rests` has,
+        and Horner's rule with at most 2K roundings: (2K + 2) u (|t_0| + |d| sum_(i>=1) |t_i| (h/2)^(i-1)).
+        """
+        close = np.abs(y) <= _FAR
+        inner = np.where(close, y, 0.0)
+        k = np.rint(inner * (1 / _STEP))
+        d, at, v = inner - k * _STEP, k.astype(np.intp) + _FAR_POINTS, 0.0
+        for t in reversed(self.tables[j]):
+            start = t[at]
+            v = start + d * v
+        error = (size(start) + size(d) * self.sizes[j][at]).ulps(2 * _DEGREE) + self.rests[j]
+        far = np.where(np.isfinite(y), np.where(y > 0, (y, 1.0)[j] if j < 2 else 0.0, 0.0), np.nan)
+        return Near(np.where(close, v, far), Above(np.where(close, error.top, _FAR_ERROR + 0 * far)))
+
+
+def _entry(x: arb) -> float:
+    """The binary64 number nearest to a value, within u of it and 2^-90."""
+    found = near_ball(x)
+    if found.error.top > U * abs(found.value) * (1 + 2.0**-20) + 2.0**-90:
+        raise ArithmeticError("a table entry is not accurate enough")
+    return float(found.value)
+
+
+def _coefficients(formula: Callable[[arb_series], arb_series], at: arb) -> list[arb]:
+    """`phi^(j)/j!` at a number, or all numbers of a ball, j from 0 to K."""
+    series = formula(arb_series([at, 1], prec=_DEGREE + 1))
+    return [series[j] for j in range(_DEGREE + 1)]
 
 
 def tanh(x: Near) -> Near:

@@ -23,7 +23,10 @@ from .expression import Tape, parse
 from .schema import Value
 
 MAX_NETWORKS, MAX_STEPS, MAX_WIDTH, MAX_NAMES = 64, 256, 2**14, 64
-FUNCTIONS = ("sin", "cos", "tanh", "exp", "atan", "sqrt")
+FUNCTIONS = (
+    *("sin", "cos", "tanh", "exp", "atan", "sqrt"),
+    *("relu", "elu", "sigmoid", "silu", "gelu", "softplus", "mish", "softsign"),
+)
 Array = NDArray[np.float64]
 V = TypeVar("V")
 
