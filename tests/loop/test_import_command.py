@@ -103,7 +103,7 @@ def test_import_as_json(run: Run) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--system", "plant.toml"], "Give --states x0,x1"),
+        (["--system", "plant.toml"], "required: --states x0,x1"),
         ([*SAID], "name the plant with --system"),
         (["--system", "plant.toml", *SAID, "--clip", "1"], "--clip takes LO..HI"),
         (["--system", "plant.toml", *SAID, "--clip", "2:1"], "lo < hi"),
@@ -200,7 +200,7 @@ def test_the_lyapunov_network_beside_the_policy(run: Run) -> None:
     ("arguments", "message"),
     [
         (["--lyapunov-prefix", "V"], "--lyapunov-prefix must go with --lyapunov-out"),
-        (["--lyapunov-out", "V.pt"], "Give --lyapunov-prefix"),
+        (["--lyapunov-out", "V.pt"], "required: --lyapunov-prefix"),
         (["--lyapunov-out", "V.pt", "--lyapunov-prefix", "W"], "no tensor is called W.0.weight"),
         (["--lyapunov-out", "./p.pt", "--lyapunov-prefix", "V"], "must be two files"),
     ],
