@@ -143,7 +143,7 @@ class Above:
         )
 
     def __getitem__(self, index: Any) -> Above:
-        """Those of some entries; a number bounds all of them."""
+        """The bounds of some entries; a number bounds all of them."""
         return self if np.ndim(self.v) == 0 else Above(self.v[index], self.k)
 
     def shaped(self, *shape: int) -> Above:
