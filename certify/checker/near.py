@@ -145,7 +145,8 @@ class Above:
         )
 
     def __getitem__(self, index: Any) -> Above:
-        return self if self is ZERO else Above(self.v[index], self.k)
+        """The bounds of some entries; a number bounds all of them."""
+        return self if np.ndim(self.v) == 0 else Above(self.v[index], self.k)
 
     def shaped(self, *shape: int) -> Above:
         """The same in another shape."""

@@ -14,7 +14,7 @@ from typing import Any
 from flint import arb, arb_mat
 
 from . import affine
-from .balls import ZERO
+from .balls import SPREAD, ZERO
 from .document import Certificate, Function
 from .expressions import Call
 from .networks import Affine, Clip, Concat, Map, Network, Observe, Sum
@@ -40,9 +40,9 @@ class InRows:
 
     def clip(self, step: Clip, v: Vector) -> Vector:
         """Numbers alone, for a clip has no model."""
-        if not all(x.g is None and x.r.is_zero() for x in v):
+        if any(x.g is not None for x in v):
             raise Refused("ring", "leaf", "a clip has no model")
-        return [Taylor(x.c.max(arb(lo)).min(arb(hi))) for x, lo, hi in zip(v, step.lo, step.hi, strict=True)]
+        return [Taylor(whole(x).max(arb(lo)).min(arb(hi))) for x, lo, hi in zip(v, step.lo, step.hi, strict=True)]
 
     def sum(self, step: Sum, *vectors: Vector) -> Vector:
         return summed(vectors)
@@ -93,9 +93,17 @@ def summed(vectors: Sequence[Vector]) -> Vector:
 
 
 def net_at_0(c: Certificate) -> list[arb]:
-    """The value of the policy's network at x = 0."""
-    value: Vector = c.policy.network.run(InRows(), [Taylor(arb(v)) for v in c.policy.origin])
-    return [y.c for y in value]
+    """The value of the policy's network at x = 0; no numbers where it may be undefined."""
+    try:
+        value: Vector = c.policy.network.run(InRows(), [Taylor(arb(v)) for v in c.policy.origin])
+    except Refused:
+        return [arb("nan")] * c.m
+    return [whole(y) for y in value]
+
+
+def whole(v: Taylor) -> arb:
+    """A model without symbols as one ball."""
+    return v.c + v.r * SPREAD
 
 
 def called(call: Call, given: Sequence[Taylor]) -> Vector:

@@ -79,7 +79,7 @@ class Loop:
         each state.
         """
         states = self.states(J, centre)
-        u, units = self.inputs(states, centre is None, rule, at)
+        u, units = self.inputs(states, centre is None, rule if self.bounded else "inputs", at)
         bounded = self.bounded or within_bounds(self.c, [(v.v, v.radius) for v in u])
         require(bounded, "inputs", at, "an input is not certain to stay in its bounds")
         return self.unclipped(states, u, units, rule, at)

@@ -17,17 +17,20 @@ from flint import arb, arb_mat, ctx, fmpq
 from certify.checker import networks as theirs
 from certify.reference.affine import OnBoxes, called
 from certify.reference.balls import PRECISION
+from certify.reference.document import read as read_certificate
 from certify.reference.expressions import equations
-from certify.reference.function import InRows, Models
+from certify.reference.function import InRows, Models, net_at_0
 from certify.reference.model import Model
 from certify.reference.networks import Network, read_network
 from certify.reference.rational import Exact, Exactly
 from certify.reference.refusal import Refused
 from certify.reference.tangents import OnBall
 from certify.reference.taylor import Taylor, constant
-from tests.checker.test_networks import SEEDS, Numbers, a_network
-from tests.support.certificates import encode
+from tests.checker.test_networks import SEEDS, Numbers, a_network, hash_of
+from tests.support.certificates import dump, encode, make
+from tests.support.earlier import newer
 from tests.support.models import curved, form, linear
+from tests.support.reference import judge_bytes
 
 Array = Any
 
@@ -274,3 +277,21 @@ def test_corners_of_equations_lie_in_their_models(seed: int) -> None:
         d /= max(1.0, float(np.linalg.norm(d)) * (1 + 1e-12))
         for v, value in zip(on_ball, true(*(centre + a @ d)), strict=bool(on_ball)):
             left_over(v, value, d.tolist())
+
+
+@pytest.mark.parametrize("undefined", [False, True])
+def test_the_value_at_0_has_all_that_is_not_known_of_it(undefined: bool) -> None:
+    """|3 tanh / 3 - tanh| is 0, of which balls only know that it is near; and the root of -1 is no number."""
+    data = newer(make([["-", "x"]], [([[1.0]], [1.0])], [[1.0]], (0.25, 0.5), squash="identity", centre="output"))
+    two = {"shape": [2, 1], "weight": encode([1.0, 3.0]), "bias": encode([0.0, 0.0])}
+    expression = ["sqrt", ["-", ["*", "a", "b"], "9"]] if undefined else ["abs", ["-", "a", ["*", "1/3", "b"]]]
+    data["networks"][0]["steps"] += [
+        {"kind": "map", "of": [1], "function": "tanh"},
+        {"kind": "affine", "of": [2], **two},
+        {"kind": "observe", "of": [3], "names": ["a", "b"], "expressions": [expression]},
+    ]
+    data["policy"]["sha256"] = hash_of(data)
+    with ctx.workprec(PRECISION):
+        (value,) = net_at_0(read_certificate(dump(data)))
+    assert not value.is_finite() if undefined else value.contains(0)
+    assert judge_bytes(dump(data)) == "inputs"  # abs may vanish, or there is no root

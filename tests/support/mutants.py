@@ -37,7 +37,7 @@ from tests.support.certificates import (
     with_tree,
 )
 from tests.support.claim_oracle import EXACT, LARGEST_FILE, Loop, bounded_by_form, exact_faults, local_fault
-from tests.support.earlier import earlier
+from tests.support.earlier import earlier, newer
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
 BASES = ("pendulum", "rotor", "rotor, preactivation", "linear", "local only", "scalar", "clipped rotor")
@@ -1143,11 +1143,12 @@ def true_edits() -> Iterator[Mutant]:
         yield mutant(f"{name}: provenance", edited(data, "provenance", {"author": "\u00e9", "of": [None, True, 7]}))
         yield mutant(f"{name}: no provenance", edited(data, "provenance", {} if data["provenance"] else {"": ""}))
         yield mutant(f"{name}: name of the plant", edited(data, "plant.name", "another"))
-        yield mutant(f"{name}: white space", b"\r\n\t " + json.dumps(data, indent=7).encode() + b"\n" * 1000)
-        yield mutant(f"{name}: order of keys", json.dumps(turned_round(data)).encode())
+        yield mutant(f"{name}: white space", b"\r\n\t " + json.dumps(newer(data), indent=7).encode() + b"\n" * 1000)
+        yield mutant(f"{name}: order of keys", json.dumps(turned_round(newer(data))).encode())
         yield mutant(f"{name}: escaped letters", dump(data).replace(b'"levels"', b'"\\u006c\\u0065vels"'))
         yield mutant(
-            f"{name}: raw UTF-8", json.dumps(edited(data, "provenance", {"a": "\u017d"}), ensure_ascii=False).encode()
+            f"{name}: raw UTF-8",
+            json.dumps(newer(edited(data, "provenance", {"a": "\u017d"})), ensure_ascii=False).encode(),
         )
         wide = [[str(Fraction(q) * 7) for q in pair] for pair in plant["domain"]]
         yield mutant(f"{name}: domain widened", edited(data, "plant.domain", wide))
