@@ -512,7 +512,15 @@ class _Sign(Function):
 
 
 class _Bent(Function):
-    """A function that is smooth but at 0: it has derivatives where the sign of v is certain, elsewhere lines alone."""
+    """A function that is smooth but at 0: it has derivatives where the sign of v is certain."""
+
+    @abstractmethod
+    def bend(self, v0: Near) -> Above:
+        """phi(v) is within this times (v - v0)^2 of the tangent at v0, for all v; NaN where v0 may be 0."""
+
+    def leap(self, v0: Near) -> Above:
+        """phi'(v) is within this times |v - v0|^3 of phi'(v0), for all v."""
+        return Above(np.nan + 0 * v0.value)
 
     def expansion(self, v0: Near, radius: Above) -> Expansion:
         return _Corner(self, v0, radius)
@@ -546,6 +554,15 @@ class _Kink(_Bent):
 
     def fourth(self, e: Expansion) -> Above:
         return _no_more(e.v)
+
+    def bend(self, v0: Near) -> Above:
+        """Beyond 0 the tangent is off by t = (right - left)(|v - v0| - |v0|), and x - y <= x^2 / (4 y)."""
+        return Above(0.25 * (self.right - self.left)).over(lower(v0))
+
+    def leap(self, v0: Near) -> Above:
+        """Beyond 0 |v - v0| is at least |v0|."""
+        p = _UNIT.over(lower(v0))
+        return p * p * p * float(self.right - self.left)
 
     def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
         """That of |v|; equations have no other."""
@@ -584,7 +601,10 @@ class _Elu(_Bent):
         return exp(_up_to_0(Near(e.v.ends[1]))).size.over(6.0)
 
     def fourth(self, e: Expansion) -> Above:
-        return e.third.over(4.0) + _no_more(e.v)
+        return self.third(e).over(4.0) + _no_more(e.v)
+
+    def bend(self, v0: Near) -> Above:
+        return Above(0.5) + _no_more(v0)
 
     def lines(self, centre: Array, radius: Above) -> Lines:
         return _lines_by_parts(lambda y: self.at(Near(y))[:2], Above(0.5), centre, radius)
@@ -616,7 +636,10 @@ class _Softsign(_Bent):
         return r * r * (r * r)
 
     def fourth(self, e: Expansion) -> Above:
-        return e.third * self._inverse(Near(lower(e.v))).size
+        return self.third(e) * self._inverse(Near(lower(e.v))).size
+
+    def bend(self, v0: Near) -> Above:
+        return _UNIT + _no_more(v0)
 
     def lines(self, centre: Array, radius: Above) -> Lines:
         return _lines_by_parts(lambda y: self.at(Near(y))[:2], _UNIT, centre, radius)
@@ -629,8 +652,10 @@ class _Softsign(_Bent):
 
 
 class _Corner(Expansion):
-    """A function that is smooth but at 0, around v0. On boxes the lines around it will do where the sign of v is not
-    certain, with an error of the value; derivatives it has only where that is certain."""
+    """A function that is smooth but at 0, around v0. Where the sign of v is not certain, models on boxes take the lines
+    around it, and jets its tangent at v0, phi'' and phi^(3) being 0; there it has no derivative."""
+
+    phi: _Bent
 
     @cached_property
     def certain(self) -> Array:
@@ -646,15 +671,37 @@ class _Corner(Expansion):
 
     @cached_property
     def f(self) -> Four:
-        smooth = Above(np.where(self.certain, 0.0, np.nan))
-        f0, f1, f2, f3 = (v.wider(smooth) for v in super().f)
-        return f0, f1, f2, f3
+        c, known = Near(self.v0.value), _no_more(self.v0)
+        three = self.phi.at(c)
+        each = zip((*three, self.phi.sixth(c, three)), self.phi.slopes(self.v0), strict=True)
+        f0, f1, f2, f3 = (v.wider(self.v0.error * steep + known) for v, steep in each)
+        return f0, f1, _either(self.certain, f2, _NONE), _either(self.certain, f3, _NONE)
+
+    @property
+    def derivative(self) -> Derivative:
+        found, smooth = Derivative(self), Above(np.where(self.certain, 0.0, np.nan))
+        f0, f1, f2 = (v.wider(smooth) for v in found.stored)
+        found.stored = f0, f1, f2
+        return found
 
     @cached_property
     def third(self) -> Above:
         """Lines leave nothing."""
-        third = self.phi.third(self)
-        return third if third is ZERO else Above(np.where(self.certain, third.top, 0.0))
+        return self._where_certain(self.phi.third(self), ZERO)
+
+    @cached_property
+    def fourth(self) -> Above:
+        """The tangent leaves at most `bend` D^2, which is at most bend/radius^2 D^4 once D^2 is as large as radius^2:
+        jets ask for the product of `fourth` and radius^2."""
+        bend = self.phi.bend(self.v0)
+        return self._where_certain(self.phi.fourth(self), bend.over((self.radius * self.radius).top))
+
+    @cached_property
+    def last(self) -> Above:
+        return self._where_certain(self.phi.last(self), self.phi.leap(self.v0))
+
+    def _where_certain(self, smooth: Above, other: Above) -> Above:
+        return Above(np.where(self.certain, smooth.top, other.top))
 
 
 def _either(condition: Array, a: Near, b: Near) -> Near:
