@@ -14,7 +14,8 @@ from flint import arb, arb_mat, fmpq
 from .balls import ONE, SPREAD, ZERO, derivatives, largest_fourth, third, total
 from .refusal import Refused
 
-HALF, NOISE = ONE / 2, arb(2) ** -30
+HALF = ONE / 2
+LITTLE = ONE / 2**30
 
 
 def mix(a: arb, x: arb_mat | None, b: arb, y: arb_mat | None) -> arb_mat | None:
@@ -215,15 +216,15 @@ class Taylor:
         return result
 
     def from_corner(self) -> arb:
-        """The value at a corner, that to which g points, and a bound of what a move away from it adds.
+        """The value at the corner to which g points, and a bound of what a move away from it adds.
 
         With M_ij = s_i s_j Q_ij for signs s_i, of which any will do, and d_i = s_i (1 - w_i), this is sum_i w_i (sum_j
         -M_ij (2 - w_j) - s_i g_i), where w_i and 2 - w_j lie in [0, 2].
         """
         if self.g is None or self.Q is None:
             return self.c + self.r + self.first
-        g, rows, result = self.g.entries(), self.Q.tolist(), self.c + self.r
-        negative = pointing_down(g, rows)
+        g, result, rows = self.g.entries(), self.c + self.r, self.Q.tolist()
+        negative = directions(g, rows)
         for v, s, row in zip(g, negative, rows, strict=True):
             lost = v if s else -v  # -s_i g_i, and what may be gained is added
             result -= lost
@@ -236,20 +237,16 @@ class Taylor:
         return result
 
 
-def pointing_down(g: Sequence[arb], rows: Sequence[Sequence[arb]]) -> list[bool]:
-    """For each symbol True if the corner is where it is -1.
-
-    A multiplier makes a coefficient of about 0, whose sign says nothing: there the terms of second order choose, with
-    the signs of all other symbols.
-    """
-    least = NOISE * sum(map(abs, g), ZERO)
-    negative, faint = [bool(v < 0) for v in g], [bool(abs(v) <= least) for v in g]
-    if not any(faint):
-        return negative
-    strong = [(j, s) for j, (s, weak) in enumerate(zip(negative, faint, strict=True)) if not weak]
+def directions(g: list[arb], rows: list[list[arb]]) -> list[bool]:
+    """True where a corner's entry is -1: by the sign of g_i or, where |g_i| <= 2^-30 sum |g| is what multipliers may
+    have left of 0, by that of sum_j Q_ij s_j over the other entries."""
+    least = sum(map(abs, g), ZERO) * LITTLE
+    told = [None if not abs(v) > least else bool(v < 0) for v in g]
     return [
-        bool(sum((-row[j] if s else row[j] for j, s in strong), ZERO) < 0) if weak else own
-        for row, own, weak in zip(rows, negative, faint, strict=True)
+        bool(sum((-q if t else q for t, q in zip(told, row, strict=True) if t is not None), ZERO).mid() < 0)
+        if s is None
+        else s
+        for s, row in zip(told, rows, strict=True)
     ]
 
 

@@ -9,7 +9,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import scipy.linalg
+from flint import arb, arb_mat
 
+from certify.checker.near import Above
+from certify.checker.taylor import Taylor as Checkers
+from certify.checker.taylor import pairs, upper_bound
+from certify.provers.bounds.taylor import Taylor as Provers
+from certify.provers.bounds.taylor import upper_bound as provers_upper_bound
+from certify.reference.taylor import Taylor as References
 from tests.reference.test_reference import judge, verdict
 from tests.support.balls import with_ball
 from tests.support.certificates import Document, edited, encode, grow, make
@@ -83,3 +90,27 @@ def test_leaves_under_deep_policies(seed: int, hidden: int) -> None:
         pytest.skip("the loop does not fall")
     *_, alone = limit(lambda c: edited(grown, "levels.roa", c.hex()), 0.5, 2.0, 12)
     assert judge(grown) is None and alone == 0
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_coefficient_that_is_noise_says_nothing_of_the_corner(seed: int) -> None:
+    """Multipliers make some g_i 0 up to rounding, others in each program: all bound such models alike, and rightly."""
+    generator = np.random.default_rng([seed, 30])
+    n, models, noisy = 5, 40, generator.permutation(5)[: 1 + seed % 3]
+    g, Q = generator.standard_normal((n, models)), 0.3 * generator.standard_normal((n, n, models))
+    Q = (Q + Q.swapaxes(0, 1)) / 2
+    i, j = pairs(n)
+    corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * n)).reshape(n, -1)
+    found, least = list[np.ndarray](), np.full(models, -np.inf)
+    for noise in (1e-17, -1e-17, generator.choice([-1e-15, 1e-15], (len(noisy), models))):
+        g[noisy] = noise
+        least = np.maximum(least, (g.T @ corners + np.einsum("ik,ijb,jk->bk", corners, Q, corners)).max(1))
+        none = np.zeros(models)
+        q = np.where((i == j)[:, None], 1.0, 2.0) * Q[i, j]
+        found.append(upper_bound(Checkers(none, np.vstack([g, q]), Above(none))))
+        found.append(provers_upper_bound(Provers(none, g, Q, none))[0])
+        references = [
+            References(arb(0), arb_mat([g[:, b].tolist()]), arb_mat(Q[..., b].tolist())) for b in range(models)
+        ]
+        found.append(np.array([float(model.bound().upper()) for model in references]))
+    assert np.ptp(found, axis=0).max() < 1e-9 and np.all(np.min(found, axis=0) >= least - 1e-12)
