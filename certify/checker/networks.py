@@ -198,7 +198,9 @@ def _network(value: Value) -> Network:
         sizes.append(made.size)
         return made
 
-    return Network(name.name(), sizes[0], steps.listed(read_next, 1, MAX_STEPS))
+    network = Network(name.name(), sizes[0], steps.listed(read_next, 1, MAX_STEPS))
+    steps.must(len(network.readers) == len(network.steps), "steps of which each but the last is read by another")
+    return network
 
 
 KEYS = {
@@ -290,7 +292,7 @@ class Algebra(ABC, Generic[V]):
         for k, step in enumerate(network.steps, 1):
             vectors[k] = self.make(step, [vectors[i] for i in step.of])
             left.subtract(step.of)
-            for i in {*step.of, k} - {len(network.steps)}:
+            for i in set(step.of):
                 if not left[i]:
                     del vectors[i]
         return vectors[len(network.steps)]  # type: ignore[no-any-return]

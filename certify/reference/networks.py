@@ -215,6 +215,8 @@ def read_network(value: Any, at: str) -> Network:
         require(wide, "format", f"{at}.steps.{k}", f"a vector of more than {MAX_WIDTH} entries")
         steps.append(step)
         sizes.append(step.size)
+    read = {i for step in steps for i in step.of}
+    require(read == set(range(len(steps))), "format", f"{at}.steps", "a step but the last is read by none")
     return Network(name, reads, tuple(steps))
 
 

@@ -216,7 +216,7 @@ class Taylor:
         return result
 
     def from_corner(self) -> arb:
-        """The value at a corner, that to which g points, and a bound of what a move away from it adds.
+        """The value at the corner to which g points, and a bound of what a move away from it adds.
 
         With M_ij = s_i s_j Q_ij for signs s_i, of which any will do, and d_i = s_i (1 - w_i), this is sum_i w_i (sum_j
         -M_ij (2 - w_j) - s_i g_i), where w_i and 2 - w_j lie in [0, 2].
