@@ -160,6 +160,5 @@ def _clipped(x: Exact, lo: float, hi: float) -> Exact:
 
 
 def _row(row: list[float], bias: float, v: list[Exact]) -> Exact:
-    terms = [None if x.value is None else Fraction(w) * x.value for w, x in zip(row, v, strict=True) if w != 0]
-    known = [q for q in terms if q is not None]
-    return Exact(sum(known, Fraction(bias)) if len(known) == len(terms) else None)
+    terms = (Exact(Fraction(w)) * x for w, x in zip(row, v, strict=True) if w != 0)
+    return reduce(add, terms, Exact(Fraction(bias)))

@@ -115,7 +115,7 @@ class Sizes:
         """Elementary operations."""
         found = 2**15 * self.a + self.net.folded + self.inverse(self.bits(self.c.P))
         if not self.c.practical:
-            found += 2**12 * self.net.entries
+            found += 2**12 * self.net.entries + 2**19 * Net(_called(self.c.dynamics)).entries
         if not isinstance(self.evidence, Partition):
             return found
         seen = min(2 * self.bits(self.evidence.T) + self.bits(self.c.P) + 16, 2**16 // self.n)

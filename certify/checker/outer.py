@@ -101,12 +101,12 @@ class Function:
     def __init__(self, tape: Tape) -> None:
         self.tape, networks = tape, [call.network for call in tape.calls.values()]
         self.values = max(2 * tape.size, *(step.size for net in networks for step in net.steps), 0)
-        self.weights = [step.weight for net in networks for step in net.steps if isinstance(step, Affine)]
+        self.shapes = [shape for net in networks for shape in net.shapes]
         prepare(*networks)
 
     def is_small(self, symbols: int) -> bool:
         """True if the models in so many symbols take an acceptable amount of memory and time."""
-        numbers = sum(len(W) * (W.shape[1] + symbols**2) for W in self.weights)
+        numbers = sum(rows * (columns + symbols**2) for rows, columns, _ in self.shapes)
         return numbers <= _MOST_NUMBERS and self.tape.size * symbols**2 <= _MOST_VALUES
 
     def along(self, states: Sequence[Taylor], F: Sequence[Taylor | None]) -> Dual:
@@ -118,7 +118,7 @@ class Function:
     def is_above(self, x: Form, level: float) -> Array:
         """True on boxes on which N is certainly above the level."""
         above = np.zeros(x.value.shape[2], dtype=bool)
-        if self.weights:  # forms are good where boxes are large
+        if self.tape.calls:  # forms are good where boxes are large
             above = self._shows(x, level, self._by_forms)
         left = np.flatnonzero(np.logical_not(above))
         above[left] = self._shows(x[:, left], level, lambda states: self.along(states, [None] * len(states)).value)

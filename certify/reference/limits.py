@@ -183,7 +183,7 @@ def operations(c: Certificate) -> int:
     z, evidence = sizes_of(c), c.evidence
     work = 2**15 * z.a + z.nets.folding + inverting(z.n, bits(c.P))
     if c.ends_at_origin:
-        work += 2**12 * z.nets.weights
+        work += 2**12 * z.nets.weights + 2**19 * nets(*called(c.plant.dynamics)).weights
     if not isinstance(evidence, Tree):
         return work
     of_S = min(2 * bits(evidence.T) + bits(c.P) + 16, 2**16 // z.n)

@@ -182,13 +182,11 @@ class Exactly:
 
 def weighted(weights: array[float], bias: float, h: list[Exact]) -> Exact:
     """A row of an affine step; weights of exact 0 ignore what stands behind them."""
-    result = exact(bias)
+    result = Exact(exact(bias))
     for w, v in zip(weights, h, strict=True):
         if w != 0 and v.value != 0:
-            if v.value is None:
-                return UNTOLD
-            result += exact(w) * v.value
-    return Exact(result)
+            result += UNTOLD if v.value is None else Exact(exact(w) * v.value)
+    return result
 
 
 def called(call: Call, given: Sequence[Exact]) -> list[Exact]:

@@ -7,6 +7,7 @@ import hashlib
 import json
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
@@ -131,7 +132,16 @@ def a_network(seed: int, reads: int, gives: int, kinds: str = "affine map clip s
                 add(Observe((i,), 3, names, parse(chosen, names, "here")))
     last = len(steps)
     add(Affine((last,), gives, rng.normal(size=(gives, sizes[last])), rng.normal(size=gives)))
-    return Network("net", reads, tuple(steps))
+    return Network("net", reads, tuple(needed(steps)))
+
+
+def needed(steps: list[Step]) -> list[Step]:
+    """The steps without those that none reads, numbered anew."""
+    wanted = {len(steps)}
+    for k in range(len(steps), 0, -1):
+        wanted |= set(steps[k - 1].of) if k in wanted else set()
+    number = {old: new for new, old in enumerate(sorted(wanted | {0}))}
+    return [replace(steps[k - 1], of=tuple(number[i] for i in steps[k - 1].of)) for k in sorted(wanted - {0})]
 
 
 @pytest.mark.parametrize("seed", SEEDS)

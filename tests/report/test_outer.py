@@ -412,7 +412,7 @@ def test_a_level_that_was_asked_for_and_missed_is_told_from_what_is_proved(prove
     data = missed.to_dict()
     text = rendered(data)
     assert text.startswith("UNKNOWN plane: the level of N is NOT proved; what is proved is {V <= 0.25} with the states")
-    assert "of the domain where N(x) <= 0.9 reason" in text and "ACCEPTED, about a smaller set" in text
+    assert "of the domain where N(x) <= 0.9 reason" in text and "ACCEPTED BY BOTH, about a smaller set" in text
     alone = rendered({**data, "outer": None})
     assert "NOT proved; what is proved is {V <= 0.25} reason" in alone
     accepted, rejected = Status("ACCEPTED", ""), Status("REJECTED", "")

@@ -392,7 +392,7 @@ def test_the_summary_does_not_hide_that_the_state_was_missed(missed: RoaResult) 
     assert data["verdict"] == "UNKNOWN" and data["checked"] == "ACCEPTED" and data["stop"] == "path"
     assert text.startswith("UNKNOWN soft_spring: the state is NOT shown to converge; what is proved is {V <= ")
     assert "without it" in text and "PROVED" not in text and "state p = 1.95 m, v = 1.95 m/s" in text
-    assert "ACCEPTED, about {V <= c2} alone, in which the state does not lie" in text
+    assert "ACCEPTED BY BOTH, about {V <= c2} alone, in which the state does not lie" in text
     unchecked = rendered({**data, "checked": None})  # of which nothing may be called proved
     assert "nothing was proved" in unchecked and "what is proved" not in unchecked
 
