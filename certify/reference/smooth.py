@@ -13,7 +13,7 @@ from .lines import Line, Turn, around, chord, limited
 from .rows import Four, Function
 
 NARROW = ONE / 2**20  # of a ball whose derivatives are not worth a second look
-HALVINGS, STEPS, CLOSE = 4, 3, ONE / 2**16  # of a range, of Newton's method, and the slope that ends it
+HALVINGS, STEPS, CLOSE = 4, 3, ONE / 2**12  # of a range, of Newton's method, and how close is close enough
 UNKNOWN = arb("nan")
 Formula = Callable[[arb_series], arb_series]
 Turns = Callable[[arb], Sequence[Turn]]  # of phi(y) - slope y for a slope strictly between the least and the most
@@ -31,8 +31,11 @@ def coefficients(formula: Formula, y: arb, count: int) -> list[arb]:
 class BySeries(Function):
     """A function whose derivatives are the coefficients of power series, phi^(k) at most `largest` on a ball.
 
-    Slopes of lines around it are between the ends of `slopes`.
+    Slopes of lines around it are between the ends of `slopes`, and near that of a chord whose ends are `inset` by this
+    share of a range: the best one where the function is convex has none.
     """
+
+    inset = ZERO
 
     def __init__(self, name: str, slopes: tuple[arb, arb], turns: Turns) -> None:
         self.name, self.slopes, self.known_turns = name, slopes, turns
@@ -42,8 +45,8 @@ class BySeries(Function):
         """phi^(k)/k! on a ball, for k below a count."""
 
     @abstractmethod
-    def largest(self, k: int, y: arb) -> arb:
-        """A bound of |phi^(k)| on a ball, k from 1 to 4; NaN without one."""
+    def largest(self, k: int, y: arb, reach: arb = ZERO) -> arb:
+        """A bound of |phi^(k)| within a reach of all numbers of a ball, k from 1 to 4; NaN without one."""
 
     @abstractmethod
     def value(self, y: arb) -> arb:
@@ -65,7 +68,8 @@ class BySeries(Function):
     def line(self, middle: arb, reach: arb) -> Line:
         lo, hi = arb((middle - reach).lower()), arb((middle + reach).upper())
         at_lo, at_hi = self.value(lo), self.value(hi)
-        slope = chord(lo, hi, at_lo, at_hi)
+        a, b = lo + self.inset * (hi - lo), hi - self.inset * (hi - lo)
+        slope = chord(a, b, self.value(a), self.value(b)) if self.inset > 0 else chord(lo, hi, at_lo, at_hi)
         if not slope.is_finite():  # on a point
             slope = self.series(lo, 2)[1].mid()
         slope = limited(slope if slope.is_finite() else ONE, *self.slopes)
@@ -101,19 +105,21 @@ class Smooth(BySeries):
     def value(self, y: arb) -> arb:
         return self.series(y, 1)[0]
 
-    def largest(self, k: int, y: arb) -> arb:
-        return lesser(math.factorial(k) * abs(self.series(y, k + 1)[k]), self.bounds[k])
+    def largest(self, k: int, y: arb, reach: arb = ZERO) -> arb:
+        return lesser(math.factorial(k) * top(self.series(y + reach * SPREAD, k + 1)[k]), self.bounds[k])
 
     def third(self, y: arb, at: Four, reach: arb) -> arb:
-        return lesser(abs(at[3]) + self.bounds[4] * reach, self.largest(3, y + reach * SPREAD))
+        return lesser(top(at[3]) + self.bounds[4] * reach, self.largest(3, y, reach))
 
     def fourth(self, y: arb, at: Four, reach: arb) -> arb:
-        here = 24 * abs(self.series(y.mid(), 5)[4]) + self.bounds[5] * (y.rad() + reach)
-        return lesser(here, self.largest(4, y + reach * SPREAD))
+        here = 24 * top(self.series(y.mid(), 5)[4]) + self.bounds[5] * (y.rad() + reach)
+        return lesser(here, self.largest(4, y, reach))
 
 
 class Bumpy(Smooth):
     """A smooth function of which no formula tells where phi' has a given value: turns are found in parts of a range."""
+
+    inset = ONE / 16
 
     def __init__(self, name: str, formula: Formula, bounds: Sequence[int]) -> None:
         super().__init__(name, formula, fmpq(0), bounds, ONE, lambda slope: ())
@@ -129,13 +135,13 @@ class Bumpy(Smooth):
         value, steep, bend = self.series(mid, 3)
         steep -= slope
         bent = self.bent(mid, radius, bend)
-        if abs(steep) > 2 * abs(bent) * radius:
+        if abs(steep) > 2 * top(bent) * radius:
             return []
         if bent > 0 or bent < 0:
             return [self.turn(slope, lo, hi, mid - (steep / (2 * bend)).mid(), bool(bent > 0))]
         here = value - slope * mid
         if halvings == 0:
-            far = lesser(abs(steep) + abs(bent) * radius, abs(slope) + self.bounds[1]) * radius
+            far = lesser(abs(steep) + top(bent) * radius, abs(slope) + self.bounds[1]) * radius
             return [(mid, here - far), (mid, here + far)]
         halves = ((lo, mid), (mid, hi))
         return [(mid, here), *(turn for ends in halves for turn in self.turns_of_part(slope, *ends, halvings - 1))]
@@ -153,11 +159,12 @@ class Bumpy(Smooth):
             y = limited(guess, lo, hi) if guess.is_finite() else lo
             value, steep, bend = self.series(y, 3)
             steep -= slope
-            far = abs(steep) * (hi - y).max(y - lo)
-            if far < CLOSE * abs(bend) * (hi - lo) * (hi - lo):
+            ends = steep * (lo - y), steep * (hi - y)
+            far = ends[0].min(ends[1]) if convex else ends[0].max(ends[1])
+            if abs(far) < CLOSE * abs(bend) * (hi - lo) * (hi - lo):
                 break
             guess = (y - steep / (2 * bend)).mid()
-        return y, value - slope * y + (-far if convex else far)
+        return y, value - slope * y + far
 
 
 class Cornered(BySeries):
@@ -174,8 +181,10 @@ class Cornered(BySeries):
         exact: Callable[[fmpq], fmpq | None],
         least: arb,
         turns: Turns,
+        inset: arb = ZERO,
     ) -> None:
         super().__init__(name, (least, ONE), turns)
+        self.inset = inset
         self.left, self.right, self.at, self.of_rational = left, right, value, exact
         self.undefined = f"{name} of what may vanish"
 
@@ -190,8 +199,10 @@ class Cornered(BySeries):
             return coefficients(self.right if y > 0 else self.left, y, count)
         return [UNKNOWN] * count
 
-    def largest(self, k: int, y: arb) -> arb:
-        size = arb(y.abs_lower())
+    def largest(self, k: int, y: arb, reach: arb = ZERO) -> arb:
+        size = arb((arb(y.abs_lower()) - reach).lower())
+        if not size > 0:
+            return UNKNOWN
         return math.factorial(k) * abs(self.series(size if y > 0 else -size, k + 1)[k])
 
     def third(self, y: arb, at: Four, reach: arb) -> arb | None:
@@ -201,8 +212,13 @@ class Cornered(BySeries):
         return self.near(4, y, reach)
 
     def near(self, k: int, y: arb, reach: arb) -> arb | None:
-        bound = self.largest(k, y + reach * SPREAD)
+        bound = self.largest(k, y, reach)
         return bound if bound.is_finite() else None
+
+
+def top(v: arb) -> arb:
+    """The largest magnitude in a ball."""
+    return arb(v.abs_upper())
 
 
 def lesser(a: arb, b: arb) -> arb:

@@ -101,11 +101,12 @@ ROWS: tuple[Function, ...] = (
         lambda q: q / (1 + abs(q)),
         ZERO,
         turns_of_softsign,
+        ONE / 16,
     ),
     Smooth("sigmoid", sigmoid, fmpq(1, 2), (250_000, 97_000, 125_000, 128_125, 250_000), QUARTER, turns_of_sigmoid),
     Smooth("softplus", softplus, None, (10**6, 250_000, 97_000, 125_000, 128_125), ONE, turns_of_softplus),
-    Bumpy("silu", silu, (1_100_000, 510_000, 310_000, 510_000, 660_000)),
-    Bumpy("gelu", gelu, (1_130_000, 800_000, 780_000, 1_600_000, 2_850_000)),
-    Bumpy("mish", mish, (1_090_000, 650_000, 590_000, 1_110_000, 2_240_000)),
+    Bumpy("silu", silu, (1_100_000, 500_100, 308_300, 500_100, 658_200)),
+    Bumpy("gelu", gelu, (1_129_000, 798_000, 778_900, 1_596_000, 2_843_000)),
+    Bumpy("mish", mish, (1_088_600, 644_300, 588_500, 1_101_200, 2_233_500)),
 )
 FUNCTIONS: dict[str, Function] = {row.name: row for row in ROWS}
