@@ -12,15 +12,16 @@ from functools import cached_property
 
 from flint import arb, arb_mat
 
-from .balls import ONE, ZERO, derivatives, norm, third, total
+from .balls import ONE, ZERO, norm, total
 from .expressions import Call
+from .lines import Line, clipped
 from .networks import Affine, Clip, Concat, Map, Network, Observe, Sum
 from .refusal import Refused
+from .table import FUNCTIONS
 from .taylor import Taylor, constant
 
 Form = tuple[arb, list[arb], arb]  # mid + slopes.d within an error
 Rows = list[list[arb]]  # for each entry of a vector a number for each leaf
-Line = tuple[arb, arb, arb]  # slope, shift and gap
 COLUMNS, WIDE = 48, 64  # of a product; networks from this width on take more of them at once without loss
 
 
@@ -144,7 +145,7 @@ class OnBoxes:
     def line(self, kind: str | tuple[arb, arb], middle: arb, reach: arb, leaf: int) -> Line:
         if not isinstance(kind, str):
             return clipped(middle - reach, middle + reach, *kind)
-        result = tanh_between(middle - reach, middle + reach) if kind == "tanh" else tangent(kind, middle, reach)
+        result = FUNCTIONS[kind].line(middle, reach)
         if result is None:
             self.undefined.add(leaf)
             return ZERO, ZERO, arb("nan")
@@ -293,63 +294,6 @@ def max_of(values: Sequence[arb]) -> arb:
         if not v <= result:
             result = v if v >= result else result.max(v)
     return arb(result.upper())
-
-
-# ------------------------------------------------------------------------- lines: |phi(y) - slope y - shift| <= gap
-
-
-def tangent(name: str, middle: arb, reach: arb) -> Line | None:
-    """The tangent in the middle of |y - middle| <= reach; None where the function may be undefined."""
-    value, slope, second, at = derivatives(name, middle)
-    most = third(name, at, middle, reach)
-    if most is None:
-        return None
-    return slope, value - slope * middle, abs(second) / 2 * reach * reach + most / 6 * reach**3
-
-
-def tanh_between(lo: arb, hi: arb) -> Line:
-    """tanh on [lo, hi]; the slope is near the chord's.
-
-    The extrema of tanh(y) - slope y are at the ends or where tanh(y)^2 = 1 - slope; a point that may lie in [lo, hi]
-    counts, and one that does not lie there can only make the gap too wide. A ball for an end holds the end.
-    """
-    at_lo, at_hi = lo.tanh(), hi.tanh()
-    slope = ((at_hi - at_lo) / (hi - lo)).mid()
-    if not (slope > 0 and slope < 1):
-        on_a_point = not slope.is_finite()  # where there is no chord
-        slope = (1 - at_lo * at_lo).mid() if on_a_point else ONE if slope > 0 else ZERO
-    first, last = at_lo - slope * lo, at_hi - slope * hi
-    top, bottom = (last, first) if first < last else (first, last) if last < first else (first.union(last),) * 2
-    if slope > 0:
-        t = (1 - slope).sqrt()
-        y = t.atanh() if slope > 1e-9 else ((1 + t) / slope.sqrt()).log()  # of t near 1 it asks for 1 - t
-        value = t - slope * y
-        if not (y < lo or y > hi):
-            top, bottom = value if value > top else top.max(value), bottom if bottom < value else bottom.min(value)
-        if not (-y < lo or -y > hi):
-            top, bottom = top if top > -value else top.max(-value), -value if -value < bottom else bottom.min(-value)
-    return slope, (top + bottom) / 2, (top - bottom) / 2
-
-
-def clipped(first: arb, last: arb, lo: arb, hi: arb) -> Line:
-    """min(max(y, lo), hi) on [first, last].
-
-    It is y where y certainly lies between them. Else it lies between two lines of a slope from 0 to 1: clip(y) - slope
-    y rises between lo and hi and falls elsewhere, so it is least and greatest at the ends of the range of y, at lo or
-    at hi; a corner that is certain to lie outside of the range does not count.
-    """
-    first, last = arb(first.lower()), arb(last.upper())
-    if first >= lo and last <= hi:
-        return ONE, ZERO, ZERO
-    ends = first.max(lo).min(hi), last.max(lo).min(hi)
-    slope = ((ends[1] - ends[0]) / (last - first)).mid() if first < last else ZERO
-    slope = ZERO if slope < 0 else ONE if slope > 1 else slope
-    away = [ends[0] - slope * first, ends[1] - slope * last]
-    away += [(1 - slope) * corner for corner in (lo, hi) if not (corner < first or corner > last)]
-    top = bottom = away[0]
-    for v in away[1:]:
-        top, bottom = top.max(v), bottom.min(v)
-    return slope, (top + bottom) / 2, (top - bottom) / 2
 
 
 def clip(y: Form, lo: arb, hi: arb) -> Form:

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 from flint import arb, arb_mat
 
-from .balls import SPREAD, ZERO, derivatives, fourth, identity, largest_fourth, total
+from .balls import SPREAD, ZERO, identity, total
 from .lipschitz import beyond_linear, beyond_square
 from .refusal import Refused
+from .rows import Four
 from .symmetric import linear_times_square, no_form
+from .table import FUNCTIONS
 
 if TYPE_CHECKING:
     from .model import Model
-
-Four = tuple[arb, arb, arb, arb]
 
 
 @dataclass(frozen=True)
@@ -45,12 +45,6 @@ class Expansion:
         return abs(self.at[3]) + self.moved[3]
 
 
-def coefficients(name: str, y: arb) -> Four:
-    """phi, phi', phi''/2 and phi'''/6 on a ball."""
-    value, first, second, third = derivatives(name, y)
-    return value, first, second / 2, third / 6
-
-
 @dataclass(frozen=True)
 class Beyond:
     """The part of a number beyond its tangent, d'Hd + C[d] within d'Rd; `lip`, if needed, is a constant of the rest."""
@@ -63,8 +57,6 @@ class Beyond:
 
 def function_of(v: Model, name: str) -> Model:
     """The model of phi of v."""
-    if name == "abs":
-        return absolute(v)
     phi = expansion(v, name)
     beyond, (off, slack) = beyond_tangent(v, phi), unsure(v, phi)
     value, p, half, _ = phi.at
@@ -73,13 +65,6 @@ def function_of(v: Model, name: str) -> Model:
     lip = None if v.lip is None or beyond.lip is None else abs(p) * v.lip + beyond.lip
     Q, K, E = p * v.Q + beyond.H, p * v.K + beyond.C, abs(p) * v.E + beyond.R
     return replace(v, v=value, a=p * v.a, Q=Q, K=K, E=E, B=B, dv=dv, da=da, lip=lip, off=off, slack=slack)
-
-
-def absolute(v: Model) -> Model:
-    sign = v.sign()
-    if not sign:
-        raise Refused("local", "ball", "abs of what may vanish")
-    return v if sign > 0 else -v
 
 
 def unsure(v: Model, phi: Expansion) -> tuple[arb, arb]:
@@ -96,18 +81,19 @@ def expansion(v: Model, name: str) -> Expansion:
 
     Whoever asked for the ball knows the rule and the place of a refusal, and puts them into it.
     """
-    at = there = coefficients(name, v.v)
+    row = FUNCTIONS[name]
+    at = there = row.derivatives(v.v)
     anywhere, moved = v.v, (ZERO, ZERO, ZERO, ZERO)
     if not v.doubt.is_zero():
         anywhere += v.doubt * SPREAD
-        there = coefficients(name, anywhere)
+        there = row.derivatives(anywhere)
         a, b, c, d = (arb((p - q).abs_upper()) for p, q in zip(there, at, strict=True))
-        moved = a, b, c, d
-    most, last = (bound(name, there[0], anywhere, v.radius) for bound in (fourth, largest_fourth))
+        moved = a, b, c / 2, d / 6
+    most, last = row.fourth(anywhere, there, v.radius), row.last(anywhere, there, v.radius)
     if most is None or last is None:
-        what = "a root of what may not be positive" if name == "sqrt" else "a division by what may be 0"
-        raise Refused("local", "ball", what)
-    return Expansion(at, moved, most / 24, last / 6)
+        raise Refused("local", "ball", row.undefined)
+    value, first, second, third = at
+    return Expansion((value, first, second / 2, third / 6), moved, most / 24, last / 6)
 
 
 def beyond_tangent(v: Model, phi: Expansion) -> Beyond:

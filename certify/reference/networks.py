@@ -19,11 +19,13 @@ from typing import Any, ClassVar, Protocol
 from flint import arb, arb_mat
 
 from .balls import absolute, norm, spectral_norm
-from .expressions import PLAIN, Equations, equations
+from .expressions import Equations, equations
 from .fields import IDENTIFIER, MAX_NAMES, entries, keys, little_endian, numbers
 from .refusal import require
+from .table import FUNCTIONS
 
 MAX_NETWORKS, MAX_STEPS, MAX_WIDTH = 64, 256, 2**14
+MAPS = tuple(name for name in FUNCTIONS if name not in ("1/", "abs"))  # these two are for expressions
 
 
 @dataclass(frozen=True)
@@ -250,8 +252,8 @@ def read_affine(step: Mapping[str, Any], at: str, of: tuple[int, ...], sizes: Se
 
 def read_map(step: Mapping[str, Any], at: str, of: tuple[int, ...], sizes: Sequence[int]) -> Map:
     function = step["function"]
-    known = isinstance(function, str) and function in PLAIN
-    require(known, "format", f"{at}.function", f"one of {', '.join(PLAIN)} was expected")
+    known = isinstance(function, str) and function in MAPS
+    require(known, "format", f"{at}.function", f"one of {', '.join(MAPS)} was expected")
     return Map(of, sizes[0], function)
 
 

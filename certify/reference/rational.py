@@ -17,6 +17,7 @@ from .expressions import MAX_BITS, Call
 from .fields import exact
 from .networks import Affine, Clip, Concat, Map, Observe, Sum
 from .refusal import Refused, require
+from .table import FUNCTIONS
 
 MAX_MATRIX_BITS = 2**16  # of a numerator over a common denominator, times rows: beyond it a decision takes minutes
 ZERO = fmpq(0)
@@ -137,18 +138,8 @@ class Exact:
     def function(self, name: str) -> Exact:
         if self.value is None:
             return UNTOLD
-        if name == "1/":
-            require(bool(self.value != 0), "equilibrium", "dynamics", "a division by 0")
-            return Exact(1 / self.value)
-        if name == "sqrt":
-            numerator, denominator = int(self.value.p), int(self.value.q)
-            require(numerator > 0, "equilibrium", "dynamics", "sqrt of what is not positive")
-            roots = math.isqrt(numerator), math.isqrt(denominator)
-            square = roots[0] ** 2 == numerator and roots[1] ** 2 == denominator
-            return Exact(fmpq(*roots)) if square else UNTOLD
-        if name == "abs":
-            return Exact(abs(self.value))
-        return UNTOLD if self.value != 0 else Exact(fmpq(name in ("cos", "exp")))
+        value = FUNCTIONS[name].exact(self.value)
+        return UNTOLD if value is None else Exact(value)
 
     def between(self, lo: fmpq, hi: fmpq) -> Exact:
         """min(max(v, lo), hi)."""

@@ -11,8 +11,10 @@ from functools import cache
 
 from flint import arb, arb_mat, fmpq
 
-from .balls import ONE, SPREAD, ZERO, derivatives, largest_fourth, third, total
+from .balls import ONE, SPREAD, ZERO, total
 from .refusal import Refused
+from .rows import Function
+from .table import FUNCTIONS
 
 HALF = ONE / 2
 LITTLE = ONE / 2**30
@@ -145,29 +147,23 @@ class Taylor:
         return 1 if self.c > self.reach else -1 if -self.c > self.reach else 0
 
     def function(self, name: str) -> Taylor:
-        """phi of the model."""
-        if name == "abs":
-            return self.absolute()
-        at = derivatives(name, self.c)
-        return self.expanded(name, at[:3], third(name, at[3], self.c, self.reach))
+        """phi of the model; where it may have a corner the line in the middle between two, and how far these are."""
+        row = FUNCTIONS[name]
+        at = row.derivatives(self.c)
+        most = row.third(self.c, at, self.reach)
+        between = row.line(self.c, self.reach) if most is None and row.cornered else None
+        if between is None:
+            return self.expanded(row, at[:3], most)
+        slope, shift, gap = between
+        return (self.scaled(slope) + Taylor(shift)).widened(gap)
 
     def slope_of(self, name: str) -> Taylor:
         """phi' of the model: its third derivative is the fourth of phi."""
-        at = derivatives(name, self.c)
-        return self.expanded(name, at[1:], largest_fourth(name, at[0], self.c, self.reach))
+        row = FUNCTIONS[name]
+        at = row.derivatives(self.c)
+        return self.expanded(row, at[1:], row.last(self.c, at, self.reach))
 
-    def absolute(self) -> Taylor:
-        """s v + shift within gap where the sign is not certain, s the chord's slope: |v| - s v is least at 0."""
-        sign = self.sign()
-        if sign:
-            return self if sign > 0 else -self
-        lo, hi = arb((self.c - self.reach).lower()), arb((self.c + self.reach).upper())
-        s = ((abs(hi) - abs(lo)) / (hi - lo)).mid() if hi > lo else ZERO
-        s = s.max(-ONE).min(ONE)
-        gap = (abs(lo) - s * lo).max(abs(hi) - s * hi) / 2
-        return (self.scaled(s) + Taylor(gap)).widened(gap)
-
-    def expanded(self, name: str, at: Sequence[arb], most: arb | None) -> Taylor:
+    def expanded(self, row: Function, at: Sequence[arb], most: arb | None) -> Taylor:
         """phi(c) + phi'(c) e + phi''(c) e^2 / 2 + phi'''(.) e^3 / 6 with e the model less its constant c.
 
         `at` has the first three of these, `most` is a bound of |phi'''|, or None where phi may be undefined.
@@ -176,15 +172,11 @@ class Taylor:
         rest = second + self.r
         reach = first + rest
         if most is None:
-            raise Refused(
-                "ring",
-                "leaf",
-                "a root of what may not be positive" if name == "sqrt" else "a division by what may be 0",
-            )
+            raise Refused("ring", "leaf", row.undefined)
         half = at[2] / 2
         r = abs(at[1]) * self.r + abs(half) * (2 * first * rest + rest * rest) + most * reach**3 / 6
         Q = mix(at[1], self.Q, ZERO, None)
-        if self.g is not None:
+        if self.g is not None and not half.is_zero():
             Q = plus(Q, self.g.transpose() * (self.g * half))
         return Taylor(at[0], mix(at[1], self.g, ZERO, None), Q, r)
 

@@ -16,7 +16,7 @@ import pytest
 from flint import arb, arb_mat, ctx
 
 from certify.reference.__main__ import as_json, in_words
-from certify.reference.balls import PRECISION, derivatives, fourth, largest_fourth
+from certify.reference.balls import PRECISION
 from certify.reference.contraction import contracts
 from certify.reference.decrease import whatever_y
 from certify.reference.document import read
@@ -27,6 +27,7 @@ from certify.reference.model import Model
 from certify.reference.rational import identity
 from certify.reference.refusal import Refused
 from certify.reference.rules import judge as whole_verdict
+from certify.reference.table import FUNCTIONS as ROWS
 from tests.reference.test_flow import FUNCTIONS, document
 from tests.reference.test_practical import scalar
 from tests.support.balls import around, exactly, square
@@ -167,20 +168,21 @@ def test_trajectories_that_part_at_the_edge(name: str, weight: float) -> None:
 def test_the_largest_fourth_derivative(name: str) -> None:
     """What the slope of the cubic leaves, |phi' - p - q D - r D^2/2|, is within m |D|^3 / 6, up to the edge."""
     generator = np.random.default_rng(4)
+    row = ROWS[name]
     with ctx.workprec(PRECISION):
         for _ in range(40):
             c, share = generator.uniform(0.2, 3.0), generator.uniform(0.01, 0.999)
             centre, reach = arb(c), arb(c * share)
-            at_c = derivatives(name, centre)
-            most, other = largest_fourth(name, at_c[0], centre, reach), fourth(name, at_c[0], centre, reach)
+            at_c = row.derivatives(centre)
+            most, other = row.last(centre, at_c, reach), row.fourth(centre, at_c, reach)
             assert most is not None and other is not None and not most < other
             for part in (-0.999999, -0.5, 1e-3, 0.7, 0.999999):
                 D = reach * part
-                slope = derivatives(name, centre + D)[1]
+                slope = row.derivatives(centre + D)[1]
                 left = abs(slope - at_c[1] - at_c[2] * D - at_c[3] * D * D / 2)
                 assert not left > most / 6 * abs(D) ** 3
-        assert largest_fourth("1/", arb(1), arb(1), arb(1)) is None
-        assert largest_fourth("sqrt", arb(1), arb(1), arb(2)) is None
+        assert ROWS["1/"].last(arb(1), (arb(1),) * 4, arb(1)) is None
+        assert ROWS["sqrt"].last(arb(1), (arb(1),) * 4, arb(2)) is None
 
 
 # --------------------------------------------------------------------------------------------------------- the constant

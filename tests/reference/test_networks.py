@@ -26,7 +26,7 @@ from certify.reference.rational import Exact, Exactly
 from certify.reference.refusal import Refused
 from certify.reference.tangents import OnBall
 from certify.reference.taylor import Taylor, constant
-from tests.checker.test_networks import SEEDS, Numbers, a_network, hash_of
+from tests.checker.test_networks import SEEDS, Numbers, a_network, has_corners, hash_of
 from tests.support.certificates import dump, encode, make
 from tests.support.earlier import newer
 from tests.support.models import curved, form, linear
@@ -125,7 +125,7 @@ def test_a_value_lies_within_its_model_on_a_ball(seed: int, unsure: bool) -> Non
         try:
             models, units = algebra.results(read(net).run(algebra, algebra.first), [1, 0])
         except Refused:
-            assert "Clip" in {type(s).__name__ for s in net.steps} or seed % 3 == 0
+            assert has_corners(net) or seed % 3 == 0
             return
         assert units.L.nrows() == 2
     for _ in range(30):
@@ -172,8 +172,12 @@ def test_models_in_rows_hold_values_and_their_rates(seed: int) -> None:
             for i in (0, 1)
         ]
         models = Models(Claimed(), ("x", "y"))  # type: ignore[arg-type]
-        value, rate = models.moving(x, [Taylor(arb(float(v))) for v in F])
-        alone, lined = models.value(x), models.by_forms(x)
+        alone, lined, rate = models.value(x), models.by_forms(x), None
+        value = alone
+        try:
+            value, rate = models.moving(x, [Taylor(arb(float(v))) for v in F])
+        except Refused:
+            assert has_corners(net)
     for _ in range(30):
         d = rng.uniform(-1, 1, 2)
 
@@ -184,7 +188,7 @@ def test_models_in_rows_hold_values_and_their_rates(seed: int) -> None:
         assert (
             holds(value, d, true(at), 1e-12) and holds(alone, d, true(at), 1e-12) and holds(lined, d, true(at), 1e-12)
         )
-        assert holds(rate, d, (true(at + 1e-6 * F) - true(at - 1e-6 * F)) / 2e-6, 1e-7)
+        assert rate is None or holds(rate, d, (true(at + 1e-6 * F) - true(at - 1e-6 * F)) / 2e-6, 1e-7)
 
 
 def holds(model: Taylor, d: Array, value: float, tolerance: float) -> bool:

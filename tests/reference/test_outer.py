@@ -18,13 +18,14 @@ from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from certify.reference import outer, rules
 from certify.reference.__main__ import in_words
-from certify.reference.balls import PRECISION, bounded_by_form, derivatives, largest_fourth, within_bounds
+from certify.reference.balls import PRECISION, bounded_by_form, within_bounds
 from certify.reference.document import Certificate, read
 from certify.reference.evidence import Tree
 from certify.reference.function import Models
 from certify.reference.leaves import Box
 from certify.reference.outer import Region, binary64_above
 from certify.reference.refusal import Refused
+from certify.reference.table import FUNCTIONS
 from certify.reference.taylor import Taylor
 from tests.reference.test_contraction import honest as around_a_level
 from tests.reference.test_practical import practical
@@ -689,12 +690,12 @@ def test_the_slope_of_a_function_as_a_function(name: str) -> None:
                 with pytest.raises(Refused):
                     x.slope_of(name)
                 continue
-            slope, p = x.slope_of(name), derivatives(name, y)
-            most = largest_fourth(name, p[0], y, arb(reach))
+            slope, p = x.slope_of(name), FUNCTIONS[name].derivatives(y)
+            most = FUNCTIONS[name].last(y, p, arb(reach))
             assert most is not None
             for share in np.linspace(-1, 1, 9):
                 v = y + arb(share * reach)
-                true = derivatives(name, v)[1]
+                true = FUNCTIONS[name].derivatives(v)[1]
                 rest = true - p[1] - p[2] * (v - y) - p[3] * (v - y) ** 2 / 2
                 assert not abs(rest) > most * abs(v - y) ** 3 / 6
                 assert not abs(true - exactly_at(slope, [share])) > slope.r

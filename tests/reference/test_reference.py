@@ -27,14 +27,16 @@ from certify.analysis.run import RoaOptions, certify_roa
 from certify.certificates.verdict import Verdict
 from certify.loop.plants import get_system
 from certify.loop.policies import load_policy
-from certify.reference import affine, balls, leaves, local, rational
+from certify.reference import balls, leaves, local, rational
 from certify.reference.document import Certificate
 from certify.reference.document import read as read_certificate
 from certify.reference.evidence import Ball, Tree
 from certify.reference.fields import exact
+from certify.reference.lines import tanh_between
 from certify.reference.loop import Loop
 from certify.reference.model import Model
 from certify.reference.refusal import Refused
+from certify.reference.table import FUNCTIONS
 from certify.reference.tangents import Policy
 from tests.checker.test_format import NOT_A_HEX_FLOAT, NOT_A_RATIONAL, NOT_BASE64, NOT_IN_THE_GRAMMAR, RAW, SHAPES
 from tests.checker.test_rules import (
@@ -386,7 +388,7 @@ def test_it_leaves_the_document_and_the_precision_as_they_are() -> None:
 @example(-3.0, 1e-12)
 def test_a_tanh_lies_between_its_two_lines(lo: float, width: float) -> None:
     with ctx.workprec(160):
-        slope, shift, gap = affine.tanh_between(arb(lo), arb(lo + width))
+        slope, shift, gap = tanh_between(arb(lo), arb(lo + width))
         for t in np.linspace(0, 1, 33).tolist():
             y = arb(lo) + arb(t) * (arb(lo + width) - arb(lo))
             assert abs(y.tanh() - slope * y - shift) <= arb((gap * (1 + arb(2) ** -100)).upper() + arb(2) ** -140)
@@ -526,8 +528,8 @@ def test_the_fourth_derivative_is_bounded(name: str) -> None:
             c, reach = float(generator.uniform(-4, 4)), float(np.exp(generator.uniform(-9, 1.5)))
             if name == "sqrt" or (name == "1/" and abs(c) <= reach):
                 c = reach * float(1 + np.exp(generator.uniform(-9, 2))) * (1 if name == "sqrt" else np.sign(c))
-            at = balls.derivatives(name, arb(c))
-            most = balls.fourth(name, at[0], arb(c), arb(reach))
+            at = FUNCTIONS[name].derivatives(arb(c))
+            most = FUNCTIONS[name].fourth(arb(c), at, arb(reach))
             assert most is not None
             for D in [-reach, reach, *(reach * generator.uniform(-1, 1, 8))]:
                 v = arb(c) + arb(float(D))
@@ -552,7 +554,7 @@ def test_the_fourth_derivative_is_bounded(name: str) -> None:
     ],
 )
 def test_what_may_be_undefined_has_no_fourth_derivative(name: str, at_0: float, reach: float) -> None:
-    assert balls.fourth(name, arb(1), arb(at_0), arb(reach)) is None
+    assert FUNCTIONS[name].fourth(arb(at_0), (arb(1),) * 4, arb(reach)) is None
     with pytest.raises(Refused, match="local"):
         model(at_0, [reach], [[0.0]], [[0.0]]).function(name)
 

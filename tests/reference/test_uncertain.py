@@ -10,7 +10,7 @@ import pytest
 from flint import arb, arb_mat, ctx, fmpq
 
 from certify.reference.__main__ import in_words
-from certify.reference.balls import PRECISION, derivatives, third
+from certify.reference.balls import PRECISION
 from certify.reference.document import Certificate
 from certify.reference.document import read as read_certificate
 from certify.reference.leaves import Box, Leaves
@@ -20,6 +20,7 @@ from certify.reference.model import Model
 from certify.reference.rational import coordinates
 from certify.reference.refusal import Refused
 from certify.reference.rules import judge as whole_verdict
+from certify.reference.table import FUNCTIONS
 from certify.reference.taylor import Taylor
 from tests.checker.test_ball import points
 from tests.checker.test_uncertain import HONEST, Edit, forgeries, honest, in_arb, wider
@@ -121,23 +122,24 @@ def test_functions_of_wide_balls(name: str) -> None:
     """All derivatives and the bound of the third at every number of the ball."""
     for lo, hi in ((fmpq(1, 3), fmpq(4)), (fmpq(5, 4), fmpq(2)), (fmpq(1), fmpq(1, 1) + fmpq(1, 2**40))):
         wide, reach = spanning((lo, hi)), arb(fmpq(1, 5))
-        found, most = derivatives(name, wide), None
-        most = third(name, found[3], wide, reach)
+        row = FUNCTIONS[name]
+        found = row.derivatives(wide)
+        most = row.third(wide, found, reach)
         assert most is not None and most.is_finite()
         for k in range(9):
             y = arb(lo + (hi - lo) * k / 8)
-            single = derivatives(name, y)
+            single = row.derivatives(y)
             assert all(a.overlaps(b) for a, b in zip(single, found, strict=True))
             for shift in (-0.1999, -0.1, 0, 0.1, 0.1999):
                 v = y + arb(shift)
-                left = abs(derivatives(name, v)[0] - single[0] - single[1] * shift - single[2] * arb(shift) ** 2 / 2)
+                left = abs(row.derivatives(v)[0] - single[0] - single[1] * shift - single[2] * arb(shift) ** 2 / 2)
                 assert not left > most * abs(arb(shift)) ** 3 / 6
 
 
 @pytest.mark.parametrize("ends", [(fmpq(-1), fmpq(2)), (fmpq(0), fmpq(2)), (fmpq(-2), fmpq(0))])
 def test_a_wide_ball_with_0_in_it_has_no_inverse_and_no_root(ends: tuple[fmpq, fmpq]) -> None:
     wide = spanning(ends)
-    assert third("1/", arb(0), wide, arb(0)) is None and third("sqrt", arb(0), wide, arb(0)) is None
+    assert all(FUNCTIONS[name].third(wide, (arb(0),) * 4, arb(0)) is None for name in ("1/", "sqrt"))
 
 
 def test_cells_cover_the_ranges_exactly() -> None:
