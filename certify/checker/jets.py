@@ -247,7 +247,7 @@ class Jet:
         H, C, R = self.beyond_tangent(phi)
         c, a, c_y, a_y = f0, self.a * f1, self.c_y * f1, self.a_y * f1
         if self.c_y.value.size:
-            c, a, c_y, a_y = self._by_y(name, phi)
+            c, a, c_y, a_y = self._by_y(name)
         E = times(self.E, f1.size) + R
         lip = f1.size * self.lip + self.lip_beyond_tangent(phi)
         return Jet(c, a, self.Q * f1 + H, self.K * f1 + C, E, self.B * f1, self.units, c_y, a_y, lip)
@@ -280,14 +280,14 @@ class Jet:
         found: Above = squares + cubes + phi.last * (self.radius * self.radius * self.radius) * (s + L)
         return found
 
-    def _by_y(self, name: str, phi: Expansion) -> tuple[Near, Vector, Near, Vector]:
+    def _by_y(self, name: str) -> tuple[Near, Vector, Near, Vector]:
         """c, a, c_y and a_y of phi(v).
 
         With delta = v(0) - c, phi(v(0)) is phi(c) + phi'(c) delta within sup|phi''|/2 delta^2, and phi'(v(0)) is
         phi'(c) + phi''(c) delta within sup|phi'''|/2 delta^2, the suprema over all that v(0) may be.
         """
         f0, f1, half, _ = FUNCTIONS[name].expansion(Near(self.c.value), ZERO).f
-        _, _, bent, twisted = (f.size for f in phi.f)
+        _, _, bent, twisted = (f.size for f in FUNCTIONS[name].expansion(self.v0, ZERO).f)
         off, twice = self.v0.error, half * 2
         c = f0.wider(f1.size * self.c.error + bent * (off * off))
         moved = f1.wider(twice.size * self.c.error + twisted * (off * off) * 3)  # phi' at y = 0

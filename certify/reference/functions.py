@@ -31,6 +31,15 @@ class Expansion:
     moved: Four
     fourth: arb
     last: arb
+    cut: bool = False
+
+    @cached_property
+    def flat(self) -> Expansion:
+        """Without the second and third derivative where it is cut by a corner on the ball: there phi is within fourth
+        radius^2 D^2 of its tangent."""
+        if not self.cut:
+            return self
+        return replace(self, at=(*self.at[:2], ZERO, ZERO), moved=(*self.moved[:2], ZERO, ZERO), cut=False)
 
     @cached_property
     def steepest(self) -> arb:
@@ -90,10 +99,14 @@ def expansion(v: Model, name: str) -> Expansion:
         a, b, c, d = (arb((p - q).abs_upper()) for p, q in zip(there, at, strict=True))
         moved = a, b, c / 2, d / 6
     most, last = row.fourth(anywhere, there, v.radius), row.last(anywhere, there, v.radius)
-    if most is None or last is None:
-        raise Refused("local", "ball", row.undefined)
     value, first, second, third = at
-    return Expansion((value, first, second / 2, third / 6), moved, most / 24, last / 6)
+    series = value, first, second / 2, third / 6
+    if most is not None and last is not None:
+        return Expansion(series, moved, most / 24, last / 6)
+    corner = row.corner(anywhere)
+    if corner is None:
+        raise Refused("local", "ball", row.undefined)
+    return Expansion(series, moved, corner[0] / (v.radius * v.radius), corner[1], cut=True)
 
 
 def beyond_tangent(v: Model, phi: Expansion) -> Beyond:
@@ -103,7 +116,7 @@ def beyond_tangent(v: Model, phi: Expansion) -> Beyond:
     left of z in 2 h y z and for h z^2; g D^3 is g y^3 but for g z (3 y^2 + 3 y z + z^2); and D^4 is at most
     radius^2 (y^2 + (2 |y| + |z|) |z|). Here phi', h, g and a are those at y = 0: by what they differ R is larger.
     """
-    n, slope, curve, a = v.a.nrows(), v.slope, v.curve, v.a
+    n, slope, curve, a, phi = v.a.nrows(), v.slope, v.curve, v.a, phi.flat
     _, _, h, g = phi.at
     outer = a * a.transpose()
     C = no_form(n) if slope.is_zero() else linear_times_square(a, 2 * h * v.Q + g * outer)

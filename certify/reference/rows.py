@@ -54,6 +54,11 @@ class Function(ABC):
         """
         return self.fourth(y, at, reach)
 
+    def corner(self, y: arb) -> tuple[arb, arb] | None:
+        """Where phi has a corner somewhere: it is within the first times D^2 of its tangent at y, and phi' within the
+        second, which may be infinite, times |D|^3 of phi'(y). None if y may be the corner, or there is none."""
+        return None
+
     def line(self, middle: arb, reach: arb) -> Line | None:
         """Lines around phi on |y - middle| <= reach, here the tangent's; None where phi may be undefined."""
         at = self.derivatives(middle)

@@ -182,9 +182,10 @@ class Cornered(BySeries):
         least: arb,
         turns: Turns,
         inset: arb = ZERO,
+        bend: arb | None = None,
     ) -> None:
         super().__init__(name, (least, ONE), turns)
-        self.inset = inset
+        self.inset, self.bend = inset, bend
         self.left, self.right, self.at, self.of_rational = left, right, value, exact
         self.undefined = f"{name} of what may vanish"
 
@@ -204,6 +205,14 @@ class Cornered(BySeries):
         if not size > 0:
             return UNKNOWN
         return math.factorial(k) * abs(self.series(size if y > 0 else -size, k + 1)[k])
+
+    def corner(self, y: arb) -> tuple[arb, arb] | None:
+        """`bend` where phi' has no leap. Where it leaps from the least slope to 1, a number beyond the corner is at
+        least |y| away, and x - y <= x^2 / (4 y)."""
+        least, leap = arb(y.abs_lower()), ONE - self.slopes[0]
+        if not least > 0:
+            return None
+        return (leap / (4 * least), leap / least**3) if self.bend is None else (self.bend, arb("inf"))
 
     def third(self, y: arb, at: Four, reach: arb) -> arb | None:
         return self.near(3, y, reach)

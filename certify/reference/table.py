@@ -92,6 +92,7 @@ ROWS: tuple[Function, ...] = (
         lambda q: q if q >= 0 else None,
         ZERO,
         turns_of_elu,
+        bend=arb(fmpq(1, 2)),
     ),
     Cornered(
         "softsign",
@@ -102,6 +103,7 @@ ROWS: tuple[Function, ...] = (
         ZERO,
         turns_of_softsign,
         ONE / 16,
+        bend=ONE,
     ),
     Smooth("sigmoid", sigmoid, fmpq(1, 2), (250_000, 97_000, 125_000, 128_125, 250_000), QUARTER, turns_of_sigmoid),
     Smooth("softplus", softplus, None, (10**6, 250_000, 97_000, 125_000, 128_125), ONE, turns_of_softplus),
