@@ -14,7 +14,7 @@ from typing import Any
 from flint import arb, arb_mat
 
 from . import affine
-from .balls import ZERO
+from .balls import SPREAD, ZERO
 from .document import Certificate, Function
 from .expressions import Call
 from .networks import Affine, Clip, Concat, Map, Network, Observe, Sum
@@ -95,7 +95,7 @@ def summed(vectors: Sequence[Vector]) -> Vector:
 def net_at_0(c: Certificate) -> list[arb]:
     """The value of the policy's network at x = 0."""
     value: Vector = c.policy.network.run(InRows(), [Taylor(arb(v)) for v in c.policy.origin])
-    return [y.c for y in value]
+    return [y.c + y.r * SPREAD for y in value]
 
 
 def called(call: Call, given: Sequence[Taylor]) -> Vector:
