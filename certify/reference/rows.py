@@ -36,6 +36,10 @@ class Function(ABC):
     def derivatives(self, y: arb) -> Four:
         """phi, phi', phi'', phi''' on a ball."""
 
+    def value(self, y: arb) -> arb:
+        """phi on a ball, also where it has a corner."""
+        return self.derivatives(y)[0]
+
     @abstractmethod
     def third(self, y: arb, at: Four, reach: arb) -> arb | None:
         """Six times a bound of what phi adds to its parabola at y, by |D|^3, for D = v - y, |D| <= reach.

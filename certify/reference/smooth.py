@@ -48,10 +48,6 @@ class BySeries(Function):
     def largest(self, k: int, y: arb, reach: arb = ZERO) -> arb:
         """A bound of |phi^(k)| within a reach of all numbers of a ball, k from 1 to 4; NaN without one."""
 
-    @abstractmethod
-    def value(self, y: arb) -> arb:
-        """phi on a ball, also where it has a corner."""
-
     def derivatives(self, y: arb) -> Four:
         """On a wide ball those of the series, or those in its middle and by how much they change, if that is less."""
         found = self.series(y, 4)

@@ -151,6 +151,8 @@ class Taylor:
         row = FUNCTIONS[name]
         at = row.derivatives(self.c)
         most = row.third(self.c, at, self.reach)
+        if most is None and row.cornered and self.g is None and self.r.is_zero():
+            return Taylor(row.value(self.c))
         between = row.line(self.c, self.reach) if most is None and row.cornered else None
         if between is None:
             return self.expanded(row, at[:3], most)

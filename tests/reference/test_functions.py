@@ -191,6 +191,16 @@ def test_models_on_leaves_hold_the_function(name: str) -> None:
                     assert not abs(truth(name, v, 1)[0] - known) > model.r
 
 
+@pytest.mark.parametrize("name", [*CORNERED, "abs"])
+def test_a_number_near_a_corner_is_a_number(name: str) -> None:
+    """A clip behind it needs one, and so does the policy's value at 0."""
+    with ctx.workprec(PRECISION):
+        found = Taylor(arb(2.0**-40, 2.0**-39)).function(name)
+    assert found.g is None and found.r == 0 and found.c.rad() < 2.0**-38
+    for y in (-(2.0**-40), -(2.0**-41), 2.0**-39, 2.0**-39 + 2.0**-40):
+        assert found.c.overlaps(truth(name, arb(y), 1)[0])
+
+
 @pytest.mark.parametrize("name", [name for name, row in FUNCTIONS.items() if isinstance(row, Smooth)])
 def test_bounds_on_all_of_the_line(name: str) -> None:
     """By Taylor's formula on cells up to 40, and on growing ones beyond. 1/4 and 1/8 are reached, as formulas say."""
