@@ -8,25 +8,26 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from fractions import Fraction
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 from flint import ctx
 
-from certify.checker import contraction, decrease, rules
+from certify.checker import contraction, rules, words
 from certify.checker.case import Case
 from certify.checker.decrease import Models
 from certify.checker.errors import Rejected
-from certify.checker.near import ZERO
 from certify.reference import contraction as other
+from certify.reference.__main__ import in_words
 from certify.reference.balls import PRECISION
 from certify.reference.document import read
 from certify.reference.evidence import Tree
 from certify.reference.loop import Loop
 from certify.reference.refusal import Refused
-from tests.support.balls import around
-from tests.support.certificates import Document, dump, edited, encode, make, parse, verdict
+from tests.support.balls import around, square
+from tests.support.certificates import Document, dump, edited, encode, grow, make, parse, rehash, verdict
 from tests.support.claim_oracle import Loop as Plant
 from tests.support.marks import slow_after
 from tests.support.reference import judge
@@ -106,7 +107,8 @@ SHAPES: dict[str, tuple[Any, float, Callable[[Any], Any], float]] = {  # phi, ra
     "quartic": (["*", "x", "x", "x", "x"], 0.5, lambda x: 4 * x**3, 0.3),
     "line and square": (["-", ["*", "x", "x"], "x"], 1.0, lambda x: 2 * x - 1, 0.9),
     "line and cube": (["-", ["*", "x", "x", "x"], "x"], 1.0, lambda x: 3 * x * x - 1, 0.3),
-    "all three": (["+", "x", ["*", "x", "x"], ["*", "-1/2", ["**", "x", 3]]], 0.75, lambda x: 1 + 2 * x - 1.5 * x**2, 0.3),
+    "all three": (["+", "x", ["*", "x", "x"], ["*", "-1/2", ["**", "x", 3]]], 0.75,
+                  lambda x: 1 + 2 * x - 1.5 * x**2, 0.3),
     "sin": (["sin", ["*", "2", "x"]], 1.0, lambda x: 2 * np.cos(2 * x), 0.1),
     "cos": (["cos", ["*", "2", "x"]], 0.75, lambda x: -2 * np.sin(2 * x), 0.1),
     "tanh": (["tanh", ["*", "2", "x"]], 0.5, lambda x: 2 / np.cosh(2 * x) ** 2, 0.1),
@@ -169,6 +171,7 @@ def test_orbits_of_period_2_and_second_fixed_points(passes: Callable[[Document],
 @pytest.mark.parametrize("cells", [1, 8])
 def test_an_uncertain_factor(cells: int, passes: Callable[[Document], bool]) -> None:
     """x+ = q x + r, q to 1 or beyond: the slope counts at both ends, with its own square at each."""
+
     def claim(lo: str, hi: str) -> Document:
         ranges = [("q", lo, hi), ("r", "-1", "1")]
         term = ["+", ["*", "q", "x"], "r"]
@@ -179,11 +182,113 @@ def test_an_uncertain_factor(cells: int, passes: Callable[[Document], bool]) -> 
         assert not passes(claim(*ends))
 
 
+# ------------------------------------------------------------------------------------------------------- broken rules
+
+
+def without_the_square(models: Models, *rest: Any) -> float:
+    return 0.0
+
+
+def at_one_corner(models: Models) -> Iterator[Models]:
+    return iter([next(CORNERS_OF(models))])
+
+
+CORNERS_OF = Models.corners
+BROKEN: dict[str, tuple[Any, str, Any, Callable[[], Document]]] = {
+    "no square of the rest": (
+        contraction, "_size_beyond", without_the_square, lambda: scalar(["*", "3/4", "x", "x"], weight=2.0**-40)
+    ),
+    "b without A": (
+        contraction, "_rest", lambda models, b, *rest: 0 * REST(models, b, *rest),
+        lambda: scalar(["+", ["*", "1/2", "x"], ["*", "3/8", "x", "x"]], weight=0.5),
+    ),
+    "one corner": (
+        Models, "corners", at_one_corner,
+        lambda: scalar(["*", "q", "x"], uncertain=[("q", "-2", "1/2")], cells=[1]),
+    ),
+}  # fmt: skip
+REST = contraction._rest
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_rule_is_caught(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Slopes of 3/2, 5/4 and -2."""
+    owner, rule, broken, claim = BROKEN[name]
+    assert not any(passes(claim()) for passes in JUDGES)
+    monkeypatch.setattr(owner, rule, broken)
+    assert passes_the_checker(claim())
+
+
+# ------------------------------------------------------------------------------------------------------ a whole claim
+
+
+@cache
+def honest() -> Document:
+    """x+ = q x + w + x^2/8 + 1/40 with |x| at most 3/10 in the end."""
+    term = ["+", ["*", "q", "x"], "w", "1/40", ["*", "1/8", "x", "x"], NOTHING]
+    ranges = [("q", "-1/2", "1/2"), ("w", "-1/10", "1/10")]
+    data = nearby([term], [[1.0]], 0.09, [0.05], J=[[0.31]], uncertain=ranges)
+    data = edited(edited(data, "levels.roa", (1.0).hex()), "evidence.root", encode([1.0]))
+    return grow(data)
+
+
+def test_an_honest_claim() -> None:
+    data = honest()
+    assert verdict(data) == "ACCEPTED" and judge(data) is None
+    said = " ".join(words.claim(parse(data)))
+    assert "after finitely many steps" in said and "is there at every step from then on" in said
+    assert "exactly one equilibrium" in said
+    with ctx.workprec(PRECISION):
+        assert "in discrete time" in in_words(read(dump(data)))
+    faster = grow(edited(data, "claim.rate", (0.02).hex()))
+    assert verdict(faster) == "ACCEPTED" and judge(faster) is None
+
+
+def ball(key: str, value: Any) -> Callable[[Document], Document]:
+    return lambda data: edited(data, f"evidence.contraction.{key}", encode(value))
+
+
+def at(path: str, value: Any) -> Callable[[Document], Document]:
+    return lambda data: edited(data, path, value)
+
+
+FORGERIES: list[tuple[str, str, Callable[[Document], Document]]] = [
+    ("contraction", "a ball in the set", ball("J", [[0.3 * (1 - 1e-9)]])),
+    ("contraction", "a ball of 0", ball("J", [[0.0]])),
+    ("contraction", "a huge ball", ball("J", [[1e200]])),
+    ("contraction", "a ball on which states part", ball("J", [[2.1]])),
+    ("contraction", "a weight of 0", ball("weights", [0.0])),
+    ("contraction", "a weight of -0", ball("weights", [-0.0])),
+    ("contraction", "a weight below 0", ball("weights", [-0.05])),
+    ("contraction", "a weight that is too large", ball("weights", [1.0])),
+    ("contraction", "a clip that acts", lambda d: rehash(edited(d, "policy.clip", [encode([-1.0]), encode([0.0])]))),
+    ("format", "no contraction", at("evidence.contraction", None)),
+    ("format", "two weights", ball("weights", [1.0, 1.0])),
+    ("format", "a matrix of two rows", ball("weight", np.eye(2))),
+    ("format", "a sample", at("claim.sample", ["1", "1"])),
+    ("format", "practical with a contraction", at("claim.kind", "practical")),
+    ("format", "an outer set", at("claim.outer", {"expression": ["**", "x", 2], "level": (2.0).hex()})),
+    ("format", "a tube", at("claim.kind", "enlarged")),
+    ("format", "a solver's word", at("evidence", {"kind": "trusted-solver", "solver": "dReal", "version": "4",
+                                                  "precision": (0.5).hex(), "queries": []})),
+    ("ring", "continuous time", at("plant.time", "continuous")),
+    ("ring", "a floor that is left", lambda d: edited(edited(d, "levels.floor", (0.04).hex()), "levels.local",
+                                                      (0.04).hex())),
+    ("levels", "no floor", at("levels.floor", (0.0).hex())),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("rule", "edit"), [pytest.param(rule, edit, id=what) for rule, what, edit in FORGERIES])
+def test_forgeries(rule: str, edit: Callable[[Document], Document]) -> None:
+    data = edit(honest())
+    assert (verdict(data), judge(data)) == (rule, rule)
+
+
 # --------------------------------------------------------------------------------------------- some states, at random
 
 
-def random_map(seed: int) -> tuple[Document, float]:
-    """A map of one to three states about its contraction's limit, and its ball's radius in the norm of P."""
+def random_map(seed: int) -> Document:
+    """A map of one to three states about its contraction's limit."""
     random = np.random.default_rng(seed)
     n = int(random.integers(1, 4))
     turn, _ = np.linalg.qr(random.standard_normal((n, n)))
@@ -202,11 +307,13 @@ def random_map(seed: int) -> tuple[Document, float]:
         ][int(random.integers(8))]])  # fmt: skip
         row.append(["*", "1/8", "u"] if i == 0 else "r")
         rows.append(row)
-    layers = [(random.standard_normal((2, n)), 0.3 * random.standard_normal(2)), (random.standard_normal((1, 2)), [0.1])]
+    layers = [
+        (random.standard_normal((2, n)), 0.3 * random.standard_normal(2)),
+        (random.standard_normal((1, 2)), [0.1]),
+    ]
     ranges = [("q", "-1/2", "1/2"), ("r", "-1/8", "1/8")]
     cells = [int(random.integers(1, 3)), 1]
-    data = nearby(rows, P, 1.0, np.ones(n), layers=layers, uncertain=ranges, cells=cells)
-    return data, 1.0
+    return nearby(rows, P, 1.0, np.ones(n), layers=layers, uncertain=ranges, cells=cells)
 
 
 def on_ball(data: Document, P: np.ndarray, level: float, share: float) -> Document:
@@ -229,8 +336,8 @@ def pairs_of(n: int, random: np.random.Generator) -> Iterator[tuple[np.ndarray, 
 
 @pytest.mark.parametrize("seed", slow_after(12, range(80)))
 def test_no_pair_parts_on_a_random_map(seed: int) -> None:
-    data, _ = random_map(seed)
-    P = np.frombuffer(__import__("base64").b64decode(data["lyapunov"]["P"])).reshape(len(data["plant"]["states"]), -1)
+    data = random_map(seed)
+    P = square(data["lyapunov"]["P"])
     n, random, accepted = len(P), np.random.default_rng(seed), [0.0, 0.0]
     for k, passes in enumerate(JUDGES):
         for level in 2.0 ** np.arange(-12, 4):
@@ -248,13 +355,18 @@ def test_no_pair_parts_on_a_random_map(seed: int) -> None:
             gap, moved = x - y, plant.field(x, plant.inputs(x)) - plant.field(y, plant.inputs(y))
             before, after = (np.einsum("ib,ij,jb->b", v, P, v) for v in (gap, moved))
             some = before > 1e-14
-            assert np.all(after[some] < before[some] * (1 + 1e-9)), (accepted, float(np.max(after[some] / before[some])))
+            assert np.all(after[some] < before[some] * (1 + 1e-9)), (
+                accepted,
+                float(np.max(after[some] / before[some])),
+            )
 
 
 def test_some_random_maps_are_accepted() -> None:
     found = 0
     for seed in range(12):
-        data, _ = random_map(seed)
-        P = np.frombuffer(__import__("base64").b64decode(data["lyapunov"]["P"])).reshape(len(data["plant"]["states"]), -1)
+        data = random_map(seed)
+        P = np.frombuffer(__import__("base64").b64decode(data["lyapunov"]["P"])).reshape(
+            len(data["plant"]["states"]), -1
+        )
         found += any(passes_the_checker(on_ball(data, P, 2.0**-8, share)) for share in (1e-3, 0.02, 0.1))
     assert found >= 3
