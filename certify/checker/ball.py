@@ -105,6 +105,12 @@ class Ball:
         these jets only know that 0 is near."""
         return self.f(self.states, self.symbols(cell))
 
+    def change(self, cell: Intervals = ()) -> list[Jet]:
+        """F, or in discrete time F - x, by how much a step changes x."""
+        if not self.case.c.discrete:
+            return self.F(cell)
+        return [f + -x for f, x in zip(self.F(cell), self.shared(self.states), strict=True)]
+
     def f(self, states: Sequence[Jet], quantities: Sequence[Jet]) -> list[Jet]:
         """f(x, pi(x), q) at such states and quantities, all components in one family of errors: the inputs', and then
         those of each call."""

@@ -1,7 +1,10 @@
 """The rule `contraction`: on a ball that holds {V <= c0} any two trajectories come closer, where q is constant, in the
-norm of P. So there is one equilibrium at most, to which those that stay in {V <= c0} converge."""
+norm of P: at all times, or in discrete time with every step. So there is one equilibrium at most, to which those that
+stay in {V <= c0} converge."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from flint import fmpq, fmpq_mat
@@ -9,12 +12,12 @@ from flint import fmpq, fmpq_mat
 from . import ball
 from .ball import Ball
 from .case import Case, Failures
-from .decrease import Models, are_finite, diagonal, rational, vectors
+from .decrease import Models, are_finite, diagonal, lengths_of_forms, rational, vectors
 from .document import Contraction
 from .exact import exactly, is_definite, root_above
 from .jets import unpacked
 from .local import is_large_enough
-from .near import Array, Tensor
+from .near import Above, Array, Tensor, size
 from .pairs import bound_of_pairs, in_binary64
 
 
@@ -38,29 +41,47 @@ def fits(ball_: Contracted) -> Failures:
 
 
 def contracts(ball_: Contracted) -> Failures:
-    """2 (x - y)'P (F(x) - F(y)) < 0 for any two points of the ball."""
-    P, count = exactly(ball_.case.c.P), 0
+    """V(e + h g) - V(e), over h, is negative for any two points of the ball; e is their difference, g that of G, and h
+    is 0 in continuous time, where this is 2 e'P g."""
+    P, h, count = exactly(ball_.case.c.P), int(ball_.case.c.discrete), 0
     for cell in ball_.case.cells:
-        F = ball_.F(cell)
-        lips = [float(f.lipschitz.top) for f in F]
-        if not (are_finite(F) and np.all(np.isfinite(lips))):
+        G = ball_.change(cell)
+        doubts = [g.lipschitz + g.slack for g in G]
+        models = Models(ball_.J, G, rest=True) if are_finite(G) and all(np.isfinite(v.top) for v in doubts) else None
+        beyond = 0.0 if models is None or not h else _size_beyond(models, doubts, ball_.case.c.P)
+        if models is None or not np.isfinite(beyond):
             yield ball_.at, "F has no finite model"
             return count
-        models = Models(ball_.J, F, rest=True)
+        sizes = [rational(v.top) for v in doubts]
         b = P * models.J  # b_i is row i
-        rest = _turning(models, b, ball_.by.weights.tolist()) + _twisting(models, b, ball_.by.weight)
-        for i, lip in enumerate(lips):
-            size = root_above(sum((v * v for v in b.tolist()[i]), rational(0.0)))
-            rest += diagonal([2 * size * (rational(F[i].slack.top) + rational(lip))] * b.ncols())
+        rest = _rest(models, b, sizes, ball_.by)
         for corner in models.corners():
             crossed = models.J.transpose() * P * corner.A
+            form = crossed + crossed.transpose()
+            if h:
+                form += corner.A.transpose() * P * corner.A + diagonal([rational(beyond) ** 2] * b.ncols())
+                rest = _rest(models, P * (models.J + corner.A), sizes, ball_.by)
             count += 1
-            if not is_definite(-(crossed + crossed.transpose()) - rest):
+            if not is_definite(-form - rest):
                 yield ball_.at, "it is not shown that trajectories come closer"
     return count
 
 
 OF_CONTRACTION = (("contraction", fits), ("contraction", ball.is_not_clipped), ("contraction", contracts))
+
+
+def _rest(models: Models, b: fmpq_mat, doubts: Sequence[fmpq], by: Contraction) -> fmpq_mat:
+    """A bound of twice the sum of b_i.e times what g_i has beyond a_i.e."""
+    lengths = [root_above(sum((v * v for v in row), fmpq(0))) for row in b.tolist()]
+    along = 2 * sum((length * doubt for length, doubt in zip(lengths, doubts, strict=True)), fmpq(0))
+    return _turning(models, b, by.weights.tolist()) + _twisting(models, b, by.weight) + diagonal([along] * b.ncols())
+
+
+def _size_beyond(models: Models, doubts: Sequence[Above], P: Array) -> float:
+    """Gamma: an upper bound of the length, in the norm of P, of what g has beyond A e, ||e|| = 1; maybe infinite."""
+    bent, twisted = lengths_of_forms(models, P)
+    roots = (size(P[i, i]).root * doubt for i, doubt in enumerate(doubts))
+    return float(sum(roots, bent * 2 + twisted * 3).top)
 
 
 def _turning(models: Models, b: fmpq_mat, weights: list[float]) -> fmpq_mat:

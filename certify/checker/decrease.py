@@ -20,7 +20,7 @@ from flint import fmpq, fmpq_mat
 from .document import Multipliers, Path
 from .exact import exactly, is_definite, root_above
 from .jets import Jet, unpacked
-from .near import Array, Near, Tensor, Vector, at_least_0, mixed, norm, size, symmetrised, triples
+from .near import Above, Array, Near, Tensor, Vector, at_least_0, mixed, norm, size, symmetrised, triples
 from .pairs import bound_of_pairs, in_binary64
 
 _NOTHING = fmpq(0)
@@ -179,14 +179,20 @@ def doubts(
 
 def size_beyond(models: Models, P: Array) -> float:
     """Gamma: an upper bound of ||g||_P / ||d||^2, g the models less (f, A d); maybe infinite, or NaN."""
-    L, often = models.units.reach, triples(models.A.ncols())[-1]
     R, E = (norm(M, (0, 1)) for M in (models.units.R, models.Es))
-    c = Near(L).through(models.shares)
+    c = Near(models.units.reach).through(models.shares)
     each = at_least_0((c * c.through(P)).sum())
-    quadratic = at_least_0(form_of(Near(models.Qs.T), models.Qs, P))
-    third = at_least_0(form_of(Near(models.K) * Near(often[:, None]), models.K.T, P))
+    bent, twisted = lengths_of_forms(models, P)
     rest = (each.root * R).sum() + (size(np.diag(P)).root * E).sum()
-    return float((quadratic.root + third.root + rest).top)
+    return float((bent + twisted + rest).top)
+
+
+def lengths_of_forms(models: Models, P: Array) -> tuple[Above, Above]:
+    """Upper bounds of ||(x'Q_i y)_i||_P and ||(K_i[x, y, z])_i||_P, where x, y and z are no longer than 1."""
+    often = triples(models.A.ncols())[-1]
+    bent = at_least_0(form_of(Near(models.Qs.T), models.Qs, P))
+    twisted = at_least_0(form_of(Near(models.K) * Near(often[:, None]), models.K.T, P))
+    return bent.root, twisted.root
 
 
 def form_of(x: Near, y: Array, P: Array) -> Near:

@@ -221,7 +221,8 @@ def certificate(data: Any, sha256: str) -> Certificate:
     fall, periods = rate.binary64(), _sample(sample)
     rate.must(0 <= fall < math.inf and (fall == 0 or kind not in WITH_TUBE), "0, or a rate where a claim may have one")
     plain = periods is None and not stated["discrete"]
-    sample.must(plain or kind not in (*WITH_TUBE, "nearby"), "null, and the plant continuous, under this claim")
+    sample.must(plain or kind not in WITH_TUBE, "null, and the plant continuous, under this claim")
+    sample.must(periods is None or kind != "nearby", "null under this claim")
     sample.must(periods is None or not stated["discrete"], "null where time is discrete")
     outer = _outer(beyond, stated["states"], networks)
     beyond.must(outer is None or (plain and fall == 0 and kind not in WITH_TUBE), "null under this claim")

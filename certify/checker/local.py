@@ -101,10 +101,8 @@ class Local(Ball):
         """The increment of x per unit of time over a step. Within a period uncertain quantities may leave the cell: the
         cell counts only for their mean, in which D is convex."""
         c, symbols = self.case.c, self.symbols(cell)
-        if c.discrete:
-            return [f + -x for f, x in zip(self.F(cell), self.shared(self.states), strict=True)]
         if c.sample is None or self.way is None:
-            return self.F(cell)
+            return self.change(cell)
         first = self.f(self.during(self.way) if self.order == 1 else self.states, symbols)
         rising = self.later or [self.constant(Fraction(0))] * len(first)
         return [self.settled(x) + self.period * more for x, more in zip(first, rising, strict=True)]

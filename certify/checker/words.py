@@ -18,9 +18,9 @@ CLAIMS = {
     "reached": "the origin is asymptotically stable; every trajectory of the closed loop that starts in V <= {c.c2!r} "
     "stays there and converges to the origin, and every one that starts in (x - c)'S(x - c) <= 1 stays in the domain, "
     "is in V <= {c.c2!r} after {time!r} units of time at the latest, and converges to the origin",
-    "nearby": "every trajectory of the closed loop that starts in V <= {c.c2!r} stays there, enters V <= {c.c0!r} in "
-    "finite time and stays there from then on; and where what is uncertain is constant in time, there is exactly one "
-    "equilibrium in V <= {c.c0!r}, and all of these trajectories converge to it",
+    "nearby": "every trajectory of the closed loop that starts in V <= {c.c2!r} {when[stays]}, enters V <= {c.c0!r} "
+    "{when[enters]} and {when[remains]} from then on; and where what is uncertain is constant in time, there is "
+    "exactly one equilibrium in V <= {c.c0!r}, and all of these trajectories converge to it",
     "practical": "every trajectory of the closed loop that starts in V <= {c.c2!r}{when[start]} {when[stays]}, enters "
     "V <= {c.c0!r} {when[enters]} and {when[remains]} from then on; nothing is claimed about what happens inside "
     "V <= {c.c0!r}, and the origin need not be an equilibrium",

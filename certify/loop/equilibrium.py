@@ -4,6 +4,7 @@ An uncentred policy has pi(0) near u_eq at best, so its equilibrium lies beside 
 method finds the point in floats, from the origin or from the end of a trajectory that starts there. The test shows in
 Arb that exactly one equilibrium lies in a box around it:
 `K = x0 - Y F(x0) + (I - Y J)(X - x0)` lies inside X, J being mean slopes of F on X and Y about the inverse of one.
+In discrete time an equilibrium is a fixed point, and F stands for what a step adds to x.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import with_origin
+from certify.loop.plants.system import Time
 from certify.loop.rigorous import field_on, in_digits, policy_on, precision
 
 Array = NDArray[np.float64]
@@ -30,6 +32,7 @@ _DIGITS = 12
 _BITS = 40  # of a point from which a loop is looked at
 _WHILE = 100.0  # of a trajectory, in the plant's unit of time
 _MOST_STEPS = 10_000  # of one: where F is no number, time stands still
+_SETTLED = 1e-9  # share of the domain's widths: a shorter step is none
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,8 +43,9 @@ class Rest:
     ----------
     x, u : decimals with 12 digits that are certain up to the last, or 0 for less than 1e-18, (n,) and (m,); x is in
         deviations from the plant's operating point.
-    eigenvalues : eigenvalues of the Jacobian there, enclosed, as text; empty if Arb cannot isolate them.
-    stable : True if all of them certainly lie left of the imaginary axis.
+    eigenvalues : eigenvalues of the Jacobian there, in discrete time of the map; enclosed, as text; empty if Arb cannot
+        isolate them.
+    stable : True if all of them certainly lie left of the imaginary axis, in discrete time in the unit circle.
     """
 
     x: tuple[str, ...]
@@ -92,7 +96,7 @@ def _enclosed(loop: ClosedLoop, start: Array) -> Rest | None:
     with precision():
         x = [flint.arb(float(v)) for v in start]
         for _ in range(_REFINEMENTS):
-            F, J = field_on(loop, x)
+            F, J = _change_on(loop, x)
             Y = _inverse(J)
             if Y is None:
                 return None
@@ -103,17 +107,29 @@ def _enclosed(loop: ClosedLoop, start: Array) -> Rest | None:
             return None
         u, _ = policy_on(loop, box)
         _, J = field_on(loop, box)
-        eigenvalues, stable = _spectrum(J)
+        eigenvalues, stable = _spectrum(J, loop.system.time)
     return Rest(_decimals(box), _decimals(u), eigenvalues, stable)
 
 
+def _change_on(loop: ClosedLoop, x: list[flint.arb]) -> tuple[list[flint.arb], flint.arb_mat]:
+    """F and its Jacobian on balls x, in discrete time less x and the identity."""
+    F, J = field_on(loop, x)
+    if loop.system.time == "continuous":
+        return F, J
+    return [f - v for f, v in zip(F, x, strict=True)], J - _identity(len(x))
+
+
+def _identity(n: int) -> flint.arb_mat:
+    return flint.arb_mat([[int(i == j) for j in range(n)] for i in range(n)])
+
+
 def _rates(loop: ClosedLoop) -> Callable[[Array], Array]:
-    """F in floats, (n,) to (n,)."""
-    f = loop.system.function()
+    """F in floats, in discrete time less x, (n,) to (n,)."""
+    f, steps = loop.system.function(), loop.system.time == "discrete"
 
     def F(x: Array) -> Array:
         with np.errstate(all="ignore"):
-            return np.asarray(f(x, loop.policy(x[None])[0]), dtype=np.float64)
+            return np.asarray(f(x, loop.policy(x[None])[0]), dtype=np.float64) - (x if steps else 0.0)
 
     return F
 
@@ -124,6 +140,8 @@ def _origin(loop: ClosedLoop) -> Array:
 
 def _end(loop: ClosedLoop) -> Array | None:
     """The end of the trajectory from the origin, by a stiff solver; None if it leaves the domain or takes too long."""
+    if loop.system.time == "discrete":
+        return _last(loop)
     import scipy.integrate
 
     F, (lo, hi) = _rates(loop), np.array([[float(a), float(b)] for a, b in loop.system.domain]).T
@@ -137,6 +155,19 @@ def _end(loop: ClosedLoop) -> Array | None:
             if solver.status == "finished":
                 return x
     return None
+
+
+def _last(loop: ClosedLoop) -> Array | None:
+    """The last state of so many steps from the origin; None if they leave the domain."""
+    change, x, (lo, hi) = _rates(loop), _origin(loop), np.array([[float(a), float(b)] for a, b in loop.system.domain]).T
+    for _ in range(_MOST_STEPS):
+        step = change(x)
+        x = x + step
+        if not np.all((lo < x) & (x < hi)):
+            return None
+        if not np.any(np.abs(step) > _SETTLED * (hi - lo)):
+            break
+    return x
 
 
 def _newton(loop: ClosedLoop, x: Array) -> Array | None:
@@ -175,23 +206,22 @@ def _inverse(J: flint.arb_mat) -> flint.arb_mat | None:
 def _is_inside(loop: ClosedLoop, x: list[flint.arb], box: list[flint.arb]) -> bool:
     """Krawczyk's test (Moore, Kearfott, Cloud, Introduction to Interval Analysis, SIAM 2009, chapter 8)."""
     n = len(x)
-    F, _ = field_on(loop, x)
-    _, J = field_on(loop, box)
+    F, _ = _change_on(loop, x)
+    _, J = _change_on(loop, box)
     Y = _inverse(J)
     if Y is None:
         return False
-    identity = flint.arb_mat([[int(i == j) for j in range(n)] for i in range(n)])
     spread = flint.arb_mat([[b - v] for b, v in zip(box, x, strict=True)])
-    K = flint.arb_mat([[v] for v in x]) - Y * flint.arb_mat([[v] for v in F]) + (identity - Y * J) * spread
+    K = flint.arb_mat([[v] for v in x]) - Y * flint.arb_mat([[v] for v in F]) + (_identity(n) - Y * J) * spread
     return all(bool(box[i].contains_interior(K[i, 0])) for i in range(n))
 
 
-def _spectrum(J: flint.arb_mat) -> tuple[tuple[str, ...], bool]:
+def _spectrum(J: flint.arb_mat, time: Time) -> tuple[tuple[str, ...], bool]:
     try:
         found = list(flint.acb_mat(J).eig(multiple=True))
     except (ValueError, ArithmeticError):
         return (), False
-    return tuple(map(in_digits, found)), all(bool(v.real < 0) for v in found)
+    return tuple(map(in_digits, found)), all(bool(abs(v) < 1 if time == "discrete" else v.real < 0) for v in found)
 
 
 def _decimals(values: list[flint.arb]) -> tuple[str, ...]:

@@ -1,10 +1,16 @@
 """Rule `contraction`: in {V <= c0} any two trajectories approach each other, for constant uncertain quantities.
 
+In discrete time it is their next states that are nearer to each other than they are.
+
 So there is one equilibrium to which all of them go. For two points J d and J d' of a ball, with e = d - d' and m half
 of their sum, the components of F differ by a_i.e + 2 m'Q_i e, by K_i[d, d, e] + K_i[d, d', e] + K_i[d', d', e], each
 within |T_i e|, and by what is beyond the third order, of which the models have a Lipschitz constant. b_i being the
 columns of J'P, the distance's derivative is a quadratic form in e, with one more for each entry of m, sum_j m_j e'N_j
 e, and as |m| <= 1 these are together below another: 2 e'w <= e'ge + w'(1/g)w.
+
+A step of discrete time changes a state by G = F - x, and the square of a distance by 2 e'J'P g + g'Pg, g being what two
+changes differ by, A e and a remainder. So b_i are the columns of (J + A)'P there, A'PA is part of the form, and the
+remainder's own square, in the norm of P, is bounded by that of its length.
 """
 
 from __future__ import annotations
@@ -13,11 +19,12 @@ from collections.abc import Sequence
 
 from flint import arb, arb_mat, fmpq_mat
 
-from .balls import columns_scaled, norm, total
-from .decrease import certainly_positive, diagonal, whatever_y, with_cubic
+from .balls import ZERO, columns_scaled, norm, total
+from .decrease import certainly_positive, diagonal, forms_of, length_of, whatever_y, with_cubic
 from .document import Certificate
 from .evidence import Contraction
 from .fields import exact
+from .flow import Steps
 from .local import cells
 from .loop import Field, Loop
 from .model import Model
@@ -28,7 +35,7 @@ RULE = "contraction"
 
 
 def contraction(loop: Loop, evidence: Contraction, parts: Sequence[int]) -> None:
-    """The ball contains {V <= c0}, and F contracts on it in each cell of the ranges."""
+    """The ball contains {V <= c0}, and the loop contracts on it in each cell of the ranges."""
     c, J, g = loop.c, evidence.J, evidence.weights
     weight = arb_mat(evidence.weight)
     if c.floor is None:
@@ -36,35 +43,54 @@ def contraction(loop: Loop, evidence: Contraction, parts: Sequence[int]) -> None
     holds = positive_definite(J.transpose() * c.P * J - exact(c.floor) * identity(c.n))
     require(holds, RULE, "ball", "it does not contain {V <= c0}: J'PJ - c0 I is not positive definite")
     require(all(v > 0 for v in g), RULE, "ball", "a weight is not positive")
-    known = loop.steady(J, RULE, "ball")
+    steps = Steps(loop, loop.steady(J, RULE, "ball"))
     for number, cell in enumerate(cells(c.plant.ranges, parts)):
         at = f"cell {number}" if parts else "ball"
-        F = loop.within(known, cell, RULE, at)
-        approaches = whatever_y(F, lambda G: contracts(c, J, list(map(arb, g)), weight, G))
+        G = steps.change(cell, RULE, at)
+        approaches = whatever_y(G, lambda change: contracts(c, J, list(map(arb, g)), weight, change))
         require(approaches, RULE, at, "trajectories do not certainly approach each other: its matrix is not definite")
 
 
-def contracts(c: Certificate, J: fmpq_mat, g: Sequence[arb], weight: arb_mat, F: Field) -> bool:
-    """True if 2 (x - y)'P (F(x) - F(y)) is certainly negative for any two points of the ball; models without y.
+def contracts(c: Certificate, J: fmpq_mat, g: Sequence[arb], weight: arb_mat, G: Field) -> bool:
+    """True if any two points of the ball certainly approach each other, G being models of F or, in steps, of F - x.
 
-    At one d and d', and for given quadratic parts and what is beyond them, this is linear in the gradients.
+    They have no y: at one d and d', and for given quadratic parts and what is beyond them, what is bounded is a convex
+    function of the gradients, as P is positive definite.
     """
-    n, A = c.n, arb_mat([list(f.a.entries()) for f in F.components])
+    n, A = c.n, arb_mat([list(f.a.entries()) for f in G.components])
     b = arb_mat(J.transpose() * c.P)
-    linear, columns = b * A, [arb_mat(n, 1, column) for column in b.transpose().tolist()]
+    form = b * A
+    form += form.transpose()
+    wrong = [f.slack + lip_of(f) for f in G.components]
+    along = ZERO
+    if c.plant.discrete:
+        of_A = A.transpose() * arb_mat(c.P)
+        form, b = form + of_A * A, b + of_A
+        along = longest_rest(c.P, G, wrong) ** 2
+    columns = [arb_mat(n, 1, column) for column in b.transpose().tolist()]
     turned, inverse = diagonal(g), [1 / v for v in g]
     for j in range(n):
         N = arb_mat(n, n)
-        for column, f in zip(columns, F.components, strict=True):
+        for column, f in zip(columns, G.components, strict=True):
             N += column * arb_mat([f.Q.tolist()[j]])
         N = 2 * (N + N.transpose())
         turned += columns_scaled(N, inverse) * N
-    left = -(linear + linear.transpose()) - turned / 2
-    for column, f in zip(columns, F.components, strict=True):
+    left = -form - turned / 2
+    for column, f in zip(columns, G.components, strict=True):
         left -= 3 * with_cubic(column, f, weight)
-    each = zip(columns, F.components, strict=True)
-    rest = total(2 * norm(column.entries()) * (f.slack + lip_of(f)) for column, f in each)
-    return certainly_positive(left - diagonal([rest] * n))
+    along += total(2 * norm(column.entries()) * v for column, v in zip(columns, wrong, strict=True))
+    return certainly_positive(left - diagonal([along] * n))
+
+
+def longest_rest(P: fmpq_mat, G: Field, wrong: Sequence[arb]) -> arb:
+    """The length, v'Pv being its square, of what the difference of G has beyond A e, for an e of length 1.
+
+    Q is met by m and e, twice, and K three times by two points and e.
+    """
+    squares, cubes = forms_of(G)
+    of_P = arb_mat(P)
+    moved = total(arb(P[i, i]).sqrt() * v for i, v in enumerate(wrong))
+    return 2 * length_of(squares, of_P) + 3 * length_of(cubes, of_P) + moved
 
 
 def lip_of(f: Model) -> arb:

@@ -133,9 +133,7 @@ def length_beyond(P: fmpq_mat, G: Field, size: int) -> arb:
     length of what it moves.
     """
     of_P, components = arb_mat(P), G.components
-    bent = arb_mat([list(g.Q.entries()) for g in components])
-    count = arb_mat(1, len(orders(size)), [arb(often).sqrt() for often in orders(size)])
-    cubes = columns_scaled(arb_mat([list(g.K.entries()) for g in components]), list(count.entries()))
+    bent, cubes = forms_of(G)
     gamma = length_of(bent, of_P) + length_of(cubes, of_P)
     gamma += total(arb(P[i, i]).sqrt() * norm(g.E.entries()) for i, g in enumerate(components))
     if G.units.R:
@@ -144,6 +142,13 @@ def length_beyond(P: fmpq_mat, G: Field, size: int) -> arb:
         sizes = [total(G.units.squares[q, i * (size + 1)] for i in range(size)) for q in range(len(lengths))]
         gamma += total(root(v) * root(w) for v, w in zip(lengths, sizes, strict=True))
     return gamma
+
+
+def forms_of(G: Field) -> tuple[arb_mat, arb_mat]:
+    """The coefficients of Q and of K, a row for each component, those of K scaled: some stand in several orders."""
+    bent = arb_mat([list(g.Q.entries()) for g in G.components])
+    often = [arb(count).sqrt() for count in orders(G.components[0].a.nrows())]
+    return bent, columns_scaled(arb_mat([list(g.K.entries()) for g in G.components]), often)
 
 
 def length_of(M: arb_mat, P: arb_mat) -> arb:

@@ -139,10 +139,9 @@ def read(raw: bytes) -> Certificate:
     n = len(plant.states)
     fixed = claim not in WITH_TUBE or not plant.uncertain
     require(fixed, "format", "plant.uncertain", f"nothing may be uncertain with claim '{claim}'")
-    flows = claim in (*WITH_TUBE, "nearby")
-    continuous = not (flows and plant.discrete)
+    continuous = not (claim in WITH_TUBE and plant.discrete)
     require(continuous, "format", "plant.time", f"time must be continuous with claim '{claim}'")
-    free = sample is None or not (flows or plant.discrete)
+    free = sample is None or not (claim in (*WITH_TUBE, "nearby") or plant.discrete)
     require(free, "format", "claim.sample", f"null was expected with claim '{claim}', or in discrete time")
     start = square(said["start"], "claim.start", n) if "start" in said else None
     centre = column(said["centre"], "claim.centre", n) if "centre" in said else None

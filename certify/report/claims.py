@@ -134,6 +134,14 @@ CLAIMS: Mapping[str, Words] = {
 
 _ASYMPTOTIC = CLAIMS["asymptotic"]
 _PRACTICAL = CLAIMS["practical"]
+_BY_CONSTANTS = (
+    "by models of the closed loop, with Lipschitz constants of what they leave out, on a ball that contains {V ≤ c₀}"
+)
+_CONTRACTION_IN_STEPS: Part = (
+    "Contraction",
+    "V(F(x) − F(y)) < V(x − y) for all x other than y with V(x) ≤ c₀ and V(y) ≤ c₀",
+    _BY_CONSTANTS,
+)
 CLAIMS = {
     **CLAIMS,
     "nearby": replace(
@@ -149,8 +157,7 @@ CLAIMS = {
             (
                 "Contraction",
                 "2(x − y)′P(F(x) − F(y)) < 0 for all x other than y with V(x) ≤ c₀ and V(y) ≤ c₀",
-                "by models of the closed loop, with Lipschitz constants of what they leave out, on a ball that "
-                "contains {V ≤ c₀}",
+                _BY_CONSTANTS,
             ),
         ),
         excluded=(
@@ -337,7 +344,7 @@ def _in_steps(kind: str, parts: tuple[Part, ...], timing: TimingInWords) -> Iter
     """The parts, with those that a loop needs that is spoken of at its samples or steps."""
     after = "F(x)" if timing.discrete else "φ(h)"
     for part in parts:
-        yield part
+        yield _CONTRACTION_IN_STEPS if part[0] == "Contraction" and timing.discrete else part
         if part[0] == "Domain" and timing.sample is not None:
             yield (
                 "Within a period",

@@ -105,7 +105,7 @@ FORGERIES: list[tuple[str, str, Edit]] = [
     ("format", "practical with a contraction", at("claim.kind", "practical")),
     ("format", "asymptotic", at("claim.kind", "asymptotic")),
     ("format", "a sample", at("claim.sample", ["1/100", "1/100"])),
-    ("format", "discrete time", at("plant.time", "discrete")),
+    ("ring", "discrete time, in which it leaps over", at("plant.time", "discrete")),
     ("format", "a solver's word", at("evidence", TRUSTED)),
     ("format", "a solver's word of what is certain", lambda d: edited(
         edited(edited(d, "plant.uncertain", []), "plant.dynamics.0", ["-", "x"]), "evidence", TRUSTED)),

@@ -622,6 +622,8 @@ def _evaluate(node: Any, names: dict[str, Any], constant: Callable[[str], Any], 
     values = [_evaluate(v, names, constant, library) for v in (rest[:1] if name == "**" else rest)]
     if name in UNARY:
         return getattr(library, name)(values[0]) if library else getattr(values[0], name)()
+    if name == "abs":
+        return abs(values[0])
     if name == "**":
         power = math.prod([values[0]] * (abs(rest[1]) - 1), start=values[0])
         return power if rest[1] > 0 else _quotient(1, power, library)

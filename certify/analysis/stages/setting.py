@@ -65,7 +65,7 @@ def _with_claim(state: State) -> State:
     InputError : the claim `asymptotic` is asked for, and the loop does not rest at the origin.
     """
     options = state.options
-    converging = options.claim in ("auto", "nearby") and not state.loop.system.in_steps
+    converging = options.claim in ("auto", "nearby") and state.loop.system.sample is None
     kind, why = _kind_of(state.loop, options)
     state = replace(state, converging=converging)
     if why is not None:
@@ -102,9 +102,9 @@ def _rest(loop: ClosedLoop, options: RoaOptions) -> tuple[Rest | None, ClosedLoo
     """
     if loop.network.is_moved:
         return None, loop
-    if options.claim != "practical" or loop.system.time == "discrete" or loop.network.centre != "none":
+    if options.claim != "practical" or loop.network.centre != "none":
         if options.around == "rest" and options.claim == "practical":
-            raise OptionError("`around` rest needs a policy without centring and a plant in continuous time.")
+            raise OptionError("`around` rest needs a policy without centring.")
         return None, loop
     rest = find_rest(loop)
     given = options.P is not None or options.level is not None or options.lyapunov is not None

@@ -30,9 +30,14 @@ def contraction(problem: Problem, T: Array, floor: float) -> Contraction | None:
             models = paths(problem.loop).models(J)
     except InputError:
         return None
-    b = problem.V.P @ J  # b_i is row i
-    crossed = b.T @ models.A
+    A, b = models.A, problem.V.P @ J  # b_i is row i
+    if problem.loop.system.time == "discrete":
+        A = A - J  # of what a step adds
+    crossed = b.T @ A
     decay = -(crossed + crossed.T)
+    if problem.loop.system.time == "discrete":
+        moved = problem.V.P @ A
+        decay, b = decay - A.T @ moved, b + moved
     if not (models.finite and np.linalg.eigvalsh(decay)[0] > 0):
         return None
     half = np.einsum("ia,ijb->jab", b, models.Q)
