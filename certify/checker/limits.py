@@ -12,7 +12,7 @@ from math import prod
 from .case import Case, Failures
 from .document import Array, Certificate, Partition
 from .expression import Tape
-from .networks import Network
+from .networks import Map, Network
 
 MOST_NUMBERS = 2**25
 MOST_WORK, MOST_IN_PATIENCE = 3 * 2**37, 2**46  # ten minutes; many hours, if somebody says that there is time for it
@@ -45,6 +45,7 @@ class Net:
         self.steps = [shape for network in networks for shape in network.shapes]
         self.units, self.kept = sum(step.units for step in steps), sum(network.kept for network in networks)
         self.widest, self.reads = max((step.size for step in steps), default=0), sum(len(step.of) for step in steps)
+        self.dear = sum(step.size for step in steps if isinstance(step, Map) and step.function not in ("tanh", "relu"))
         self.entries = sum(rows * columns for rows, columns, _ in self.steps)
 
     @property
@@ -63,7 +64,9 @@ class Net:
         return sum(4 * r * (d + before) for r, _, before in self.steps) + 3 * self.units * t
 
     def on_a_leaf(self, symbols: int) -> int:
-        return sum(r * (c * (symbols + 2) + 5 * before + 64 * symbols + 7 * 2**9) for r, c, before in self.steps)
+        return 2**15 * self.dear + sum(
+            r * (c * (symbols + 2) + 5 * before + 64 * symbols + 7 * 2**9) for r, c, before in self.steps
+        )
 
     def on_a_ball(self, d: int, t: int) -> int:
         return sum(r * (c * (d + before) + before * t) + 2**21 for r, c, before in self.steps) + 64 * self.units * t

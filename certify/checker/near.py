@@ -643,6 +643,10 @@ class Polynomials:
     """
 
     def __init__(self, formula: Callable[[arb_series], arb_series]) -> None:
+        with ctx.workprec(128):
+            self._make(formula)
+
+    def _make(self, formula: Callable[[arb_series], arb_series]) -> None:
         points = [arb(k) * _STEP for k in range(-_FAR_POINTS, _FAR_POINTS + 1)]
         cells = [_coefficients(formula, arb(g, _STEP / 2)) for g in points]
         largest = [max(near_ball(abs(cell[j])).ends[1] for cell in cells) for j in range(_DEGREE + 1)]

@@ -40,7 +40,7 @@ class Nets:
     """Some networks: rows and columns of their steps with the units of the network before each.
 
     `units` are those of all of them, `widest` is the most entries that a step makes, `read` counts the vectors that
-    steps read, `waiting` those that a step reads which is not the next.
+    steps read, `waiting` those that a step reads which is not the next, `dear` the entries of functions that take long.
     """
 
     shapes: tuple[tuple[int, int, int], ...]
@@ -48,6 +48,7 @@ class Nets:
     widest: int
     read: int
     waiting: int
+    dear: int
 
     @property
     def weights(self) -> int:
@@ -66,6 +67,7 @@ class Nets:
     def forms(self, leaves: int, symbols: int) -> int:
         """Affine forms on so many leaves."""
         each = sum(p * (q * (symbols + 2) + 5 * g + 64 * symbols + 7 * 2**9) for p, q, g in self.shapes)
+        each += 2**15 * self.dear
         return leaves * each // 8
 
     def models(self, symbols: int) -> int:
@@ -83,7 +85,8 @@ def nets(*networks: Network) -> Nets:
     units = sum(units_of(step) for _, step in steps)
     waiting = sum(len({i for k, step in enumerate(network.steps) for i in step.of if i != k}) for network in networks)
     widest, read = max((step.size for _, step in steps), default=0), sum(len(step.of) for _, step in steps)
-    return Nets(tuple(shapes), units, widest, read, waiting)
+    dear = sum(step.size for _, step in steps if isinstance(step, Map) and step.function not in ("tanh", "relu"))
+    return Nets(tuple(shapes), units, widest, read, waiting, dear)
 
 
 def units_of(step: Step) -> int:

@@ -59,7 +59,7 @@ class Function(ABC):
         return self.fourth(y, at, reach)
 
     def corner(self, y: arb) -> tuple[arb, arb] | None:
-        """Where phi has a corner somewhere: it is within the first times D^2 of its tangent at y, and phi' within the
+        """Bounds for a phi with a corner: it is within the first times D^2 of its tangent at y, and phi' within the
         second, which may be infinite, times |D|^3 of phi'(y). None if y may be the corner, or there is none."""
         return None
 
