@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flint import ctx
+from flint import arb, ctx
 
 from certify.checker import contraction, rules, words
 from certify.checker.case import Case
@@ -217,6 +217,14 @@ def test_a_broken_rule_is_caught(name: str, monkeypatch: pytest.MonkeyPatch) -> 
     assert not any(passes(claim()) for passes in JUDGES)
     monkeypatch.setattr(owner, rule, broken)
     assert passes_the_checker(claim())
+
+
+def test_a_broken_reference_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where A is -J only the square of the rest counts, and its slope is 3/2."""
+    data = scalar(["*", "3/4", "x", "x"])
+    assert not passes_the_reference(data)
+    monkeypatch.setattr(other, "longest_rest", lambda *rest: arb(0))
+    assert passes_the_reference(data)
 
 
 # ------------------------------------------------------------------------------------------------------ a whole claim

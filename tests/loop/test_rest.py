@@ -27,7 +27,7 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.equilibrium import Rest, find_rest, seen_from
 from certify.loop.expressions import Expression, Number, atan, exp, sin, symbols
 from certify.loop.float32 import float_error
-from certify.loop.plants import System, domain_of_values, get_system
+from certify.loop.plants import System, domain_of_values, get_system, load_system
 from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
 from certify.loop.rigorous import field_on, precision
 from certify.lyapunov.function import Quadratic
@@ -314,3 +314,34 @@ def test_the_largest_rate_is_of_the_set_around_the_rest(tmp_path: Path) -> None:
     assert result.problem is not None and result.problem.rate > 0.5
     read = read_certificate(result.certificate)
     assert read.network.is_moved and read.system.exact_x_eq()[0] < 0 and result.contains([-0.0843, 0.0])
+
+
+def test_in_discrete_time_it_is_a_fixed_point() -> None:
+    """x+ = x/2 + u, u = 1/4 - x/4, rests at 1/3, where a step multiplies a deviation by 1/4."""
+    loop = scalar(x / 2 + u, -0.25, 0.25)
+    found = find_rest(ClosedLoop(replace(loop.system, time="discrete"), loop.network))
+    assert found is not None and found.stable and found.x == ("0.333333333333",) and found.u == ("0.166666666667",)
+    assert found.eigenvalues == ("0.25",)
+    for gain, stable in ((-1.25, True), (-1.75, False)):  # it turns around, by 0.75 and by 1.25
+        turned = scalar(x / 2 + u, gain, 0.25)
+        found = find_rest(ClosedLoop(replace(turned.system, time="discrete"), turned.network))
+        assert found is not None and found.stable is stable
+        assert found.x == (f"{0.25 / (0.5 - gain):.12f}",)
+
+
+def test_a_range_moves_the_fixed_point_of_a_map(tmp_path: Path) -> None:
+    """The Henon map whose a has a range: practically stable for any a(k), and for each a with one fixed point."""
+    folder = Path(__file__).parents[2] / "examples"
+    system = load_system(folder / "plants" / "henon.toml").with_ranges({"a": (Fraction(139, 100), Fraction(141, 100))})
+    policy = load_policy(folder / "policies" / "henon.pt")
+    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="lyapunov", effort=0.3))
+    assert result.verdict is Verdict.PROVED and result.claim == "nearby" and result.certificate is not None
+    assert result.levels.floor is not None and result.levels.floor < 1e-2
+    certificate = read_certificate(result.certificate)
+    V, loop = certificate.V.P, ClosedLoop(system, policy.network)
+    states = np.linalg.solve(np.linalg.cholesky(V).T, np.array([[1.0, 0.0, -0.7], [0.0, -1.0, 0.7]])).T
+    for a in ("1.39", "1.4", "1.41"):
+        f, x = system.with_parameters({"a": a}).function(), states * np.sqrt(certificate.roa)
+        for _ in range(2000):
+            x = np.stack([f(v, loop.policy(v[None])[0]) for v in x])
+        assert np.ptp(x, axis=0).max() < 1e-9 and x[0] @ V @ x[0] <= result.levels.floor
