@@ -26,10 +26,10 @@ from certify.certificates.evidence import read_evidence
 from certify.certificates.formats import SCHEMA, other_version
 from certify.certificates.model import Certificate
 from certify.errors import CertificateFormatError
+from certify.loop.activations import ACTIVATIONS
 from certify.loop.expressions import Number, Symbol, from_tree
 from certify.loop.plants import System
 from certify.loop.plants.system import Interval
-from certify.loop.activations import ACTIVATIONS
 from certify.loop.policies import TanhNetwork
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.neural import Neural

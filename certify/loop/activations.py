@@ -50,7 +50,7 @@ class Activation(ABC):
 
     def __call__(self, x: Any) -> Any:
         """phi of a number, a numpy array or a torch tensor."""
-        return self.pair(x)[0] if isinstance(x, np.ndarray | float) else self.in_torch(x)
+        return self.pair(np.asarray(x))[0] if isinstance(x, np.ndarray | float) else self.in_torch(x)
 
     @abstractmethod
     def pair(self, y: Array) -> tuple[Array, Array]:

@@ -355,7 +355,9 @@ def affine(W: Array, b: Array, h: Balls) -> Balls:
 def _through(phi: Activation, y: Balls, J: flint.arb_mat) -> tuple[Balls, flint.arb_mat]:
     """A function of balls, and the Jacobian behind it, for mean values where it has a corner in one."""
     slope = [phi.slope_in_arb(v) for v in y]
-    return [phi.in_arb(v) for v in y], flint.arb_mat([[slope[i] * J[i, j] for j in range(J.ncols())] for i in range(J.nrows())])
+    return [phi.in_arb(v) for v in y], flint.arb_mat(
+        [[slope[i] * J[i, j] for j in range(J.ncols())] for i in range(J.nrows())]
+    )
 
 
 def matrix(W: Array) -> flint.arb_mat:

@@ -125,7 +125,7 @@ def change(*path: Any, to: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (change("format", to="certify-policy/3"), "format"),
+        (change("format", to="certify-policy/4"), "format"),
         (change("format", to="certify-policy/2"), "clip"),
         (change("activation", to="relu"), "only tanh|Only tanh"),
         (change("weights", 0, to=torch.ones(3, 2) * float("nan")), "finite"),

@@ -13,6 +13,7 @@ from certify.loop.activations import ACTIVATIONS
 from certify.loop.policies.network import TanhNetwork
 
 _NEAR = 1e-9
+_MOST_BITS = 2**16  # of a number, beyond which it counts as unknown: sums of fractions grow from layer to layer
 
 
 def bounded_by_form(network: TanhNetwork, bounds: Sequence[tuple[Fraction, Fraction]]) -> bool:
@@ -108,6 +109,8 @@ def _affine(row: Sequence[float], h: Sequence[Fraction | None], bias: float) -> 
             if v is None:
                 return None
             total += Fraction(float(w)) * v
+            if max(total.numerator.bit_length(), total.denominator.bit_length()) > _MOST_BITS:
+                return None
     return total
 
 

@@ -1,5 +1,5 @@
-"""The policy file `certify-policy/1`, with a clip or bounds of validity `certify-policy/2`, with another activation than
-tanh `certify-policy/3`: plain tensors only.
+"""The policy file: plain tensors only. It is `certify-policy/1`, with a clip or bounds of validity `certify-policy/2`,
+with another activation than tanh `certify-policy/3`.
 
 Nothing in a file is executed, and equal policies give equal bytes (see `certify.loop.files.plain`).
 """

@@ -85,9 +85,7 @@ def sha256_of(head: bytes, arrays: Iterable[Array], words: str = "") -> str:
     return digest.hexdigest()
 
 
-def through(
-    weights: Sequence[Array], biases: Sequence[Array], x: Any, phi: Activation = ACTIVATIONS["tanh"]
-) -> Any:
+def through(weights: Sequence[Array], biases: Sequence[Array], x: Any, phi: Activation = ACTIVATIONS["tanh"]) -> Any:
     """Apply the layers to the last axis of x, in x's arithmetic (numpy array or torch tensor)."""
     for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         if k:

@@ -132,9 +132,10 @@ def relaxed(ends: Two, values: Two, s: Real, p: Real, t: Real, centre: Real) -> 
     return (upper + lower) / 2, gap
 
 
-def bent(centre: Real, spread: Real, s: Real, shift: Real, gap: Real, own: Real) -> Two:
-    """The middle of a unit's affine form behind a function, and its fresh error, from the rounding in front."""
-    fresh = gap + abs(s) * own + EPS * (abs(s) * (abs(centre) + spread) + abs(shift)) + TINY
+def bent(centre: Real, spread: Real, s: Real, steep: Real, shift: Real, gap: Real, own: Real) -> Two:
+    """The middle of a unit's affine form behind a function, and its fresh error, from the rounding in front; `steep` is
+    the size of s."""
+    fresh = gap + steep * own + EPS * (steep * (abs(centre) + spread) + abs(shift)) + TINY
     return s * centre + shift, fresh
 
 
@@ -310,7 +311,7 @@ def bend(
     for i in range(units):
         for k in range(batch):
             steep = abs(slope[i, k])
-            middle, new = bent(y[i, 0, k], spread[i, k], slope[i, k], shift[i, k], gap[i, k], rounding[i, k])
+            middle, new = bent(y[i, 0, k], spread[i, k], slope[i, k], steep, shift[i, k], gap[i, k], rounding[i, k])
             old = steep * error[i, k]
             form = (abs(middle) + steep * spread[i, k]) * wider
             y[i, 0, k] = middle

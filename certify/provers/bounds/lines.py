@@ -68,8 +68,6 @@ def _between(lower: Array, upper: Array, s: Array, slack: Array) -> Lines:
 LINES: dict[str, Callable[[Array, Array], Lines]] = {
     "relu": _relu,
     "sigmoid": _sigmoid,
-    **{
-        name: partial(_by_parts, ACTIVATIONS[name]) for name in ("elu", "silu", "gelu", "softplus", "mish", "softsign")
-    },
+    **{name: partial(_by_parts, ACTIVATIONS[name]) for name in ("elu", "silu", "gelu", "softplus", "mish", "softsign")},
 }
 """All activations but tanh, by their names."""

@@ -82,7 +82,7 @@ def bend(
     """See `kernels.bend`."""
     grown, wider = 1 + width * EPS, 1 + (y.shape[1] - 1) * EPS
     steep = np.abs(slope)
-    y[:, 0], errors[:, 0] = bent(y[:, 0], spread, slope, shift, gap, rounding)
+    y[:, 0], errors[:, 0] = bent(y[:, 0], spread, slope, steep, shift, gap, rounding)
     errors[:, 1] = steep * error
     form = (np.abs(y[:, 0]) + steep * spread) * wider
     size[:], fresh[:], older = ((v * v).sum(0) for v in (form, errors[:, 0], errors[:, 1]))
