@@ -82,7 +82,7 @@ class Activation(ABC):
             return self.at_point(v.lower()).union(self.at_point(v.upper())) if v.rad() != 0 else self.at_point(v)
         direct, middle = self.formula(v), v.mid()
         near = self.formula(middle) + self.slope_in_arb(v) * (v - middle)
-        return direct.intersection(near) if direct.overlaps(near) else near
+        return direct.intersection(near) if direct.is_finite() else near
 
     def at_point(self, v: flint.arb) -> flint.arb:
         """phi of a small ball."""
@@ -94,7 +94,7 @@ class Activation(ABC):
         here = self.formula(flint.arb_series([middle, 1], prec=2))[1]
         found = here + flint.arb(0, 2 * self.bend) * (v - middle)
         most = flint.arb(0, self.steepest)
-        return found.intersection(most) if found.overlaps(most) else found
+        return found.intersection(most) if found.is_finite() else most
 
 
 def fourth_of_tanh(y: Array, radius: Array) -> Array:

@@ -187,7 +187,7 @@ class Machine:
             phi = self.phi if k < len(self.layers) - 1 else ACTIVATIONS["tanh"]
             wide = [v + flint.arb(0, e) for v, e in zip(y, error, strict=True)]
             slopes = [_slope(phi, v) for v in wide]
-            fresh = [self.tanh_ulp * _ulp(phi, v) + ball(_TINY) for v in wide]
+            fresh = [_fresh(phi, v, self.tanh_ulp) for v in wide]
             steps.append(_Step(numbers, sums, phi.name, fresh, slopes))
             over = [_slope(phi, v) for v in y]
             h, middle = [_value(phi, v) for v in y], [phi.in_arb(v) for v in middle]
@@ -343,13 +343,19 @@ def _slope(phi: Activation, y: flint.arb) -> flint.arb:
     return (1 - most * most).union(1 - least * least)
 
 
-def _ulp(phi: Activation, y: flint.arb) -> flint.arb:
-    """The unit in the last place of the largest binary32 number among phi's values; |tanh| < 1 in truth. 0 for relu,
-    which rounds nothing."""
-    size = float(_value(phi, y).abs_upper())  # rounding does not lead below a power of two
+def _ulp(t: flint.arb, most: float = math.inf) -> flint.arb:
+    """The unit in the last place of the largest binary32 number within t, of numbers below `most`, a power of two, in
+    truth."""
+    size = float(t.abs_upper())  # rounding does not lead below a power of two
     exponent = math.frexp(size)[1] if size else -149
-    exponent = min(exponent, 0) if phi.name == "tanh" else exponent
-    return flint.arb(0) if phi.name == "relu" else flint.arb(2) ** max(exponent - _DIGITS, -149)
+    exponent = min(exponent, math.frexp(most)[1] - 1) if most < math.inf else exponent
+    return flint.arb(2) ** max(exponent - _DIGITS, -149)
+
+
+def _fresh(phi: Activation, y: flint.arb, units: flint.arb) -> flint.arb:
+    """The error of phi itself, of so many units in the last place; relu has none."""
+    t, most = _value(phi, y), 1.0 if phi.name == "tanh" else math.inf
+    return flint.arb(0) if phi.name == "relu" else units * _ulp(t, most) + ball(_TINY)
 
 
 def _spectral_norm(W: flint.arb_mat) -> flint.arb:

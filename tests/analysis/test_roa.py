@@ -318,7 +318,10 @@ def test_the_reference_is_asked_where_it_is_quick(tmp_path: Path) -> None:
     result = certify_roa(*scalar_tanh(), tmp_path)
     assert result.checker is not None and result.to_dict()["reference"] == "ACCEPTED"
     assert result.checker["reference"]["certificate_sha256"] == result.checker["certificate_sha256"]
-    assert "ACCEPTED BY BOTH" in dict(rows_of(result.to_dict(), True))["checker"] and "So did the reference" in result.report().read_text()
+    assert (
+        "ACCEPTED BY BOTH" in dict(rows_of(result.to_dict(), True))["checker"]
+        and "So did the reference" in result.report().read_text()
+    )
 
 
 def test_what_the_reference_refuses_is_mended_or_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -276,10 +276,11 @@ def test_units_of_tanh_are_those_of_binary32() -> None:
         (2.0**-140, 2.0**-149),
         (0.0, 2.0**-149),
     ]:
-        assert float(binary32._ulp(flint.arb(float(t)))) == unit
-        assert float(binary32._ulp(flint.arb(-float(t)))) == unit
+        assert float(binary32._ulp(flint.arb(float(t)), 1.0)) == unit
+        assert float(binary32._ulp(flint.arb(-float(t)), 1.0)) == unit
     for t in np.random.default_rng(0).uniform(-1, 1, 1000).astype(f32):
-        assert float(binary32._ulp(flint.arb(float(t)))) == float(np.spacing(abs(t)))
+        assert float(binary32._ulp(flint.arb(float(t)), 1.0)) == float(np.spacing(abs(t)))
+        assert float(binary32._ulp(flint.arb(float(64 * t)))) == float(np.spacing(abs(64 * t)))
 
 
 def test_the_tanh_of_torch_and_numpy_is_as_good_as_the_default_says() -> None:
