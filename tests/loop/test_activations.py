@@ -14,8 +14,8 @@ import torch
 
 from certify.checker.document import Policy as Stated
 from certify.checker.functions import FUNCTIONS
-from certify.checker.networks import Affine, Map, Network
 from certify.checker.networks import FUNCTIONS as OF_MAPS
+from certify.checker.networks import Affine, Map, Network
 from certify.errors import InputError
 from certify.loop.activations import ACTIVATIONS, Activation
 from certify.loop.plants import get_system
