@@ -230,7 +230,8 @@ def _may_go_beyond(result: RoaResult, options: RoaOptions) -> bool:
 
 def _can_be_flattened(result: RoaResult) -> bool:
     """True if `controllers flatten` takes the policy and judges it by the loop that is certified."""
-    return len(result.network.weights) > 1 and not result.system.in_steps and not result.system.ranges
+    network, system = result.network, result.system
+    return len(network.weights) > 1 and network.activation == "tanh" and not (system.in_steps or system.ranges)
 
 
 def _share_proved(result: RoaResult) -> float:

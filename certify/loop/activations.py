@@ -17,19 +17,17 @@ from typing import Any
 
 import flint
 import numpy as np
-from numpy.typing import NDArray
 
 from certify.errors import InputError
+from certify.loop import smooth
+from certify.loop.smooth import Array, Five
 
-Array = NDArray[np.float64]
-Five = tuple[Array, Array, Array, Array, Array]
 Pair = Callable[[Array], tuple[Array, Array]]
 Derivatives = Callable[[Array], Five]
 Formula = Callable[[Any], Any]
 CERTAIN = 1 + 1e-3  # share of its range by which a number must be away from 0 for its sign, beyond all rounding
 TANH4, TANH5 = 4.1, 16.0  # no derivative of tanh of this order is larger
 _THRESHOLD = 40.0  # where torch's softplus may become v itself
-_NORMAL = 1 / math.sqrt(2 * math.pi)
 
 
 class Activation(ABC):
@@ -145,11 +143,11 @@ class _Sigmoid(Activation):
         return Fraction(1, 2) if q == 0 else None
 
     def pair(self, y: Array) -> tuple[Array, Array]:
-        s = _sigmoid(y)
+        s = smooth.sigmoid(y)
         return s, s * (1 - s)
 
     def series(self, y: Array) -> Five:
-        s, p, p2, p3, p4 = _sigmoids(y)
+        s, p, p2, p3, p4 = smooth.sigmoids(y)
         return s, p, p2 / 2, p3 / 6, p4 / 24
 
     def formula(self, v: Any) -> Any:
@@ -290,127 +288,22 @@ class _Softsign(_Bent):
         return (far * far).union(near * near)
 
 
-# ----------------------------------------------------------------------------------------------- the smooth functions
-
-
-def _sigmoid(y: Array) -> Array:
-    return np.asarray(0.5 + 0.5 * np.tanh(0.5 * y))
-
-
-def _sigmoids(y: Array) -> Five:
-    """The sigmoid and its derivatives."""
-    s = _sigmoid(y)
-    p, odd = s * (1 - s), 1 - 2 * s
-    return s, p, p * odd, p * (1 - 6 * p), p * odd * (1 - 12 * p)
-
-
-def _silu(y: Array) -> Five:
-    return _times_v(y, _sigmoids(y))
-
-
-def _softplus(y: Array) -> Five:
-    s, p, p2, p3, _ = _sigmoids(y)
-    return _logarithm(y), s, p, p2, p3
-
-
-def _logarithm(y: Array) -> Array:
-    """log(1 + exp(y))."""
-    return np.asarray(np.maximum(y, 0.0) + np.log1p(np.exp(-np.abs(y))))
-
-
-def _normal(y: Array) -> tuple[Array, Array]:
-    """The normal distribution and its density."""
-    from scipy.special import ndtr
-
-    return ndtr(y), _NORMAL * np.exp(-0.5 * y * y)
-
-
-def _gelu(y: Array) -> Five:
-    below, g = _normal(y)
-    w = y * y
-    return y * below, below + y * g, g * (2 - w), g * y * (w - 4), g * (w * (7 - w) - 4)
-
-
-def _mish(y: Array) -> Five:
-    s1, s2, s3, s4, _ = _sigmoids(y)
-    t, q = _tanh_of_softplus(y)
-    q2, q3, q4 = -2 * t * q, q * (6 * t * t - 2), q * t * (16 - 24 * t * t)
-    return _times_v(
-        y,
-        (
-            t,
-            q * s1,
-            q2 * s1**2 + q * s2,
-            q3 * s1**3 + 3 * q2 * s1 * s2 + q * s3,
-            q4 * s1**4 + 6 * q3 * s1**2 * s2 + q2 * (3 * s2**2 + 4 * s1 * s3) + q * s4,
-        ),
-    )
-
-
-def _tanh_of_softplus(y: Array) -> tuple[Array, Array]:
-    """tanh(log w), w = 1 + exp(y), which is 1 - 2/(1 + w^2), and 1 minus its square, which is (2 w/(1 + w^2))^2."""
-    e = np.exp(-np.abs(y))
-    up = y > 0
-    a = np.where(up, e, 1.0)  # w = b/a
-    b = np.where(up, e + 1, 1 + e)
-    whole = a * a + b * b
-    half = 2 * a * b / whole
-    return 1 - 2 * a * a / whole, half * half
-
-
-def _times_v(y: Array, f: Five) -> Five:
-    """v f(v) and its derivatives, by those of f."""
-    f0, f1, f2, f3, f4 = f
-    return y * f0, f0 + y * f1, 2 * f1 + y * f2, 3 * f2 + y * f3, 4 * f3 + y * f4
-
-
-def _silu_pair(y: Array) -> tuple[Array, Array]:
-    s = _sigmoid(y)
-    f = y * s
-    return f, s + f * (1 - s)
-
-
-def _gelu_pair(y: Array) -> tuple[Array, Array]:
-    below, g = _normal(y)
-    return y * below, below + y * g
-
-
-def _softplus_pair(y: Array) -> tuple[Array, Array]:
-    return _logarithm(y), _sigmoid(y)
-
-
-def _mish_pair(y: Array) -> tuple[Array, Array]:
-    t, q = _tanh_of_softplus(y)
-    return y * t, t + y * q * _sigmoid(y)
-
-
-def _mish_in_arb(v: Any) -> Any:
-    w = v.exp() + 1
-    return v * (1 - 2 / (w * w + 1))
-
-
-def _gelu_in_arb(v: Any) -> Any:
-    return v * ((v * (flint.arb(1) / 2).sqrt()).erf() + 1) / 2
-
-
-def _silu_in_arb(v: Any) -> Any:
-    return v / ((-v).exp() + 1)
-
-
-def _softplus_in_arb(v: Any) -> Any:
-    return (v.exp() + 1).log()
-
-
 ACTIVATIONS: dict[str, Activation] = {
     row.name: row
     for row in (
         *(_Tanh(), _Relu(), _Elu(), _Sigmoid()),
-        _Smooth("silu", "SiLU", _silu_pair, _silu, _silu_in_arb).bounded(False, 0.2621, 1.106, 0.03516, 0.03693),
-        _Smooth("gelu", "GELU", _gelu_pair, _gelu, _gelu_in_arb).bounded(False, 0.3991, 1.139, 0.06654, 0.02508),
-        _Softplus("softplus", "Softplus", _softplus_pair, _softplus, _softplus_in_arb).bounded(
-            True, 0.138, 1.0, 0.07006, 0.08393
+        _Smooth("silu", "SiLU", smooth.silu_pair, smooth.silu, smooth.silu_in_arb).bounded(
+            rises=False, bend=0.2621, steepest=1.106, fourth=0.03516, fifth=0.03693
         ),
-        _Smooth("mish", "Mish", _mish_pair, _mish, _mish_in_arb).bounded(False, 0.3406, 1.105, 0.3439, 0.7983),
+        _Smooth("gelu", "GELU", smooth.gelu_pair, smooth.gelu, smooth.gelu_in_arb).bounded(
+            rises=False, bend=0.3991, steepest=1.139, fourth=0.06654, fifth=0.02508
+        ),
+        _Softplus("softplus", "Softplus", smooth.softplus_pair, smooth.softplus, smooth.softplus_in_arb).bounded(
+            rises=True, bend=0.138, steepest=1.0, fourth=0.07006, fifth=0.08393
+        ),
+        _Smooth("mish", "Mish", smooth.mish_pair, smooth.mish, smooth.mish_in_arb).bounded(
+            rises=False, bend=0.3406, steepest=1.105, fourth=0.3439, fifth=0.7983
+        ),
         _Softsign(),
     )
 }

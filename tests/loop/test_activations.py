@@ -248,4 +248,5 @@ def test_an_onnx_graph_is_read(name: str, tmp_path: Path) -> None:
     )
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=9), tmp_path / "p.onnx")
     found = import_policy(tmp_path / "p.onnx", PLANT, SAID)
-    assert found.policy.network.activation == name and found.difference.in_double < 1e-12
+    most = 1e-6 if name == "gelu" else 1e-12  # the onnx package's own has constants of single precision
+    assert found.policy.network.activation == name and found.difference.in_double < most

@@ -209,6 +209,8 @@ def test_a_corner_at_the_operating_point_proves_nothing() -> None:
     biases = (first, *law.biases[1:])
     case = case_of(PLANT, replace(law, biases=biases))
     assert prove_local(case.problem, case.T, domain_limit(case.P, PLANT.domain)) is None
+    result = certify_roa(PLANT, case.loop.network)
+    assert result.verdict is Verdict.UNKNOWN and "a unit of relu has its corner at the operating point" in result.reason
 
 
 # --------------------------------------------------------------------------------------------------------------- proofs

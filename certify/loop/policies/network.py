@@ -69,10 +69,9 @@ class TanhNetwork:
 
     def __post_init__(self) -> None:
         weights, biases = frozen_layers(self.weights, self.biases, _WHOSE)
-        name = activation(self.activation).name  # or it is refused
-        object.__setattr__(self, "activation", name if len(weights) > 1 else "tanh")
-        object.__setattr__(self, "weights", weights)
-        object.__setattr__(self, "biases", biases)
+        function = activation(self.activation).name if len(weights) > 1 else "tanh"
+        for name, value in (("weights", weights), ("biases", biases), ("activation", function)):
+            object.__setattr__(self, name, value)
         for name in ("scale", "offset"):
             object.__setattr__(self, name, frozen(getattr(self, name), name, _WHOSE))
         if self.squash not in get_args(Squash):
@@ -209,13 +208,13 @@ class TanhNetwork:
     def folded(self, u_eq: Sequence[Fraction]) -> TanhNetwork:
         """A network without centring that reads x and is pi up to rounding: for search and simulation."""
         if self.is_moved:
-            first = self.biases[0] + self.weights[0] @ self.origin
-            return replace(self, biases=(first, *self.biases[1:]), origin=np.zeros(self.n))
+            biases = (self.biases[0] + self.weights[0] @ self.origin, *self.biases[1:])
+            return replace(self, biases=biases, origin=np.zeros(self.n))
         if self.centre == "none":
             return self
         shift, offset = self.centring(u_eq, self.net(np.zeros(self.n)).tolist(), _ARRAYS)
-        biases = (*self.biases[:-1], self.biases[-1] + np.array(shift))
-        return replace(self, biases=biases, offset=np.array(offset), centre="none")
+        last = self.biases[-1] + np.array(shift)
+        return replace(self, biases=(*self.biases[:-1], last), offset=np.array(offset), centre="none")
 
     def jacobian_at_origin(self, u_eq: Sequence[Fraction]) -> Array:
         """`d pi / d x` at 0 in float64, shape (m, n).
@@ -224,8 +223,7 @@ class TanhNetwork:
         ------
         InputError : the clip may act at the origin.
         """
-        x = self.origin
-        jacobian = np.eye(self.n)
+        x, jacobian = self.origin, np.eye(self.n)
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             if k:
                 x, slope = self.phi.pair(x)
@@ -233,21 +231,19 @@ class TanhNetwork:
             x, jacobian = weight @ x + bias, weight @ jacobian
         squashed = self.squashed(self.beta(u_eq) if self.centre == "preactivation" else x)
         self.require_unclipped(u_eq if self.centre != "none" else (self.scale * squashed + self.offset).tolist())
-        outer = self.squash_slope(squashed) * np.ones(self.m)
-        return np.asarray(self.scale[:, None] * (outer[:, None] * jacobian))
+        return np.asarray(self.scale[:, None] * ((self.squash_slope(squashed) * np.ones(self.m))[:, None] * jacobian))
 
     def sha256(self) -> str:
-        """Hash of the canonical bytes: squash, centre, then the arrays as `sha256_of` has them.
-
-        They are the layers in order as weight, bias; scale; offset; with a clip lo and hi; then, unless the activation
-        is tanh, the steps in words. The origin is not part of them.
-        """
+        """Hash of the canonical bytes as FORMAT.md has them; the origin is not part of them."""
         pairs = [a for pair in zip(self.weights, self.biases, strict=True) for a in pair]
-        head = f"certify-policy/1\0{self.squash}\0{self.centre}\0".encode()
-        steps, words = 2 * len(self.weights) - 1, ""
-        if self.activation != "tanh":
-            words = "".join(f"map {k} {self.activation}\0" if k % 2 else f"affine {k}\0" for k in range(steps))
-        return sha256_of(head, (*pairs, self.scale, self.offset, *(self.clip or ())), words)
+        head, rest = f"certify-policy/1\0{self.squash}\0{self.centre}\0", (self.scale, self.offset, *(self.clip or ()))
+        return sha256_of(head.encode(), (*pairs, *rest), _in_words(self))
+
+
+def _in_words(network: TanhNetwork) -> str:
+    """The steps as the hash has them; nothing where tanh is the only function."""
+    steps = range(0 if network.activation == "tanh" else 2 * len(network.weights) - 1)
+    return "".join(f"map {k} {network.activation}\0" if k % 2 else f"affine {k}\0" for k in steps)
 
 
 class _Arrays:

@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 _CALL, _EACH, _ENTRY = 3e5, 1e5, 0.12  # operations of a layer, of one of the equations, of an entry of a product
 _MOST_NUMBERS, _MOST_PRODUCTS = 2**25, 2**33  # size of the sums over paths: the checker refuses more
 _MARGIN = 1e-3  # share of an input's range, left to the checker's rounding where a clip begins
+_AT_CORNER = 1e-12  # what a unit reads, so near 0 that no ball of any use is free of its corner
 _UNIT = 2.0**-51  # twice what a checker counts for each term of a sum, relative to the sum's size
 _ROUNDED = 2.0**-49  # and for anything else that it computes
 
@@ -279,6 +280,14 @@ def paths(loop: ClosedLoop, at: Array | None = None, resting: bool = True) -> Pa
         wrong = np.zeros_like(u)
     rounding = np.zeros_like(u) if resting else wrong + _ROUNDED * (np.abs(u) + np.abs(folded.offset))
     return Paths(loop, middle, u, rounding, tuple(layers))
+
+
+def corner_of(known: Paths) -> str | None:
+    """The activation with a corner at the paths' middle itself, where no ball around that has a model; or None."""
+    for layer in known.layers:
+        if layer.phi is not None and not layer.phi.is_smooth and np.any(np.abs(layer.y) <= _AT_CORNER):
+            return layer.phi.name
+    return None
 
 
 def _room(loop: ClosedLoop, u: Array) -> Array:

@@ -25,7 +25,6 @@ SAMPLES = 10_000
 _SLACK = 4.0
 _TANH_UNITS = 8.0
 _STRAIGHT = 20.0  # from where on torch takes softplus for its argument
-# The onnx package's own gelu has constants of single precision.
 _SINGLE, _DOUBLE = 2.0**-24, 2.0**-53
 
 
@@ -157,7 +156,7 @@ def _run(steps: Sequence[Step], x: Array, error: Array, unit: float) -> tuple[Ar
                 e = phi.steepest * e + _TANH_UNITS * unit * (np.abs(h) + np.abs(value))
                 if step.function == "softplus":
                     e = np.where(h > _STRAIGHT - e, e + np.exp(-_STRAIGHT), e)
-                if step.function == "gelu":
+                if step.function == "gelu":  # the onnx package's own has constants of single precision
                     e = e + _SINGLE * np.abs(h)
                 h = value
             case Clip():

@@ -92,7 +92,7 @@ def fold(steps: Sequence[Step], n: int) -> Folded:
 
 
 def _one_activation(steps: Sequence[Step]) -> tuple[list[Step], str]:
-    """The steps with `Tanh` in the place of the one function between their layers, and its name; relu may be a clip.
+    """The steps with `Tanh` for the one function between their layers, and that function's name; relu may be a clip.
 
     Raises
     ------

@@ -290,11 +290,8 @@ def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain
             return graph.scaled(chain, others[0], at, divide=True)
         case "Neg", 0, 1:
             return graph.negated(chain)
-        case "Elu", 0, 1 if "alpha" in flags and flags["alpha"].f != 1:
-            raise InputError(f"{at} must have alpha 1; found {flags['alpha'].f}.")
-        case "Gelu", 0, 1 if "approximate" in flags and flags["approximate"].s != b"none":
-            raise InputError(f"{at} must be the exact one, without `approximate`.")
         case _, 0, 1 if kind in _ACTIVATIONS:
+            _require_known_form(flags, at)
             return graph.mapped(chain, kind.lower())
         case "Identity", 0, 1:
             return chain
@@ -311,6 +308,14 @@ def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain
             bounds = [*given[1:], None, None]
             return graph.clipped(chain, bounds[0], bounds[1], at)
     raise InputError(f"{at} is not read: the operations are {_KNOWN}, with the observation in the usual place.")
+
+
+def _require_known_form(flags: dict[str, Any], at: str) -> None:
+    """Refuse an Elu with another alpha than 1, and the Gelu that is an approximation."""
+    if "alpha" in flags and flags["alpha"].f != 1:
+        raise InputError(f"{at} must have alpha 1; found {flags['alpha'].f}.")
+    if "approximate" in flags and flags["approximate"].s != b"none":
+        raise InputError(f"{at} must be the exact one, without `approximate`.")
 
 
 def _require_real(flags: dict[str, Any], at: str) -> None:
