@@ -185,13 +185,13 @@ def volume_name(n: int) -> str:
     return {1: "length", 2: "area"}.get(n, "volume")
 
 
-def network_name(widths: Sequence[int], activation: str = "tanh") -> str:
+def network_name(widths: Sequence[int]) -> str:
     """The name of a network without a squash.
 
     >>> network_name((2, 16, 1))
     'the 2-16-1 tanh network'
     """
-    return f"the {'-'.join(map(str, widths))} {activation} network"
+    return f"the {'-'.join(map(str, widths))} tanh network"
 
 
 def estimated(volume: float, deviation: float, unit: str) -> str:

@@ -291,8 +291,7 @@ def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain
         case "Neg", 0, 1:
             return graph.negated(chain)
         case _, 0, 1 if kind in _ACTIVATIONS:
-            _require_known_form(flags, at)
-            return graph.mapped(chain, kind.lower())
+            return _activated(chain, kind, flags, at)
         case "Identity", 0, 1:
             return chain
         case "Cast", 0, 1:
@@ -310,12 +309,13 @@ def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain
     raise InputError(f"{at} is not read: the operations are {_KNOWN}, with the observation in the usual place.")
 
 
-def _require_known_form(flags: dict[str, Any], at: str) -> None:
-    """Refuse an Elu with another alpha than 1, and the Gelu that is an approximation."""
+def _activated(chain: Chain, kind: str, flags: dict[str, Any], at: str) -> Chain:
+    """An activation of the chain, but no Elu with another alpha than 1, nor the Gelu that is an approximation."""
     if "alpha" in flags and flags["alpha"].f != 1:
         raise InputError(f"{at} must have alpha 1; found {flags['alpha'].f}.")
     if "approximate" in flags and flags["approximate"].s != b"none":
         raise InputError(f"{at} must be the exact one, without `approximate`.")
+    return graph.mapped(chain, kind.lower())
 
 
 def _require_real(flags: dict[str, Any], at: str) -> None:
