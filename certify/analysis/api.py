@@ -106,7 +106,7 @@ def certify_roa(
         "FILE.py:NAME" (whose code is run), a `System`, or None for the plant that the policy names. For other
         parameters or another domain: `get_system("pendulum").with_parameters({"m": "0.2"})`, `with_domain`.
     policy : the path of a policy file, of this program or another's; a `Policy` or `TanhNetwork`; a torch module of
-        Linear and Tanh layers and constant scalings; or a state_dict of such layers.
+        Linear layers, activations and constant scalings; or a state_dict of such layers.
     out : folder for `certificate.json`, made if it is not there. None is a temporary folder that lives as long as the
         result does: copy the certificate, or keep the result. No report is drawn until `result.report()` asks for it.
     options : all options of the run in one `RoaOptions`, instead of the keywords below.

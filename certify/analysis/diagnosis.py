@@ -230,7 +230,8 @@ def _may_go_beyond(result: RoaResult, options: RoaOptions) -> bool:
 
 def _can_be_flattened(result: RoaResult) -> bool:
     """True if `controllers flatten` takes the policy and judges it by the loop that is certified."""
-    return len(result.network.weights) > 1 and not result.system.in_steps and not result.system.ranges
+    network, system = result.network, result.system
+    return len(network.weights) > 1 and network.activation == "tanh" and not (system.in_steps or system.ranges)
 
 
 def _share_proved(result: RoaResult) -> float:
@@ -257,9 +258,8 @@ def _bend(network: TanhNetwork, half_widths: Array) -> float:
     y, J, units = np.zeros(network.n), np.eye(network.n), list[tuple[Array, Array, Array]]()
     for W, b in zip(network.weights[:-1], network.biases[:-1], strict=True):
         y, J = W @ y + b, W @ J
-        t, reach = np.tanh(y), np.abs(J) @ half_widths
-        slope = 1 - t**2
-        ends = [np.abs(np.tanh(y + v) - t - slope * v) for v in (reach, -reach)]
+        (t, slope), reach = network.phi.pair(y), np.abs(J) @ half_widths
+        ends = [np.abs(network.phi(y + v) - t - slope * v) for v in (reach, -reach)]
         units.append((W, slope, (ends[0] + ends[1]) / 2))
         y, J = t, slope[:, None] * J
     gain, total = network.weights[-1], 0.0

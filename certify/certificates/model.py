@@ -90,7 +90,10 @@ class Certificate:
                 "outer": None if self.claim.outer is None else _outer(self.claim.outer, system),
             }
             | _start(self.claim),
-            "networks": [network_section(POLICY, network.weights, network.biases), *_networks(self.claim.outer)],
+            "networks": [
+                network_section(POLICY, network.weights, network.biases, network.activation),
+                *_networks(self.claim.outer),
+            ],
             **loop_sections(system, network),
             "lyapunov": {"kind": "quadratic", "P": encode(self.V.P)},
             "levels": {name: float(level).hex() for name, level in self.claim.levels.items()},

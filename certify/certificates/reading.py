@@ -21,11 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates.claims import CLAIMS, Claim, Outer
-from certify.certificates.encoding import decode, decode_layers, network_named
+from certify.certificates.encoding import decode, decode_layers, function_of, network_named
 from certify.certificates.evidence import read_evidence
 from certify.certificates.formats import SCHEMA, other_version
 from certify.certificates.model import Certificate
 from certify.errors import CertificateFormatError
+from certify.loop.activations import ACTIVATIONS
 from certify.loop.expressions import Number, Symbol, from_tree
 from certify.loop.plants import System
 from certify.loop.plants.system import Interval
@@ -138,14 +139,16 @@ def _read_system(plant: Mapping[str, Any], sample: Any, people: Mapping[str, Map
 
 
 def _read_network(policy: Mapping[str, Any], networks: Sequence[Mapping[str, Any]], n: int, m: int) -> TanhNetwork:
+    named = network_named(networks, policy["network"])
     return TanhNetwork(
-        *decode_layers(network_named(networks, policy["network"])),
+        *decode_layers(named, ACTIVATIONS),
         scale=decode(policy["scale"], (m,)),
         offset=decode(policy["offset"], (m,)),
         squash=policy["squash"],
         centre=policy["centre"],
         clip=_read_clip(policy["clip"], m),
         origin=decode(policy["origin"], (n,)),
+        activation=function_of(named),
     )
 
 

@@ -24,7 +24,7 @@ _HELP = {
     "kind": _KINDS,
     "states": "The plant's states in the order in which the network reads them, as in x,theta.",
     "prefix": "Keys of a state_dict's layers up to their numbers, as in actor.pi_net.fcs.",
-    "activation": "Between the layers of a state_dict: tanh.",
+    "activation": "Between the layers of a state_dict: tanh, relu, elu, silu, gelu and others; docs/import.md has all.",
     "squash": "After the last layer of a state_dict: identity, tanh or relu-tanh.",
     "normaliser": "File of the observations' normaliser (VecNormalize, rsl_rl), or none.",
     "epsilon": "What rsl_rl's normaliser adds to the standard deviation; 0.01 if nothing is said.",

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError, OptionError
+from certify.loop.activations import ACTIVATIONS, Activation
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.rigorous import Balls, ball, centring_with_errors, rounded_up
 
@@ -60,12 +61,13 @@ class _Layer:
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """A layer's own errors on a box: of its numbers and sums before the tanh, (out,), and of the tanh itself, with the
-    slopes through which errors pass; both None without a tanh."""
+    """A layer's own errors on a box: of its numbers and sums before the function, (out,), and of the function itself,
+    with its name and the slopes through which errors pass; None without a function."""
 
     numbers: Balls
     sums: Balls
-    tanh: Balls | None
+    name: str
+    fresh: Balls | None
     slopes: Balls | None
 
 
@@ -81,6 +83,7 @@ class Machine:
     offset_error: Balls
     clip_errors: tuple[tuple[float, float], ...]
     tanh_ulp: flint.arb
+    phi: Activation
     reach: tuple[float, ...]
 
     @property
@@ -135,6 +138,7 @@ class Machine:
             offset_error=error_of_offset,
             clip_errors=tuple(zip(*clip, strict=True)),
             tanh_ulp=flint.arb(float(tanh_ulp)),
+            phi=network.phi,
             reach=tuple(np.abs(network.weights[0]).sum(axis=0).tolist()),
         )
 
@@ -177,15 +181,17 @@ class Machine:
                 for v, c, d in zip(natural, middle, _times(J, away), strict=True)
             ]
             if k == len(self.layers) - 1 and not self.squash:
-                steps.append(_Step(numbers, sums, None, None))
+                steps.append(_Step(numbers, sums, "", None, None))
                 h = y
                 break
-            around = [_tanh(v + flint.arb(0, e)) for v, e in zip(y, error, strict=True)]
-            slopes = [_slope(t) for t in around]
-            fresh = [self.tanh_ulp * _ulp(t) + ball(_TINY) for t in around]
-            steps.append(_Step(numbers, sums, fresh, slopes))
-            h, middle = [_tanh(v) for v in y], [v.tanh() for v in middle]
-            J = flint.arb_mat([[s * J[i, j] for j in range(n)] for i, s in enumerate(map(_slope, h))])
+            phi = self.phi if k < len(self.layers) - 1 else ACTIVATIONS["tanh"]
+            wide = [v + flint.arb(0, e) for v, e in zip(y, error, strict=True)]
+            slopes = [_slope(phi, v) for v in wide]
+            fresh = [_fresh(phi, v, self.tanh_ulp) for v in wide]
+            steps.append(_Step(numbers, sums, phi.name, fresh, slopes))
+            over = [_slope(phi, v) for v in y]
+            h, middle = [_value(phi, v) for v in y], [phi.in_arb(v) for v in middle]
+            J = flint.arb_mat([[s * J[i, j] for j in range(n)] for i, s in enumerate(over)])
             error = [s.abs_upper() * e + f for s, e, f in zip(slopes, error, fresh, strict=True)]
         return steps, entering, self._output([v.abs_upper() + e for v, e in zip(h, error, strict=True)])
 
@@ -210,9 +216,9 @@ class Machine:
         )
         for k in reversed(range(len(steps))):
             step, layer = steps[k], self.layers[k]
-            if step.tanh is not None and step.slopes is not None:
-                found[f"layer {k}, tanh"] = rows.on(step.tanh)
-                rows = rows.through_tanh(step.slopes)
+            if step.fresh is not None and step.slopes is not None:
+                found[f"layer {k}, {step.name}"] = rows.on(step.fresh)
+                rows = rows.through_function(step.slopes)
             found[f"layer {k}, sums"] = rows.on(step.sums)
             found[f"layer {k}, rounded numbers"] = rows.on(step.numbers)
             rows = rows.through(layer)
@@ -236,8 +242,8 @@ class _Rows:
         direct, added = _times(_magnitude(self.centre), errors), _times(self.spread, errors)
         return [(c + s.min(r * length)).upper() for c, s, r in zip(direct, added, self.radius, strict=True)]
 
-    def through_tanh(self, slopes: Balls) -> _Rows:
-        """The derivatives in front of tanh, whose slopes are in these balls, (k,)."""
+    def through_function(self, slopes: Balls) -> _Rows:
+        """The derivatives in front of a function, whose slopes are in these balls, (k,)."""
         m, columns = self.centre.nrows(), range(len(slopes))
         middles, radii = [s.mid() for s in slopes], [flint.arb(s.rad()).upper() for s in slopes]
         steepest = [s.abs_upper() for s in slopes]
@@ -323,22 +329,33 @@ def _require_finite(size: flint.arb, what: str) -> None:
         )
 
 
-def _tanh(y: flint.arb) -> flint.arb:
-    """tanh of a whole ball, from its ends, since tanh rises; Arb's own tanh is wide on wide balls."""
-    return y.lower().tanh().union(y.upper().tanh())
+def _value(phi: Activation, y: flint.arb) -> flint.arb:
+    """phi of a whole ball; tanh from its ends, since it rises: Arb's own is wide on wide balls."""
+    return y.lower().tanh().union(y.upper().tanh()) if phi.name == "tanh" else phi.in_arb(y)
 
 
-def _slope(t: flint.arb) -> flint.arb:
-    """1 - t^2, the slope of tanh at the value t."""
+def _slope(phi: Activation, y: flint.arb) -> flint.arb:
+    """The slopes of phi on a ball; those of tanh are 1 - t^2 at its values t."""
+    if phi.name != "tanh":
+        return phi.slope_in_arb(y)
+    t = _value(phi, y)
     most, least = t.abs_upper(), t.abs_lower()
     return (1 - most * most).union(1 - least * least)
 
 
-def _ulp(t: flint.arb) -> flint.arb:
-    """The unit in the last place of the largest binary32 number within t, |t| < 1 in truth."""
+def _ulp(t: flint.arb, most: float = math.inf) -> flint.arb:
+    """The unit in the last place of the largest binary32 number within t, of numbers below `most`, a power of two, in
+    truth."""
     size = float(t.abs_upper())  # rounding does not lead below a power of two
     exponent = math.frexp(size)[1] if size else -149
-    return flint.arb(2) ** max(min(exponent, 0) - _DIGITS, -149)
+    exponent = min(exponent, math.frexp(most)[1] - 1) if most < math.inf else exponent
+    return flint.arb(2) ** max(exponent - _DIGITS, -149)
+
+
+def _fresh(phi: Activation, y: flint.arb, units: flint.arb) -> flint.arb:
+    """The error of phi itself, of so many units in the last place; relu has none."""
+    t, most = _value(phi, y), 1.0 if phi.name == "tanh" else math.inf
+    return flint.arb(0) if phi.name == "relu" else units * _ulp(t, most) + ball(_TINY)
 
 
 def _spectral_norm(W: flint.arb_mat) -> flint.arb:

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class ClosedLoop:
-    """A plant under a tanh policy; `u_eq` is the exact equilibrium input, `folded` the policy without its centring,
+    """A plant under a policy; `u_eq` is the exact equilibrium input, `folded` the policy without its centring,
     `dynamics` the nominal equations. `operations` are about those of F at one state, as an `Effort` counts them.
 
     Raises

@@ -4,12 +4,13 @@ A certificate is about the real function pi. A robot computes it with rounded nu
 library chooses. The bound rests on the usual model of that (Higham, Accuracy and Stability of Numerical Algorithms,
 sections 2.2 and 3.1): each operation has a relative error of at most 2^-24, and a product in a sum passes through no
 more additions than the sum has, in any order. The mean value theorem carries each new error to the output, through the
-slopes of tanh on a box of states and the errors around it.
+slopes of the activation on a box of states and the errors around it.
 
-With ranges and slopes known on a box, let the computed values be y^_k before and h^_k behind the tanh of layer k. Then
+With ranges and slopes known on a box, let the computed values be y^_k before and h^_k behind the function phi of
+layer k. Then
 
     net^(x) - net(x) = sum_k J_k (y^_k - W_k h^_(k-1) - b_k)
-                     + sum_k J_(k+1) W_(k+1) (h^_k - tanh(y^_k)) + J_1 W_1 (x^ - x)
+                     + sum_k J_(k+1) W_(k+1) (h^_k - phi(y^_k)) + J_1 W_1 (x^ - x)
 
 row by row. J_k is the derivative of net by y_k at points between the computed values and those that are exact from
 layer k on. All of these lie within E_k of y_k(x), where E_k bounds the error of the layers up to k. Each row of J_k is
@@ -49,7 +50,8 @@ class FloatOptions:
 
     Parameters
     ----------
-    tanh_ulp : accuracy of tanh, in units in the last place of binary32 of the exact value.
+    tanh_ulp : accuracy of tanh and of other activations, in units in the last place of binary32 of the exact value; of
+        the largest value on a box for other activations.
     chain : the most additions that one product passes through in a sum; None allows any order.
     boxes : number of parts that the domain is cut into; more parts give a smaller bound. None takes a few seconds:
         256 for a network of 4000 weights or less and one from a million on.
@@ -190,13 +192,20 @@ def _assumptions(network: TanhNetwork, options: FloatOptions) -> tuple[str, ...]
         if options.chain is None
         else f"in an order in which no product passes through more than {options.chain} additions"
     )
-    used = len(network.weights) > 1 or network.squash == "tanh"
     ulp = options.tanh_ulp
     tanh = (
         f"tanh of a binary32 number is within {ulp:g} units in the last place of the exact value t: within {ulp:g} * "
         "2^(e-23) where 2^e <= |t| < 2^(e+1), so that its error is relative near 0, and near 1 at most "
         f"{ulp:g} * 2^-24; below 2^-126 the unit is 2^-149"
     )
+    phi = network.activation
+    other = (
+        f"{phi} of a binary32 number is within {ulp:g} units in the last place of its largest value on the part of the "
+        "domain, as a sum of functions is that each err by few units"
+    )
+    layered = len(network.weights) > 1
+    used = network.squash == "tanh" or (layered and phi == "tanh")
+    others = layered and phi not in ("tanh", "relu")
     return (
         "operations are those of IEEE binary32, rounded to nearest, or more precise ones; numbers below 2^-126 may be "
         "taken for 0",
@@ -204,5 +213,6 @@ def _assumptions(network: TanhNetwork, options: FloatOptions) -> tuple[str, ...]
         "the state lies in the domain and is rounded to nearest once, as a deviation from x_eq",
         f"each value of a layer is the sum of its products and its bias, {order}, with or without fused multiply-add",
         *((tanh,) if used else ()),
+        *((other,) if others else ()),
         "the output is scale * squash + offset" + ("" if network.clip is None else ", and the clip comes last"),
     )

@@ -15,6 +15,7 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.loop.activations import ACTIVATIONS, Activation
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Algebra, Expression, Symbol, differentiate, evaluate, solution_series
 from certify.loop.policies import TanhNetwork
@@ -205,7 +206,7 @@ def policy_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
     J = flint.arb_mat([[int(i == j) for j in range(network.n)] for i in range(network.n)])
     for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
         if k:
-            y, J = _through_tanh(y, J)
+            y, J = _through(network.phi, y, J)
         y, J = affine(W, b, y), matrix(W) * J
     shift, offset = _centring(loop)
     squashed = [network.squashed(v + d, _NUMBERS) for v, d in zip(y, shift, strict=True)]
@@ -328,7 +329,7 @@ def _centring(loop: ClosedLoop) -> tuple[Balls, Balls]:
 
 
 def _net(network: TanhNetwork, x: Balls) -> Balls:
-    return layers_on(network.weights, network.biases, _read(network, x))
+    return layers_on(network.weights, network.biases, _read(network, x), network.phi)
 
 
 def _read(network: TanhNetwork, x: Balls) -> Balls:
@@ -336,10 +337,12 @@ def _read(network: TanhNetwork, x: Balls) -> Balls:
     return [v + at for v, at in zip(x, points(network.origin), strict=True)] if network.is_moved else list(x)
 
 
-def layers_on(weights: Sequence[Array], biases: Sequence[Array], h: Balls) -> Balls:
-    """Affine layers with tanh between them, on balls."""
+def layers_on(
+    weights: Sequence[Array], biases: Sequence[Array], h: Balls, phi: Activation = ACTIVATIONS["tanh"]
+) -> Balls:
+    """Affine layers with a function between them, on balls."""
     for k, (W, b) in enumerate(zip(weights, biases, strict=True)):
-        h = affine(W, b, [v.tanh() for v in h] if k else h)
+        h = affine(W, b, [phi.in_arb(v) for v in h] if k else h)
     return h
 
 
@@ -349,10 +352,12 @@ def affine(W: Array, b: Array, h: Balls) -> Balls:
     return [product[i, 0] + flint.arb(float(c)) for i, c in enumerate(b)]
 
 
-def _through_tanh(y: Balls, J: flint.arb_mat) -> tuple[Balls, flint.arb_mat]:
-    t = [v.tanh() for v in y]
-    slope = [1 - v * v for v in t]  # Arb's own power is NaN for a ball around 0
-    return t, flint.arb_mat([[slope[i] * J[i, j] for j in range(J.ncols())] for i in range(J.nrows())])
+def _through(phi: Activation, y: Balls, J: flint.arb_mat) -> tuple[Balls, flint.arb_mat]:
+    """A function of balls, and the Jacobian behind it, for mean values where it has a corner in one."""
+    slope = [phi.slope_in_arb(v) for v in y]
+    return [phi.in_arb(v) for v in y], flint.arb_mat(
+        [[slope[i] * J[i, j] for j in range(J.ncols())] for i in range(J.nrows())]
+    )
 
 
 def matrix(W: Array) -> flint.arb_mat:

@@ -162,6 +162,8 @@ def _require_answers(
         wanted.append("--activation tanh (between the layers)")
     if options.normaliser is None and not own:
         wanted.append("--normaliser none (nothing was done to the states)")
+    if options.activation not in (None, "tanh"):
+        raise InputError(f"--activation must be tanh for a Lyapunov network; found {options.activation!r}.")
     if wanted:
         raise InputError(
             f"the file does not fully define the function; these options are required: {'; '.join(wanted)}."

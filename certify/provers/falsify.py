@@ -197,15 +197,16 @@ class _Search:
 
     @np.errstate(all="ignore")
     def _inputs(self, x: Array) -> tuple[Array, Array, list[Array]]:
-        """u (B, m), its values before the clip, and the values after each layer and the squash."""
+        """u (B, m), its values before the clip, and the slopes behind each layer but the last, and the squash."""
         network, passed, h = self.network, list[Array](), x
         for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
             if k:
-                h = np.tanh(h)
-                passed.append(h)
+                h, slope = network.phi.pair(h)
+                passed.append(slope)
             h = h @ W.T + b
-        passed.append(network.squashed(h))
-        whole = network.scale * passed[-1] + network.offset
+        squashed = network.squashed(h)
+        passed.append(network.squash_slope(squashed) * np.ones_like(h))
+        whole = network.scale * squashed + network.offset
         return network.clipped(whole), whole, passed
 
     def _slopes(self, z: Array) -> tuple[Array, Array, Array, Array]:
@@ -229,11 +230,11 @@ class _Search:
         network = self.network
         if network.clip is not None:
             slope = np.where((whole > network.clip[0]) & (whole < network.clip[1]), slope, 0.0)
-        slope = slope * network.scale * network.squash_slope(passed[-1])
+        slope = slope * network.scale * passed[-1]
         for W, inner in zip(reversed(network.weights), [*reversed(passed[:-1]), None], strict=True):
             slope = slope @ W
             if inner is not None:
-                slope = slope * (1 - inner * inner)
+                slope = slope * inner
         return slope
 
     def _worst(self) -> list[tuple[list[Array], float | Array]]:

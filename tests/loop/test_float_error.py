@@ -17,6 +17,7 @@ import pytest
 from certify.cli.main import _run
 from certify.errors import InputError
 from certify.loop import binary32
+from certify.loop.activations import ACTIVATIONS
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import symbols
 from certify.loop.float32 import FloatError, FloatOptions, float_error
@@ -276,10 +277,11 @@ def test_units_of_tanh_are_those_of_binary32() -> None:
         (2.0**-140, 2.0**-149),
         (0.0, 2.0**-149),
     ]:
-        assert float(binary32._ulp(flint.arb(float(t)))) == unit
-        assert float(binary32._ulp(flint.arb(-float(t)))) == unit
+        assert float(binary32._ulp(flint.arb(float(t)), 1.0)) == unit
+        assert float(binary32._ulp(flint.arb(-float(t)), 1.0)) == unit
     for t in np.random.default_rng(0).uniform(-1, 1, 1000).astype(f32):
-        assert float(binary32._ulp(flint.arb(float(t)))) == float(np.spacing(abs(t)))
+        assert float(binary32._ulp(flint.arb(float(t)), 1.0)) == float(np.spacing(abs(t)))
+        assert float(binary32._ulp(flint.arb(float(64 * t)))) == float(np.spacing(abs(64 * t)))
 
 
 def test_the_tanh_of_torch_and_numpy_is_as_good_as_the_default_says() -> None:
@@ -486,3 +488,25 @@ def test_the_command_refuses(
     save_policy(path, Policy(pendulum_network((8, 8)), "pendulum"))
     assert _run(["float-error", str(path), *given, "--json"], True) == 2
     assert message in json.loads(capsys.readouterr().out)["error"]
+
+
+@pytest.mark.parametrize("name", [name for name in ACTIVATIONS if name != "tanh"])
+def test_other_activations_stay_within_the_bound(name: str) -> None:
+    """In torch's binary32, at states of the domain and across the corners of units."""
+    import torch
+
+    plant, network = get_system("pendulum"), dataclasses.replace(pendulum_network((12, 8), "output"), activation=name)
+    network = dataclasses.replace(network, weights=(*network.weights[:-1], network.weights[-1] / 8))
+    found = float_error(network, plant, FloatOptions(boxes=8))
+    half = np.array([float(hi) for _, hi in plant.domain])
+    x = (half * np.random.default_rng(0).uniform(-1, 1, (20_000, 2))).astype(f32)
+    exact = network(x.astype(np.float64), plant.exact_u_eq())
+    h = torch.tensor(x)
+    folded = network.folded(plant.exact_u_eq())
+    for k, (W, b) in enumerate(zip(folded.weights, folded.biases, strict=True)):
+        h = (ACTIVATIONS[name](h) if k else h) @ torch.tensor(W.astype(f32).T) + torch.tensor(b.astype(f32))
+    single = torch.tanh(h) * torch.tensor(folded.scale.astype(f32)) + torch.tensor(folded.offset.astype(f32))
+    worst = float(np.max(np.abs(single.numpy().astype(np.float64) - exact)))
+    assert 0 < worst <= found.bounds[0] < 1e4 * worst
+    assert any(part.source == f"layer 0, {name}" for part in found.parts)
+    assert any(name in said for said in found.assumptions) is (name != "relu")

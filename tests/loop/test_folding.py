@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from certify.errors import InputError
 from certify.loop.policies.importers.comparing import apply, rounding
 from certify.loop.policies.importers.folding import Folded, fold
-from certify.loop.policies.importers.steps import Affine, Clip, Diagonal, Normalise, Step, Tanh
+from certify.loop.policies.importers.steps import Activate, Affine, Clip, Diagonal, Normalise, Step, Tanh
 
 NUMBER = st.floats(-4, 4).map(lambda v: round(v, 6))
 POSITIVE = st.floats(1e-3, 4)
@@ -173,11 +173,13 @@ def test_clips_of_the_action(tail: list[Step], expected: Any) -> None:
 @pytest.mark.parametrize(
     ("steps", "message"),
     [
-        ([ONE, Clip((Fraction(0),), (None,)), ONE], "ReLU between its layers"),
-        ([ONE, Clip((Fraction(-1),), (Fraction(1),)), ONE], "a clip between its layers"),
+        ([ONE, Clip((Fraction(0),), (None,)), ONE, Tanh(), ONE], "one activation between its layers.* relu and tanh"),
+        ([ONE, Activate("elu")], "elu must stand between two layers"),
+        ([Activate("elu"), ONE], "elu must stand between two layers"),
+        ([ONE, Clip((Fraction(-1),), (Fraction(1),)), ONE], "the file has a clip there"),
         ([ONE, Clip((Fraction(0),), (None,))], "must have two bounds"),
-        ([ONE, Tanh(), Tanh()], "two tanh in a row"),
-        ([ONE, Tanh(), Diagonal((Fraction(2),), (Fraction(0),)), Tanh()], "two tanh in a row"),
+        ([ONE, Tanh(), Tanh()], "two in a row"),
+        ([ONE, Tanh(), Diagonal((Fraction(2),), (Fraction(0),)), Tanh()], "two in a row"),
         ([Tanh(), ONE], "tanh before the first"),
         ([Tanh()], "must have a layer"),
         ([ONE, Diagonal((Fraction(0),), (Fraction(0),))], "must not be 0"),

@@ -125,9 +125,9 @@ def test_refused_state_dicts(name: str, tmp_path: Path) -> None:
         import_policy(saved(tmp_path, data), plant(), options)
 
 
-@pytest.mark.parametrize("name", ["relu", "ELU", "sin"])
+@pytest.mark.parametrize("name", ["selu", "ELU", "sin"])
 def test_other_activations_are_refused_by_name(name: str) -> None:
-    with pytest.raises(InputError, match=f"only tanh networks are proved.*{name}"):
+    with pytest.raises(InputError, match=f"--activation must be one of tanh, relu, .*{name}"):
         ImportOptions(activation=name)
 
 
@@ -265,9 +265,9 @@ def test_what_goes_without_saying_in_stable_baselines_is_refused_where_said(stab
 @pytest.mark.parametrize(
     ("kind", "given", "message"),
     [
-        ("SAC", {}, "it is ReLU"),
-        ("TD3", {}, "it is ReLU"),
-        ("PPO", {"activation_fn": torch.nn.ELU}, "it is ELU"),
+        ("SAC", {"activation_fn": torch.nn.SELU}, "it is SELU"),
+        ("TD3", {"activation_fn": torch.nn.LeakyReLU}, "it is LeakyReLU"),
+        ("PPO", {"activation_fn": torch.nn.Hardtanh}, "it is Hardtanh"),
     ],
 )
 def test_other_activations_of_stable_baselines_are_refused_by_name(
@@ -441,10 +441,8 @@ class Hidden(torch.nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         y = self.a(x)
-        if self.kind == "relu":
-            y = torch.relu(y)
-        elif self.kind == "elu":
-            y = torch.nn.functional.elu(y)
+        if self.kind == "elu":
+            y = torch.nn.functional.elu(y, 2.0)
         elif self.kind == "skip":
             y = torch.tanh(y) + y
         elif self.kind == "product":
@@ -457,14 +455,13 @@ class Hidden(torch.nn.Module):
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        ("relu", "ReLU"),
-        ("elu", "torch.elu"),
+        ("elu", "torch.elu .*with 2.0"),
         ("skip", "must join one"),
         ("product", "must join one"),
         ("sum", "not read"),
     ],
 )
-def test_graphs_that_are_no_chain_of_tanh_layers_are_refused(kind: str, message: str, tmp_path: Path) -> None:
+def test_graphs_that_are_no_chain_of_layers_are_refused(kind: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message):
         import_policy(scripted(Hidden(kind), "trace", tmp_path / "p.pt"), plant(), SAID)
 

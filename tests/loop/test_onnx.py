@@ -153,9 +153,9 @@ def function(made: Any) -> Any:
 
 TWO = (("Gemm", "*", "W1", "B1"), ("Tanh", "*"))
 REFUSED = {
-    "relu": (model(chain(MLP[0], ("Relu", "*"), MLP[2])), "ReLU between its layers"),
-    "elu": (model(chain(MLP[0], ("Elu", "*"), MLP[2])), "Elu .*only tanh networks are proved"),
-    "sigmoid": (model(chain(*MLP, ("Sigmoid", "*"))), "Sigmoid"),
+    "leaky relu": (model(chain(MLP[0], ("LeakyRelu", "*"), MLP[2])), "LeakyRelu .*is not read"),
+    "elu": (model(chain(MLP[0], ("Elu", "*", {"alpha": 2.0}), MLP[2])), "Elu .*must have alpha 1"),
+    "sigmoid": (model(chain(*MLP, ("Sigmoid", "*"))), "sigmoid must stand between two layers"),
     "another file": (other_file(model(chain(*MLP))), "must lie in the file itself"),
     "two inputs": (two_inputs(model(chain(*MLP))), "one input"),
     "a shape that lies": (shape_that_lies(model(chain(*MLP))), "damaged"),
@@ -299,7 +299,7 @@ SHAPED = {
     "an unknown shape": (shaped("Expand", "s", shape=[1, 6]), "as wide as it is"),
     "a normalisation": (shaped("LayerNormalization", "B1"), "LayerNorm, and every other .* train the policy again"),
     "a mean": (shaped("ReduceMean"), "a part of LayerNorm"),
-    "a sigmoid": (shaped("Sigmoid"), r"only tanh networks are proved.*activation_fn=torch\.nn\.Tanh"),
+    "a selu": (shaped("Selu"), r"The activations that are proved are .*activation_fn=torch\.nn\.Tanh"),
 }
 
 

@@ -146,20 +146,20 @@ def test_layer_norm_in_a_state_dict_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["SAC", "TD3"])
-def test_the_default_activation_of_stable_baselines_has_a_next_step(kind: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"it is ReLU, the default of {kind}.* again with {TANH}"):
-        import_policy(sb3(kind, tmp_path, net_arch=[8])[2], plant(), SAID)
-    given = {"activation_fn": torch.nn.ELU, "net_arch": [8]}
-    with pytest.raises(InputError, match=rf"it is ELU\. .* again with {TANH}"):
+def test_the_default_activation_of_stable_baselines_is_read(kind: str, tmp_path: Path) -> None:
+    read = import_policy(sb3(kind, tmp_path, net_arch=[8])[2], plant(), SAID)
+    assert read.policy.network.activation == "relu" and "relu between the layers is the default" in read.assumed
+    given = {"activation_fn": torch.nn.SELU, "net_arch": [8]}
+    with pytest.raises(InputError, match=rf"it is SELU\. .* again with .*{TANH}"):
         import_policy(sb3(kind, tmp_path, **given)[2], plant(), SAID)
 
 
 def test_other_activations_have_a_next_step(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"relu is not proved. Train .*{TANH}"):
-        ImportOptions(activation="relu")
+    with pytest.raises(InputError, match=f"found 'selu'.* Train .*{TANH}"):
+        ImportOptions(activation="selu")
     for layer, message in (
-        (torch.nn.ReLU(), "ReLU between its layers"),
-        (torch.nn.ELU(), r"torch\.elu .* is not read"),
+        (torch.nn.SELU(), r"torch\.selu .* is not read"),
+        (torch.nn.ELU(2.0), r"torch\.elu .* is not read"),
     ):
         module = torch.nn.Sequential(torch.nn.Linear(2, 4), layer, torch.nn.Linear(4, 1))
         with pytest.raises(InputError, match=f"{message}.*{TANH}"):

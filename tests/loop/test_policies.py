@@ -125,9 +125,9 @@ def change(*path: Any, to: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (change("format", to="certify-policy/3"), "format"),
+        (change("format", to="certify-policy/4"), "format"),
         (change("format", to="certify-policy/2"), "clip"),
-        (change("activation", to="relu"), "only tanh|Only tanh"),
+        (change("activation", to="relu"), "`activation` of certify-policy/[12] must be one of tanh; found 'relu'"),
         (change("weights", 0, to=torch.ones(3, 2) * float("nan")), "finite"),
         (change("biases", 1, to=torch.tensor([float("inf")])), "finite"),
         (change("weights", 0, to=torch.ones(3, 2, dtype=torch.int64)), "float32 or float64"),

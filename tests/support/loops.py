@@ -8,6 +8,7 @@ from fractions import Fraction
 import numpy as np
 import scipy.linalg
 
+from certify.loop.activations import ACTIVATIONS
 from certify.loop.expressions import Number, Symbol, atan, exp, sqrt, symbols, tanh
 from certify.loop.plants import System
 from certify.loop.policies import TanhNetwork
@@ -102,13 +103,20 @@ def chain(n: int, poles: list[float]) -> tuple[System, TanhNetwork]:
 
 
 def saturated_lqr(
-    K: np.ndarray, scale: float, offset: float, spread: list[float], widths: tuple[int, ...], centre: str, seed: int
+    K: np.ndarray,
+    scale: float,
+    offset: float,
+    spread: list[float],
+    widths: tuple[int, ...],
+    centre: str,
+    seed: int,
+    activation: str = "tanh",
 ) -> TanhNetwork:
-    """A tanh policy near u = offset + scale tanh(-Kx/scale): random features, last layer by least squares.
+    """A policy near u = offset + scale tanh(-Kx/scale): random features, last layer by least squares.
 
     K (m, n); spread (n,): half-widths of the states over which it is fitted.
     """
-    generator = np.random.default_rng(seed)
+    generator, phi = np.random.default_rng(seed), ACTIVATIONS[activation]
     m, n = K.shape
     weights, biases, width = [], [], n
     for out in widths:
@@ -121,11 +129,12 @@ def saturated_lqr(
     x = np.concatenate([x, 1e-3 * generator.standard_normal((200, n))])
     h, h0 = x, np.zeros((1, n))
     for W, b in zip(weights, biases, strict=True):
-        h, h0 = np.tanh(h @ W.T + b), np.tanh(h0 @ W.T + b)
+        h, h0 = phi(h @ W.T + b), phi(h0 @ W.T + b)
     importance = np.where(np.arange(len(x)) < 4000, 1.0, 3000.0)[:, None]
     last, *_ = np.linalg.lstsq((h - h0) * importance, -(x @ K.T) / scale * importance, rcond=1e-6)
     return TanhNetwork(
-        (*weights, last.T), (*biases, np.full(m, 0.1)), np.full(m, scale), np.full(m, offset), "tanh", centre
+        *((*weights, last.T), (*biases, np.full(m, 0.1)), np.full(m, scale), np.full(m, offset), "tanh", centre),
+        activation=activation,
     )
 
 

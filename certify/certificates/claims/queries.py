@@ -46,10 +46,15 @@ def query(condition: Condition, problem: Problem) -> Query:
     ------
     InputError : the local condition, where -(A'P + PA) is not positive definite; a plant with uncertain
     quantities, because the query would be about nominal values alone; time in steps, or a rate; an equation with
-    abs, min, max or clip.
+    abs, min, max or clip; another activation than tanh.
     """
     system = problem.loop.system
     require_no_corners(system)
+    if problem.loop.network.activation != "tanh":
+        raise InputError(
+            f"queries for solvers of formulas must be about tanh policies; this one has "
+            f"{problem.loop.network.activation} between its layers. Use the engine bounds."
+        )
     if system.ranges:
         raise InputError(
             f"queries for solvers of formulas must be about exact equations; {system.name} has ranges of "

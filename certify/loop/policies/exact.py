@@ -9,9 +9,11 @@ from fractions import Fraction
 import numpy as np
 
 from certify.errors import InputError
+from certify.loop.activations import ACTIVATIONS
 from certify.loop.policies.network import TanhNetwork
 
 _NEAR = 1e-9
+_MOST_BITS = 2**16  # of a number, beyond which it counts as unknown: sums of fractions grow from layer to layer
 
 
 def bounded_by_form(network: TanhNetwork, bounds: Sequence[tuple[Fraction, Fraction]]) -> bool:
@@ -34,15 +36,16 @@ def bounded_by_form(network: TanhNetwork, bounds: Sequence[tuple[Fraction, Fract
 
 
 def raw_at_origin(network: TanhNetwork) -> tuple[Fraction | None, ...]:
-    """raw(0) as rationals, (m,), x = 0 being the network's origin; None where a tanh is taken at another point than 0.
+    """raw(0) as rationals, (m,), x = 0 being the network's origin; None where a function has no rational value.
 
     A weight of exact 0 removes an unknown value.
     """
     h: list[Fraction | None] = [Fraction(float(v)) for v in network.origin]
-    last = len(network.weights) - 1
+    last, phi, squash = len(network.weights) - 1, network.phi, ACTIVATIONS["tanh"]
     for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
         y = [_affine(row, h, float(c)) for row, c in zip(W, b, strict=True)]
-        h = [_tanh(v) for v in y] if k < last or network.squash == "tanh" else y
+        of = phi if k < last else squash
+        h = [None if v is None else of.exact(v) for v in y] if k < last or network.squash == "tanh" else y
     return tuple(
         None if v is None else Fraction(float(s)) * v + Fraction(float(o))
         for v, s, o in zip(h, network.scale, network.offset, strict=True)
@@ -74,7 +77,7 @@ def require_centred(network: TanhNetwork, u_eq: Sequence[Fraction], names: Seque
     for j, (value, u) in enumerate(zip(at_origin(network), u_eq, strict=True)):
         if value != u:
             named = f"input {names[j]}" if names else f"input {j}"
-            found = _found(value, float(network(np.zeros(network.n), u_eq)[j]), float(u))
+            found = _found(network, value, float(network(np.zeros(network.n), u_eq)[j]), float(u))
             raise InputError(
                 f"the policy is not centred: pi(0), what it commands at the operating point, must be exactly "
                 f"u_eq = {float(u):.12g}; its {named} is {found}. Shift it by the difference with "
@@ -82,13 +85,14 @@ def require_centred(network: TanhNetwork, u_eq: Sequence[Fraction], names: Seque
             )
 
 
-def _found(value: Fraction | None, about: float, wanted: float) -> str:
+def _found(network: TanhNetwork, value: Fraction | None, about: float, wanted: float) -> str:
     """pi(0) of an input in words, `about` being it in floats."""
     if value is not None:
         return f"{float(value)!r}, exactly {_short(value)}"
     near = math.isclose(about, wanted, rel_tol=_NEAR, abs_tol=_NEAR)
-    tanh = ", and whether exactly that cannot be decided: tanh at the operating point gives no fraction" if near else ""
-    return f"about {about:.9g}{tanh}"
+    why = f"{network.activation} at the operating point gives no fraction"
+    undecided = f", and whether exactly that cannot be decided: {why}" if near else ""
+    return f"about {about:.9g}{undecided}"
 
 
 def _centrings(network: TanhNetwork, u_eq: Sequence[Fraction]) -> str:
@@ -105,11 +109,9 @@ def _affine(row: Sequence[float], h: Sequence[Fraction | None], bias: float) -> 
             if v is None:
                 return None
             total += Fraction(float(w)) * v
+            if max(total.numerator.bit_length(), total.denominator.bit_length()) > _MOST_BITS:
+                return None
     return total
-
-
-def _tanh(v: Fraction | None) -> Fraction | None:
-    return v if v == 0 else None
 
 
 def _short(q: Fraction) -> str:

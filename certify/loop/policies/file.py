@@ -1,4 +1,5 @@
-"""The policy file `certify-policy/1`, or with a clip or bounds of validity `certify-policy/2`: plain tensors only.
+"""The policy file: plain tensors only. It is `certify-policy/1`, with a clip or bounds of validity `certify-policy/2`,
+with another activation than tanh `certify-policy/3`.
 
 Nothing in a file is executed, and equal policies give equal bytes (see `certify.loop.files.plain`).
 """
@@ -17,12 +18,15 @@ from typing import Any, cast
 import numpy as np
 
 from certify.errors import InputError
+from certify.loop.activations import ACTIVATIONS
 from certify.loop.files.plain import array_in, layers_in, origin_in, read_plain, require_keys, tensors, write_plain
 from certify.loop.policies.network import Array, Centre, Squash, TanhNetwork
 
 FORMAT = "certify-policy/1"
 # The same with `output.clip`, a pair of tensors, or `valid`, a tensor (n, 2), or both; others stay version 1.
 SECOND = "certify-policy/2"
+# The same with another `activation`.
+THIRD = "certify-policy/3"
 _KEYS = {"format", "activation", "weights", "biases", "output", "centre", "system"}
 _OPTIONAL = {"training", "beta", "valid"}
 _WHAT = "policy file"
@@ -112,8 +116,8 @@ def save_policy(path: str | Path, policy: Policy) -> None:
     numbers = tensors(arrays)
     scale, offset, *clip = numbers[2 * depth :]
     data: dict[str, Any] = {
-        "format": FORMAT if network.clip is None and policy.valid is None else SECOND,
-        "activation": "tanh",
+        "format": _format_of(policy),
+        "activation": network.activation,
         "weights": numbers[:depth],
         "biases": numbers[depth : 2 * depth],
         "output": {"squash": network.squash, "scale": scale, "offset": offset},
@@ -130,13 +134,27 @@ def save_policy(path: str | Path, policy: Policy) -> None:
     write_plain(path, data, _WHAT)
 
 
+def _format_of(policy: Policy) -> str:
+    """The oldest version of the format that holds it."""
+    if policy.network.activation != "tanh":
+        return THIRD
+    return FORMAT if policy.network.clip is None and policy.valid is None else SECOND
+
+
+def _require_activation(version: str, name: Any) -> None:
+    """Reject a function that this version does not have; version 3 is there for all but tanh."""
+    known = ("tanh",) if version != THIRD else tuple(row for row in ACTIVATIONS if row != "tanh")
+    if not isinstance(name, str) or name not in known:
+        raise InputError(f"`activation` of {version} must be one of {', '.join(known)}; found {name!r}.")
+
+
 def load_policy(path: str | Path) -> Policy:
     """Read a policy file.
 
     Raises
     ------
-    InputError : the file is missing, is not an archive of plain tensors, does not follow `certify-policy/1` or
-        `certify-policy/2`, or is another program's; then the message says how to import it.
+    InputError : the file is missing, is not an archive of plain tensors, does not follow `certify-policy/1`,
+        `certify-policy/2` or `certify-policy/3`, or is another program's; then the message says how to import it.
     """
     try:
         data = read_plain(path, _WHAT)
@@ -198,17 +216,18 @@ def _to_import(path: Path, found: str) -> str:
 
 def _policy(data: Any) -> Policy:
     found = data.get("format") if isinstance(data, dict) else type(data).__name__
-    if not isinstance(data, dict) or found not in (FORMAT, SECOND):
-        raise InputError(f"`format` must be {FORMAT!r} or {SECOND!r}; found {found!r}.")
+    if not isinstance(data, dict) or found not in (FORMAT, SECOND, THIRD):
+        raise InputError(f"`format` must be {FORMAT!r}, {SECOND!r} or {THIRD!r}; found {found!r}.")
     keys, output = set(data), data.get("output")
     parts = {"squash", "scale", "offset"}
     if found == SECOND and isinstance(output, dict) and ("clip" in output or "valid" not in keys):
         parts |= {"clip"}  # one of the two is what makes a file version 2
+    if found == THIRD and isinstance(output, dict) and "clip" in output:
+        parts |= {"clip"}
     if found == FORMAT and "valid" in keys:
         raise InputError(f"`valid` must go with format {SECOND!r}; found {FORMAT!r}.")
     require_keys(data, _KEYS, _OPTIONAL)
-    if data["activation"] != "tanh":
-        raise InputError(f"`activation` must be 'tanh'; found {data['activation']!r}. Only tanh networks are proved.")
+    _require_activation(found, data["activation"])
     if not isinstance(output, dict) or set(output) != parts:
         raise InputError(f"`output` of {found} must be a dictionary with exactly {', '.join(sorted(parts))}.")
     clip = output.get("clip", ())
@@ -224,7 +243,10 @@ def _policy(data: Any) -> Policy:
         squash=cast(Squash, output["squash"]),
         centre=cast(Centre, data["centre"]),
         clip=cast(Any, tuple(array_in(end, "output.clip") for end in clip) or None),
+        activation=data["activation"],
     )
+    if network.activation != data["activation"]:
+        raise InputError(f"`activation` must be 'tanh' of a policy with one layer; found {data['activation']!r}.")
     beta = array_in(data["beta"], "beta") if "beta" in data else None
     if beta is not None and (beta.shape != (network.m,) or network.centre != "preactivation"):
         raise InputError(f"`beta` must have shape ({network.m},) and goes with centre 'preactivation'.")

@@ -1,4 +1,4 @@
-"""Affine layers with tanh between them, as exact binary64 numbers, for policies and neural Lyapunov functions.
+"""Affine layers with a function between them, as exact binary64 numbers, for policies and neural Lyapunov functions.
 
 This module has only the layers. A squash, a scale or a centring after the last one belongs to their owner.
 """
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
+from certify.loop.activations import ACTIVATIONS, Activation
 
 Array = NDArray[np.float64]
 
@@ -70,8 +71,8 @@ def widths(weights: Sequence[Array]) -> tuple[int, ...]:
     return (int(weights[0].shape[1]), *(int(w.shape[0]) for w in weights))
 
 
-def sha256_of(head: bytes, arrays: Iterable[Array]) -> str:
-    """Hash of `head` and then of each array's shape and little-endian binary64.
+def sha256_of(head: bytes, arrays: Iterable[Array], words: str = "") -> str:
+    """Hash of `head`, then of each array's shape and little-endian binary64, then of `words`.
 
     Every array contributes its number of axes and its axes as unsigned 64-bit little-endian integers, then its numbers
     in row order.
@@ -80,21 +81,22 @@ def sha256_of(head: bytes, arrays: Iterable[Array]) -> str:
     for array in arrays:
         digest.update(struct.pack(f"<{1 + array.ndim}Q", array.ndim, *array.shape))
         digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
+    digest.update(words.encode())
     return digest.hexdigest()
 
 
-def through(weights: Sequence[Array], biases: Sequence[Array], x: Any) -> Any:
+def through(weights: Sequence[Array], biases: Sequence[Array], x: Any, phi: Activation = ACTIVATIONS["tanh"]) -> Any:
     """Apply the layers to the last axis of x, in x's arithmetic (numpy array or torch tensor)."""
     for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         if k:
-            x = tanh(x)
+            x = phi(x)
         x = x @ like(weight.T, x) + like(bias, x)
     return x
 
 
 def tanh(x: Any) -> Any:
     """tanh of a number, a numpy array or a torch tensor."""
-    return np.tanh(x) if isinstance(x, np.ndarray | float) else x.tanh()
+    return ACTIVATIONS["tanh"](x)
 
 
 def like(array: Array, x: Any) -> Any:

@@ -1,4 +1,4 @@
-"""The policy `u = pi(x)`: a tanh network with exact binary64 numbers and a centring that gives pi(0) = u_eq.
+"""The policy `u = pi(x)`: a network with exact binary64 numbers and a centring that gives pi(0) = u_eq.
 
 `raw(x) = scale * tanh(net(x)) + offset` with squash `tanh`, or `scale * net(x) + offset` with squash
 `identity`. Centring makes pi(0) = u_eq by its form:
@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
+from certify.loop.activations import Activation, activation
 from certify.loop.policies.arithmetic import Arithmetic
 from certify.loop.policies.layers import frozen, frozen_layers, like, sha256_of, tanh, through, widths
 
@@ -38,7 +39,7 @@ _WHOSE = "the policy"  # in messages
 
 @dataclass(frozen=True, slots=True)
 class TanhNetwork:
-    """Affine layers with tanh between them; float32 weights are converted, which is exact.
+    """Affine layers with a function between them; float32 weights are converted, which is exact.
 
     Parameters
     ----------
@@ -48,6 +49,7 @@ class TanhNetwork:
     scale, offset : arrays of shape (m,), in the input's units; scale is nonzero.
     clip : (lo, hi), arrays of shape (m,) in the input's units with lo < hi, which limit each input; or None.
     origin : the state that the layers read at x = 0, shape (n,); empty for 0.
+    activation : the function between layers, by its name in `certify.loop.activations`; tanh where there is one layer.
 
     Raises
     ------
@@ -63,11 +65,13 @@ class TanhNetwork:
     centre: Centre = "preactivation"
     clip: tuple[Array, Array] | None = None
     origin: Array = field(default_factory=lambda: np.zeros(0))
+    activation: str = "tanh"
 
     def __post_init__(self) -> None:
         weights, biases = frozen_layers(self.weights, self.biases, _WHOSE)
-        object.__setattr__(self, "weights", weights)
-        object.__setattr__(self, "biases", biases)
+        function = activation(self.activation).name if len(weights) > 1 else "tanh"
+        for name, value in (("weights", weights), ("biases", biases), ("activation", function)):
+            object.__setattr__(self, name, value)
         for name in ("scale", "offset"):
             object.__setattr__(self, name, frozen(getattr(self, name), name, _WHOSE))
         if self.squash not in get_args(Squash):
@@ -90,6 +94,11 @@ class TanhNetwork:
             raise InputError(f"`origin` must have shape ({self.n},); found {self.origin.shape}.")
         if self.is_moved and self.centre != "none":
             raise InputError(f"`origin` must be 0 of a policy that is centred; found {self.origin.tolist()}.")
+
+    @property
+    def phi(self) -> Activation:
+        """The function between layers."""
+        return activation(self.activation)
 
     @property
     def is_moved(self) -> bool:
@@ -135,7 +144,7 @@ class TanhNetwork:
 
     def net(self, x: Any) -> Any:
         """`net(x)`, last axis n to m, in the arithmetic of x (numpy array or torch tensor)."""
-        return through(self.weights, self.biases, x + like(self.origin, x) if self.is_moved else x)
+        return through(self.weights, self.biases, x + like(self.origin, x) if self.is_moved else x, self.phi)
 
     def __call__(self, x: Any, u_eq: Sequence[Fraction]) -> Any:
         """pi(x) in float64, shape (..., n) to (..., m); for simulation and search, not for proofs."""
@@ -199,13 +208,13 @@ class TanhNetwork:
     def folded(self, u_eq: Sequence[Fraction]) -> TanhNetwork:
         """A network without centring that reads x and is pi up to rounding: for search and simulation."""
         if self.is_moved:
-            first = self.biases[0] + self.weights[0] @ self.origin
-            return replace(self, biases=(first, *self.biases[1:]), origin=np.zeros(self.n))
+            biases = (self.biases[0] + self.weights[0] @ self.origin, *self.biases[1:])
+            return replace(self, biases=biases, origin=np.zeros(self.n))
         if self.centre == "none":
             return self
         shift, offset = self.centring(u_eq, self.net(np.zeros(self.n)).tolist(), _ARRAYS)
-        biases = (*self.biases[:-1], self.biases[-1] + np.array(shift))
-        return TanhNetwork(self.weights, biases, self.scale, np.array(offset), self.squash, "none", self.clip)
+        last = self.biases[-1] + np.array(shift)
+        return replace(self, biases=(*self.biases[:-1], last), offset=np.array(offset), centre="none")
 
     def jacobian_at_origin(self, u_eq: Sequence[Fraction]) -> Array:
         """`d pi / d x` at 0 in float64, shape (m, n).
@@ -214,27 +223,27 @@ class TanhNetwork:
         ------
         InputError : the clip may act at the origin.
         """
-        x = self.origin
-        jacobian = np.eye(self.n)
+        x, jacobian = self.origin, np.eye(self.n)
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             if k:
-                x = np.tanh(x)
-                jacobian = (1 - x**2)[:, None] * jacobian
+                x, slope = self.phi.pair(x)
+                jacobian = slope[:, None] * jacobian
             x, jacobian = weight @ x + bias, weight @ jacobian
         squashed = self.squashed(self.beta(u_eq) if self.centre == "preactivation" else x)
         self.require_unclipped(u_eq if self.centre != "none" else (self.scale * squashed + self.offset).tolist())
-        slope = self.squash_slope(squashed)
-        return np.asarray(self.scale[:, None] * ((slope * np.ones(self.m))[:, None] * jacobian))
+        return np.asarray(self.scale[:, None] * ((self.squash_slope(squashed) * np.ones(self.m))[:, None] * jacobian))
 
     def sha256(self) -> str:
-        """Hash of the canonical bytes: squash, centre, then the arrays as `sha256_of` has them.
-
-        They are the layers in order as weight, bias; scale; offset; with a clip lo and hi. The origin is not part of
-        them.
-        """
+        """Hash of the canonical bytes as FORMAT.md has them; the origin is not part of them."""
         pairs = [a for pair in zip(self.weights, self.biases, strict=True) for a in pair]
-        head = f"certify-policy/1\0{self.squash}\0{self.centre}\0".encode()
-        return sha256_of(head, (*pairs, self.scale, self.offset, *(self.clip or ())))
+        head, rest = f"certify-policy/1\0{self.squash}\0{self.centre}\0", (self.scale, self.offset, *(self.clip or ()))
+        return sha256_of(head.encode(), (*pairs, *rest), _in_words(self))
+
+
+def _in_words(network: TanhNetwork) -> str:
+    """The steps as the hash has them; nothing where tanh is the only function."""
+    steps = range(0 if network.activation == "tanh" else 2 * len(network.weights) - 1)
+    return "".join(f"map {k} {network.activation}\0" if k % 2 else f"affine {k}\0" for k in steps)
 
 
 class _Arrays:

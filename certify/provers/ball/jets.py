@@ -19,12 +19,12 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.loop.activations import CERTAIN, fourth_of_tanh
 from certify.loop.expressions import Algebra
 from certify.provers.bounds.taylor import EXP_END
 
 Array = NDArray[np.float64]
-CERTAIN = 1 + 1e-3  # share of its range by which a number must be away from 0 for its sign, beyond all rounding
-TANH4, TANH5, ATAN4 = 4.1, 16.0, 4.7  # no derivative of this order is larger
+ATAN4 = 4.7  # no derivative of this order is larger
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,13 +142,6 @@ def remainder(squares: Array, size: Sizes, E: Array, second: Array, third: Array
     m = fourth * size.radius**2
     spread = second * curve + third * (3 * slope**2 + 3 * slope * curve + curve**2) + m * (2 * slope + curve)
     return np.asarray((2 * second * slope)[:, x] * flat + spread[:, x] * wide + m[:, x] * squares)
-
-
-def fourth_of_tanh(y: Array, radius: Array) -> Array:
-    """At least |tanh''''|/24 on |v - y| <= radius."""
-    t = np.tanh(y)
-    there = np.abs(8 * t * (2 - 3 * t**2) * (1 - t**2))
-    return np.asarray(np.minimum(TANH4, there + TANH5 * radius) / 24)
 
 
 def is_extreme(c: float) -> bool:

@@ -1,11 +1,12 @@
 """Third-order models of the closed loop on a ball, in floats, which rules `local` and `tube` bound.
 
 On the ball x = m + J d, ||d|| <= 1, the components of F are jets (jets.py), and the bounds hold for every smaller
-radius too and leave no hole at its middle m. The terms that each tanh adds to its tangent reach the output through the
+radius too and leave no hole at its middle m. The terms that each unit adds to its tangent reach the output through the
 products of weights and slopes at m, `Paths`, and cancel there as they do in truth; the products do not depend on the
-ball. The remainder of each tanh beyond its third order, e_q, stays apart to the end: F has all of them in a linear
+ball. The remainder of each unit beyond its third order, e_q, stays apart to the end: F has all of them in a linear
 combination that is known exactly, and so they keep the directions that they have in x. d may have more entries than x:
-along a path its last is the motion.
+along a path its last is the motion. A unit that is not smooth at 0 has a model where the sign of what it reads is
+certain; on a ball that meets its corner there is none, and the search takes a smaller one.
 """
 
 from __future__ import annotations
@@ -20,16 +21,18 @@ from numpy.typing import NDArray
 
 from certify.certificates.limits import numbers_of_a_jet
 from certify.errors import InputError
+from certify.loop.activations import ACTIVATIONS, Activation
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import evaluate, nodes
 from certify.loop.policies import bounded_by_form
-from certify.provers.ball.jets import Jet, Jets, basis, beyond_tangent, fourth_of_tanh, remainder, sizes
+from certify.provers.ball.jets import Jet, Jets, basis, beyond_tangent, remainder, sizes
 from certify.provers.ball.ranged import RangedJet
 
 Array = NDArray[np.float64]
 _CALL, _EACH, _ENTRY = 3e5, 1e5, 0.12  # operations of a layer, of one of the equations, of an entry of a product
 _MOST_NUMBERS, _MOST_PRODUCTS = 2**25, 2**33  # size of the sums over paths: the checker refuses more
 _MARGIN = 1e-3  # share of an input's range, left to the checker's rounding where a clip begins
+_AT_CORNER = 1e-12  # what a unit reads, so near 0 that no ball of any use is free of its corner
 _UNIT = 2.0**-51  # twice what a checker counts for each term of a sum, relative to the sum's size
 _ROUNDED = 2.0**-49  # and for anything else that it computes
 
@@ -64,7 +67,7 @@ class Spread:
 @dataclass(frozen=True, slots=True)
 class Models:
     """The components of F on a ball: values f (n,) at its middle, gradients A (n, k), half Hessians Q (n, k, k), forms
-    of third order K (n, k, k, k) and remainders E (n, k, k) beyond those of the tanhs, k the entries of d.
+    of third order K (n, k, k, k) and remainders E (n, k, k) beyond those of the units, k the entries of d.
 
     Those are N numbers |e_q| <= d'R_q d, R (N, k, k), which enter F as `shares` (n, N) times e; `squares` are R_q'R_q.
     `spread` says what is uncertain of f and A, None that nothing is; `stays` whether the states are certain to stay in
@@ -109,15 +112,13 @@ class Models:
 
 @dataclass(frozen=True, slots=True)
 class _Layer:
-    """`y = y(m) + X [x - m, A]`: A stacks what every tanh before this layer adds to its tangent at m."""
+    """`y = y(m) + X [x - m, A]`: A stacks what every unit before this layer adds to its tangent at m. `phi` is the
+    function behind the layer, None behind the last of a policy without a squash."""
 
     y: Array
     X: Array
     W: Array  # the last columns of X, those of the layer just before
-
-    @property
-    def slope(self) -> Array:
-        return np.asarray(1 - np.tanh(self.y) ** 2)
+    phi: Activation | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +175,7 @@ class Paths:
     """The closed loop at a state `middle`, (n,): all of its models that does not depend on the ball around it.
 
     `u` are the inputs there, before a clip, and `rounding` (m,) is about what a checker does not know of them for its
-    roundings; `squashed` says whether a tanh comes after the last layer.
+    roundings.
     """
 
     loop: ClosedLoop
@@ -182,7 +183,6 @@ class Paths:
     u: Array
     rounding: Array
     layers: tuple[_Layer, ...]
-    squashed: bool
 
     @property
     def operations(self) -> float:
@@ -222,27 +222,26 @@ class Paths:
 
     def _policy(self, J: Array) -> _Policy:
         n, k = J.shape
-        form, last = basis(k), len(self.layers) - 1
+        form = basis(k)
         Q, K, R = (np.zeros((rows, len(of))) for rows, of in ((n, form.eye), (n, form.scale3), (0, form.eye)))
-        for number, layer in enumerate(self.layers):
+        for layer in self.layers:
             G, M = layer.X[:, :n] @ J, layer.X[:, n:]
             Q, K = layer.W @ Q, layer.W @ K
-            if number == last and not self.squashed:
+            if layer.phi is None:
                 return _Policy(G, Q, K, M, R)
-            E, t, slope = np.abs(M) @ R, np.tanh(layer.y), layer.slope
+            E = np.abs(M) @ R
             size = sizes(G, Q, K, E)
-            second, third = -t * slope, (3 * t**2 - 1) * slope / 3
+            _, slope, second, third, fourth = layer.phi.around(layer.y, size.radius)
             squares = form.square(G)
             H, cubic = beyond_tangent(G, squares, Q, K, second, third)
-            bounds = np.abs(second), np.abs(third), fourth_of_tanh(layer.y, size.radius)
-            rest = remainder(squares, size, E, *bounds)
+            rest = remainder(squares, size, E, np.abs(second), np.abs(third), fourth)
             R = np.concatenate([R, rest])
             Q, K = slope[:, None] * Q + H, slope[:, None] * K + cubic
         return _Policy(slope[:, None] * G, Q, K, np.concatenate([slope[:, None] * M, np.eye(len(G))], axis=1), R)
 
 
 def paths(loop: ClosedLoop, at: Array | None = None, resting: bool = True) -> Paths:
-    """Follow the states and every tanh's output through the network's linearisation at a state, (n,), the origin if
+    """Follow the states and every unit's output through the network's linearisation at a state, (n,), the origin if
     none is given; if that is not `resting`, the inputs there are what the policy says, else u_eq.
 
     Raises
@@ -250,7 +249,7 @@ def paths(loop: ClosedLoop, at: Array | None = None, resting: bool = True) -> Pa
     InputError : the network is larger than the checker's rules allow.
     """
     network = loop.network
-    n, squashed = network.n, network.squash == "tanh"
+    n, last = network.n, len(network.weights) - 1
     columns = k = n if at is None else n + 1
     numbers, products = numbers_of_a_jet(k), 0
     for W in network.weights[1:]:
@@ -267,19 +266,28 @@ def paths(loop: ClosedLoop, at: Array | None = None, resting: bool = True) -> Pa
         wrong = np.abs(W) @ wrong + terms + _ROUNDED * (np.abs(y) + np.abs(b))
         if number:
             X = np.concatenate([X, W], axis=1)
-        layers.append(_Layer(y, X, W))
-        h = np.tanh(y)
-        X = layers[-1].slope[:, None] * X
-        if squashed or number < len(folded.weights) - 1:
-            wrong = wrong + _ROUNDED * np.abs(h)
+        phi = network.phi if number < last else ACTIVATIONS["tanh"] if network.squash == "tanh" else None
+        layers.append(_Layer(y, X, W, phi))
+        h = y
+        if phi is not None:
+            h, slope = phi.pair(y)
+            X, wrong = slope[:, None] * X, phi.steepest * wrong + _ROUNDED * np.abs(h)
     u = np.array([float(q) for q in loop.u_eq])
     wrong = np.abs(folded.scale) * wrong
     if at is not None or (not resting and network.centre == "none"):
-        u = folded.scale * (h if squashed else y) + folded.offset
+        u = folded.scale * h + folded.offset
     else:
         wrong = np.zeros_like(u)
     rounding = np.zeros_like(u) if resting else wrong + _ROUNDED * (np.abs(u) + np.abs(folded.offset))
-    return Paths(loop, middle, u, rounding, tuple(layers), squashed)
+    return Paths(loop, middle, u, rounding, tuple(layers))
+
+
+def corner_of(known: Paths) -> str | None:
+    """The activation with a corner at the paths' middle itself, where no ball around that has a model; or None."""
+    for layer in known.layers:
+        if layer.phi is not None and not layer.phi.is_smooth and np.any(np.abs(layer.y) <= _AT_CORNER):
+            return layer.phi.name
+    return None
 
 
 def _room(loop: ClosedLoop, u: Array) -> Array:

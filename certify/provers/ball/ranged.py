@@ -21,12 +21,10 @@ from functools import reduce
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.loop.activations import CERTAIN, TANH4, TANH5
 from certify.loop.expressions import Algebra
 from certify.provers.ball.jets import (
     ATAN4,
-    CERTAIN,
-    TANH4,
-    TANH5,
     Sizes,
     basis,
     beyond_tangent,

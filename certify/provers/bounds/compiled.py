@@ -19,7 +19,7 @@ _FORMULAS = (
     *("smaller", "larger", "enclosed", "chord", "relaxed", "bent", "expansion"),
     *("corner", "coefficients", "sizes", "result"),
 )
-_LOOPS = ("ranges", "chords", "bend", "backwards", "play")
+_LOOPS = ("ranges", "chords", "relax", "bend", "backwards", "play")
 _TYPES = {
     "Line": "f8[::1]",
     "Plane": "f8[:,::1]",
@@ -39,6 +39,7 @@ class Loops(Protocol):
 
     ranges: Loop
     chords: Loop
+    relax: Loop
     bend: Loop
     backwards: Loop
     play: Loop

@@ -15,6 +15,7 @@ import numpy as np
 
 from certify.provers.bounds.arrays import Array
 from certify.provers.bounds.compiled import Loops
+from certify.provers.bounds.lines import LINES
 from certify.provers.bounds.taylor import TINY
 
 
@@ -35,8 +36,8 @@ class _Prepared:
     """A layer with the memory that it works in.
 
     `h` and `errors` come in as matrices (K, ...), `y` and `through` are what W and |W| make of them. `error`, the fresh
-    errors and the older ones (H, 2, B), and `slope` (H, B) enter the backward pass. `ranges`, `chords` and `bend`
-    are the arguments of these kernels.
+    errors and the older ones (H, 2, B), and `slope` (H, B) enter the backward pass. `ranges`, `chords`, `relax`
+    and `bend` are the arguments of these kernels; `relax` leaves the lines' shifts in t, their gaps in p.
     """
 
     layer: Layer
@@ -53,19 +54,23 @@ class _Prepared:
     slope: Array
     ranges: tuple[Any, ...]
     chords: tuple[Any, ...]
+    relax: tuple[Any, ...]
     bend: tuple[Any, ...]
 
 
 class FusedLayers:
-    """Bounds of layers with tanh between them, and behind the last if `squash`, on `batch` boxes at a time.
+    """Bounds of layers with a function between them, and tanh behind the last if `squash`, on `batch` boxes at a time.
 
     Parameters
     ----------
     scale : of the outputs (m,), by which errors are weighed.
+    activation : the function's name.
     """
 
-    def __init__(self, layers: Sequence[Layer], squash: bool, scale: Array, batch: int) -> None:
-        self.squash, self.scale, self.batch = squash, scale, batch
+    def __init__(
+        self, layers: Sequence[Layer], squash: bool, scale: Array, batch: int, activation: str = "tanh"
+    ) -> None:
+        self.squash, self.scale, self.batch, self.around = squash, scale, batch, LINES.get(activation)
         n, m = layers[0].W.shape[1], len(scale)
         units = max(len(layer.W) for layer in layers)
         widest = max(n, units)
@@ -87,13 +92,14 @@ class FusedLayers:
             sums = (self._size, self._fresh, self._ball)
             known = (layer.bias, layer.bias_error, layer.rows, through[:H], *sums)
             first = (y, *known, layer.norm, K, lo_hi, whole[:H], rounding[:H], spread[:H])
-            given = (y, lo_hi, tanh, slope, t[:H], p[:H])
+            given = (lo_hi, tanh, slope, t[:H], p[:H])
             share = self._share if i == 0 else self._share[:0]
-            last = (*given, K, whole[:H], rounding[:H], spread[:H], new, *sums, share)
+            last = (y, *given[2:], K, whole[:H], rounding[:H], spread[:H], new, *sums, share)
             self._layers.append(
                 _Prepared(
                     layer, h.reshape(K, -1), errors.reshape(K, -1), y.reshape(H, -1), through[:H].reshape(H, -1), lo_hi,
-                    tanh, **own, error=new, slope=slope, ranges=first, chords=(lo_hi, tanh, slope, t[:H]), bend=last,
+                    tanh, **own, error=new, slope=slope, ranges=first, chords=given[:-1], relax=(*given, y),
+                    bend=last,
                 )
             )  # fmt: skip
             h, errors = y, new
@@ -116,9 +122,13 @@ class FusedLayers:
                 each.error[:, 0] = each.rounding
                 each.slope[:] = 1.0
                 break
-            np.tanh(each.ends, out=each.values)
-            loops.chords(*each.chords)
-            np.arctanh(each.t, out=each.p)
+            if self.around is None or at == len(self._layers) - 1:
+                np.tanh(each.ends, out=each.values)
+                loops.chords(*each.chords)
+                np.arctanh(each.t, out=each.p)
+                loops.relax(*each.relax)
+            else:
+                each.slope[:], each.t[:], each.p[:] = self.around(*each.ends)
             loops.bend(*each.bend)
         share = self._share + TINY
         return self._form.copy(), self._error_backwards(loops, x_error), share / share.sum(0)

@@ -132,9 +132,10 @@ def relaxed(ends: Two, values: Two, s: Real, p: Real, t: Real, centre: Real) -> 
     return (upper + lower) / 2, gap
 
 
-def bent(centre: Real, spread: Real, s: Real, shift: Real, gap: Real, own: Real) -> Two:
-    """The middle of a unit's affine form behind tanh, and its fresh error, from the rounding in front."""
-    fresh = gap + s * own + EPS * (s * (abs(centre) + spread) + abs(shift)) + TINY
+def bent(centre: Real, spread: Real, s: Real, steep: Real, shift: Real, gap: Real, own: Real) -> Two:
+    """The middle of a unit's affine form behind a function, and its fresh error, from the rounding in front; `steep` is
+    the size of s."""
+    fresh = gap + steep * own + EPS * (steep * (abs(centre) + spread) + abs(shift)) + TINY
     return s * centre + shift, fresh
 
 
@@ -265,13 +266,21 @@ def chords(ends: Block, values: Block, slope: Plane, t: Plane) -> None:
             slope[i, k], t[i, k] = chord(ends[0, i, k], ends[1, i, k], values[0, i, k], values[1, i, k])
 
 
+def relax(ends: Block, values: Block, slope: Plane, t: Plane, p: Plane, y: Block) -> None:
+    """The lines of `relaxed` for a layer's units: t and p, sqrt(1 - slope) and where tanh is that, become their shifts
+    and gaps (H, B)."""
+    _, units, batch = ends.shape
+    for i in range(units):
+        for k in range(batch):
+            there, known = (ends[0, i, k], ends[1, i, k]), (values[0, i, k], values[1, i, k])
+            t[i, k], p[i, k] = relaxed(there, known, slope[i, k], p[i, k], t[i, k], y[i, 0, k])
+
+
 def bend(
     y: Block,
-    ends: Block,
-    values: Block,
     slope: Plane,
-    t: Plane,
-    p: Plane,
+    shift: Plane,
+    gap: Plane,
     width: int,
     error: Plane,
     rounding: Plane,
@@ -282,11 +291,11 @@ def bend(
     ball: Line,
     share: Plane,
 ) -> None:
-    """tanh of a layer's affine forms y (H, n + 1, B), in their place: `relaxed` and what follows from it.
+    """A function of a layer's affine forms y (H, n + 1, B), in their place, by parallel lines around it.
 
     Parameters
     ----------
-    t, p : sqrt(1 - slope), and where tanh is that.
+    slope, shift, gap : of the lines; a slope may be negative.
     width : how many came into the layer.
     spread : overwritten.
     errors : becomes the fresh errors and the older ones (H, 2, B).
@@ -301,19 +310,17 @@ def bend(
     fresh[:] = 0.0
     for i in range(units):
         for k in range(batch):
-            s, centre = slope[i, k], y[i, 0, k]
-            there = ends[0, i, k], ends[1, i, k]
-            shift, gap = relaxed(there, (values[0, i, k], values[1, i, k]), s, p[i, k], t[i, k], centre)
-            middle, new = bent(centre, spread[i, k], s, shift, gap, rounding[i, k])
-            old = s * error[i, k]
-            form = (abs(middle) + s * spread[i, k]) * wider
+            steep = abs(slope[i, k])
+            middle, new = bent(y[i, 0, k], spread[i, k], slope[i, k], steep, shift[i, k], gap[i, k], rounding[i, k])
+            old = steep * error[i, k]
+            form = (abs(middle) + steep * spread[i, k]) * wider
             y[i, 0, k] = middle
             errors[i, 0, k], errors[i, 1, k] = new, old
-            spread[i, k] = gap / (spread[i, k] + TINY)
+            spread[i, k] = gap[i, k] / (spread[i, k] + TINY)
             size[k] += form * form
             fresh[k] += new * new
             older[k] += old * old
-            steepest[k] = s if s > steepest[k] else steepest[k]
+            steepest[k] = steep if steep > steepest[k] else steepest[k]
         for j in range(len(share)):
             for k in range(batch):
                 share[j, k] += spread[i, k] * abs(y[i, j + 1, k])
@@ -326,7 +333,7 @@ def bend(
 
 def backwards(weight: Block, errors: Block, slope: Plane, result: Plane) -> None:
     """Add what a layer's fresh errors, `errors[:, 0]` of (H, 2, B), weigh in the outputs (m, B), and multiply their
-    weights (H, m, B) by the slopes of tanh."""
+    weights (H, m, B) by the slopes of its lines."""
     units, outputs, batch = weight.shape
     total = np.zeros((outputs, batch))
     for i in range(units):

@@ -1,6 +1,6 @@
 """The policy on a box: affine in the box coordinates, with an error of second order.
 
-Each layer is an affine form in d plus the errors made so far. tanh is relaxed by two parallel lines. Errors pass
+Each layer is an affine form in d plus the errors made so far. Functions are relaxed by two parallel lines. Errors pass
 forwards to give the next layer's range: the newest through |W|, the older ones through |W| or by their 2-norm through
 ||W||_2, whichever is less; for four layers of 256 this saves tenfold in boxes, at the price of one more column, where
 a backward pass for every hidden neuron would cost a hundred. One backward pass for the outputs then sums each layer's
@@ -47,7 +47,7 @@ class LayersEnclosure:
         rows = [np.linalg.norm(w, axis=1) for w in weights]
         norms = [float(np.linalg.norm(w, 2)) * min(w.shape) ** (1 / 128) for w in weights]
         self.squash = network.squash == "tanh"
-        self.scale = network.scale
+        self.scale, self.activation = network.scale, network.activation
         shift, shift_error, self.offset, self.offset_error = centring
         bias = biases[-1]
         biases[-1] = bias + shift
@@ -92,7 +92,7 @@ class LayersEnclosure:
         try:
             layers = self._spare.pop()
         except IndexError:
-            layers = FusedLayers(self.layers, self.squash, self.scale, self.piece)
+            layers = FusedLayers(self.layers, self.squash, self.scale, self.piece, self.activation)
         how = loops(self.units * batch)
         for first in range(0, batch, self.piece):
             index = np.arange(first, first + self.piece).clip(max=batch - 1)

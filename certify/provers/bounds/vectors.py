@@ -59,13 +59,16 @@ def chords(ends: Block, values: Block, slope: Plane, t: Plane) -> None:
     slope[:], t[:] = chord(*ends, *values)
 
 
+def relax(ends: Block, values: Block, slope: Plane, t: Plane, p: Plane, y: Block) -> None:
+    """See `kernels.relax`."""
+    t[:], p[:] = relaxed(tuple(ends), tuple(values), slope, p, t, y[:, 0])
+
+
 def bend(
     y: Block,
-    ends: Block,
-    values: Block,
     slope: Plane,
-    t: Plane,
-    p: Plane,
+    shift: Plane,
+    gap: Plane,
     width: int,
     error: Plane,
     rounding: Plane,
@@ -78,12 +81,12 @@ def bend(
 ) -> None:
     """See `kernels.bend`."""
     grown, wider = 1 + width * EPS, 1 + (y.shape[1] - 1) * EPS
-    shift, gap = relaxed(tuple(ends), tuple(values), slope, p, t, y[:, 0])
-    y[:, 0], errors[:, 0] = bent(y[:, 0], spread, slope, shift, gap, rounding)
-    errors[:, 1] = slope * error
-    form = (np.abs(y[:, 0]) + slope * spread) * wider
+    steep = np.abs(slope)
+    y[:, 0], errors[:, 0] = bent(y[:, 0], spread, slope, steep, shift, gap, rounding)
+    errors[:, 1] = steep * error
+    form = (np.abs(y[:, 0]) + steep * spread) * wider
     size[:], fresh[:], older = ((v * v).sum(0) for v in (form, errors[:, 0], errors[:, 1]))
-    ball[:] = smaller(np.fmax.reduce(slope, 0, initial=0.0) * ball, (np.sqrt(older) + LOST) * grown)
+    ball[:] = smaller(np.fmax.reduce(steep, 0, initial=0.0) * ball, (np.sqrt(older) + LOST) * grown)
     if len(share):
         share += ((gap / (spread + TINY))[:, None] * np.abs(y[:, 1:])).sum(0)
     y[:, 1:] *= slope[:, None]

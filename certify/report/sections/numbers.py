@@ -149,8 +149,9 @@ def _geometry(certificate: Certificate) -> Rows:
 def _evidence(certificate: Certificate, accepted: Mapping[str, Any] | None, sha256: str, size: int | None) -> Rows:
     """The claim's basis: the policy, the file, and the checker's counts if it `accepted`."""
     network, beyond, slabs = certificate.network, certificate.claim.outer, slabs_of(certificate)
+    layers = "-".join(map(str, network.layers))
     rows = [
-        ("policy", f"{'-'.join(map(str, network.layers))} tanh, squash {network.squash}, centre {network.centre}"),
+        ("policy", f"{layers} {network.activation}, squash {network.squash}, centre {network.centre}"),
         *(() if network.clip is None else (("clipped to", _clip(certificate)),)),
         *((("its layers read", read_in_words(certificate)),) if network.is_moved else ()),
         ("policy sha256", network.sha256()),

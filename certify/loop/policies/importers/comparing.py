@@ -2,9 +2,9 @@
 
 The framework usually works in single precision. Its rounding is bounded step by step in the usual way (Higham, Accuracy
 and Stability of Numerical Algorithms, section 3): a sum of k products has an error of at most `k u / (1 - k u)` times
-the sum of their magnitudes; tanh enlarges no error and adds a few units of its own. A difference beyond four times that
-bound is no rounding: the file was misread, and the import is rejected. The bound is loose for wide networks, so the
-comparison is repeated in double precision, where it is tight.
+the sum of their magnitudes; an activation multiplies an error by its slope and adds a few units of its own. A
+difference beyond four times that bound is no rounding: the file was misread, and the import is rejected. The bound is
+loose for wide networks, so the comparison is repeated in double precision, where it is tight.
 """
 
 from __future__ import annotations
@@ -16,13 +16,15 @@ from typing import Any
 import numpy as np
 
 from certify.errors import InputError
+from certify.loop.activations import ACTIVATIONS
 from certify.loop.policies.importers.reading import Reading
-from certify.loop.policies.importers.steps import Affine, Clip, Diagonal, Normalise, Step, Tanh
+from certify.loop.policies.importers.steps import Activate, Affine, Clip, Diagonal, Normalise, Step, Tanh
 from certify.loop.policies.network import Array
 
 SAMPLES = 10_000
 _SLACK = 4.0
 _TANH_UNITS = 8.0
+_STRAIGHT = 20.0  # from where on torch takes softplus for its argument
 _SINGLE, _DOUBLE = 2.0**-24, 2.0**-53
 
 
@@ -148,6 +150,15 @@ def _run(steps: Sequence[Step], x: Array, error: Array, unit: float) -> tuple[Ar
             case Tanh():
                 h = np.tanh(h)
                 e = e + _TANH_UNITS * unit * np.abs(h)
+            case Activate():
+                phi = ACTIVATIONS[step.function]
+                value = phi(h)
+                e = phi.steepest * e + _TANH_UNITS * unit * (np.abs(h) + np.abs(value))
+                if step.function == "softplus":
+                    e = np.where(h > _STRAIGHT - e, e + np.exp(-_STRAIGHT), e)
+                if step.function == "gelu":  # the onnx package's own has constants of single precision
+                    e = e + _SINGLE * np.abs(h)
+                h = value
             case Clip():
                 h = np.clip(h, _ends(step.lo, -np.inf), _ends(step.hi, np.inf))
     return h, e

@@ -1,4 +1,4 @@
-"""Fold a file's steps into the form of a proof: layers with tanh between them, then scale, offset and a clip.
+"""Fold a file's steps into the form of a proof: layers with an activation between them, then scale, offset and a clip.
 
 Each number of the network is computed from the steps exactly, in rationals, and rounded once to the nearest
 binary64; where a normaliser divides by the square root of a rational that is no square, the number is enclosed in Arb
@@ -22,10 +22,11 @@ import numpy as np
 
 from certify.errors import InputError
 from certify.loop.policies.importers.options import WITH_TANH
-from certify.loop.policies.importers.steps import Affine, Clip, Diagonal, Normalise, Step, Tanh, spread
+from certify.loop.policies.importers.steps import Activate, Affine, Clip, Diagonal, Normalise, Step, Tanh, spread
 from certify.loop.policies.network import Array, Squash
 
 Bounds = tuple[Fraction | None, Fraction | None]
+_IN_A_ROW = "between two activations there must be a layer; the file has two in a row."
 _BITS = (128, 512, 2048, 8192)
 _ROOT_BITS = 128
 _NO_BOUNDS: Bounds = (None, None)
@@ -40,6 +41,7 @@ class Folded:
     weights, biases : the layers, shapes (out, in) and (out,).
     scale, offset : shape (m,).
     squash : `tanh` or `identity`.
+    activation : between the layers.
     clip : (lo, hi), shapes (m,), or None.
     inactive : for each observation the exact bounds within which no clip of it acts, rounded inwards where they are no
         rationals; None for a side without a bound.
@@ -52,6 +54,7 @@ class Folded:
     squash: Squash
     clip: tuple[Array, Array] | None
     inactive: tuple[Bounds, ...]
+    activation: str = "tanh"
 
 
 def fold(steps: Sequence[Step], n: int) -> Folded:
@@ -59,8 +62,9 @@ def fold(steps: Sequence[Step], n: int) -> Folded:
 
     Raises
     ------
-    InputError : the steps are no tanh network with a clip at its ends, or their shapes do not chain.
+    InputError : the steps are no network with one activation and a clip at its ends, or their shapes do not chain.
     """
+    steps, activation = _one_activation(steps)
     first = next((k for k, step in enumerate(steps) if isinstance(step, Affine)), None)
     if first is None:
         raise InputError("a policy must have a layer; the file has none.")
@@ -75,7 +79,7 @@ def fold(steps: Sequence[Step], n: int) -> Folded:
         elif any(isinstance(step, Affine) for step in segment):
             layers.append(_layer(None, segment, width))
         else:
-            raise InputError("between two tanh there must be a layer; the file has two tanh in a row.")
+            raise InputError(_IN_A_ROW)
         width = len(layers[-1][1])
     ends = [k for k, step in enumerate(last) if isinstance(step, Affine)]
     squash: Squash = "tanh"
@@ -83,9 +87,37 @@ def fold(steps: Sequence[Step], n: int) -> Folded:
         layers.append(_layer(head if not hidden else None, last[: ends[-1] + 1], width))
         width, squash, tail = len(layers[-1][1]), "identity", last[ends[-1] + 1 :]
     scale, offset, clip = _tail(tail, width, squash)
-    return Folded(
-        tuple(w for w, _ in layers), tuple(b for _, b in layers), scale, offset, squash, clip, tuple(inactive)
-    )
+    weights, biases = tuple(w for w, _ in layers), tuple(b for _, b in layers)
+    return Folded(weights, biases, scale, offset, squash, clip, tuple(inactive), activation)
+
+
+def _one_activation(steps: Sequence[Step]) -> tuple[list[Step], str]:
+    """The steps with `Tanh` for the one function between their layers, and that function's name; relu may be a clip.
+
+    Raises
+    ------
+    InputError : there are several functions, or one of them has no layer after it and is neither tanh nor a clip.
+    """
+    ends = [k for k, step in enumerate(steps) if isinstance(step, Affine)]
+    first, last = (ends[0], ends[-1]) if ends else (0, 0)
+    inner = [_as_relu(step) if first < k < last else step for k, step in enumerate(steps)]
+    found = dict.fromkeys(_function(step) for step in inner[first:last] if isinstance(step, Tanh | Activate))
+    if len(found) > 1:
+        raise InputError(f"a policy must have one activation between its layers; the file has {' and '.join(found)}.")
+    beyond = [step.function for k, step in enumerate(inner) if isinstance(step, Activate) and not first < k < last]
+    if beyond:
+        raise InputError(f"{beyond[0]} must stand between two layers; behind the last one only tanh and a clip may.")
+    return [Tanh() if isinstance(step, Activate) else step for step in inner], next(iter(found), "tanh")
+
+
+def _as_relu(step: Step) -> Step:
+    """relu where a clip is that."""
+    is_relu = isinstance(step, Clip) and all(v == 0 for v in step.lo) and all(v is None for v in step.hi)
+    return Activate("relu") if is_relu else step
+
+
+def _function(step: Tanh | Activate) -> str:
+    return "tanh" if isinstance(step, Tanh) else step.function
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +209,7 @@ def _root_towards(square: Fraction, up: bool) -> Fraction:
 
 
 def _segments(steps: Sequence[Step]) -> list[list[Step]]:
-    """The steps between one tanh and the next."""
+    """The steps between one function and the next."""
     segments: list[list[Step]] = [[]]
     for step in steps:
         if isinstance(step, Tanh):
@@ -191,10 +223,7 @@ def _layer(head: _Head | None, segment: Sequence[Step], width: int) -> tuple[Arr
     """One layer from all steps of a segment, and from `head` before them."""
     for step in segment:
         if isinstance(step, Clip):
-            relu = all(v == 0 for v in step.lo) and all(v is None for v in step.hi)
-            found = "ReLU" if relu else "a clip"
-            after = f" {WITH_TANH}" if relu else ""
-            raise InputError(f"the activation must be tanh; the file has {found} between its layers.{after}")
+            raise InputError(f"between layers there must be an activation; the file has a clip there. {WITH_TANH}")
         if isinstance(step, Normalise):
             raise InputError("a normaliser must read the observation itself.")
     if len(segment) == 1 and isinstance(segment[0], Affine) and (head is None or head.is_nothing):
@@ -232,7 +261,7 @@ def _product(segment: Sequence[Step], width: int) -> tuple[flint.fmpq_mat, list[
                 entries = [_rational(scales[i]) * weight[i, j] for i in rows for j in range(weight.ncols())]
                 weight = flint.fmpq_mat(weight.nrows(), weight.ncols(), entries)
     if weight is None:
-        raise InputError("between two tanh there must be a layer; the file has none there.")
+        raise InputError(_IN_A_ROW)
     return weight, bias
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from certify.errors import InputError
 from certify.loop.files.arrays import Numbers
-from certify.loop.policies.importers.steps import Affine, Clip, Diagonal, Step, Tanh, exactly
+from certify.loop.policies.importers.steps import Activate, Affine, Clip, Diagonal, Step, Tanh, activated, exactly
 
 Chain = tuple[Step, ...]
 _EXACT_INTEGERS = 2**53
@@ -86,9 +86,20 @@ def negated(chain: Chain) -> Chain:
     return (*chain, Diagonal((Fraction(-1),), (Fraction(0),)))
 
 
-def tanh(chain: Chain) -> Chain:
-    """`tanh h`."""
-    return (*chain, Tanh())
+def mapped(chain: Chain, function: str) -> Chain:
+    """`phi(h)`, by the activation's name."""
+    return (*chain, activated(function))
+
+
+def product(one: Chain, other: Chain) -> Chain | None:
+    """`h * sigmoid(h)` and `h * tanh(softplus(h))`, as programs write silu and mish; None for other products."""
+    short, long = sorted((one, other), key=len)
+    same = all(a is b for a, b in zip(short, long, strict=False))
+    more = long[len(short) :]
+    for name, gate in (("silu", (Activate("sigmoid"),)), ("mish", (Activate("softplus"), Tanh()))):
+        if same and more == gate:
+            return (*short, Activate(name))
+    return None
 
 
 def clipped(chain: Chain, lo: Any | None, hi: Any | None, what: str) -> Chain:

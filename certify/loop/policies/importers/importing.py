@@ -202,7 +202,7 @@ def _require_answers(kind: Content, reading: Reading, options: ImportOptions, pl
     if options.states is None and plant.n > 1:
         wanted.append(f"--states {order} (what the network reads, in its order)")
     if options.activation is None and layers_only:
-        wanted.append("--activation tanh (between the layers)")
+        wanted.append("--activation tanh, relu or another (between the layers)")
     if options.squash is None and (layers_only or kind == "two-stage"):
         wanted.append("--squash identity, tanh or relu-tanh (after the last layer)")
     if options.normaliser is None and reading.normaliser is None and kind != "two-stage":
@@ -261,8 +261,10 @@ def _network(
     """The network over the plant's states, and the states where no observation is clipped, (n, 2), rounded inwards."""
     first = over_states(folded.weights[0], index, n)
     centre: Centre = "preactivation" if reading.beta is not None else options.centre or "none"
+    weights, clip = (first, *folded.weights[1:]), folded.clip
     network = TanhNetwork(
-        (first, *folded.weights[1:]), folded.biases, folded.scale, folded.offset, folded.squash, centre, folded.clip
+        *(weights, folded.biases, folded.scale, folded.offset, folded.squash, centre, clip),
+        activation=folded.activation,
     )
     valid = np.tile([-math.inf, math.inf], (n, 1))
     for k, bounds in zip(index, folded.inactive, strict=True):

@@ -1,7 +1,7 @@
 """Import policies in memory, a torch module or a state_dict, in the same way as their files.
 
 A module is more than its tensors: the functions between the layers are in its code. So it is traced, and the trace is
-read like a TorchScript archive: affine layers, tanh and constant scalings, and nothing else. A trace follows one
+read like a TorchScript archive: affine layers, activations and constant scalings, and nothing else. A trace follows one
 observation and ignores branches; torch's warning about a branch counts as an error, and the folded policy is compared
 with the module itself at states of the plant's domain, not with its trace. A state_dict holds only numbers, and missing
 facts are asked for, as for a file.
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from certify.loop.plants import System
 
 _INSTEAD = (
-    "Give its state_dict with the options of one, or a module of Linear and Tanh layers and constant scalings, whose "
-    "forward takes states (k, n) and returns actions (k, m)."
+    "Give its state_dict with the options of one, or a module of Linear layers, activations and constant scalings, "
+    "whose forward takes states (k, n) and returns actions (k, m)."
 )
 
 

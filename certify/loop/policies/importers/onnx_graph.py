@@ -1,4 +1,4 @@
-"""ONNX graphs of Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu and Tanh that form one chain.
+"""ONNX graphs of Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip and activations that form one chain.
 
 The file is parsed, and only the part of its graph that the action depends on is read. The comparison runs that part in
 the reference evaluator of the onnx package, which knows only the standard operators. Exporters add operations that
@@ -22,11 +22,12 @@ from certify.loop.policies.importers.options import WITH_TANH, WITHOUT_NORMALISA
 from certify.loop.policies.importers.reading import Observations, Reading, Values
 from certify.loop.policies.importers.steps import Affine
 
+_ACTIVATIONS = ("Tanh", "Elu", "Sigmoid", "Gelu", "Softplus", "Mish", "Softsign")
 _OPERATIONS = {
-    "Gemm", "MatMul", "Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", "Tanh",
+    "Gemm", "MatMul", "Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", *_ACTIVATIONS,
     "Identity", "Cast", "Flatten", "Reshape", "Constant",
 }  # fmt: skip
-_KNOWN = "Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu, Tanh, Identity, Flatten and Constant"
+_KNOWN = f"Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu, {', '.join(_ACTIVATIONS)}, Identity, Flatten and Constant"
 _NORMALISATIONS = {
     "LayerNormalization",
     "BatchNormalization",
@@ -41,8 +42,10 @@ _FLAGS = {
     "Cast": {"to", "saturate"},
     "Flatten": {"axis"},
     "Reshape": {"allowzero"},
+    "Elu": {"alpha"},
+    "Gelu": {"approximate"},
 }
-_ELEMENTWISE = {"Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", "Tanh", "Exp", "Log", "Identity", "Cast"}
+_ELEMENTWISE = {"Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", *_ACTIVATIONS, "Exp", "Log", "Identity", "Cast"}
 
 
 def read_onnx(raw: bytes, what: str, wanted: str | None = None, folder: Path | None = None) -> Reading:
@@ -216,10 +219,7 @@ def _walk(graph_: Any, name: str, output: str, what: str) -> Chain:
             part = " (a part of LayerNorm, as exporters write it)" if node.op_type == "ReduceMean" else ""
             raise InputError(f"{at} in {what}{part} is not read. {WITHOUT_NORMALISATION}")
         if node.op_type not in _OPERATIONS:
-            raise InputError(
-                f"{at} in {what} is not read: only tanh networks are proved, and the operations are {_KNOWN}. "
-                f"{WITH_TANH}"
-            )
+            raise InputError(f"{at} in {what} is not read: the operations are {_KNOWN}. {WITH_TANH}")
         flags = {a.name: a for a in node.attribute}
         if len(flags) != len(node.attribute):
             raise InputError(f"{at} in {what} must have each attribute once.")
@@ -249,6 +249,8 @@ def _walk(graph_: Any, name: str, output: str, what: str) -> Chain:
 
 def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain:
     found = [k for k, value in enumerate(given) if isinstance(value, tuple)]
+    if len(found) == 2 and kind == "Mul" and (gated := graph.product(*given)) is not None:
+        return gated
     if len(found) != 1:
         raise InputError(
             f"{at} must join one value that depends on the observation with constants; it has {len(found)}."
@@ -288,8 +290,8 @@ def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain
             return graph.scaled(chain, others[0], at, divide=True)
         case "Neg", 0, 1:
             return graph.negated(chain)
-        case "Tanh", 0, 1:
-            return graph.tanh(chain)
+        case _, 0, 1 if kind in _ACTIVATIONS:
+            return _activated(chain, kind, flags, at)
         case "Identity", 0, 1:
             return chain
         case "Cast", 0, 1:
@@ -305,6 +307,15 @@ def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain
             bounds = [*given[1:], None, None]
             return graph.clipped(chain, bounds[0], bounds[1], at)
     raise InputError(f"{at} is not read: the operations are {_KNOWN}, with the observation in the usual place.")
+
+
+def _activated(chain: Chain, kind: str, flags: dict[str, Any], at: str) -> Chain:
+    """An activation of the chain, but no Elu with another alpha than 1, nor the Gelu that is an approximation."""
+    if "alpha" in flags and flags["alpha"].f != 1:
+        raise InputError(f"{at} must have alpha 1; found {flags['alpha'].f}.")
+    if "approximate" in flags and flags["approximate"].s != b"none":
+        raise InputError(f"{at} must be the exact one, without `approximate`.")
+    return graph.mapped(chain, kind.lower())
 
 
 def _require_real(flags: dict[str, Any], at: str) -> None:

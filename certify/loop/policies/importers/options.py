@@ -11,16 +11,19 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from certify.errors import InputError
+from certify.loop.activations import ACTIVATIONS
 from certify.loop.policies.importers.steps import Clip
 from certify.loop.policies.network import Centre
 
 Kind = Literal["auto", "state-dict", "torchscript", "onnx", "sb3", "safetensors", "two-stage"]
 Output = Literal["identity", "tanh", "relu-tanh"]
 Observes = Literal["absolute", "deviation"]
-REFUSED_ACTIVATIONS = ("relu", "elu", "selu", "gelu", "silu", "leaky_relu", "sigmoid", "softplus", "mish")
+KNOWN_ACTIVATIONS = f"{', '.join(list(ACTIVATIONS)[:-1])} and {list(ACTIVATIONS)[-1]}"
+"""The activations that are proved, in words."""
 WITH_TANH = (
-    "Train the policy again with torch.nn.Tanh() between its layers: policy_kwargs=dict(activation_fn=torch.nn.Tanh) "
-    "for stable-baselines3, activation = 'tanh' for rsl_rl, fcnet_activation = 'tanh' for RLlib."
+    f"The activations that are proved are {KNOWN_ACTIVATIONS}. Train the policy again with one of them between its "
+    "layers, such as tanh: policy_kwargs=dict(activation_fn=torch.nn.Tanh) for stable-baselines3, activation = 'tanh' "
+    "for rsl_rl, fcnet_activation = 'tanh' for RLlib."
 )
 """The next step where a policy has another activation."""
 WITHOUT_NORMALISATION = (
@@ -38,7 +41,8 @@ class ImportOptions:
     ----------
     kind : the kind of file, or `auto`.
     prefix : in a state_dict, the keys of the policy's layers up to their numbers, such as `actor.pi_net.fcs`.
-    activation : between the layers of a state_dict: `tanh`.
+    activation : between the layers of a state_dict, by its name: tanh, relu, elu (alpha 1), sigmoid, silu, gelu (the
+        exact one), softplus (beta 1), mish or softsign.
     squash : what follows the last layer of a state_dict: `identity`, `tanh`, or `relu-tanh` for relu(tanh(.)).
     states : the plant's states in the order in which the network reads them.
     normaliser : a file with the observations' normaliser, or `none`.
@@ -79,10 +83,10 @@ class ImportOptions:
         ):
             if value is not None and value not in known:
                 raise InputError(f"{option} must be one of {', '.join(known)}; found {value!r}.")
-        if self.activation is not None and self.activation != "tanh":
-            named = self.activation.lower() in REFUSED_ACTIVATIONS
-            found = f"{self.activation} is not proved" if named else f"found {self.activation!r}"
-            raise InputError(f"--activation must be tanh: only tanh networks are proved; {found}. {WITH_TANH}")
+        if self.activation is not None and self.activation not in ACTIVATIONS:
+            raise InputError(
+                f"--activation must be one of {', '.join(ACTIVATIONS)}; found {self.activation!r}. {WITH_TANH}"
+            )
         if self.states is not None and len(set(self.states)) != len(self.states):
             raise InputError(f"--states must name each state once; found {','.join(self.states)}.")
         if self.action_scale is not None and 0 in self.action_scale:

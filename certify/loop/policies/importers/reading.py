@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
+from certify.loop.activations import ACTIVATIONS
 from certify.loop.policies.importers.options import Output
-from certify.loop.policies.importers.steps import Affine, Diagonal, Normalise, Step, Tanh
+from certify.loop.policies.importers.steps import Affine, Diagonal, Normalise, Step, activated
 from certify.loop.policies.network import Array
 
 Observations = NDArray[np.floating[Any]]
@@ -74,8 +75,9 @@ class Reading:
         return next(int(step.weight.shape[0]) for step in reversed(self.steps) if isinstance(step, Affine))
 
 
-def perceptron(layers: Sequence[Affine], squash: Output = "identity") -> Evaluate:
-    """The layers with tanh between them, and `squash` behind them, in numpy."""
+def perceptron(layers: Sequence[Affine], squash: Output = "identity", activation: str = "tanh") -> Evaluate:
+    """The layers with an activation between them, and `squash` behind them, in numpy."""
+    phi = ACTIVATIONS[activation]
     ends: dict[Output, Callable[[Values], Values]] = {
         "identity": lambda y: y,
         "tanh": np.tanh,
@@ -86,15 +88,15 @@ def perceptron(layers: Sequence[Affine], squash: Output = "identity") -> Evaluat
         kind = np.float64 if double else np.float32
         h = x.astype(kind)
         for k, layer in enumerate(layers):
-            h = (np.tanh(h) if k else h) @ layer.weight.T.astype(kind) + layer.bias.astype(kind)
+            h = (phi(h) if k else h) @ layer.weight.T.astype(kind) + layer.bias.astype(kind)
         return ends[squash](h)
 
     return evaluate
 
 
-def between(layers: Sequence[Affine]) -> tuple[Step, ...]:
-    """The layers as steps, with tanh between them."""
-    return tuple(step for layer in layers for step in (layer, Tanh()))[:-1]
+def between(layers: Sequence[Affine], activation: str = "tanh") -> tuple[Step, ...]:
+    """The layers as steps, with an activation between them."""
+    return tuple(step for layer in layers for step in (layer, activated(activation)))[:-1]
 
 
 def widths(layers: Sequence[Affine]) -> str:

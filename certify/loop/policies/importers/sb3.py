@@ -1,4 +1,4 @@
-"""The zip files of stable-baselines3: PPO, A2C, SAC, TD3 and DDPG with tanh between the layers.
+"""The zip files of stable-baselines3: PPO, A2C, SAC, TD3 and DDPG with an activation of the table between the layers.
 
 The numbers come from `policy.pth`, their meaning from `data`: JSON with other objects as pickles in base64, which are
 read as data. PPO and A2C *clip* their actions to the bounds of the action space; SAC, TD3 and DDPG squash them by tanh
@@ -17,9 +17,11 @@ from typing import Any
 import numpy as np
 
 from certify.errors import InputError
+from certify.loop.activations import ACTIVATIONS
 from certify.loop.files.archives import Archive
 from certify.loop.files.arrays import Numbers, array_of
 from certify.loop.files.pickles import Call, Name, brief, read_pickle
+from certify.loop.policies.importers.options import WITH_TANH
 from certify.loop.policies.importers.reading import Observations, Reading, Values, between, perceptron, widths
 from certify.loop.policies.importers.steps import Affine, Clip, Diagonal, Tanh, exactly, linear
 from certify.loop.policies.importers.tensors import load_tensors
@@ -28,8 +30,8 @@ from certify.loop.policies.importers.unread import braced, unread
 _ON_POLICY = Name("stable_baselines3.common.policies", "ActorCriticPolicy")
 _SAC = Name("stable_baselines3.sac.policies", "SACPolicy")
 _TD3 = Name("stable_baselines3.td3.policies", "TD3Policy")
-_DEFAULTS = {_ON_POLICY: "PPO and A2C", _SAC: "SAC", _TD3: "TD3 and DDPG"}
 _TANH = Name("torch.nn.modules.activation", "Tanh")
+_MODULES = {row.name: Name("torch.nn.modules.activation", row.module) for row in ACTIVATIONS.values()}
 _FLATTEN = Name("stable_baselines3.common.torch_layers", "FlattenExtractor")
 _HARMLESS = {  # they change how a policy was trained, or are seen in its tensors
     "net_arch", "ortho_init", "log_std_init", "full_std", "use_expln", "optimizer_class", "optimizer_kwargs",
@@ -62,7 +64,7 @@ def read_sb3(archive: Archive, what: str, ignored: tuple[str, ...] | None = None
             f"the policy of {what} must be MlpPolicy of PPO, A2C, SAC, TD3 or DDPG; it is {brief(policy)}. "
             "Export it to ONNX and import that."
         )
-    _require_tanh(policy, {} if given is None else given, what)
+    activation = _activation(policy, {} if given is None else given, what)
     n, bounds = _spaces(data, what)
     tensors = load_tensors(archive.read("policy.pth"), f"policy.pth in {what}")
     if any(name.startswith(_BELOW) for name in tensors):
@@ -70,10 +72,10 @@ def read_sb3(archive: Archive, what: str, ignored: tuple[str, ...] | None = None
     layers, left = _layers(tensors, policy, what, ignored)
     if layers[0].weight.shape[1] != n or len(layers[-1].bias) != bounds.shape[1]:
         raise InputError(f"the spaces of {what} must match its layers; they have {n} and {bounds.shape[1]} numbers.")
-    steps = list(between(layers))
+    steps = list(between(layers, activation))
     low, high = bounds
     described = widths(layers)
-    net = perceptron(layers, "identity" if policy == _ON_POLICY else "tanh")
+    net = perceptron(layers, "identity" if policy == _ON_POLICY else "tanh", activation)
     if policy == _ON_POLICY:
         lows = [None if np.isneginf(v) else exactly(v)[0] for v in low]
         highs = [None if np.isposinf(v) else exactly(v)[0] for v in high]
@@ -100,7 +102,7 @@ def read_sb3(archive: Archive, what: str, ignored: tuple[str, ...] | None = None
     action = tuple(zip(exactly(low), exactly(high), strict=True)) if finite else None
     left |= _elsewhere(archive)
     who = "what its policy_kwargs say" if given and "activation_fn" in given else "the default of its kind"
-    assumed = f"tanh between the layers is {who}, the rest is how stable-baselines3 documents its policies"
+    assumed = f"{activation} between the layers is {who}, the rest is how stable-baselines3 documents its policies"
     return Reading(words=words, steps=tuple(steps), evaluate=evaluate, action=action, assumed=assumed, unread=left)
 
 
@@ -131,17 +133,15 @@ def _value(data: Mapping[str, Any], key: str) -> Any:
     return read_pickle(raw, f"{key} in data")
 
 
-def _require_tanh(policy: Name, given: Any, what: str) -> None:
+def _activation(policy: Name, given: Any, what: str) -> str:
+    """The activation between layers, and refusals of what else changes the policy."""
     if not isinstance(given, dict):
         raise InputError(f"policy_kwargs of {what} must be a dictionary; found {brief(given)}.")
     activation = given.get("activation_fn", _TANH if policy == _ON_POLICY else Name("torch.nn", "ReLU"))
-    if activation != _TANH:
+    rows = [row for row, name in _MODULES.items() if activation in (name, Name("torch.nn", name.name))]
+    if not rows:
         found = activation.name if isinstance(activation, Name) else brief(activation)
-        default = f", the default of {_DEFAULTS[policy]}" if "activation_fn" not in given else ""
-        raise InputError(
-            f"the activation of {what} must be tanh: only tanh networks are proved; it is {found}{default}. Train the "
-            "policy again with policy_kwargs=dict(activation_fn=torch.nn.Tanh)."
-        )
+        raise InputError(f"the activation of {what} is not proved; it is {found}. {WITH_TANH}")
     if given.get("use_sde") not in (None, False) and policy == _SAC:
         raise InputError(
             f"{what} has state-dependent exploration, which bounds its mean by another function (use_sde)."
@@ -154,6 +154,7 @@ def _require_tanh(policy: Name, given: Any, what: str) -> None:
     unknown = sorted(str(key) for key in given if key not in known)
     if unknown:
         raise InputError(f"policy_kwargs of {what} must be those of MlpPolicy; unknown are {', '.join(unknown)}.")
+    return rows[0]
 
 
 def _spaces(data: Mapping[str, Any], what: str) -> tuple[int, Numbers]:

@@ -108,13 +108,14 @@ def read_state_dict(
         known |= dict.fromkeys((f"{at}_var", f"{at}count"), "of the normaliser that is read")
     if beside is not None:
         known |= dict.fromkeys(_own(tensors, beside), "the Lyapunov network that is imported beside it")
+    activation = options.activation or "tanh"
     return Reading(
         words=f"state_dict {prefix} {widths(layers)}",
-        steps=(*between(layers), *_ENDS[squash]),
-        evaluate=perceptron(layers, squash),
+        steps=(*between(layers, activation), *_ENDS[squash]),
+        evaluate=perceptron(layers, squash, activation),
         normaliser=rsl_normaliser(tensors, options.epsilon),
         double=_is_double(tensors, prefix),
-        assumed=f"tanh between the layers is what --activation says, {squash} behind them what --squash says",
+        assumed=f"{activation} between the layers is what --activation says, {squash} behind them what --squash says",
         unread=unread(tensors, read, prefix, m, options.ignore, known),
     )
 

@@ -85,6 +85,13 @@ class Tanh:
 
 
 @dataclass(frozen=True, slots=True)
+class Activate:
+    """`y_i = phi(h_i)`, phi another activation than tanh, by its name in `certify.loop.activations`."""
+
+    function: str
+
+
+@dataclass(frozen=True, slots=True)
 class Clip:
     """`y_i = min(max(h_i, lo_i), hi_i)`; None for a side without a bound, one bound for every component."""
 
@@ -98,7 +105,12 @@ class Clip:
                 raise InputError(f"a clip must have lo < hi; found {float(lo)} and {float(hi)}.")
 
 
-Step = Affine | Diagonal | Normalise | Tanh | Clip
+Step = Affine | Diagonal | Normalise | Tanh | Activate | Clip
+
+
+def activated(function: str) -> Tanh | Activate:
+    """The step of an activation, by its name."""
+    return Tanh() if function == "tanh" else Activate(function)
 
 
 def spread(values: tuple[T, ...], width: int) -> tuple[T, ...]:

@@ -1,4 +1,4 @@
-"""TorchScript archives, their code read as text: affine layers, tanh and constant scalings that form one chain.
+"""TorchScript archives, their code read as text: affine layers, activations and constant scalings that form one chain.
 
 torch.jit.load compiles the code of an archive and runs the methods by which its modules set their state; some
 operations of TorchScript read files. So it is not called. The code is parsed by Python's grammar, which it follows, and
@@ -27,7 +27,13 @@ from certify.loop.policies.importers.reading import Observations, Reading, Value
 _MAX_OPERATIONS = 1000
 _MAX_DEPTH = 40
 _MAX_TEXT = 2**20
-_KNOWN = "linear, addmm, matmul, add, sub, rsub, mul, div, neg, clamp, hardtanh, relu and tanh"
+_KNOWN = (
+    "linear, addmm, matmul, add, sub, rsub, mul, div, neg, clamp, hardtanh, relu, tanh, elu, sigmoid, silu, gelu, "
+    "softplus and mish"
+)
+_ACTIVATIONS: dict[str, tuple[float, ...]] = {  # with what a program may write behind the value
+    **{"tanh": (), "sigmoid": (), "silu": (), "gelu": (), "mish": (), "elu": (1.0, 1.0, 1.0), "softplus": (1.0, 20.0)}
+}
 _NORMALISATIONS = ("layer_norm", "batch_norm", "group_norm", "instance_norm", "rms_norm")
 _RESERVED = ("torch", "CONSTANTS", "getattr")
 _DEFAULTS: dict[str, tuple[Any, ...]] = {"hardtanh": (-1.0, 1.0), "clamp": (None, None)}
@@ -261,14 +267,15 @@ def _step(name: str, place: int, count: int, chain: Chain, given: tuple[Any, ...
             return graph.scaled(chain, given[0], at, divide=True)
         case "neg", 0, 1:
             return graph.negated(chain)
-        case "tanh", 0, 1:
-            return graph.tanh(chain)
+        case _, 0, _ if name in _ACTIVATIONS and given == _ACTIVATIONS[name][: len(given)]:
+            return graph.mapped(chain, name)
         case "relu", 0, 1:
             return graph.clipped(chain, 0.0, None, at)
         case ("clamp", 0, 1 | 2 | 3) | ("hardtanh", 0, 1 | 2 | 3):
             lo, hi = (*given, *_DEFAULTS[name][len(given) :])
             return graph.clipped(chain, lo, hi, at)
-    raise InputError(f"{at} is not read: only tanh networks are proved, and the operations are {_KNOWN}. {WITH_TANH}")
+    said = f" with {', '.join(map(str, given))}" if name in _ACTIVATIONS else ""
+    raise InputError(f"{at}{said} is not read: the operations are {_KNOWN}. {WITH_TANH}")
 
 
 def _run(name: str, y: Any, given: tuple[Any, ...], double: bool) -> Any:
@@ -289,6 +296,10 @@ def _run(name: str, y: Any, given: tuple[Any, ...], double: bool) -> Any:
         "div": torch.div,
         "neg": torch.neg,
         "tanh": torch.tanh,
+        "sigmoid": torch.sigmoid,
+        **{name: getattr(torch.nn.functional, name) for name in ("silu", "gelu", "mish")},
+        "elu": lambda h, *_: torch.nn.functional.elu(h),
+        "softplus": lambda h, *_: torch.nn.functional.softplus(h),
         "relu": torch.relu,
         "clamp": torch.clamp,
         "hardtanh": torch.nn.functional.hardtanh,
