@@ -570,7 +570,7 @@ class _Kink(_Bent):
         return [v[0].function("abs"), *(sign * v[k] if k < len(v) else constant(Fraction(0)) for k in range(1, count))]
 
     def lines(self, centre: Array, radius: Above) -> Lines:
-        """Lines of slopes near the chord's; phi(v) - s v is linear to both sides of 0, and so is extreme at ends, or at 0."""
+        """Lines of slopes near the chord's; phi(v) - s v is linear to both sides of 0, so extreme at ends or at 0."""
         lo, hi = Near(centre, radius).ends
         s = np.clip((self.value(hi) - self.value(lo)) / (hi - lo), self.left, self.right)
         s = np.where(lo >= 0, self.right, np.where(hi <= 0, self.left, s))

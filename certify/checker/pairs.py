@@ -24,7 +24,7 @@ def bound_of_pairs(p: Vector, T: Tensor, weight: Array) -> fmpq_mat:
     kept = np.any(p.value, axis=0) & np.any(T.value, axis=(0, 1))
     rows, whole = p.value[:, kept], T.value[:, :, kept]
     tau = np.einsum("irq,ij,jrq->q", whole, weight, whole) / np.einsum("iq,ij,jq->q", rows, weight, rows)
-    t = np.clip(np.sqrt(np.sqrt(np.where((tau > 0) & (tau < np.inf), tau, 1.0))), 1 / _FARTHEST, _FARTHEST)
+    t = np.clip(np.sqrt(np.sqrt(np.where((tau >= 0) & (tau < np.inf), tau, 1.0))), 1 / _FARTHEST, _FARTHEST)
     k = len(rows)
     S: Square = gram(Near(rows) * Near(t)) + gram(Near(whole.reshape(k, -1)).over(np.tile(t, whole.shape[1])))
     found = exactly(S.wider(lost).majorant) * fmpq(2) ** (by_p + by_T)

@@ -4,7 +4,7 @@ A row has its values in numpy, torch, Arb and rationals, its derivatives, and bo
 of their own (FORMAT.md, functions); no number here is trusted. Bounds are not below the checker's, so that what is
 found with them is accepted.
 
-A row that is not smooth at 0 has derivatives where the sign of its argument is certain, and NaN elsewhere.
+A row that is not smooth at 0 has derivatives where the sign of its argument is certain, elsewhere a tangent.
 """
 
 from __future__ import annotations
@@ -195,9 +195,18 @@ class _Bent(Activation):
     is_smooth = False
 
     def around(self, y: Array, radius: Array) -> Five:
+        """As of a smooth one where the sign of v is certain. Elsewhere the tangent is all there is: the last two terms
+        are 0, and what it leaves, a multiple of (v - y)^2, stands for |phi^(4)|/24 times radius^2."""
         f0, f1, f2, f3, _ = self.series(y)
-        certain = np.where(np.abs(y) > CERTAIN * radius, 1.0, np.nan)
-        return f0, f1, f2, f3, self.beyond(y, radius) * certain
+        certain = np.abs(y) > CERTAIN * radius
+        with np.errstate(divide="ignore", invalid="ignore"):
+            left = self.left_by_tangent(y) * CERTAIN / radius**2
+        fourth = np.where(certain, self.beyond(y, radius), left)
+        return f0, f1, np.where(certain, f2, 0.0), np.where(certain, f3, 0.0), fourth
+
+    def left_by_tangent(self, y: Array) -> Array:
+        """A bound of what the tangent at y leaves, by (v - y)^2."""
+        return self.bend + 0 * y
 
     @abstractmethod
     def beyond(self, y: Array, radius: Array) -> Array:
@@ -224,6 +233,9 @@ class _Relu(_Bent):
 
     def beyond(self, y: Array, radius: Array) -> Array:
         return 0.0 * radius
+
+    def left_by_tangent(self, y: Array) -> Array:
+        return np.asarray(0.25 / np.abs(y))
 
     def formula(self, v: Any) -> Any:
         return v if v >= 0 else flint.arb(0)

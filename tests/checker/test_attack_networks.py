@@ -61,9 +61,21 @@ class Truth:
 
 
 def phi(name: str, v: arb) -> arb:
-    if name in ("inv", "abs"):
-        return 1 / v if name == "inv" else abs(v)
-    return getattr(v, name)()
+    return PHI[name](v) if name in PHI else getattr(v, name)()
+
+
+PHI: dict[str, Callable[[arb], arb]] = {
+    "inv": lambda v: 1 / v,
+    "abs": abs,
+    "relu": lambda v: v.max(arb(0)),
+    "elu": lambda v: v.max(arb(0)) + v.min(arb(0)).expm1(),
+    "softsign": lambda v: v / (1 + abs(v)),
+    "sigmoid": lambda v: 1 / (1 + (-v).exp()),
+    "silu": lambda v: v / (1 + (-v).exp()),
+    "gelu": lambda v: v * (1 + (v / arb(2).sqrt()).erf()) / 2,
+    "softplus": lambda v: (1 + v.exp()).log(),
+    "mish": lambda v: v * (1 + v.exp()).log().tanh(),
+}
 
 
 class Truths(Algebra[list[arb]]):

@@ -89,12 +89,15 @@ def test_bounds_hold_and_are_not_below_the_checkers(name: str) -> None:
 def test_the_fourth_order_bound_holds_around_a_point(name: str) -> None:
     row, generator = ACTIVATIONS[name], np.random.default_rng(1)
     y, radius = generator.normal(size=400) * 3, 10.0 ** generator.uniform(-4, 1, 400)
-    bound = row.around(y, radius)[4]
-    uncertain = np.isnan(bound)
-    assert np.array_equal(uncertain, np.abs(y) <= 1.001 * radius) if not row.is_smooth else not uncertain.any()
+    f0, f1, f2, f3, bound = row.around(y, radius)
+    cut = (np.abs(y) <= 1.001 * radius) & (not row.is_smooth)
+    assert np.all(np.isfinite(bound)) and not f2[cut].any() and not f3[cut].any()
     for share in np.linspace(-1, 1, 21):
-        fourth = np.abs(row.series(y + share * radius)[4])
-        assert np.all((fourth <= bound * (1 + 1e-9) + 1e-15) | uncertain)
+        D = share * radius
+        fourth = np.abs(row.series(y + D)[4])
+        assert np.all((fourth <= bound * (1 + 1e-9) + 1e-15) | cut)
+        left = np.abs(row.pair(y + D)[0] - f0 - f1 * D)
+        assert np.all((left <= bound * radius**2 * D**2 + 1e-14 * (np.abs(y) + radius)) | ~cut)
 
 
 @pytest.mark.parametrize("name", ACTIVATIONS)

@@ -31,7 +31,7 @@ from certify.loop.policies import TanhNetwork
 from certify.loop.policies.exact import at_origin
 from certify.loop.rigorous import evaluate_policy
 from certify.lyapunov import domain_limit
-from certify.provers.ball.local import ball_around, prove_local
+from certify.provers.ball.local import prove_local
 from certify.provers.ball.models import paths
 from certify.provers.bounds.lines import LINES
 from certify.provers.bounds.policy import PolicyEnclosure
@@ -189,18 +189,19 @@ def test_models_on_balls(name: str, moved: bool) -> None:
 
 
 @pytest.mark.parametrize("name", BENT)
-def test_a_ball_that_meets_a_corner_has_no_model_and_the_search_stops_before_it(name: str) -> None:
-    """The level that is found is 2 % below one that has none, or below one whose remainders are too large."""
-    case = case_of(PLANT, policy(name))
-    known, limit = paths(case.loop), domain_limit(case.P, PLANT.domain)
-    first = case.loop.network
+def test_a_ball_that_meets_corners_has_tangents_and_a_level_beyond_them(name: str) -> None:
+    case, generator = case_of(PLANT, policy(name)), np.random.default_rng(5)
+    known, limit, first = paths(case.loop), domain_limit(case.P, PLANT.domain), case.loop.network
     corner = np.min(np.abs(first.biases[0]) / np.linalg.norm(first.weights[0] @ case.T, axis=1))
-    with np.errstate(all="ignore"):
-        assert not known.models(case.T * corner * 1.01).finite
-        level = prove_local(case.problem, case.T, limit)
-        assert level is not None and level < corner**2 * 1.01
-        if name == "relu":
-            assert not known.models(ball_around(case.problem, case.T, 1.05 * level)).finite
+    d = generator.standard_normal((4000, 2))
+    d *= generator.random((4000, 1)) ** 0.1 / np.linalg.norm(d, axis=1, keepdims=True)
+    for far in (1.01, 1.5, 3.0):
+        J = far * corner * case.T
+        models = known.models(J)
+        error, bound = beyond(case.loop, models, d @ J.T, d)
+        assert models.finite and np.all(error <= bound * (1 + 1e-9) + 1e-12)
+    level = prove_local(case.problem, case.T, limit)
+    assert level is not None and level > (0.9 if name == "softsign" else 1.0) * corner**2
 
 
 def test_a_corner_at_the_operating_point_proves_nothing() -> None:

@@ -5,8 +5,8 @@ radius too and leave no hole at its middle m. The terms that each unit adds to i
 products of weights and slopes at m, `Paths`, and cancel there as they do in truth; the products do not depend on the
 ball. The remainder of each unit beyond its third order, e_q, stays apart to the end: F has all of them in a linear
 combination that is known exactly, and so they keep the directions that they have in x. d may have more entries than x:
-along a path its last is the motion. A unit that is not smooth at 0 has a model where the sign of what it reads is
-certain; on a ball that meets its corner there is none, and the search takes a smaller one.
+along a path its last is the motion. A unit that is not smooth at 0 has its tangent alone on a
+ball that meets its corner, which leaves the more the closer the corner is to the middle.
 """
 
 from __future__ import annotations
