@@ -26,7 +26,7 @@ def on_boxes(ring: Ring, centre: Array, radius: Array) -> tuple[list[Model], lis
 
 def least(function: Function, x: Form) -> Array:
     """A lower bound of N on boxes by the forms of its networks, (B,); that it is none where nothing is known."""
-    if not function.weights:
+    if not function.tape.calls:
         return np.full(x.value.shape[2], -np.inf)
     N = function._by_forms(models(Form(x.value), x.error))
     return np.where(np.isfinite(N.size.top), -upper_bound(-N), -np.inf)
