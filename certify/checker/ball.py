@@ -147,8 +147,9 @@ def fits(ball: Ball) -> Failures:
     operations = (c.dynamics.size + c.policy.network.operations) * ball.order**2 * (1 + ball.count)
     if operations * numbers_of(symbols) > _MOST_JETS:
         yield "plant.dynamics", "the equations are too large for this rule"
-    for network in (c.policy.network, *(call.network for call in c.dynamics.calls.values())):
-        if is_too_large(network, symbols):
+    called = [(call.network, call.network.reads) for call in c.dynamics.calls.values()]
+    for network, arguments in ((c.policy.network, 0), *called):
+        if is_too_large(network, symbols, arguments):
             yield "networks", f"the network {network.name} is too large for this rule"
     return 0
 
@@ -178,13 +179,14 @@ def numbers_of(k: int) -> int:
     return k * k + len(triples(k)[0])
 
 
-def is_too_large(network: Network, k: int) -> bool:
-    """True if jets of a network in k symbols take too much memory or time."""
+def is_too_large(network: Network, k: int, arguments: int) -> bool:
+    """True if jets of a network in k symbols, of which so many arguments are units, take too much memory or time."""
     products = 0
     for rows, width, before in network.shapes:
-        if before:
-            products += rows * (k + before) * (width + numbers_of(k))
-            if (k + before) * (rows + numbers_of(k)) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
+        if before + arguments:
+            columns = k + before + arguments
+            products += rows * columns * (width + numbers_of(k))
+            if columns * (rows + numbers_of(k)) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
                 return True
     return False
 

@@ -38,13 +38,17 @@ def in_short(count: int) -> str:
 
 
 class Net:
-    """Sums over the steps of networks, as `Network.shapes` has them."""
+    """Sums over the steps of networks, as `Network.shapes` has them, of which the arguments of calls are units too."""
 
-    def __init__(self, networks: Sequence[Network]) -> None:
+    def __init__(self, called: Sequence[Network], policy: Sequence[Network] = ()) -> None:
+        networks, arguments = [*policy, *called], [network.reads for network in called]
         steps = [step for network in networks for step in network.steps]
-        self.steps = [shape for network in networks for shape in network.shapes]
-        self.units, self.kept = sum(step.units for step in steps), sum(network.kept for network in networks)
-        self.widest, self.reads = max((step.size for step in steps), default=0), sum(len(step.of) for step in steps)
+        self.steps = [shape for network in policy for shape in network.shapes]
+        self.steps += [(r, c, before + network.reads) for network in called for r, c, before in network.shapes]
+        self.units = sum(step.units for step in steps) + sum(arguments)
+        self.kept = sum(network.kept for network in networks)
+        self.widest = max((*(step.size for step in steps), *arguments), default=0)
+        self.reads = sum(len(step.of) for step in steps)
         self.dear = sum(step.size for step in steps if isinstance(step, Map) and step.function not in ("tanh", "relu"))
         self.entries = sum(rows * columns for rows, columns, _ in self.steps)
 
@@ -88,7 +92,7 @@ class Sizes:
         self.d = self.n + (c.claim == "reached")
         self.t = 2 * self.d**2 + self.d * (self.d + 1) * (self.d + 2) // 6
         self.a = c.dynamics.size + c.policy.network.operations
-        self.net = Net([c.policy.network, *_called(c.dynamics)])
+        self.net = Net(_called(c.dynamics), [c.policy.network])
 
     # ------------------------------------------------------------------------------------------------------ numbers
 

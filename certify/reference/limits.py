@@ -8,7 +8,7 @@ the counts were measured with, and so takes fewer operations unless it is asked 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from .document import Certificate
@@ -79,12 +79,16 @@ class Nets:
         return sum(p * (q * (d + g) + g * t) + 2**21 for p, q, g in self.shapes) + 64 * self.units * t
 
 
-def nets(*networks: Network) -> Nets:
-    shapes = [shape for network in networks for shape in shapes_of(network)]
+def nets(called: Sequence[Network], *policy: Network) -> Nets:
+    """The arguments of a call may be units of its network."""
+    networks, arguments = (*policy, *called), [network.reads for network in called]
+    shapes = [shape for network in policy for shape in shapes_of(network)]
+    shapes += [(p, q, g + network.reads) for network in called for p, q, g in shapes_of(network)]
     steps = [(k, step) for network in networks for k, step in enumerate(network.steps)]
-    units = sum(units_of(step) for _, step in steps)
+    units = sum(units_of(step) for _, step in steps) + sum(arguments)
     waiting = sum(len({i for k, step in enumerate(network.steps) for i in step.of if i != k}) for network in networks)
-    widest, read = max((step.size for _, step in steps), default=0), sum(len(step.of) for _, step in steps)
+    widest = max((*arguments, *(step.size for _, step in steps)), default=0)
+    read = sum(len(step.of) for _, step in steps)
     dear = sum(step.size for _, step in steps if isinstance(step, Map) and step.function not in ("tanh", "relu"))
     return Nets(tuple(shapes), units, widest, read, waiting, dear)
 
@@ -105,9 +109,9 @@ def shapes_of(network: Network) -> Iterator[tuple[int, int, int]]:
         units += units_of(step)
 
 
-def called(expressions: Equations) -> Iterator[Network]:
+def called(expressions: Equations) -> list[Network]:
     """The network of each call."""
-    return (call.network for call in expressions.calls.values())
+    return [call.network for call in expressions.calls.values()]
 
 
 def observing(*networks: Network) -> int:
@@ -141,7 +145,7 @@ class Sizes:
 def sizes_of(c: Certificate) -> Sizes:
     f, policy = c.plant.dynamics, c.policy.network
     y, z, a = c.k + c.varies, f.entries, len(f.steps) + observing(policy, *called(f))
-    return Sizes(c.n, c.m, z, c.n + c.m + y + z, c.n + (c.claim == "reached"), y, a, nets(policy, *called(f)))
+    return Sizes(c.n, c.m, z, c.n + c.m + y + z, c.n + (c.claim == "reached"), y, a, nets(called(f), policy))
 
 
 def asked_of_leaves(c: Certificate, evidence: Tree) -> bool:
@@ -171,7 +175,7 @@ def numbers(c: Certificate) -> int:
         count += sum(4 * p * (z.d + g) for p, _, g in z.nets.shapes) + 3 * z.nets.units * z.t
     if c.beyond is not None:
         N = c.beyond.expression
-        over = nets(*called(N))
+        over = nets(called(N))
         count += sum(4 * p * q + 2 * p * square for p, q, _ in over.shapes)
         count += 2**14 * (over.read + over.waiting * (z.s + 1))
         count += 8 * (len(N.steps) + observing(*called(N))) * square
@@ -186,7 +190,7 @@ def operations(c: Certificate) -> int:
     z, evidence = sizes_of(c), c.evidence
     work = 2**15 * z.a + z.nets.folding + inverting(z.n, bits(c.P))
     if c.ends_at_origin:
-        work += 2**12 * z.nets.weights + 2**19 * nets(*called(c.plant.dynamics)).weights
+        work += 2**12 * z.nets.weights + 2**19 * nets(called(c.plant.dynamics)).weights
     if not isinstance(evidence, Tree):
         return work
     of_S = min(2 * bits(evidence.T) + bits(c.P) + 16, 2**16 // z.n)
@@ -260,7 +264,7 @@ def beyond(c: Certificate, z: Sizes, evidence: Tree) -> int:
     if c.beyond is None or covering is None:
         return 0
     N = c.beyond.expression
-    a, over = len(N.steps) + observing(*called(N)), nets(*called(N))
+    a, over = len(N.steps) + observing(*called(N)), nets(called(N))
     faces, leaves = sum(face.count(LEAF) for face in covering.faces), covering.tree.count(LEAF)
     held, calls = max(2 * a, over.widest), 200 * over.read
     work = over.folding + inverting(z.n, bits(covering.T))
