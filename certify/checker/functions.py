@@ -694,7 +694,7 @@ class _Corner(Expansion):
         """The tangent leaves at most `bend` D^2, which is at most bend/radius^2 D^4 once D^2 is as large as radius^2:
         jets ask for the product of `fourth` and radius^2."""
         bend = self.phi.bend(self.v0)
-        return self._where_certain(self.phi.fourth(self), bend.over((self.radius * self.radius).top))
+        return self._where_certain(self.phi.fourth(self), bend.share(self.radius * self.radius))
 
     @cached_property
     def last(self) -> Above:

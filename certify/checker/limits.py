@@ -46,8 +46,8 @@ class Net:
         self.steps = [shape for network in policy for shape in network.shapes]
         self.steps += [(r, c, before + network.reads) for network in called for r, c, before in network.shapes]
         self.units = sum(step.units for step in steps) + sum(arguments)
-        self.kept = sum(network.kept for network in networks)
         self.widest = max((*(step.size for step in steps), *arguments), default=0)
+        self.kept = -(-sum(network.kept for network in networks) // max(self.widest, 1))
         self.reads = sum(len(step.of) for step in steps)
         self.dear = sum(step.size for step in steps if isinstance(step, Map) and step.function not in ("tanh", "relu"))
         self.entries = sum(rows * columns for rows, columns, _ in self.steps)
@@ -62,7 +62,7 @@ class Net:
 
     def held_on_leaves(self, symbols: int) -> int:
         """Vectors that wait for a step, on as many leaves as are examined at once."""
-        return 2**14 * (self.reads + self.kept * symbols)
+        return 2**14 * (self.reads + 8 * self.kept * symbols)
 
     def held_on_a_ball(self, d: int, t: int) -> int:
         return sum(4 * r * (d + before) for r, _, before in self.steps) + 3 * self.units * t

@@ -97,6 +97,10 @@ class Above:
         """
         return Above(self.v / np.where((least > 0) & (least < np.inf), least, np.nan) + LEAST, self.k + 2)
 
+    def share(self, of: Above) -> Above:
+        """Numbers whose products with `of`, taken as bounds, are bounds of these: of.top is below of.v (1 + 2^-41)."""
+        return self.over(of.top) * _MORE
+
     @property
     def root(self) -> Above:
         """Square roots."""

@@ -137,8 +137,9 @@ class Network:
 
     @property
     def kept(self) -> int:
-        """The number of vectors that a step reads which is not the next."""
-        return len({i for k, step in enumerate(self.steps) for i in step.of if i < k})
+        """The entries of vectors that a step reads which is not the next."""
+        sizes = [self.reads, *(step.size for step in self.steps)]
+        return sum(sizes[i] for i in {i for k, step in enumerate(self.steps) for i in step.of if i < k})
 
     @property
     def is_chain(self) -> bool:

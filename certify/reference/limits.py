@@ -40,7 +40,8 @@ class Nets:
     """Some networks: rows and columns of their steps with the units of the network before each.
 
     `units` are those of all of them, `widest` is the most entries that a step makes, `read` counts the vectors that
-    steps read, `waiting` those that a step reads which is not the next, `dear` the entries of functions that take long.
+    steps read, `waiting` the entries of those that a step reads which is not the next, by `widest`, `dear` the entries
+    of functions that take long.
     """
 
     shapes: tuple[tuple[int, int, int], ...]
@@ -86,11 +87,17 @@ def nets(called: Sequence[Network], *policy: Network) -> Nets:
     shapes += [(p, q, g + network.reads) for network in called for p, q, g in shapes_of(network)]
     steps = [(k, step) for network in networks for k, step in enumerate(network.steps)]
     units = sum(units_of(step) for _, step in steps) + sum(arguments)
-    waiting = sum(len({i for k, step in enumerate(network.steps) for i in step.of if i != k}) for network in networks)
     widest = max((*arguments, *(step.size for _, step in steps)), default=0)
+    waiting = -(-sum(map(entries_waiting, networks)) // max(widest, 1))
     read = sum(len(step.of) for _, step in steps)
     dear = sum(step.size for _, step in steps if isinstance(step, Map) and step.function not in ("tanh", "relu"))
     return Nets(tuple(shapes), units, widest, read, waiting, dear)
+
+
+def entries_waiting(network: Network) -> int:
+    """The entries of vectors that a step reads which is not the next."""
+    late = {i for k, step in enumerate(network.steps) for i in step.of if i != k}
+    return sum(network.reads if i == 0 else network.steps[i - 1].size for i in late)
 
 
 def units_of(step: Step) -> int:
@@ -169,7 +176,7 @@ def numbers(c: Certificate) -> int:
     order = max(evidence.order, evidence.ball.order if evidence.ball else 1)
     values = z.a * (1 if c.sample is None else 4 * order) + 2 * z.n + 8
     if asked_of_leaves(c, evidence) or c.beyond is not None:
-        count += values * square + 2**14 * (z.n + z.m + z.z + z.nets.read + z.nets.waiting * (z.s + z.m + z.z))
+        count += values * square + 2**14 * (z.n + z.m + z.z + z.nets.read + 8 * z.nets.waiting * (z.s + z.m + z.z))
     if evidence.ball or evidence.contraction or evidence.tube:
         count += values * (z.t + z.d * z.y + z.m + z.z) + z.d**4 // 4
         count += sum(4 * p * (z.d + g) for p, _, g in z.nets.shapes) + 3 * z.nets.units * z.t
@@ -177,7 +184,7 @@ def numbers(c: Certificate) -> int:
         N = c.beyond.expression
         over = nets(called(N))
         count += sum(4 * p * q + 2 * p * square for p, q, _ in over.shapes)
-        count += 2**14 * (over.read + over.waiting * (z.s + 1))
+        count += 2**14 * (over.read + 8 * over.waiting * (z.s + 1))
         count += 8 * (len(N.steps) + observing(*called(N))) * square
     return count
 
