@@ -56,7 +56,7 @@ def layers_of(network: Mapping[str, Any], functions: Container[str] = ("tanh",))
 
 def function_of(network: Mapping[str, Any]) -> str:
     """The function of its first step `map`; tanh where it has none."""
-    return next((str(step["function"]) for step in network["steps"] if step["kind"] == "map"), "tanh")
+    return next((str(step.get("function")) for step in network["steps"] if step.get("kind") == "map"), "tanh")
 
 
 def decode_layers(

@@ -313,7 +313,7 @@ MALFORMED = {
     "a layer of False": ("networks.0.steps.0.of", [False], "a step must have"),
     "a layer more": ("networks.0.steps", then(TANH), "sha256 must be"),
     "a tanh with an unknown key": ("networks.0.steps", then(TANH | {"gain": "2"}), "found the keys .*gain"),
-    "a tanh that is not named": ("networks.0.steps", then({"kind": "map", "of": [1]}), "a step must have"),
+    "a tanh that is not named": ("networks.0.steps", then({"kind": "map", "of": [1]}), OTHER_STEPS),
     "another function": ("networks.0.steps", then(TANH | {"function": "sin"}), OTHER_STEPS),
     "a tanh of the argument": ("networks.0.steps", then(TANH | {"of": [0]}), OTHER_STEPS),
     "a tanh of True": ("networks.0.steps", then(TANH | {"of": [True]}), "a step must have"),

@@ -428,7 +428,7 @@ def test_what_holds_by_form_holds_at_every_state(
         (np.array([[1.0]]),), (np.zeros(1),), np.array([scale]), np.array([offset]), "tanh" if squash else "identity",
         "none", clip=(np.array([low]), np.array([low + width])),
     )  # fmt: skip
-    values = network(np.linspace(-40, 40, 201)[:, None], (Fraction(0),))
+    values = network(np.linspace(-1, 1, 201)[:, None] * (40 if squash else 1e6), (Fraction(0),))
     least, most = Fraction(float(values.min())), Fraction(float(values.max()))
     hair = Fraction(1, 10**9)
     assert bounded_by_form(network, ((least - hair, most + hair),))

@@ -97,7 +97,8 @@ def shipped(path: Path) -> tuple[TanhNetwork, System]:
     policy = load_policy(path)
     if policy.system in available_systems():
         return policy.network, get_system(policy.system).with_parameters(policy.parameters)
-    return policy.network, load_system(EXAMPLES / "plants" / f"{path.stem}.toml")
+    plant = EXAMPLES / "plants" / path.relative_to(EXAMPLES / "policies").with_suffix(".toml")
+    return policy.network, load_system(plant)
 
 
 @pytest.mark.parametrize("path", slow_after(3, POLICIES), ids=lambda p: f"{p.parent.name}-{p.stem}")

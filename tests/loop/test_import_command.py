@@ -111,7 +111,7 @@ def test_import_as_json(run: Run) -> None:
         (["--system", "plant.toml", *SAID, "--epsilon", "1,2"], "--epsilon takes one number"),
         (["--system", "plant.toml", *SAID[2:], "--states", "x0,cos_x1"], "cos_x1"),
         (["--system", "plant.toml", *SAID, "--from", "sb3"], "--from says"),
-        (["--system", "plant.toml", *SAID[:2], "--activation", "relu"], "relu is not proved"),
+        (["--system", "plant.toml", *SAID[:2], "--activation", "prelu"], "found 'prelu'"),
         (["--system", "plant.toml", *SAID, "--stats", "x"], "No such option"),
     ],
 )
