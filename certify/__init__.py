@@ -1,4 +1,4 @@
-"""Regions of attraction of plants controlled by tanh networks, proved and independently checked.
+"""Regions of attraction of plants controlled by neural networks, proved and independently checked.
 
 `import certify` loads nothing heavy: public names are resolved on first use (PEP 562).
 """

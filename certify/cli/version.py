@@ -41,4 +41,4 @@ def certify(
         ),
     ] = False,
 ) -> None:
-    """Regions of attraction of plants controlled by tanh networks, proved and independently checked."""
+    """Regions of attraction of plants controlled by neural networks, proved and independently checked."""
