@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, Symbol, sin, symbols
 from certify.loop.plants import System, available_systems, exact, get_system
-from certify.loop.policies import Policy, TanhNetwork, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, save_policy
 
 Array = NDArray[np.float64]
 
 
-def fit_policy(system: System, widths: tuple[int, ...], spread: Array, steps: int = 1200, seed: int = 0) -> TanhNetwork:
+def fit_policy(
+    system: System, widths: tuple[int, ...], spread: Array, steps: int = 1200, seed: int = 0
+) -> PolicyNetwork:
     """A tanh policy `n-widths-m` for `system`, within its input bounds.
 
     Parameters
@@ -61,7 +63,7 @@ def fit_policy(system: System, widths: tuple[int, ...], spread: Array, steps: in
         loss.backward()
         optimiser.step()
         schedule.step()
-    return TanhNetwork(
+    return PolicyNetwork.of_layers(
         tuple(layer.weight.detach().double().numpy() for layer in layers),
         tuple(layer.bias.detach().double().numpy() for layer in layers),
         scale.double().numpy(),
@@ -74,7 +76,7 @@ def fit_policy(system: System, widths: tuple[int, ...], spread: Array, steps: in
 def lqr_gain(system: System) -> Array:
     """Continuous LQR gain (m, n) for Q = I and R = 1 / (half the input's range)^2 scaled to a tenth of the state's."""
     n, m = system.n, system.m
-    linear = TanhNetwork((np.zeros((m, n)),), (np.zeros(m),), np.ones(m), np.zeros(m), "identity", "output")
+    linear = PolicyNetwork.of_layers((np.zeros((m, n)),), (np.zeros(m),), np.ones(m), np.zeros(m), "identity", "output")
     A, B, _ = ClosedLoop(system, linear).linearise()
     half = np.array([float(hi - lo) / 2 for lo, hi in system.input_bounds])
     R = np.diag(9 / half**2)

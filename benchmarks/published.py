@@ -26,7 +26,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import scipy.linalg
 
-from certify import TanhNetwork, certify_roa, load_policy
+from certify import PolicyNetwork, certify_roa, load_policy
 from certify.analysis.results import RoaResult
 from certify.loop.plants import System, get_system, load_system
 from certify.loop.policies.importers import ImportOptions, import_policy
@@ -137,29 +137,31 @@ class Loop:
 
     name: str
     system: System
-    network: TanhNetwork
+    network: PolicyNetwork
     published: str
 
 
-def _still(n: int) -> TanhNetwork:
+def _still(n: int) -> PolicyNetwork:
     """No input."""
-    return TanhNetwork((np.zeros((1, n)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    return PolicyNetwork.of_layers((np.zeros((1, n)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
 
 
-def _shipped(name: str, box: Mapping[str, str]) -> tuple[System, TanhNetwork]:
+def _shipped(name: str, box: Mapping[str, str]) -> tuple[System, PolicyNetwork]:
     policy = load_policy(EXAMPLES / "policies" / f"{name}.pt")
     system = get_system(policy.system).with_parameters(policy.parameters)
     return system.with_domain({s: (-Fraction(d), Fraction(d)) for s, d in box.items()}), policy.network
 
 
-def _saturated() -> tuple[System, TanhNetwork]:
+def _saturated() -> tuple[System, PolicyNetwork]:
     """The pendulum with its LQR, tanh of it, of 0.75 N m at most."""
     system = get_system("pendulum").with_domain(
         {"theta": (Fraction(-6), Fraction(6)), "theta_dot": (Fraction(-40), Fraction(40))}
     )
     A, B = np.array([[0, 1], [9.81 / 0.5, -0.1 / 0.0375]]), np.array([[0], [1 / 0.0375]])
     K = B.T @ scipy.linalg.solve_continuous_are(A, B, np.eye(2), np.eye(1))
-    return system, TanhNetwork((-K / 0.75,), (np.zeros(1),), np.array([0.75]), np.zeros(1), "tanh", "preactivation")
+    return system, PolicyNetwork.of_layers(
+        (-K / 0.75,), (np.zeros(1),), np.array([0.75]), np.zeros(1), "tanh", "preactivation"
+    )
 
 
 def loops() -> tuple[Loop, ...]:

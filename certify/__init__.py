@@ -30,7 +30,7 @@ if TYPE_CHECKING:
         tanh,
     )
     from certify.loop.plants import System, get_system
-    from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
+    from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_policy
     from certify.loop.policies.importers import ImportOptions
     from certify.lyapunov import Neural, Polynomial, load_lyapunov, save_lyapunov
 
@@ -52,7 +52,7 @@ _PUBLIC = {
     "maximum": "certify.loop.expressions",
     "clip": "certify.loop.expressions",
     "from_sympy": "certify.loop.expressions",
-    "TanhNetwork": "certify.loop.policies",
+    "PolicyNetwork": "certify.loop.policies",
     "Policy": "certify.loop.policies",
     "load_policy": "certify.loop.policies",
     "save_policy": "certify.loop.policies",
@@ -75,11 +75,11 @@ __all__ = [
     "InputError",
     "Neural",
     "Policy",
+    "PolicyNetwork",
     "Polynomial",
     "RoaOptions",
     "RoaResult",
     "System",
-    "TanhNetwork",
     "Verdict",
     "__version__",
     "atan",

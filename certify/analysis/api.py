@@ -35,7 +35,7 @@ from certify.analysis.run import certify_roa as run
 from certify.analysis.values import changes_in, import_options_in, kind_of, number, options_in, path_in, require
 from certify.errors import InputError
 from certify.loop.plants import System
-from certify.loop.policies import Policy, TanhNetwork
+from certify.loop.policies import Policy, PolicyNetwork
 from certify.loop.policies.importers import ImportOptions, import_module, import_state_dict
 from certify.lyapunov import Candidate, Neural, Polynomial, Symbolic
 
@@ -83,7 +83,7 @@ class Keywords(TypedDict, total=False):
 
 def certify_roa(
     system: str | os.PathLike[str] | System | None,
-    policy: str | os.PathLike[str] | Policy | TanhNetwork | torch.nn.Module | Mapping[str, Any],
+    policy: str | os.PathLike[str] | Policy | PolicyNetwork | torch.nn.Module | Mapping[str, Any],
     out: str | os.PathLike[str] | None = None,
     options: RoaOptions | None = None,
     *,
@@ -105,7 +105,7 @@ def certify_roa(
     system : the plant: the name of one that ships ("pendulum"; `certify systems` lists them), the path of a TOML file,
         "FILE.py:NAME" (whose code is run), a `System`, or None for the plant that the policy names. For other
         parameters or another domain: `get_system("pendulum").with_parameters({"m": "0.2"})`, `with_domain`.
-    policy : the path of a policy file, of this program or another's; a `Policy` or `TanhNetwork`; a torch module of
+    policy : the path of a policy file, of this program or another's; a `Policy` or `PolicyNetwork`; a torch module of
         Linear layers, activations and constant scalings; or a state_dict of such layers.
     out : folder for `certificate.json`, made if it is not there. None is a temporary folder that lives as long as the
         result does: copy the certificate, or keep the result. No report is drawn until `result.report()` asks for it.
@@ -132,15 +132,15 @@ def certify_roa(
     Notes
     -----
     A policy reads deviations from the plant's operating point x_eq. Where a policy is valid on a part of the states
-    only (`Policy.valid`), the domain is cut to it, and `result.notices` says so. A `TanhNetwork` says nothing of that.
+    only (`Policy.valid`), the domain is cut to it, and `result.notices` says so. A `PolicyNetwork` has no such part.
     Where a number must be exact, of the plant and of `importing`, text means its decimal value, a float its binary one.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from certify import TanhNetwork, certify_roa, get_system
+    >>> from certify import PolicyNetwork, certify_roa, get_system
     >>> K = [[8.0, 2.0]]
-    >>> law = TanhNetwork((-np.array(K),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    >>> law = PolicyNetwork.of_layers((-np.array(K),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
     >>> system = get_system("pendulum")
     >>> result = certify_roa(system, law, candidate="lyapunov", level=1e-3)
     >>> result.verdict.value, result.contains([1e-3, 0.0]), result.contains([3.0, 0.0])
@@ -155,8 +155,8 @@ def certify_roa(
         require(progress is None or callable(progress), "progress", "callable", progress)
         named = _system(system)
         stored = _policy(policy, named, import_options_in(importing), notices.append, changes)
-        if isinstance(stored, TanhNetwork):
-            plant, network = plant_for("a TanhNetwork", named, changes), stored
+        if isinstance(stored, PolicyNetwork):
+            plant, network = plant_for("a PolicyNetwork", named, changes), stored
         else:
             plant, network = plant_of(stored, named, changes, notices.append), stored.network
         if function is not None:
@@ -283,13 +283,13 @@ def _policy(
     asked: ImportOptions,
     tell: Callable[[str], None],
     changes: PlantChanges,
-) -> Policy | TanhNetwork:
+) -> Policy | PolicyNetwork:
     """The policy, whatever it was given as."""
-    if isinstance(given, Policy | TanhNetwork):
+    if isinstance(given, Policy | PolicyNetwork):
         others = set(asked.given) - ({"--centre"} if isinstance(given, Policy) else set())
         if others:
             raise InputError(f"{', '.join(sorted(others))} must be left out: a {type(given).__name__} says all itself.")
-        if isinstance(given, TanhNetwork) or asked.centre is None:
+        if isinstance(given, PolicyNetwork) or asked.centre is None:
             return given
         return centred(given, asked.centre, plant_of(given, system, changes, lambda _: None), tell)
     if isinstance(given, str | os.PathLike):
@@ -301,7 +301,7 @@ def _policy(
         imported = import_state_dict(given, plant_for("a state_dict", system, changes), asked)
     else:
         raise InputError(
-            "`policy` must be the path of a policy file, a Policy, a TanhNetwork, a torch.nn.Module or a state_dict; "
+            "`policy` must be the path of a policy file, a Policy, a PolicyNetwork, a torch.nn.Module or a state_dict; "
             f"found {kind_of(given)}."
         )
     for line in lines(imported):

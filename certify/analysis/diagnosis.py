@@ -25,7 +25,7 @@ from certify.effort import UNIT, UNLIMITED, WHOLE, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, require_equilibrium
-from certify.loop.policies import Centre, TanhNetwork
+from certify.loop.policies import Centre, PolicyNetwork
 from certify.lyapunov import domain_limit, extents, increment_matrix, volume
 from certify.provers.ball.models import paths
 from certify.provers.base import FEW, Proof
@@ -51,7 +51,7 @@ def diagnose(
     result: RoaResult,
     options: RoaOptions,
     proof: Proof | None,
-    asked: tuple[System, TanhNetwork] | None = None,
+    asked: tuple[System, PolicyNetwork] | None = None,
     effort: Effort = UNLIMITED,
 ) -> Diagnosis:
     """Find what limits `result`, whose engine found `proof`; the next step is looked for with this effort.
@@ -163,7 +163,7 @@ def _next(
     result: RoaResult,
     options: RoaOptions,
     proof: Proof | None,
-    asked: tuple[System, TanhNetwork],
+    asked: tuple[System, PolicyNetwork],
     effort: Effort,
 ) -> Step:
     if (correction := _correction(result, options, asked[0])) is not None:
@@ -231,7 +231,9 @@ def _may_go_beyond(result: RoaResult, options: RoaOptions) -> bool:
 def _can_be_flattened(result: RoaResult) -> bool:
     """True if `controllers flatten` takes the policy and judges it by the loop that is certified."""
     network, system = result.network, result.system
-    return len(network.weights) > 1 and network.activation == "tanh" and not (system.in_steps or system.ranges)
+    return (
+        network.network.is_chain and network.network.functions == ("tanh",) and not (system.in_steps or system.ranges)
+    )
 
 
 def _share_proved(result: RoaResult) -> float:
@@ -249,7 +251,7 @@ def _is_bent(result: RoaResult, proof: Proof | None) -> bool:
     return _bend(result.network.folded(result.system.exact_u_eq()), half_widths) > _BENT
 
 
-def _bend(network: TanhNetwork, half_widths: Array) -> float:
+def _bend(network: PolicyNetwork, half_widths: Array) -> float:
     """Bends of the hidden units on a box as bounds see them, over the policy's linear part there, to first order.
 
     The sum over all hidden units of their distance from their tangent at 0, at both ends of what the box drives them
@@ -258,8 +260,9 @@ def _bend(network: TanhNetwork, half_widths: Array) -> float:
     y, J, units = np.zeros(network.n), np.eye(network.n), list[tuple[Array, Array, Array]]()
     for W, b in zip(network.weights[:-1], network.biases[:-1], strict=True):
         y, J = W @ y + b, W @ J
-        (t, slope), reach = network.phi.pair(y), np.abs(J) @ half_widths
-        ends = [np.abs(network.phi(y + v) - t - slope * v) for v in (reach, -reach)]
+        t, reach = np.tanh(y), np.abs(J) @ half_widths
+        slope = 1 - t**2
+        ends = [np.abs(np.tanh(y + v) - t - slope * v) for v in (reach, -reach)]
         units.append((W, slope, (ends[0] + ends[1]) / 2))
         y, J = t, slope[:, None] * J
     gain, total = network.weights[-1], 0.0
@@ -319,7 +322,7 @@ def _slower(result: RoaResult, options: RoaOptions) -> Step | None:
     return Step((("--rate", f"{_BELOW * falls:.3g}"),), why)
 
 
-def _centring(system: System, network: TanhNetwork) -> str | None:
+def _centring(system: System, network: PolicyNetwork) -> str | None:
     """A centring with which the loop rests at the origin, exactly; None if it has one, or none can be had."""
     if network.centre != "none":
         return None

@@ -30,7 +30,7 @@ from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, exact
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import diagonalising_coordinates
 from certify.lyapunov.function import Quadratic
 from certify.provers.falsify import is_violated
@@ -48,7 +48,7 @@ _DIGITS = 3
 def certify_largest(
     quantity: Quantity,
     system: System,
-    network: TanhNetwork,
+    network: PolicyNetwork,
     out: Path,
     options: RoaOptions,
     *,
@@ -159,7 +159,7 @@ def _largest(
     return proved
 
 
-def _tried(quantity: Quantity, system: System, network: TanhNetwork, P: Any, level: float) -> Sequence[Fraction]:
+def _tried(quantity: Quantity, system: System, network: PolicyNetwork, P: Any, level: float) -> Sequence[Fraction]:
     """Shares of the largest value for which no violation is sampled in the set, rounded to a few digits."""
     loop = ClosedLoop(system, network)
     L = loop.mean_rate()

@@ -29,7 +29,7 @@ from certify.certificates.verdict import Stop, Verdict
 from certify.errors import InputError
 from certify.loop.equilibrium import Rest
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import volume
 from certify.lyapunov.sublevel import Sublevel
 from certify.provers.falsify import Witness
@@ -62,7 +62,7 @@ class RoaResult:
     verdict: Verdict
     stop: Stop
     system: System
-    network: TanhNetwork
+    network: PolicyNetwork
     claim: str = "asymptotic"
     detail: str = ""
     problem: Problem | None = None

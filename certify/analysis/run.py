@@ -28,7 +28,7 @@ from certify.effort import WHOLE, Effort
 from certify.errors import InputError, SoundnessError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 
 if TYPE_CHECKING:
     from certify.provers.execution import Runner
@@ -40,7 +40,7 @@ _BEFORE_TUBE, _BEFORE_OUTER = 0.5, 0.25
 
 def certify_roa(
     system: System,
-    network: TanhNetwork,
+    network: PolicyNetwork,
     out: Path,
     options: RoaOptions | None = None,
     *,

@@ -28,7 +28,7 @@ from certify.certificates.claims import Problem
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import is_positive_definite, leaves_domain
 from certify.lyapunov.function import Quadratic
 from certify.provers.base import SearchState, Task
@@ -120,7 +120,7 @@ class NothingYetError(InputError):
     """The run that left this file was stopped before it had a candidate."""
 
 
-def identity(system: System, network: TanhNetwork, rate: float) -> str:
+def identity(system: System, network: PolicyNetwork, rate: float) -> str:
     """A hash of the loop, its periods and the rate, which a search is about."""
     sample = None if system.sample is None else [str(h) for h in system.sample]
     said = json.dumps([loop_sections(system, network), sample, float(rate).hex()], sort_keys=True)
@@ -159,7 +159,7 @@ def save(path: Path, unfinished: Unfinished) -> None:
     _write(path, data)
 
 
-def save_nothing_yet(path: Path, system: System, network: TanhNetwork, rate: float) -> None:
+def save_nothing_yet(path: Path, system: System, network: PolicyNetwork, rate: float) -> None:
     """Write down that a run about this loop and rate was stopped before it had a candidate.
 
     Raises

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import CertificateFormatError
+from certify.loop.activations import ACTIVATIONS
+from certify.loop.expressions import Symbol, from_tree, to_tree
+from certify.loop.networks import Affine, Clip, Concat, Map, Network, Observe, Step, Sum
 
 Array = NDArray[np.float64]
 
@@ -22,50 +25,64 @@ def decode(text: str, shape: tuple[int, ...]) -> Array:
     return np.frombuffer(base64.b64decode(text), dtype="<f8").reshape(shape).astype(np.float64)
 
 
-def network_section(
-    name: str, weights: Sequence[Array], biases: Sequence[Array], function: str = "tanh"
-) -> dict[str, Any]:
-    """A network of affine layers with a function between them, as steps, each of the vector just before."""
-    steps: list[dict[str, Any]] = []
-    for W, b in zip(weights, biases, strict=True):
-        if steps:
-            steps.append({"kind": "map", "of": [len(steps)], "function": function})
-        array = {"shape": list(W.shape), "weight": encode(W), "bias": encode(b)}
-        steps.append({"kind": "affine", "of": [len(steps)], **array})
-    return {"name": name, "reads": int(weights[0].shape[1]), "steps": steps}
+def network_section(name: str, network: Network) -> dict[str, Any]:
+    """A network as its section of a file."""
+    return {"name": name, "reads": network.reads, "steps": [_step(step) for step in network.steps]}
 
 
-def layers_of(network: Mapping[str, Any], functions: Container[str] = ("tanh",)) -> list[Mapping[str, Any]]:
-    """The affine steps of a network that has one of these functions between them, each of the vector just before.
+def _step(step: Step) -> dict[str, Any]:
+    parts: dict[str, Any] = {"kind": step.kind, "of": list(step.of)}
+    match step:
+        case Affine():
+            parts |= {"shape": list(step.weight.shape), "weight": encode(step.weight), "bias": encode(step.bias)}
+        case Map():
+            parts["function"] = step.function
+        case Clip():
+            parts |= {"lo": encode(step.lo), "hi": encode(step.hi)}
+        case Observe():
+            parts["names"] = [s.name for s in step.symbols]
+            parts["expressions"] = [to_tree(e) for e in step.expressions]
+    return parts
+
+
+def read_network(section: Mapping[str, Any]) -> Network:
+    """The network of a section.
 
     Raises
     ------
-    CertificateFormatError : the network has other steps.
+    CertificateFormatError : it has a function that this program does not prove.
+    InputError : its steps do not belong together.
     """
-    function = function_of(network)
-    kinds = [(step["kind"], step["of"], step.get("function", function)) for step in network["steps"]]
-    expected = [(("affine", "map")[k % 2], [k], function) for k in range(len(kinds))]
-    if kinds != expected or len(kinds) % 2 == 0 or function not in functions:
-        which = "tanh" if "relu" not in functions else "one function of the table"
-        raise CertificateFormatError(
-            f"the network {network['name']} must be of affine steps with {which} between them, each of the vector just "
-            "before; found others, which the checkers read but reports and Coq do not yet."
-        )
-    return list(network["steps"][::2])
+    sizes, steps = [int(section["reads"])], list[Step]()
+    for part in section["steps"]:
+        steps.append(_read_step(part, section["name"], [sizes[i] for i in part["of"]]))
+        sizes.append(steps[-1].size([sizes[i] for i in part["of"]]))
+    return Network(sizes[0], tuple(steps))
 
 
-def function_of(network: Mapping[str, Any]) -> str:
-    """The function of its first step `map`; tanh where it has none."""
-    return next((str(step.get("function")) for step in network["steps"] if step.get("kind") == "map"), "tanh")
-
-
-def decode_layers(
-    network: Mapping[str, Any], functions: Container[str] = ("tanh",)
-) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """The weights and biases of such a network."""
-    layers = layers_of(network, functions)
-    weights = tuple(decode(x["weight"], tuple(x["shape"])) for x in layers)
-    return weights, tuple(decode(x["bias"], (x["shape"][0],)) for x in layers)
+def _read_step(part: Mapping[str, Any], name: str, widths: Sequence[int]) -> Step:
+    of = tuple(part["of"])
+    match part["kind"]:
+        case "affine":
+            rows, columns = part["shape"]
+            return Affine(of, decode(part["weight"], (rows, columns)), decode(part["bias"], (rows,)))
+        case "map":
+            if part["function"] not in ACTIVATIONS:
+                raise CertificateFormatError(
+                    f"the network {name} has the function {str(part['function'])[:40]!r}. The checkers read such "
+                    "files, this command does not yet."
+                )
+            return Map(of, part["function"])
+        case "clip":
+            return Clip(of, decode(part["lo"], (widths[0],)), decode(part["hi"], (widths[0],)))
+        case "sum":
+            return Sum(of)
+        case "concat":
+            return Concat(of)
+        case "observe":
+            names = {s: Symbol(s) for s in part["names"]}
+            return Observe(of, tuple(names.values()), tuple(from_tree(t, names) for t in part["expressions"]))
+    raise CertificateFormatError(f"the network {name} has a step of an unknown kind, {str(part['kind'])[:40]!r}.")
 
 
 def network_named(networks: Sequence[Mapping[str, Any]], name: str) -> Mapping[str, Any]:

@@ -6,31 +6,33 @@ The checkers have the same limits, so that no file can exhaust their time or mem
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 
 import numpy as np
 
 from certify.errors import InputError
 from certify.loop.expressions import Expression, Operation, Tree, constant_of, gathered, nodes, to_tree
+from certify.loop.networks import Observe
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 
-MOST_STATES, MOST_LAYERS, MOST_ROWS = 64, 128, 2**14
+MOST_STATES, MOST_STEPS, MOST_ROWS = 64, 256, 2**14
 MOST_NODES, MOST_DEPTH, MOST_EXPONENT, MOST_DIGITS = 20_000, 200, 64, 1201
 MOST_NUMBERS = 2**26  # operations times the numbers of a jet, under the rule `local`
 _LARGEST = Fraction(2) ** 1000
 MOST_MATRIX_BITS = 2**16  # of the longest number of P, times n
 
 
-def require_within_limits(system: System, network: TanhNetwork) -> None:
+def require_within_limits(system: System, network: PolicyNetwork) -> None:
     """Reject a closed loop that no certificate can hold.
 
     Raises
     ------
     InputError : a limit of the format is exceeded; the message names it.
     """
-    dynamics = system.uncertain_dynamics()
+    observations = [e for step in network.network.steps if isinstance(step, Observe) for e in step.expressions]
+    dynamics = (*system.uncertain_dynamics(), *observations)
     deepest = max(e.depth for e in dynamics)
     if deepest > MOST_DEPTH:
         raise InputError(_too_large(system, "levels of nesting in an equation", deepest, MOST_DEPTH))
@@ -49,12 +51,12 @@ def require_within_limits(system: System, network: TanhNetwork) -> None:
     for what, found, most in (
         ("states", system.n, MOST_STATES),
         ("inputs", system.m, MOST_STATES),
-        ("layers of the policy", len(network.weights), MOST_LAYERS),
-        ("units in a layer", max(len(W) for W in network.weights), MOST_ROWS),
+        ("steps of the policy", len(network.network.steps), MOST_STEPS),
+        ("units in a layer", max(network.network.sizes), MOST_ROWS),
         ("nodes in the equations", len(listed), MOST_NODES),
         ("as the largest exponent in an equation", max(exponents, default=1), MOST_EXPONENT),
         ("digits in the parts of a rational", max(digits), MOST_DIGITS),
-        ("operations in the equations, times the numbers of a model of each,", _size(system), MOST_NUMBERS),
+        ("operations in the equations, times the numbers of a model of each,", _size(system, dynamics), MOST_NUMBERS),
     ):
         if found > most:
             raise InputError(_too_large(system, what, found, most))
@@ -91,9 +93,9 @@ def numbers_of_a_jet(k: int) -> int:
     return k**2 + k * (k + 1) * (k + 2) // 6
 
 
-def _size(system: System) -> int:
+def _size(system: System, expressions: Sequence[Expression]) -> int:
     """Operations, each counted once however often it stands in the equations, times their numbers; an upper bound."""
-    return sum(_operations(node) for node in nodes(*system.uncertain_dynamics())) * numbers_of_a_jet(system.n)
+    return sum(_operations(node) for node in nodes(*expressions)) * numbers_of_a_jet(system.n)
 
 
 def _operations(node: Expression) -> int:

@@ -19,7 +19,7 @@ from certify.certificates.formats import SCHEMA
 from certify.errors import InputError
 from certify.loop.expressions import to_tree
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.neural import Neural
 
@@ -45,7 +45,7 @@ class Certificate:
     """
 
     system: System
-    network: TanhNetwork
+    network: PolicyNetwork
     V: Quadratic
     claim: Claim
     evidence: PartitionTree | TrustedSolver
@@ -91,7 +91,7 @@ class Certificate:
             }
             | _start(self.claim),
             "networks": [
-                network_section(POLICY, network.weights, network.biases, network.activation),
+                network_section(POLICY, network.network),
                 *_networks(self.claim.outer),
             ],
             **loop_sections(system, network),
@@ -104,7 +104,7 @@ class Certificate:
         return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
-def loop_sections(system: System, network: TanhNetwork) -> dict[str, Any]:
+def loop_sections(system: System, network: PolicyNetwork) -> dict[str, Any]:
     """The file's sections `plant` and `policy`."""
     return {
         "plant": {
@@ -141,7 +141,7 @@ def _networks(outer: Outer | None) -> list[dict[str, Any]]:
     """The networks that N calls."""
     if outer is None or not isinstance(outer.function, Neural):
         return []
-    return [network_section(N_NAME, outer.function.weights, outer.function.biases)]
+    return [network_section(N_NAME, outer.function.network)]
 
 
 def _outer(outer: Outer, system: System) -> dict[str, Any]:

@@ -21,16 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates.claims import CLAIMS, Claim, Outer
-from certify.certificates.encoding import decode, decode_layers, function_of, network_named
+from certify.certificates.encoding import decode, network_named, read_network
 from certify.certificates.evidence import read_evidence
 from certify.certificates.formats import SCHEMA, other_version
 from certify.certificates.model import Certificate
 from certify.errors import CertificateFormatError
-from certify.loop.activations import ACTIVATIONS
 from certify.loop.expressions import Number, Symbol, from_tree
 from certify.loop.plants import System
 from certify.loop.plants.system import Interval
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.symbolic import Symbolic
@@ -138,17 +137,15 @@ def _read_system(plant: Mapping[str, Any], sample: Any, people: Mapping[str, Map
     )
 
 
-def _read_network(policy: Mapping[str, Any], networks: Sequence[Mapping[str, Any]], n: int, m: int) -> TanhNetwork:
-    named = network_named(networks, policy["network"])
-    return TanhNetwork(
-        *decode_layers(named, ACTIVATIONS),
+def _read_network(policy: Mapping[str, Any], networks: Sequence[Mapping[str, Any]], n: int, m: int) -> PolicyNetwork:
+    return PolicyNetwork(
+        read_network(network_named(networks, policy["network"])),
         scale=decode(policy["scale"], (m,)),
         offset=decode(policy["offset"], (m,)),
         squash=policy["squash"],
         centre=policy["centre"],
         clip=_read_clip(policy["clip"], m),
         origin=decode(policy["origin"], (n,)),
-        activation=function_of(named),
     )
 
 
@@ -184,7 +181,14 @@ def _read_claim(data: Mapping[str, Any], states: tuple[Symbol, ...]) -> Claim:
 def _read_outer(data: Mapping[str, Any], networks: Sequence[Mapping[str, Any]], states: tuple[Symbol, ...]) -> Outer:
     level, tree = float.fromhex(data["level"]), data["expression"]
     if tree[:1] == ["network"] and tree[2:] == [0, *(s.name for s in states)]:
-        return Outer(Neural(*decode_layers(network_named(networks, tree[1]))), level)
+        network = read_network(network_named(networks, tree[1]))
+        if not network.is_chain or network.functions not in ((), ("tanh",)):
+            raise CertificateFormatError(
+                f"the network {tree[1]} must be of affine steps with tanh between them, each of the vector just "
+                "before; found others, which the checkers read but this command does not yet."
+            )
+        layers = network.affine
+        return Outer(Neural(tuple(step.weight for step in layers), tuple(step.bias for step in layers)), level)
     return Outer(Symbolic(from_tree(tree, {s.name: s for s in states}), states), level)
 
 

@@ -224,14 +224,14 @@ def _certificates(folder: Path) -> tuple[Path, Path]:
     from certify.errors import SoundnessError
     from certify.loop.expressions import Number, symbols
     from certify.loop.plants import System
-    from certify.loop.policies import TanhNetwork
+    from certify.loop.policies import PolicyNetwork
 
     x, u = symbols(["x", "u"])
     system = System(
         name="known", states=(x,), inputs=(u,), parameters={}, dynamics=(x / 2 + u,), u_eq=(Number(0),),
         domain=((Fraction(-3), Fraction(3)),), input_bounds=((Fraction(-1), Fraction(1)),),
     )  # fmt: skip
-    network = TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    network = PolicyNetwork.of_layers((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     result = certify_roa(system, network, folder, RoaOptions(P=np.eye(1), level=1.0))
     if result.verdict is not Verdict.PROVED or result.raw is None or result.certificate is None:
         raise SoundnessError(

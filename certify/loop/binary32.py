@@ -138,7 +138,7 @@ class Machine:
             offset_error=error_of_offset,
             clip_errors=tuple(zip(*clip, strict=True)),
             tanh_ulp=flint.arb(float(tanh_ulp)),
-            phi=network.phi,
+            phi=ACTIVATIONS[network.activation],
             reach=tuple(np.abs(network.weights[0]).sum(axis=0).tolist()),
         )
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from certify.errors import InputError
 from certify.loop.expressions import Expression, evaluate_exactly, nodes, symbols_of
 from certify.loop.plants import Matrix, System, in_floats, linearise
-from certify.loop.policies import TanhNetwork, require_centred
+from certify.loop.policies import PolicyNetwork, require_centred
 
 Array = NDArray[np.float64]
 
@@ -31,9 +31,9 @@ class ClosedLoop:
     """
 
     system: System
-    network: TanhNetwork
+    network: PolicyNetwork
     u_eq: tuple[Fraction, ...] = field(init=False, repr=False, compare=False)
-    folded: TanhNetwork = field(init=False, repr=False, compare=False)
+    folded: PolicyNetwork = field(init=False, repr=False, compare=False)
     dynamics: tuple[Expression, ...] = field(init=False, repr=False, compare=False)
     operations: float = field(init=False, repr=False, compare=False)
 
@@ -48,9 +48,9 @@ class ClosedLoop:
         object.__setattr__(self, "u_eq", u_eq)
         object.__setattr__(self, "folded", network.folded(u_eq))
         object.__setattr__(self, "dynamics", system.exact_dynamics())
-        weights, neurons = sum(W.size for W in network.weights), sum(len(b) for b in network.biases)
-        equations = sum(1 for _ in nodes(*self.dynamics))
-        object.__setattr__(self, "operations", 0.07 * weights + 2.0 * neurons + 4.0 * equations)
+        of = network.network
+        equations = sum(1 for _ in nodes(*self.dynamics)) + of.operations
+        object.__setattr__(self, "operations", 0.07 * of.entries + 2.0 * of.units + 4.0 * equations)
 
     def require_rest(self) -> None:
         """Refuse a loop whose origin is not an equilibrium, exactly: `f(0, u_eq) = 0` and `pi(0) = u_eq`.

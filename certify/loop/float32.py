@@ -34,7 +34,7 @@ from certify.errors import InputError, OptionError, SoundnessError
 from certify.loop.binary32 import Errors, Machine
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.loop.rigorous import precision, rounded_up
 
 Array = NDArray[np.float64]
@@ -100,7 +100,7 @@ class FloatError:
     boxes: int
 
 
-def float_error(network: TanhNetwork, system: System, options: FloatOptions | None = None) -> FloatError:
+def float_error(network: PolicyNetwork, system: System, options: FloatOptions | None = None) -> FloatError:
     """Bound the error of each input when the policy is computed in binary32, for every state of the plant's domain.
 
     Parameters
@@ -123,8 +123,8 @@ def float_error(network: TanhNetwork, system: System, options: FloatOptions | No
 
     Examples
     --------
-    >>> from certify import TanhNetwork, get_system
-    >>> law = TanhNetwork(([[-8.0, -2.0]],), ([0.0],), [1.0], [0.0], "identity", "none")
+    >>> from certify import PolicyNetwork, get_system
+    >>> law = PolicyNetwork.of_layers(([[-8.0, -2.0]],), ([0.0],), [1.0], [0.0], "identity", "none")
     >>> found = float_error(law, get_system("pendulum"))
     >>> 1e-6 < found.bounds[0] < 1e-4
     True
@@ -177,7 +177,7 @@ def _worst(found: Sequence[Errors], j: int) -> Errors:
     return found[bounds.index(max(bounds))]
 
 
-def _assumptions(network: TanhNetwork, options: FloatOptions) -> tuple[str, ...]:
+def _assumptions(network: PolicyNetwork, options: FloatOptions) -> tuple[str, ...]:
     """The assumptions about the robot's program, in words."""
     centring = {
         "none": "",

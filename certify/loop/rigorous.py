@@ -15,10 +15,11 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.loop.activations import ACTIVATIONS, Activation
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Algebra, Expression, Symbol, differentiate, evaluate, solution_series
-from certify.loop.policies import TanhNetwork
+from certify.loop.networks import Affine, Clip, Concat, Map, Network, Observe, Sum
+from certify.loop.networks import Algebra as Networks
+from certify.loop.policies import PolicyNetwork
 
 Array = NDArray[np.float64]
 _PRECISION = 200  # bits
@@ -202,27 +203,25 @@ def policy_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
     If the clip may or may not act, the slope is the ball of all slopes between 0 and 1: valid only for mean
     values.
     """
-    network, y = loop.network, _read(loop.network, x)
-    J = flint.arb_mat([[int(i == j) for j in range(network.n)] for i in range(network.n)])
-    for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
-        if k:
-            y, J = _through(network.phi, y, J)
-        y, J = affine(W, b, y), matrix(W) * J
+    network = loop.network
+    eye = flint.arb_mat([[int(i == j) for j in range(network.n)] for i in range(network.n)])
+    y, J = _Slopes().run(network.network, (_read(network, x), eye))
     shift, offset = _centring(loop)
     squashed = [network.squashed(v + d, _NUMBERS) for v, d in zip(y, shift, strict=True)]
     slopes = [network.squash_slope(v, _NUMBERS) for v in squashed]
     scale = [flint.arb(float(s)) for s in network.scale]
     u = [s * v + o for s, v, o in zip(scale, squashed, offset, strict=True)]
     slopes = [s * slope * clip for s, slope, clip in zip(scale, slopes, _clip_slopes(network, u), strict=True)]
-    gain = flint.arb_mat([[slopes[i] * J[i, j] for j in range(network.n)] for i in range(network.m)])
-    return list(network.clipped(u, _NUMBERS)), gain
+    return list(network.clipped(u, _NUMBERS)), _scaled(slopes, J)
 
 
-def _clip_slopes(network: TanhNetwork, u: Balls) -> Balls:
-    if network.clip is None:
-        return [flint.arb(1)] * len(u)
+def _clip_slopes(network: PolicyNetwork, u: Balls) -> Balls:
+    return [flint.arb(1)] * len(u) if network.clip is None else _slopes_of_clip(u, *network.clip)
+
+
+def _slopes_of_clip(u: Balls, least: Array, most: Array) -> Balls:
     slopes = []
-    for v, lo, hi in zip(u, *network.clip, strict=True):
+    for v, lo, hi in zip(u, least, most, strict=True):
         inside, outside = v > float(lo) and v < float(hi), v < float(lo) or v > float(hi)
         slopes.append(flint.arb(1) if inside else flint.arb(0) if outside else flint.arb(0.5, 0.5))
     return slopes
@@ -328,22 +327,77 @@ def _centring(loop: ClosedLoop) -> tuple[Balls, Balls]:
     return loop.network.centring(loop.u_eq, at_0, _NUMBERS)
 
 
-def _net(network: TanhNetwork, x: Balls) -> Balls:
-    return layers_on(network.weights, network.biases, _read(network, x), network.phi)
+def _net(network: PolicyNetwork, x: Balls) -> Balls:
+    return network_on(network.network, _read(network, x))
 
 
-def _read(network: TanhNetwork, x: Balls) -> Balls:
+class _Points(Networks[Balls]):
+    """A network's vectors as balls."""
+
+    def affine(self, step: Affine, v: Balls) -> Balls:
+        return affine(step.weight, step.bias, v)
+
+    def map(self, step: Map, v: Balls) -> Balls:
+        return [step.phi.in_arb(b) for b in v]
+
+    def clip(self, step: Clip, v: Balls) -> Balls:
+        ends = zip(v, step.lo, step.hi, strict=True)
+        return [b.max(flint.arb(float(lo))).min(flint.arb(float(hi))) for b, lo, hi in ends]
+
+    def sum(self, step: Sum, *vectors: Balls) -> Balls:
+        return [sum(row, flint.arb(0)) for row in zip(*vectors, strict=True)]
+
+    def concat(self, step: Concat, *vectors: Balls) -> Balls:
+        return [b for v in vectors for b in v]
+
+    def observe(self, step: Observe, v: Balls) -> Balls:
+        return _expressions(step.expressions, step.symbols, v)
+
+
+_POINTS = _Points()
+Tangent = tuple[Balls, flint.arb_mat]
+
+
+class _Slopes(Networks[Tangent]):
+    """The same with the Jacobian by the states, as `policy_on` says."""
+
+    def affine(self, step: Affine, v: Tangent) -> Tangent:
+        return affine(step.weight, step.bias, v[0]), matrix(step.weight) * v[1]
+
+    def map(self, step: Map, v: Tangent) -> Tangent:
+        return _POINTS.map(step, v[0]), _scaled([step.phi.slope_in_arb(b) for b in v[0]], v[1])
+
+    def clip(self, step: Clip, v: Tangent) -> Tangent:
+        return _POINTS.clip(step, v[0]), _scaled(_slopes_of_clip(v[0], step.lo, step.hi), v[1])
+
+    def sum(self, step: Sum, *vectors: Tangent) -> Tangent:
+        first, *others = (J for _, J in vectors)
+        return _POINTS.sum(step, *(y for y, _ in vectors)), sum(others, first)
+
+    def concat(self, step: Concat, *vectors: Tangent) -> Tangent:
+        return _POINTS.concat(step, *(y for y, _ in vectors)), flint.arb_mat(
+            [row for _, J in vectors for row in J.tolist()]
+        )
+
+    def observe(self, step: Observe, v: Tangent) -> Tangent:
+        k, slopes = len(step.symbols), _expressions(step.slopes, step.symbols, v[0])
+        own = flint.arb_mat([slopes[i : i + k] for i in range(0, len(slopes), k)])
+        return _POINTS.observe(step, v[0]), own * v[1]
+
+
+def _expressions(expressions: Sequence[Expression], symbols: Sequence[Symbol], v: Balls) -> Balls:
+    values, known = dict(zip(symbols, v, strict=True)), dict[Expression, flint.arb]()
+    return [evaluate(e, values, BallAlgebra(), known) for e in expressions]
+
+
+def _read(network: PolicyNetwork, x: Balls) -> Balls:
     """The layers' inputs at a state."""
     return [v + at for v, at in zip(x, points(network.origin), strict=True)] if network.is_moved else list(x)
 
 
-def layers_on(
-    weights: Sequence[Array], biases: Sequence[Array], h: Balls, phi: Activation = ACTIVATIONS["tanh"]
-) -> Balls:
-    """Affine layers with a function between them, on balls."""
-    for k, (W, b) in enumerate(zip(weights, biases, strict=True)):
-        h = affine(W, b, [phi.in_arb(v) for v in h] if k else h)
-    return h
+def network_on(network: Network, x: Balls) -> Balls:
+    """A network's value on balls."""
+    return _POINTS.run(network, x)
 
 
 def affine(W: Array, b: Array, h: Balls) -> Balls:
@@ -352,12 +406,9 @@ def affine(W: Array, b: Array, h: Balls) -> Balls:
     return [product[i, 0] + flint.arb(float(c)) for i, c in enumerate(b)]
 
 
-def _through(phi: Activation, y: Balls, J: flint.arb_mat) -> tuple[Balls, flint.arb_mat]:
-    """A function of balls, and the Jacobian behind it, for mean values where it has a corner in one."""
-    slope = [phi.slope_in_arb(v) for v in y]
-    return [phi.in_arb(v) for v in y], flint.arb_mat(
-        [[slope[i] * J[i, j] for j in range(J.ncols())] for i in range(J.nrows())]
-    )
+def _scaled(by: Balls, J: flint.arb_mat) -> flint.arb_mat:
+    """The matrix whose rows are multiplied by numbers."""
+    return flint.arb_mat([[by[i] * J[i, j] for j in range(J.ncols())] for i in range(J.nrows())])
 
 
 def matrix(W: Array) -> flint.arb_mat:

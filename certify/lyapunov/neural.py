@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.loop.policies.layers import frozen_layers, sha256_of, tanh, through, widths
+from certify.loop.networks import Network, frozen_layers, layered, sha256_of, tanh, through, widths
 
 Array = NDArray[np.float64]
 
@@ -57,6 +57,11 @@ class Neural:
     def widths(self) -> tuple[int, ...]:
         """Widths from the states to 1, such as (2, 16, 16, 1)."""
         return widths(self.weights)
+
+    @property
+    def network(self) -> Network:
+        """Its layers as a network."""
+        return Network(self.n, layered(self.weights, self.biases))
 
     def sha256(self) -> str:
         """Hash by which a network is named: of each layer's weight and bias, as `sha256_of` has them."""

@@ -15,8 +15,8 @@ from certify.loop.rigorous import (
     evaluate_arb,
     evaluate_policy,
     field_at,
-    layers_on,
     matrix,
+    network_on,
     points,
     precision,
 )
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 def evaluate_function(N: Neural | Symbolic, x: Balls) -> flint.arb:
     """N at balls around a state, n of them, at the precision that is set."""
     if isinstance(N, Neural):
-        return layers_on(N.weights, N.biases, x)[0]
+        return network_on(N.network, x)[0]
     return evaluate_arb(N.expression, dict(zip(N.states, x, strict=True)))
 
 
@@ -41,7 +41,7 @@ def evaluate_rise(loop: ClosedLoop, N: Neural | Symbolic, x: Array) -> tuple[fli
         values |= zip(loop.system.inputs, evaluate_policy(loop, x), strict=True)
         F = field_at(loop, values)
         if isinstance(N, Neural):
-            return layers_on(N.weights, N.biases, state)[0], _rise(N, state, F)
+            return network_on(N.network, state)[0], _rise(N, state, F)
         slopes = [evaluate_arb(differentiate(N.expression, s), values) for s in N.states]
         return evaluate_function(N, state), sum((a * b for a, b in zip(slopes, F, strict=True)), flint.arb(0))
 

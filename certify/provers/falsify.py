@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from certify.certificates.claims import Problem
 from certify.effort import UNLIMITED, Effort
+from certify.loop.networks import Gradients
 from certify.loop.plants import System, at_values, corners, mean_rate
 from certify.loop.policies import bounded_by_form
 from certify.loop.rigorous import evaluate_increment, evaluate_policy
@@ -196,25 +197,18 @@ class _Search:
         return np.concatenate(decrease).max(0), np.maximum(self.lo - u, u - self.hi).max(-1)
 
     @np.errstate(all="ignore")
-    def _inputs(self, x: Array) -> tuple[Array, Array, list[Array]]:
-        """u (B, m), its values before the clip, and the slopes behind each layer but the last, and the squash."""
-        network, passed, h = self.network, list[Array](), x
-        for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
-            if k:
-                h, slope = network.phi.pair(h)
-                passed.append(slope)
-            h = h @ W.T + b
-        squashed = network.squashed(h)
-        passed.append(network.squash_slope(squashed) * np.ones_like(h))
-        whole = network.scale * squashed + network.offset
-        return network.clipped(whole), whole, passed
+    def _inputs(self, x: Array) -> tuple[Array, Array, Gradients]:
+        """u (B, m), its values before the clip, and the network with its derivatives there."""
+        network, inner = self.network, Gradients(self.network.network, x)
+        whole = network.scale * network.squashed(inner.value) + network.offset
+        return network.clipped(whole), whole, inner
 
     def _slopes(self, z: Array) -> tuple[Array, Array, Array, Array]:
         """`violation` at z (B, n), and the gradients (B, n) of both: by differences in x and u, and from u on by the
         chain rule."""
         x, n = z @ self.T.T, z.shape[1]
         self._charge(len(z), n + self.network.m + 3)
-        u, whole, passed = self._inputs(x)
+        u, whole, inner = self._inputs(x)
         size = np.linalg.norm(z, axis=-1, keepdims=True) * np.linalg.norm(self.T, axis=1)
         apart = _APART * np.concatenate([size, np.broadcast_to(np.abs(self.network.scale), u.shape)], -1) + 1e-300
         here = np.concatenate([x, u], -1)
@@ -222,20 +216,16 @@ class _Search:
         moved = np.concatenate([here[None], here + ways[:, None] * apart]).reshape(-1, len(ways))
         values = [v.reshape(-1, len(z)) for v in self._at(moved[:, :n], moved[:, n:])]
         slopes = [((v[1:] - v[0]) / apart.T).T for v in values]
-        gradients = [(s[:, :n] + self._backwards(s[:, n:], whole, passed)) @ self.T for s in slopes]
+        gradients = [(s[:, :n] + self._backwards(s[:, n:], whole, inner)) @ self.T for s in slopes]
         return values[0][0], values[1][0], gradients[0], gradients[1]
 
-    def _backwards(self, slope: Array, whole: Array, passed: list[Array]) -> Array:
+    def _backwards(self, slope: Array, whole: Array, inner: Gradients) -> Array:
         """The slope in the states (B, n) that follows from a slope in the inputs (B, m)."""
         network = self.network
         if network.clip is not None:
             slope = np.where((whole > network.clip[0]) & (whole < network.clip[1]), slope, 0.0)
-        slope = slope * network.scale * passed[-1]
-        for W, inner in zip(reversed(network.weights), [*reversed(passed[:-1]), None], strict=True):
-            slope = slope @ W
-            if inner is not None:
-                slope = slope * inner
-        return slope
+        behind = network.squash_slope(network.squashed(inner.value))
+        return inner.backwards(slope * network.scale * behind)
 
     def _worst(self) -> list[tuple[list[Array], float | Array]]:
         """Corners (C, 1) of the ranges and steps, one for all or (C, 1, 1), at which D' is looked at together."""

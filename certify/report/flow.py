@@ -18,7 +18,7 @@ from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
 from certify.loop.plants import System
 from certify.loop.plants.ode import eigenvalues_of, rk4_step
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 
 Array = NDArray[np.float64]
 Field = Callable[[Array], Array]
@@ -58,7 +58,7 @@ class Flow:
     cost: float = 0.0
 
     @classmethod
-    def of(cls, system: System, network: TanhNetwork) -> Flow:
+    def of(cls, system: System, network: PolicyNetwork) -> Flow:
         """Compile the equations.
 
         Raises
@@ -112,7 +112,7 @@ class Flow:
         return rk4_step(self.field if u is None else lambda y: self.plant(y, u), x, step)
 
 
-def cost_of(network: TanhNetwork) -> float:
+def cost_of(network: PolicyNetwork) -> float:
     """Multiplications' worth of one evaluation of a loop with this policy."""
     return _EQUATIONS + sum(w.size for w in network.weights) + _TANH * sum(b.size for b in network.biases)
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.report.flow import Flow, simulate, time_scales
 
 Array = NDArray[np.float64]
@@ -158,7 +158,7 @@ def _fates(path: Array, begins: Mask, P: Array, level: float, target: float, apa
 
 def simulated_roa_fraction(
     system: System,
-    network: TanhNetwork,
+    network: PolicyNetwork,
     P: Array,
     level: float,
     *,

@@ -7,10 +7,10 @@ import torch
 
 from certify.errors import InputError
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 
 
-def curvature(network: TanhNetwork, system: System, radius: float, points: int = 256) -> float:
+def curvature(network: PolicyNetwork, system: System, radius: float, points: int = 256) -> float:
     """Largest `||J_pi(x) - J_pi(0)|| / ||x||` over random states of ||x|| <= radius, Frobenius norm.
 
     An estimate from below of the largest second derivative of pi in the ball, in input units per state squared.

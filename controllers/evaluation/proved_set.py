@@ -12,7 +12,7 @@ from certify.certificates.membership import ProvedSet
 from certify.errors import InputError
 from certify.loop.expressions import Expression, gathered
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ class Covered:
     certificate_sha256: str
 
 
-def count_covered(proved: ProvedSet, network: TanhNetwork, system: System, x0: Array) -> Covered:
+def count_covered(proved: ProvedSet, network: PolicyNetwork, system: System, x0: Array) -> Covered:
     """Count the states (N, n), deviations from x_eq, in a set that is proved about this very closed loop.
 
     Raises
@@ -42,7 +42,7 @@ def count_covered(proved: ProvedSet, network: TanhNetwork, system: System, x0: A
     return Covered(inside, len(x0), proved.claim, proved.certificate_sha256)
 
 
-def require_same_loop(proved: ProvedSet, network: TanhNetwork, system: System) -> None:
+def require_same_loop(proved: ProvedSet, network: PolicyNetwork, system: System) -> None:
     """Refuse a set that is proved about another closed loop.
 
     Raises
@@ -73,7 +73,7 @@ def require_same_loop(proved: ProvedSet, network: TanhNetwork, system: System) -
         )
 
 
-def require_same_question(proved: ProvedSet, network: TanhNetwork, system: System) -> None:
+def require_same_question(proved: ProvedSet, network: PolicyNetwork, system: System) -> None:
     """Refuse a set that is proved about another closed loop, or about this one as it no longer is.
 
     Raises

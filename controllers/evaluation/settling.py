@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from certify.errors import OptionError
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from controllers.options import Plant
 from controllers.simulation.closed_loop import Loop, held_loop
 from controllers.simulation.trajectories import initial_states, mean_action
@@ -82,7 +82,7 @@ class Settling:
 
 
 def settle(
-    network: TanhNetwork,
+    network: PolicyNetwork,
     system: System,
     dt: float,
     Q: Array,

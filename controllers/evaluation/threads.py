@@ -7,13 +7,13 @@ from contextlib import contextmanager
 
 import torch
 
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 
 _SMALL_NETWORK = 10_000  # weights
 
 
 @contextmanager
-def threads_for(network: TanhNetwork) -> Iterator[None]:
+def threads_for(network: PolicyNetwork) -> Iterator[None]:
     """One thread for a small network: its operations are shorter than the threads' handshakes."""
     threads = torch.get_num_threads()
     if sum(W.size for W in network.weights) < _SMALL_NETWORK:

@@ -8,18 +8,16 @@ would have to find that way through five layers step by step; it is a closed for
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 
 Array = NDArray[np.float64]
 
 
-def contracted(network: TanhNetwork, factor: float) -> TanhNetwork:
+def contracted(network: PolicyNetwork, factor: float) -> PolicyNetwork:
     """The policy whose hidden units range, and rest at the origin, at `factor` times what they did.
 
     Values before each tanh at the origin become `factor` times as large, and with them, to first order, what each
@@ -55,15 +53,15 @@ def contracted(network: TanhNetwork, factor: float) -> TanhNetwork:
         h, shrunk = np.tanh(y), np.tanh(weights[-1] @ shrunk + biases[-1])
         old, new = 1 - h**2, 1 - shrunk**2
         slopes = np.divide(old, new, out=np.zeros(len(old)), where=old > 0)  # a saturated unit passes nothing on
-    return replace(network, weights=tuple(weights), biases=tuple(biases))
+    return network.with_layers(weights=tuple(weights), biases=tuple(biases))
 
 
-def with_value_at_origin(network: TanhNetwork, value: Array) -> TanhNetwork:
+def with_value_at_origin(network: PolicyNetwork, value: Array) -> PolicyNetwork:
     """The network with the last bias that makes net(0) equal `value` (m,), up to rounding."""
     h = np.zeros(network.n)
     for weight, bias in zip(network.weights[:-1], network.biases[:-1], strict=True):
         h = np.tanh(weight @ h + bias)
-    return replace(network, biases=(*network.biases[:-1], _last_bias(network.weights[-1], h, value)))
+    return network.with_layers(biases=(*network.biases[:-1], _last_bias(network.weights[-1], h, value)))
 
 
 def _last_bias(weight: Array, h: Array, wanted: Array) -> Array:

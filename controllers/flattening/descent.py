@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from controllers.flattening.result import Ended
 from controllers.flattening.selection import GAIN, Selection
 from controllers.flattening.student import Student
@@ -38,7 +38,7 @@ class Descent:
         self.states = selection.states
         self._generator = torch.Generator().manual_seed(task.options.seed)
 
-    def run(self, start: TanhNetwork, report: Report | None) -> tuple[int, Ended]:
+    def run(self, start: PolicyNetwork, report: Report | None) -> tuple[int, Ended]:
         """Take gradient steps from `start`; their number, and why they ended."""
         options, every = self.task.options, max(1, self.task.options.steps // CHECKS)
         student = Student(start, self.task.value, self.task.folded, trains_biases=not self.task.exactly_centred)
@@ -91,7 +91,7 @@ class Descent:
         squashed = folded.squashed(self.task.value)
         return np.asarray(folded.scale * folded.squash_slope(squashed) * np.ones(self.task.system.m))
 
-    def _add(self, network: TanhNetwork) -> None:
+    def _add(self, network: PolicyNetwork) -> None:
         self.states = np.concatenate([self.states, self.task.visited(network)])
 
     def _data(self) -> tuple[Tensor, Tensor]:
@@ -99,7 +99,7 @@ class Descent:
         inputs = self.task.inputs(self.task.goal, self.states)
         return torch.from_numpy(self.states).float(), torch.from_numpy(inputs).float()
 
-    def _exported(self, student: Student) -> TanhNetwork:
+    def _exported(self, student: Student) -> PolicyNetwork:
         weights, biases = (
             tuple(p.detach().double().numpy() for p in parameters) for parameters in (student.weights, student.biases)
         )

@@ -30,7 +30,7 @@ import torch
 
 from certify.errors import InputError, OptionError
 from certify.loop.plants import System
-from certify.loop.policies import Policy, TanhNetwork
+from certify.loop.policies import Policy, PolicyNetwork
 from controllers.evaluation.curvature import curvature
 from controllers.flattening.contraction import contracted
 from controllers.flattening.descent import Descent, Report
@@ -100,7 +100,7 @@ def flatten(
     )
 
 
-def _contracted(task: Task, selection: Selection) -> tuple[float, TanhNetwork]:
+def _contracted(task: Task, selection: Selection) -> tuple[float, PolicyNetwork]:
     """The best contraction within the bounds; the goal itself if there is none."""
     candidates = [contracted(task.goal, factor) for factor in FACTORS]
     ranked = sorted(range(len(FACTORS)), key=lambda k: selection.objective(candidates[k]))
@@ -111,7 +111,7 @@ def _contracted(task: Task, selection: Selection) -> tuple[float, TanhNetwork]:
     return FACTORS[0], candidates[0]
 
 
-def _record(task: Task, network: TanhNetwork) -> dict[str, Any]:
+def _record(task: Task, network: PolicyNetwork) -> dict[str, Any]:
     """The old record with the figures that changed."""
     record = dict(task.policy.training)
     if task.K is not None and "K" in record:

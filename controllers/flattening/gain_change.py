@@ -9,20 +9,19 @@ form need not.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 
 Array = NDArray[np.float64]
 _LEAST = 1e-6  # ratio of singular values: below it an input follows from the others, up to single precision
 
 
-def regained(network: TanhNetwork, u_eq: Sequence[Fraction], J: Array, box: Array) -> TanhNetwork:
+def regained(network: PolicyNetwork, u_eq: Sequence[Fraction], J: Array, box: Array) -> PolicyNetwork:
     """The policy `x -> pi(G x)`, whose Jacobian at the origin is J; only the first layer's weights are other ones.
 
     `G x` is the smallest state, relative to the box, at which the old Jacobian asks for what J asks for at x:
@@ -50,4 +49,4 @@ def regained(network: TanhNetwork, u_eq: Sequence[Fraction], J: Array, box: Arra
         )
     first = network.weights[0] @ (box[:, None] * (np.linalg.pinv(old) @ J))
     single = np.asarray(first.astype(np.float32), dtype=np.float64)
-    return replace(network, weights=(single, *network.weights[1:]))
+    return network.with_layers(weights=(single, *network.weights[1:]))

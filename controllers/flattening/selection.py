@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.loop.policies import TanhNetwork, require_centred
+from certify.loop.policies import PolicyNetwork, require_centred
 from controllers.flattening.result import Figures
 from controllers.flattening.task import Task
 from controllers.training.departure import departure_of
@@ -40,10 +40,10 @@ class Selection:
                 f"the policy must have a finite median cost to compare with; half of {task.options.states} runs of "
                 f"{task.system.name} or more diverge. Choose smaller `initial_states`, or train it further."
             )
-        self.best: tuple[TanhNetwork, Figures] | None = None
+        self.best: tuple[PolicyNetwork, Figures] | None = None
         self._objective = math.inf
 
-    def keep(self, network: TanhNetwork) -> bool:
+    def keep(self, network: PolicyNetwork) -> bool:
         """Remember a policy that is better than all before and within the bounds; True if it is one."""
         if not all(np.all(np.isfinite(a)) for a in (*network.weights, *network.biases)):
             return False
@@ -63,7 +63,7 @@ class Selection:
         self.best, self._objective = (network, figures), objective
         return True
 
-    def objective(self, network: TanhNetwork) -> float:
+    def objective(self, network: PolicyNetwork) -> float:
         """The loss of training in double precision, on the states that are the same for all."""
         task = self.task
         change = (task.inputs(network, self.states) - task.inputs(task.goal, self.states)) / self.size

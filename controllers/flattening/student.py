@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from controllers.training.departure import linearised
 
 Array = NDArray[np.float64]
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 class Student(torch.nn.Module):
     """The policy as it is trained: float32, `scale * squash(net(x) - net(0) + value) + offset`, then the clip."""
 
-    def __init__(self, start: TanhNetwork, value: Array, folded: TanhNetwork, trains_biases: bool) -> None:
+    def __init__(self, start: PolicyNetwork, value: Array, folded: PolicyNetwork, trains_biases: bool) -> None:
         super().__init__()
         self._weights = torch.nn.ParameterList(torch.tensor(W, dtype=torch.float32) for W in start.weights)
         self._biases = torch.nn.ParameterList(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from certify.errors import InputError, OptionError
 from certify.loop.plants import System
-from certify.loop.policies import Policy, TanhNetwork, require_centred
+from certify.loop.policies import Policy, PolicyNetwork, require_centred
 from controllers.evaluation.settling import MONITORING, settle
 from controllers.flattening.bend import bend
 from controllers.flattening.contraction import with_value_at_origin
@@ -66,7 +66,7 @@ class Task:
         self.exactly_centred = self._is_exactly_centred()
         self.x0 = initial_states(self.system, _RUNS, options.seed, self.plant)
 
-    def visited(self, network: TanhNetwork) -> Array:
+    def visited(self, network: PolicyNetwork) -> Array:
         """States (N, n) on the way from the box of initial states, over an episode's horizon, inside the domain."""
         loop = held_loop(self.system, self.dt, mean_action(network, self.system), self.Q, self.R)
         preset, every = self.plant.preset, 1 if self.system.time == "discrete" else _EVERY
@@ -75,7 +75,7 @@ class Task:
         lo, hi = np.array(self.system.domain, dtype=np.float64).T
         return np.asarray(states[((states >= lo) & (states <= hi)).all(axis=1)])  # NaN, a run that diverged, is not
 
-    def inputs(self, network: TanhNetwork, states: Array) -> Array:
+    def inputs(self, network: PolicyNetwork, states: Array) -> Array:
         """The inputs (N, m) that a policy gives at states (N, n)."""
         return mean_action(network, self.system)(states)
 
@@ -95,12 +95,12 @@ class Task:
             )
         return np.asarray(math.sqrt(mean) * np.abs(self.goal.scale))
 
-    def gain_change(self, network: TanhNetwork, J: Array) -> float:
+    def gain_change(self, network: PolicyNetwork, J: Array) -> float:
         """The difference of a policy's Jacobian at the origin from J (m, n), on the box and relative to J."""
         size = max(float(np.linalg.norm(J * self.box)), SMALLEST)
         return float(np.linalg.norm((network.jacobian_at_origin(self.u_eq) - J) * self.box)) / size
 
-    def figures(self, network: TanhNetwork) -> Figures:
+    def figures(self, network: PolicyNetwork) -> Figures:
         """The figures of a policy, by the runs that judge."""
         judged = replace(MONITORING, states=self.options.states, seed=self.options.seed)
         found = settle(network, self.system, self.dt, self.Q, self.R, judged, self.plant)
@@ -112,9 +112,9 @@ class Task:
             cost=found.cost,
         )
 
-    def with_layers(self, weights: tuple[Array, ...], biases: tuple[Array, ...]) -> TanhNetwork:
+    def with_layers(self, weights: tuple[Array, ...], biases: tuple[Array, ...]) -> PolicyNetwork:
         """The old policy with other layers, and with the old value before its squash at the origin."""
-        network = replace(self.old, weights=weights, biases=biases)
+        network = self.old.with_layers(weights=weights, biases=biases)
         return with_value_at_origin(network, np.asarray(self.old.net(np.zeros(self.system.n))))
 
     def lqr_weights(self) -> tuple[Array, Array]:

@@ -7,14 +7,14 @@ import torch
 from numpy.typing import NDArray
 
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from controllers.options import Plant, TrainingOptions, get_plant
 from controllers.simulation.closed_loop import Action, held_loop
 
 Array = NDArray[np.float64]
 
 
-def mean_action(network: TanhNetwork, system: System) -> Action:
+def mean_action(network: PolicyNetwork, system: System) -> Action:
     """`network` as an `Action`, in float64; torch's tanh takes a fraction of numpy's time."""
     u_eq = system.exact_u_eq()
     folded = network.folded(u_eq)  # once, not in every step

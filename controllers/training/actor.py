@@ -10,7 +10,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from controllers.options import Centre, GainNorm
 from controllers.training.departure import departure
 from controllers.training.device import CPU, exact
@@ -153,12 +153,12 @@ class Actor(nn.Module):
         offset = float(torch.linalg.vector_norm(mean - self.u_eq))
         return math.nan if K is None else float(torch.linalg.vector_norm(jacobian + K)), offset
 
-    def network(self) -> TanhNetwork:
+    def network(self) -> PolicyNetwork:
         """The mean action as an exact tanh network with its centring; the states' factors are folded in exactly."""
         layers = [*self._layers(), self.mean]
         weights = [exact(layer.weight) for layer in layers]
         weights[0] = weights[0] * exact(self.factors)
-        return TanhNetwork(
+        return PolicyNetwork.of_layers(
             weights=tuple(weights),
             biases=tuple(exact(layer.bias) for layer in layers),
             scale=exact(self.scale),

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 
 _LEAST = 1e-30  # below any range that counts: a network that ignores the state has no scale of its own
 
@@ -89,7 +89,7 @@ def departure(weights: Sequence[Tensor], biases: Sequence[Tensor], box: Tensor) 
     return total / linear.clamp_min(_LEAST)
 
 
-def departure_of(network: TanhNetwork, box: Sequence[float]) -> float:
+def departure_of(network: PolicyNetwork, box: Sequence[float]) -> float:
     """`departure` of a policy on the box with these half-widths, (n,)."""
     weights, biases = (
         [torch.tensor(a, dtype=torch.float64) for a in arrays] for arrays in (network.weights, network.biases)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from controllers.evaluation.curvature import curvature
 from controllers.evaluation.settling import settle
 from controllers.identification.gain_learner import Identified
@@ -17,7 +17,7 @@ from controllers.training.log import Monitored
 
 
 def monitored(
-    network: TanhNetwork,
+    network: PolicyNetwork,
     identified: Identified | None,
     system: System,
     plant: Plant | None,

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from controllers.evaluation.curvature import curvature
 from controllers.identification.gain_learner import Identified
 from controllers.options import TrainingOptions
@@ -29,7 +29,7 @@ def parameters_of(system: System) -> dict[str, str]:
 def training_record(
     options: TrainingOptions,
     system: System,
-    network: TanhNetwork,
+    network: PolicyNetwork,
     identified: Identified | None,
     off: tuple[float, float],
     device: torch.device,

@@ -18,7 +18,7 @@ import pytest
 import torch
 
 import certify
-from certify import ImportOptions, InputError, Policy, RoaOptions, TanhNetwork, Verdict, certify_roa, get_system
+from certify import ImportOptions, InputError, Policy, PolicyNetwork, RoaOptions, Verdict, certify_roa, get_system
 from certify.analysis.api import _remove, in_python
 from certify.analysis.results import RoaResult
 from certify.certificates import parse_certificate
@@ -55,7 +55,7 @@ def away() -> RoaResult:
         input_bounds=((Fraction(-1), Fraction(1)),),
         x_eq=(h0,),
     )
-    network = TanhNetwork((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
     return certify_roa(system, network, P=[[1.0]], level=0.0625)
 
 
@@ -209,7 +209,7 @@ def test_options_at_once_or_by_name() -> None:
         ({"system": "mine.py"}, "must be followed by the name"),
         ({"system": "policy.pt"}, "looks like a policy file. The plant comes before the policy"),
         ({"system": b"pendulum"}, "found a bytes"),
-        ({"system": None, "policy": pendulum_network((4,))}, "a TanhNetwork does not say what it controls"),
+        ({"system": None, "policy": pendulum_network((4,))}, "a PolicyNetwork does not say what it controls"),
         ({"system": None, "policy": mlp()}, "a module does not say what it controls"),
         ({"policy": 3}, "`policy` must be the path .* found a int"),
         ({"policy": None}, "`policy` must be the path .* found None"),
@@ -386,9 +386,9 @@ def test_a_policy_that_rests_beside_the_origin_gets_the_other_claim_and_says_so(
         certify_roa("pendulum", Policy(small_pendulum(), "pendulum"), importing={"centre": "output"})
 
 
-def small_pendulum() -> TanhNetwork:
+def small_pendulum() -> PolicyNetwork:
     network = pendulum_network((4,))
-    return dataclasses.replace(network, biases=tuple(b + 1e-3 for b in network.biases))
+    return network.with_layers(biases=tuple(b + 1e-3 for b in network.biases))
 
 
 def test_a_beta_of_another_plant_is_refused() -> None:

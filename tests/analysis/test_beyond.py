@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from certify import Neural, Polynomial, System, TanhNetwork, certify_roa, save_lyapunov
+from certify import Neural, PolicyNetwork, Polynomial, System, certify_roa, save_lyapunov
 from certify.analysis.acceptance import Clerk
 from certify.analysis.results import RoaResult
 from certify.certificates import Certificate, PartitionTree
@@ -25,7 +25,7 @@ from certify.provers.outer import Rise
 
 x, u = Symbol("x"), Symbol("u")
 SQUARE = Polynomial(np.array([[2]]), np.array([1.0]))
-REST = TanhNetwork((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+REST = PolicyNetwork.of_layers((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
 HALF = 0.125  # of V = x^2/2: the ellipsoid is |x| <= 1/2
 
 

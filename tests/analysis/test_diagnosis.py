@@ -129,7 +129,7 @@ def test_an_unstable_loop_needs_another_policy(
 def test_a_plant_that_rests_elsewhere_is_to_be_corrected(tmp_path: Path) -> None:
     """No warning of floats on the way: levels sink to 0 around a point at which nothing rests."""
     system, network = chain(2, [-1.0, -2.0])
-    law = replace(network, biases=(np.zeros(1),), centre="output")
+    law = network.with_layers(biases=(np.zeros(1),), centre="output")
     x, v = system.states
     pushed = replace(system, dynamics=(v, system.inputs[0] - 2 + 0 * x), input_bounds=((Fraction(-1), Fraction(1)),))
     result = certify_roa(pushed, law, tmp_path, LITTLE)

@@ -29,7 +29,7 @@ from certify.errors import BackendError, InputError, SoundnessError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, Number, Symbol, sin, symbols
 from certify.loop.plants import System, get_system
-from certify.loop.policies import TanhNetwork, bounded_by_form, load_policy
+from certify.loop.policies import PolicyNetwork, bounded_by_form, load_policy
 from certify.lyapunov import domain_limit, leaves_domain, solve_lyapunov
 from certify.lyapunov.function import Quadratic
 from certify.provers.base import Progress
@@ -150,7 +150,9 @@ def test_input_bounds_limit_the_level(tmp_path: Path) -> None:
     """u = -1.5 x with |u| <= 1 on xdot = x/2 + u: V = x^2 / 2, so c <= (2/3)^2 / 2."""
     x, u = symbols("x u")
     system = System("s", (x,), (u,), {}, (x / 2 + u,), (Number(0),), box(3), box(1))
-    network = TanhNetwork((np.array([[-1.5]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers(
+        (np.array([[-1.5]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none"
+    )
     result = certify_roa(system, network, tmp_path, RoaOptions(candidate="lyapunov"))
     assert result.verdict is Verdict.PROVED and result.reason == "inputs"
     level = result.levels.roa
@@ -401,7 +403,7 @@ def test_a_witness_above_the_level_refutes_nothing(tmp_path: Path, monkeypatch: 
 
 def test_a_policy_that_is_nearly_centred_is_named_before_any_work(tmp_path: Path) -> None:
     system, network = scalar_tanh()
-    off = dataclasses.replace(network, biases=(np.array([1e-12]),))
+    off = network.with_layers(biases=(np.array([1e-12]),))
     with pytest.raises(InputError, match=r"not centred.*practical"):
         certify_roa(system, off, tmp_path, RoaOptions(claim="asymptotic"))
 
@@ -410,7 +412,9 @@ def test_an_equilibrium_that_is_not_decided_in_rationals_is_named(tmp_path: Path
     x, u = symbols("x u")
     dynamics = (sin(1 + x) - sin(1) + u,)
     system = System("s", (x,), (u,), {}, dynamics, (Number(0),), box(1), box(9))
-    network = TanhNetwork((np.array([[-5.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers(
+        (np.array([[-5.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none"
+    )
     with pytest.raises(InputError, match="not decided in rationals: sin of 1"):
         certify_roa(system, network, tmp_path, RoaOptions(claim="asymptotic"))
 
@@ -418,7 +422,7 @@ def test_an_equilibrium_that_is_not_decided_in_rationals_is_named(tmp_path: Path
 def test_input_bounds_are_decided_in_rationals(tmp_path: Path) -> None:
     """offset + scale is 1 + 2^-53, which rounds to the bound 1: the squash alone does not keep the input below it."""
     half = float(np.nextafter(0.5, 1))
-    network = TanhNetwork((np.array([[-2.0]]),), (np.zeros(1),), np.array([half]), np.array([0.5]))
+    network = PolicyNetwork.of_layers((np.array([[-2.0]]),), (np.zeros(1),), np.array([half]), np.array([0.5]))
     bounds = ((Fraction(-1), Fraction(1)),)
     assert 0.5 + half == 1.0 and not bounded_by_form(network, bounds)
     assert bounded_by_form(network, ((Fraction(-1), Fraction(2)),))
@@ -437,7 +441,9 @@ def test_a_plant_too_large_for_a_certificate_is_named(
 ) -> None:
     x, u = symbols("x u")
     system = System("large", (x,), (u,), {}, (dynamics(x, u),), (Number(0),), box(1), box(9))
-    network = TanhNetwork((np.array([[-5.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers(
+        (np.array([[-5.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none"
+    )
     with pytest.raises(InputError, match=f"too large for a certificate.*{named}"):
         certify_roa(system, network, tmp_path)
 

@@ -30,7 +30,7 @@ from certify.loop.plants import (
     load_system,
     with_input_errors,
 )
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
 from certify.provers.falsify import Witness
 from tests.support.algebra import same
@@ -73,9 +73,9 @@ def spring(folder: Path, wind: str = "0") -> System:
     return load_system(path)
 
 
-def soft() -> TanhNetwork:
+def soft() -> PolicyNetwork:
     """One tanh, with which the spring rests at the origin."""
-    return TanhNetwork((np.array([[-0.3, -0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    return PolicyNetwork.of_layers((np.array([[-0.3, -0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +201,7 @@ def test_errors_of_inputs_are_recognised_in_a_certificate(name: str) -> None:
     plant = get_system(name)
     system = PlantChanges(input_error=F(1, 100)).of(plant)
     n, m = system.n, system.m
-    network = TanhNetwork((np.zeros((m, n)),), (np.zeros(m),), np.ones(m), np.zeros(m), "tanh", "none")
+    network = PolicyNetwork.of_layers((np.zeros((m, n)),), (np.zeros(m),), np.ones(m), np.zeros(m), "tanh", "none")
     evidence = PartitionTree(np.eye(n), np.ones(n), bytes([255]), cells=(1,) * m)
     written = Certificate(system, network, Quadratic(np.eye(n)), Asymptotic(roa=1.0, local=1.0), evidence)
     read = parse_certificate(written.to_json().encode(), "c").system
@@ -270,7 +270,7 @@ def test_all_kinds_at_once_are_claimed_for_a_line(tmp_path: Path) -> None:
         "line", (p,), (u,), {"k": F(1)}, (-k * p + p**3 / 4 + u + w,), (Number(0),), ((F(-2), F(2)),),
         ((F(-1), F(1)),), disturbances=(w,),
     )  # fmt: skip
-    law = TanhNetwork((np.array([[-0.3]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    law = PolicyNetwork.of_layers((np.array([[-0.3]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     result = certify_roa(
         line, law, tmp_path, candidate="lyapunov", ranges=K, disturbances={"wind": "0.05"}, input_error="0.001"
     )
@@ -353,7 +353,7 @@ def test_the_thrust_of_a_quadrotor_is_nominal() -> None:
     lift = PlantChanges(parameters={"m": (F(476, 1000), F(496, 1000))}).of(system)
     assert lift.exact_u_eq() == system.exact_u_eq()
     offset = np.array([float(q) for q in system.exact_u_eq()])
-    law = TanhNetwork((np.zeros((2, 6)),), (np.zeros(2),), np.ones(2), offset, "identity", "output")
+    law = PolicyNetwork.of_layers((np.zeros((2, 6)),), (np.zeros(2),), np.ones(2), offset, "identity", "output")
     ClosedLoop(system, law).require_rest()
     with pytest.raises(InputError, match="whatever m may be; y_dot' depends on that"):
         ClosedLoop(lift, law).require_rest()

@@ -10,7 +10,7 @@ import numpy as np
 from certify.certificates import loop_sections
 from certify.certificates.encoding import network_section
 from certify.loop.plants import get_system, load_system
-from certify.loop.policies import TanhNetwork, load_policy
+from certify.loop.policies import PolicyNetwork, load_policy
 from tests.support.certificates import dump, make
 from tests.support.earlier import newer
 
@@ -50,8 +50,8 @@ def van_der_pol() -> Document:
     }
 
 
-def _networks(network: TanhNetwork) -> list[Document]:
-    return [network_section("policy", network.weights, network.biases)]
+def _networks(network: PolicyNetwork) -> list[Document]:
+    return [network_section("policy", network.network)]
 
 
 def scalar() -> Document:

@@ -243,9 +243,9 @@ def test_a_check_that_needs_patience_is_said(tmp_path: Path, monkeypatch: pytest
 
 def test_the_limits_are_the_checker_s() -> None:
     """The producer names what the checker would refuse; the two share no line, so the numbers are compared."""
-    assert (limits.MOST_STATES, 2 * limits.MOST_LAYERS - 1, limits.MOST_ROWS) == (
+    assert (limits.MOST_STATES, limits.MOST_STEPS, limits.MOST_ROWS) == (
         checker_document.MAX_STATES,
-        checker_networks.MAX_STEPS - 1,  # tanh is between layers
+        checker_networks.MAX_STEPS,
         checker_networks.MAX_WIDTH,
     )
     assert (limits.MOST_NODES, limits.MOST_DEPTH, limits.MOST_EXPONENT) == (

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from certify import TanhNetwork, certify_roa
+from certify import PolicyNetwork, certify_roa
 from certify.analysis.arguments import region
 from certify.certificates import parse_certificate
 from certify.certificates.membership import Box, Containment, Ellipsoid, Located, ProvedSet, proved_set
@@ -67,7 +67,7 @@ def at(*values: Fraction | int) -> Box:
 def disc(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An accepted certificate of x^2 + y^2 <= 1, in deviations from (2, 0)."""
     folder = tmp_path_factory.mktemp("disc")
-    law = TanhNetwork((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    law = PolicyNetwork.of_layers((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
     result = certify_roa(still(2, (2, 0)), law, folder, P=np.eye(2), level=1.0)
     assert result.verdict.value == "PROVED" and result.certificate is not None, result.reason
     return result.certificate

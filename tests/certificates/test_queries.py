@@ -20,7 +20,7 @@ from certify.certificates.claims.conditions import (
 from certify.certificates.claims.queries import Query, decay, query
 from certify.errors import InputError
 from certify.loop.plants import System, get_system
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.loop.rigorous import evaluate_policy, evaluate_vdot
 from certify.provers.ball.local import prove_local
 from tests.support.cases import Case, case_of
@@ -28,7 +28,7 @@ from tests.support.loops import chain, lqr_gain, pendulum_network, saturated_lqr
 from tests.support.oracle import value_of
 
 
-def quadrotor() -> tuple[System, TanhNetwork]:
+def quadrotor() -> tuple[System, PolicyNetwork]:
     """u_eq is not the middle of the inputs' range: beta is not 0."""
     system = get_system("quadrotor2d")
     K = lqr_gain(system, np.eye(6), np.eye(2))

@@ -37,10 +37,10 @@ from certify.checker.taylor import upper_bound
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, cos, sin, symbols, tan, to_tree
 from certify.loop.plants import System, get_system
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.loop.policies.network import Centre, Squash
 from certify.loop.rigorous import evaluate_policy
-from certify.provers.bounds import PolicyEnclosure
+from certify.provers.bounds import policy_enclosure
 from certify.provers.bounds import taylor as producer_taylor
 from tests.support import plain
 from tests.support.certificates import make, parse
@@ -407,9 +407,9 @@ def random_policy(
     return Policy(plain.chain(weights, biases), scale, offset, squash, centre)
 
 
-def network_of(policy: Policy, squash: Squash, centre: Centre) -> TanhNetwork:
+def network_of(policy: Policy, squash: Squash, centre: Centre) -> PolicyNetwork:
     weights, biases = zip(*plain.layers(policy.network), strict=True)
-    return TanhNetwork(weights, biases, policy.scale, policy.offset, squash, centre)
+    return PolicyNetwork.of_layers(weights, biases, policy.scale, policy.offset, squash, centre)
 
 
 def still_system(n: int, u_eq: tuple[Fraction, ...]) -> System:
@@ -510,7 +510,7 @@ def situation(generator: Generator, squash: Squash, centre: Centre, wide: bool, 
 def producer_bounds(s: Situation, squash: Squash, centre: Centre, way: Way = "numpy") -> list[Array]:
     loop = ClosedLoop(still_system(len(s.x), s.u_eq), network_of(s.policy, squash, centre))
     with bounded(way):
-        return list(PolicyEnclosure(loop)(s.x, s.x_error)[:3])
+        return list(policy_enclosure(loop)(s.x, s.x_error)[:3])
 
 
 @sizes((40, 5), (2000, 50))

@@ -24,7 +24,7 @@ from certify.cli.main import _run, command_line
 from certify.cli.options import options_of
 from certify.cli.terminal import ring_line
 from certify.loop.plants import get_system
-from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_policy
 from certify.provers.base import Progress
 from tests.support.loops import chain, pendulum_network
 
@@ -152,7 +152,7 @@ def test_a_run_without_a_certificate_says_where_the_earlier_one_is(
 
 
 def test_a_plant_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    network = TanhNetwork((np.array([[-0.5, -0.4]]),), (np.zeros(1),), np.array([6.0]), np.zeros(1))
+    network = PolicyNetwork.of_layers((np.array([[-0.5, -0.4]]),), (np.zeros(1),), np.array([6.0]), np.zeros(1))
     save_policy(tmp_path / "v.pt", Policy(network, "somebody's plant"))
     status, out, err = run(
         capsys,
@@ -590,7 +590,9 @@ def spring(tmp_path: Path) -> tuple[str | Path, ...]:
     """The options of a command that name a plant of two states and a policy of one tanh."""
     plant, policy = tmp_path / "spring.toml", tmp_path / "spring.pt"
     plant.write_text(SPRING)
-    network = TanhNetwork((np.array([[-0.3, -0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    network = PolicyNetwork.of_layers(
+        (np.array([[-0.3, -0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none"
+    )
     save_policy(policy, Policy(network, "soft_spring"))
     return "--policy", policy, "--system", plant, "--out", tmp_path / "o"
 

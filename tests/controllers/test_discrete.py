@@ -18,7 +18,7 @@ from certify.analysis.api import certify_roa
 from certify.certificates.verdict import Verdict
 from certify.errors import InputError
 from certify.loop.plants import get_system, load_system
-from certify.loop.policies import Policy, TanhNetwork, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, save_policy
 from controllers.cli import app
 from controllers.comparison.methods import OURS
 from controllers.comparison.options import CompareOptions
@@ -84,7 +84,9 @@ def henon():
 
 def _linear(gain, name="henon", **record):
     """u = u_eq - K x with hardly a bend, and a record of what evaluations need."""
-    network = TanhNetwork((-np.array([gain]) / 100,), (np.zeros(1),), np.array([100.0]), np.zeros(1), "tanh", "output")
+    network = PolicyNetwork.of_layers(
+        (-np.array([gain]) / 100,), (np.zeros(1),), np.array([100.0]), np.zeros(1), "tanh", "output"
+    )
     return Policy(network, name, training={"state_weights": [1.0, 1.0], "input_weights": [1.0]} | record)
 
 
@@ -246,7 +248,7 @@ def _bent(K, seed=0):
     h = np.tanh(x @ W.T + b) - np.tanh(b)
     last = np.linalg.lstsq(h, -x @ np.array(K).T, rcond=None)[0].T
     weights, biases = [W, last], [b, -last @ np.tanh(b)]
-    return TanhNetwork(
+    return PolicyNetwork.of_layers(
         tuple(w.astype(np.float32).astype(float) for w in weights),
         tuple(v.astype(np.float32).astype(float) for v in biases),
         np.ones(1), np.zeros(1), "tanh", "output",

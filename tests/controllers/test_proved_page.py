@@ -17,7 +17,7 @@ import pytest
 from certify.analysis.api import certify_roa
 from certify.certificates.claims import Practical
 from certify.loop.plants import get_system
-from certify.loop.policies import Policy, TanhNetwork, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, save_policy
 
 PENDULUM = get_system("pendulum")
 
@@ -37,7 +37,7 @@ def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def _law(gain: list[list[float]]) -> Policy:
-    network = TanhNetwork((-np.array(gain),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers((-np.array(gain),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
     return Policy(network, "pendulum", {"m": "0.15", "l": "0.5", "b": "0.1", "g": "9.81"})
 
 

@@ -19,7 +19,7 @@ from certify.checker.networks import Affine, Map, Network
 from certify.errors import InputError
 from certify.loop.activations import ACTIVATIONS, Activation
 from certify.loop.plants import get_system
-from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_policy
 from certify.loop.policies.exact import raw_at_origin
 from certify.loop.policies.importers import ImportOptions, import_policy
 from certify.loop.policies.importers.memory import import_module, import_state_dict
@@ -32,7 +32,7 @@ SAID = ImportOptions(states=("theta", "theta_dot"), normaliser="none", action_sc
 POINTS = np.concatenate([np.linspace(-12, 12, 97), [-700.0, -90.0, -41.0, 41.0, 90.0, 700.0], 0.3 * np.arange(-5, 6)])
 
 
-def network(name: str, **changes: Any) -> TanhNetwork:
+def network(name: str, **changes: Any) -> PolicyNetwork:
     return replace(pendulum_network((6, 5)), activation=name, **changes)
 
 
@@ -154,7 +154,9 @@ def test_the_hash_is_the_checkers(name: str, widths: tuple[int, ...]) -> None:
 
 
 def test_one_layer_has_no_activation() -> None:
-    law = TanhNetwork((np.ones((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none", activation="elu")
+    law = PolicyNetwork.of_layers(
+        (np.ones((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none", activation="elu"
+    )
     assert law.activation == "tanh"
     with pytest.raises(InputError, match="`activation` must be one of tanh, relu"):
         network("selu")

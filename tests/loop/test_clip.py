@@ -32,7 +32,7 @@ from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number
 from certify.loop.plants import System, get_system
-from certify.loop.policies import Policy, TanhNetwork, bounded_by_form, load_policy, require_centred, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, bounded_by_form, load_policy, require_centred, save_policy
 from certify.loop.rigorous import eigenvalues, evaluate_policy
 from certify.provers.ball.local import prove_local
 from certify.provers.bounds import policy as producer
@@ -166,11 +166,11 @@ def test_what_is_not_finite_is_never_made_finite(who: str, bad: tuple[float, flo
 FORMS = [("tanh", "preactivation"), ("tanh", "output"), ("tanh", "none"), ("identity", "output"), ("identity", "none")]
 
 
-def clipped_pendulum(squash: str, centre: str, reach: float, offset: float = 0.25) -> TanhNetwork:
+def clipped_pendulum(squash: str, centre: str, reach: float, offset: float = 0.25) -> PolicyNetwork:
     base = pendulum_network((6, 5))
     biases = (*base.biases[:-1], 0.1 + base.biases[-1] - base.net(np.zeros(2)))  # raw is not saturated at 0
     ends = np.array([-reach]), np.array([1.5 * reach])
-    return TanhNetwork(base.weights, biases, base.scale, np.array([offset]), squash, centre, ends)  # type: ignore[arg-type]
+    return PolicyNetwork.of_layers(base.weights, biases, base.scale, np.array([offset]), squash, centre, ends)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("squash", "centre"), FORMS)
@@ -184,7 +184,7 @@ def test_the_policy_on_boxes_and_at_points(squash: str, centre: str) -> None:
         x = generator.standard_normal((2, 3, 6)) * np.array([1.0, size, size])[None, :, None]
         nothing = np.zeros((2, 6))
         forms = [plain.enclose_on_boxes(checker.fold(theirs, loop.u_eq), x, nothing)]
-        forms.append(producer.PolicyEnclosure(loop)(x, nothing)[:3])
+        forms.append(producer.policy_enclosure(loop)(x, nothing)[:3])
         with ctx.workprec(300):
             for b, d in itertools.product(range(6), [*itertools.product([-1.0, 1.0], repeat=2), (0.25, -0.5)]):
                 state = [
@@ -237,7 +237,7 @@ def test_the_centre_must_lie_strictly_inside(centre: str, lo: float, hi: float) 
 
 
 def test_without_centring_the_origin_is_decided_after_the_clip() -> None:
-    network = TanhNetwork(
+    network = PolicyNetwork.of_layers(
         (np.array([[1.0]]),), (np.array([3.0]),), np.ones(1), np.zeros(1), "identity", "none", (-np.ones(1), np.ones(1))
     )
     require_centred(network, (Fraction(1),))
@@ -358,7 +358,7 @@ def test_a_rectified_tanh_is_a_clip(tmp_path: Path) -> None:
     """u = 2 relu(tanh(net(x) - net(0) + beta)), u_eq = 1: it reaches 0 on part of the set, and never 2."""
     x, u = get_system("pendulum").states[0], get_system("pendulum").inputs[0]
     system = System("lift", (x,), (u,), {}, (u - 1,), (Number(1),), box(4), ((Fraction(0), Fraction(2)),))
-    network = TanhNetwork(
+    network = PolicyNetwork.of_layers(
         (np.array([[-0.5]]),), (np.array([0.7]),), np.array([2.0]), np.zeros(1), "tanh", "preactivation",
         (np.zeros(1), np.array([2.0])),
     )  # fmt: skip
@@ -424,7 +424,7 @@ def test_what_holds_by_form_holds_at_every_state(
     scale: float, offset: float, low: float, width: float, squash: bool
 ) -> None:
     """Against the policy's values from one end of its range to the other, for bounds just wide enough and just not."""
-    network = TanhNetwork(
+    network = PolicyNetwork.of_layers(
         (np.array([[1.0]]),), (np.zeros(1),), np.array([scale]), np.array([offset]), "tanh" if squash else "identity",
         "none", clip=(np.array([low]), np.array([low + width])),
     )  # fmt: skip

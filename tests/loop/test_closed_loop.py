@@ -13,7 +13,7 @@ from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, Symbol, symbols
 from certify.loop.plants import System, get_system, with_input_errors
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.loop.rigorous import eigenvalues, evaluate_policy, evaluate_vdot
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
 
@@ -68,7 +68,7 @@ def test_counts_must_match(pendulum: System) -> None:
 def test_the_origin_must_be_an_equilibrium() -> None:
     x, u = symbols("x u")
     system = System("s", (x,), (u,), {}, (x + u + Fraction(1, 10**9),), (Number(0),), box(1), box(1))
-    network = TanhNetwork((np.array([[-2.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    network = PolicyNetwork.of_layers((np.array([[-2.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     with pytest.raises(InputError, match="must be exactly 0"):
         ClosedLoop(system, network).require_rest()
 
@@ -82,7 +82,7 @@ def test_nonzero_equilibrium_input() -> None:
     x, u = symbols("x u")
     c = Symbol("c")
     system = System("s", (x,), (u,), {"c": Fraction(3, 10)}, (u - c,), (c,), box(1), box(1))
-    network = TanhNetwork((np.array([[-2.0]]),), (np.array([0.7]),), np.ones(1), np.array([0.1]))
+    network = PolicyNetwork.of_layers((np.array([[-2.0]]),), (np.array([0.7]),), np.ones(1), np.array([0.1]))
     loop = ClosedLoop(system, network)
     value = evaluate_policy(loop, np.zeros(1))[0]
     with flint.ctx.workprec(200):
@@ -94,13 +94,13 @@ def test_a_policy_that_is_not_centred_is_told_by_how_much_and_what_to_type() -> 
     """Of pi(0), where it is no fraction, the message says what it is about, and options as they are typed."""
     system = get_system("pendulum")
     base = pendulum_network((8, 8))
-    off = replace(base, biases=tuple(b + 0.1 for b in base.biases), centre="none")
+    off = base.with_layers(biases=tuple(b + 0.1 for b in base.biases), centre="none")
     with pytest.raises(InputError, match=r"exactly u_eq = 0; its input u is about -?\d\.\d+\. .*--centre output or"):
         ClosedLoop(system, off).require_rest()
     value = float(off(np.zeros(2), (Fraction(0),))[0])
     with pytest.raises(InputError, match=f"about {value:.9g}"):
         ClosedLoop(system, off).require_rest()
-    near = replace(off, biases=(*off.biases[:-1], off.biases[-1] - np.arctanh(value / off.scale[0])))
+    near = off.with_layers(biases=(*off.biases[:-1], off.biases[-1] - np.arctanh(value / off.scale[0])))
     with pytest.raises(InputError, match="whether exactly that cannot be decided: tanh at the operating point"):
         ClosedLoop(system, near).require_rest()
     plain = replace(off, squash="identity")

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, Number, atan, cos, evaluate, exp, sin, sqrt, symbols, tan, tanh
 from certify.loop.plants import System, get_system
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.loop.rigorous import evaluate_arb, evaluate_policy
-from certify.provers.bounds import Models, PolicyEnclosure, Taylor, compiled, upper_bound
+from certify.provers.bounds import Models, Taylor, compiled, policy_enclosure, upper_bound
 from certify.provers.bounds.loop import played
 from certify.provers.bounds.tape import recorded
 from certify.provers.bounds.taylor import ConstantsLast
@@ -60,7 +60,7 @@ def test_relaxation_is_of_second_order_and_never_looser_than_an_interval(centre:
     assert bool((s >= 0).all()) and bool((s <= 1).all())
 
 
-def _networks() -> list[tuple[System, TanhNetwork]]:
+def _networks() -> list[tuple[System, PolicyNetwork]]:
     generator = np.random.default_rng(1)
     pendulum = get_system("pendulum")
     x, y, z, u, v = symbols("x y z u v")
@@ -75,19 +75,19 @@ def _networks() -> list[tuple[System, TanhNetwork]]:
         input_bounds=box(9, 9),
     )
     normal = generator.standard_normal
-    wide = TanhNetwork(
+    wide = PolicyNetwork.of_layers(
         (normal((40, 3)), normal((30, 40)) / 3, normal((2, 30))),
         (generator.standard_normal(40), generator.standard_normal(30), generator.standard_normal(2)),
         np.array([2.0, -3.0]), np.array([0.2, 0.1]), "tanh", "preactivation",
     )  # fmt: skip
-    linear = TanhNetwork(
+    linear = PolicyNetwork.of_layers(
         (generator.standard_normal((2, 3)),), (np.ones(2),), np.ones(2), np.ones(2), "identity", "output"
     )
     return [
         (pendulum, pendulum_network()),
         (pendulum, pendulum_network(centre="output")),
         (two, wide),
-        (two, TanhNetwork(wide.weights, wide.biases, wide.scale, wide.offset, "identity", "output")),
+        (two, PolicyNetwork.of_layers(wide.weights, wide.biases, wide.scale, wide.offset, "identity", "output")),
         (two, linear),
     ]
 
@@ -104,7 +104,7 @@ def test_the_policy_lies_in_its_enclosure(case: int, size: float, way: Way) -> N
     slopes = size * generator.standard_normal((n, n, batch))
     x = np.concatenate([tensor(centre)[:, None], tensor(slopes)], 1)
     with bounded(way):
-        mid, gradient, error, _ = PolicyEnclosure(loop)(x, np.zeros((n, batch)))
+        mid, gradient, error, _ = policy_enclosure(loop)(x, np.zeros((n, batch)))
     checked = 0
     for b in range(batch):
         for d in [np.ones(n), *generator.uniform(-1, 1, (3, n))]:
@@ -121,7 +121,7 @@ def test_the_policy_lies_in_its_enclosure(case: int, size: float, way: Way) -> N
 
 
 def test_policy_error_is_of_second_order(pendulum: System) -> None:
-    enclosure = PolicyEnclosure(ClosedLoop(pendulum, pendulum_network()))
+    enclosure = policy_enclosure(ClosedLoop(pendulum, pendulum_network()))
     errors = []
     for k in range(8):
         slopes = 0.2 * 2.0**-k * np.eye(2)[:, :, None]
@@ -263,9 +263,9 @@ def test_the_enclosure_is_invariant_under_the_oddness_of_tanh(pendulum: System) 
     """Negating a hidden layer's incoming and outgoing weights leaves the function, and its bounds, as they are."""
     network = pendulum_network()
     W, b = network.weights, network.biases
-    flipped = TanhNetwork((-W[0], -W[1], W[2]), (-b[0], b[1], b[2]), network.scale, network.offset)
+    flipped = PolicyNetwork.of_layers((-W[0], -W[1], W[2]), (-b[0], b[1], b[2]), network.scale, network.offset)
     x = np.concatenate([tensor([0.2, 0.5])[:, None, None], 0.3 * np.eye(2)[:, :, None]], 1)
     none = np.zeros((2, 1))
-    first, second = (PolicyEnclosure(ClosedLoop(pendulum, w))(x, none) for w in (network, flipped))
+    first, second = (policy_enclosure(ClosedLoop(pendulum, w))(x, none) for w in (network, flipped))
     for a, c in zip(first[:3], second[:3], strict=True):
         np.testing.assert_allclose(a, c, rtol=1e-9, atol=1e-12)

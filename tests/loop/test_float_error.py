@@ -22,7 +22,7 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import symbols
 from certify.loop.float32 import FloatError, FloatOptions, float_error
 from certify.loop.plants import System, available_systems, get_system, load_system
-from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_policy
 from certify.loop.rigorous import evaluate_policy, precision
 from tests.support.loops import box, pendulum_network
 from tests.support.marks import slow_after
@@ -55,21 +55,21 @@ def plant(n: int, m: int, half_width: str = "1", u_eq: str = "0") -> System:
     )
 
 
-def random_network(widths: tuple[int, ...], seed: int, size: float = 1.0, **kind: Any) -> TanhNetwork:
+def random_network(widths: tuple[int, ...], seed: int, size: float = 1.0, **kind: Any) -> PolicyNetwork:
     """Numbers of binary64 that are none of binary32."""
     generator = np.random.default_rng(seed)
     weights = tuple(size * generator.standard_normal((b, a)) / a**0.5 for a, b in itertools.pairwise(widths))
     biases = tuple(generator.uniform(-0.5, 0.5, b) for b in widths[1:])
     m = widths[-1]
     scale, offset = generator.uniform(0.5, 3, m) * np.where(np.arange(m) % 2, -1, 1), generator.uniform(-0.3, 0.3, m)
-    return TanhNetwork(weights, biases, scale, offset, **kind)
+    return PolicyNetwork.of_layers(weights, biases, scale, offset, **kind)
 
 
-def in_double(network: TanhNetwork, system: System, x: np.ndarray) -> np.ndarray:
+def in_double(network: PolicyNetwork, system: System, x: np.ndarray) -> np.ndarray:
     return np.asarray(network(x, system.exact_u_eq()))
 
 
-def errors(network: TanhNetwork, system: System, x: np.ndarray, u: np.ndarray, worst: int = 3) -> np.ndarray:
+def errors(network: PolicyNetwork, system: System, x: np.ndarray, u: np.ndarray, worst: int = 3) -> np.ndarray:
     """|u - pi(x)| for each input, (m,), the largest of the states by Arb, rounded down."""
     loop, found = ClosedLoop(system, network), np.zeros(system.m)
     off = np.abs(u.astype(float) - in_double(network, system, x))
@@ -81,7 +81,9 @@ def errors(network: TanhNetwork, system: System, x: np.ndarray, u: np.ndarray, w
     return found
 
 
-def require_within(found: FloatError, network: TanhNetwork, system: System, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+def require_within(
+    found: FloatError, network: PolicyNetwork, system: System, x: np.ndarray, u: np.ndarray
+) -> np.ndarray:
     off = errors(network, system, x, u)
     assert np.all(off <= found.bounds), f"off by {off}, and at most {found.bounds} was promised"
     return off
@@ -93,7 +95,7 @@ def ends(system: System) -> tuple[np.ndarray, np.ndarray]:
     return np.nextafter(lo, 0), np.nextafter(hi, 0)
 
 
-def shipped(path: Path) -> tuple[TanhNetwork, System]:
+def shipped(path: Path) -> tuple[PolicyNetwork, System]:
     policy = load_policy(path)
     if policy.system in available_systems():
         return policy.network, get_system(policy.system).with_parameters(policy.parameters)
@@ -153,7 +155,7 @@ def test_any_order_is_any_order() -> None:
     bound allows that counts fewer additions."""
     count = 512
     W = np.concatenate([[1.0], np.full(count - 1, U)])[None]
-    network = TanhNetwork((W,), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers((W,), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
     system = plant(count, 1)
     x = np.full((1, count), 1 - 2.0**-24)
     x[0, 0] = 1 - 2.0**-24
@@ -167,16 +169,16 @@ def test_any_order_is_any_order() -> None:
 
 @pytest.mark.parametrize("chain", [1, 7])
 def test_no_sum_has_shorter_chains_than_its_logarithm(chain: int) -> None:
-    network = TanhNetwork((np.ones((1, 255)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers((np.ones((1, 255)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
     with pytest.raises(InputError, match="`chain` must be at least 8: in a sum of 256 terms"):
         float_error(network, plant(255, 1), FloatOptions(chain=chain))
     float_error(network, plant(255, 1), FloatOptions(chain=8, boxes=1))
 
 
-def chained(depth: int, **kind: Any) -> TanhNetwork:
+def chained(depth: int, **kind: Any) -> PolicyNetwork:
     """Layers of one unit, at weights that binary32 has."""
     ones = tuple(np.ones((1, 1)) for _ in range(depth))
-    return TanhNetwork(ones, (np.zeros(1),) * depth, np.ones(1), np.zeros(1), **{"centre": "none", **kind})
+    return PolicyNetwork.of_layers(ones, (np.zeros(1),) * depth, np.ones(1), np.zeros(1), **{"centre": "none", **kind})
 
 
 def test_the_state_is_rounded() -> None:
@@ -193,7 +195,7 @@ def test_each_number_of_a_layer_is_rounded(what: str) -> None:
     """The sum itself is exact: nothing but the number's rounding is left."""
     value = 1 + 2.0**-24 - 2.0**-52
     weight, bias = (value, 0.0) if what == "weight" else (0.0, value)
-    network = TanhNetwork(([[weight]],), ([bias],), [1.0], [0.0], "identity", "none")
+    network = PolicyNetwork.of_layers(([[weight]],), ([bias],), [1.0], [0.0], "identity", "none")
     system, x = plant(1, 1), np.array([[1 - 2.0**-24]])
     found = float_error(network, system, FloatOptions(boxes=1))
     off = require_within(found, network, system, x, Machine()(network, (Fraction(0),), x))[0]
@@ -205,7 +207,7 @@ def test_each_number_of_a_layer_is_rounded(what: str) -> None:
 @pytest.mark.parametrize("offset", [0.0, 0.1, 1 + 2.0**-24 - 2.0**-52])
 def test_scale_offset_and_their_sum_are_rounded(scale: float, offset: float) -> None:
     """The layer before them is exact, and so is the state: all of the error is the output map's."""
-    network = TanhNetwork(([[1.0]],), ([0.0],), [scale], [offset], "identity", "none")
+    network = PolicyNetwork.of_layers(([[1.0]],), ([0.0],), [scale], [offset], "identity", "none")
     system = plant(1, 1)
     x = np.random.default_rng(0).uniform(-1, 1, (200_000, 1)).astype(f32).astype(float)
     found = sources(float_error(network, system, FloatOptions(boxes=1)))["output"]
@@ -217,7 +219,7 @@ def test_scale_offset_and_their_sum_are_rounded(scale: float, offset: float) -> 
 def test_the_scale_its_product_and_the_sum_may_all_err_the_same_way() -> None:
     """A scale, products and sums just above 1, where half a unit is worth most: nearly 3 * 2^-24."""
     scale, offset = 1 + 4097 * 2.0**-23 + 2.0**-24 - 2.0**-50, float(f32(1e-6))
-    network = TanhNetwork(([[1.0]],), ([0.0],), [scale], [offset], "identity", "none")
+    network = PolicyNetwork.of_layers(([[1.0]],), ([0.0],), [scale], [offset], "identity", "none")
     x = np.random.default_rng(0).uniform(1, 1 + 2.0**-10, (100_000, 1)).astype(f32).astype(float)
     found = sources(float_error(network, plant(1, 1, "1025/1024"), FloatOptions(boxes=1)))["output"]
     off = np.abs(Machine()(network, (Fraction(0),), x) - (scale * x + offset)).max() - 2.0**-50
@@ -228,7 +230,7 @@ def test_a_constant_of_centring_may_be_off_by_a_unit() -> None:
     """Rounded the wrong way, and then a sum that rounds the wrong way as well: still within the bound."""
     unit = 2.0**-23
     u_eq = Fraction(1) + Fraction(unit) / 100
-    network = TanhNetwork(([[1.0]],), ([0.0],), [1.0], [0.0], "identity", "output")
+    network = PolicyNetwork.of_layers(([[1.0]],), ([0.0],), [1.0], [0.0], "identity", "output")
     system = plant(1, 1, "1/1000000", str(u_eq))
     x = -0.49 * unit
     computed = f32(f32(1 + unit) + f32(x))
@@ -240,10 +242,10 @@ def test_a_constant_of_centring_may_be_off_by_a_unit() -> None:
 
 def test_each_input_has_the_bound_of_its_worst_part_of_the_domain() -> None:
     """Two inputs that are each other's mirror image: where one is steep the other is saturated."""
-    network = TanhNetwork(([[32.0], [32.0]],), ([-16.0, 16.0],), [1.0, 1.0], [0.0, 0.0], "tanh", "none")
+    network = PolicyNetwork.of_layers(([[32.0], [32.0]],), ([-16.0, 16.0],), [1.0, 1.0], [0.0, 0.0], "tanh", "none")
     first, second = float_error(network, plant(1, 2)).bounds
     assert first == pytest.approx(second, rel=1e-2)
-    only = dataclasses.replace(network, weights=([[0.0], [32.0]],), biases=([0.0, 16.0],))
+    only = network.with_layers(weights=([[0.0], [32.0]],), biases=([0.0, 16.0],))
     assert float_error(only, plant(1, 2)).bounds[1] == pytest.approx(second, rel=1e-1)
 
 
@@ -301,7 +303,7 @@ def test_the_tanh_of_torch_and_numpy_is_as_good_as_the_default_says() -> None:
 @pytest.mark.parametrize(("centre", "squash"), [("preactivation", "tanh"), ("output", "tanh"), ("output", "identity")])
 def test_what_centring_adds_is_rounded(centre: str, squash: str) -> None:
     """A constant of centring far larger than what it is added to: most of the error is its rounding."""
-    network = TanhNetwork(([[2.0**-20]],), ([0.0],), [3.0], [0.0], squash, centre)  # type: ignore[arg-type]
+    network = PolicyNetwork.of_layers(([[2.0**-20]],), ([0.0],), [3.0], [0.0], squash, centre)  # type: ignore[arg-type]
     system, x = plant(1, 1, u_eq="1/3"), np.array([[0.5]])
     found = float_error(network, system)
     seen = []
@@ -314,7 +316,7 @@ def test_what_centring_adds_is_rounded(centre: str, squash: str) -> None:
 
 def test_a_clip_is_rounded_too() -> None:
     """Where it always acts, its rounding is the error; it never makes others larger."""
-    free = TanhNetwork(([[1.0]],), ([0.5],), [1.0], [0.0], "identity", "none")
+    free = PolicyNetwork.of_layers(([[1.0]],), ([0.5],), [1.0], [0.0], "identity", "none")
     far = dataclasses.replace(free, clip=(np.array([0.1]), np.array([1e6 / 3])))
     system, x = plant(1, 1), np.array([[-0.9]])
     found = float_error(far, system)
@@ -332,7 +334,7 @@ def test_a_clip_is_rounded_too() -> None:
 )
 def test_tiny_numbers_may_be_lost(weight: float, state: float, large: float, flush: bool) -> None:
     """What is 0 to the machine comes out large behind a large weight."""
-    network = TanhNetwork(([[weight]], [[large]]), ([0.0], [0.0]), [1.0], [0.0], "identity", "none")
+    network = PolicyNetwork.of_layers(([[weight]], [[large]]), ([0.0], [0.0]), [1.0], [0.0], "identity", "none")
     system, x = plant(1, 1, str(2**20)), np.array([[state]])
     machine = Machine(flush=flush, tanh=lambda y: y)  # of numbers that small
     found = float_error(network, system)
@@ -360,7 +362,7 @@ def test_what_may_overflow_is_refused(edit: dict[str, Any], message: str) -> Non
 
 
 def test_states_that_overflow_are_refused_even_where_no_weight_reads_them() -> None:
-    network = TanhNetwork(([[0.0]],), ([0.0],), [1.0], [0.0], "tanh", "none")
+    network = PolicyNetwork.of_layers(([[0.0]],), ([0.0],), [1.0], [0.0], "tanh", "none")
     with pytest.raises(InputError, match="a state must stay below 2\\^127"):
         float_error(network, plant(1, 1, str(10**39)))
 
@@ -497,7 +499,7 @@ def test_other_activations_stay_within_the_bound(name: str) -> None:
     import torch
 
     plant, network = get_system("pendulum"), dataclasses.replace(pendulum_network((12, 8), "output"), activation=name)
-    network = dataclasses.replace(network, weights=(*network.weights[:-1], network.weights[-1] / 8))
+    network = network.with_layers(weights=(*network.weights[:-1], network.weights[-1] / 8))
     found = float_error(network, plant, FloatOptions(boxes=8))
     half = np.array([float(hi) for _, hi in plant.domain])
     x = (half * np.random.default_rng(0).uniform(-1, 1, (20_000, 2))).astype(f32)

@@ -38,7 +38,7 @@ from certify.loop.expressions import (
 )
 from certify.loop.plants import System, load_system
 from certify.loop.plants.toml import parse_expression
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.loop.rigorous import evaluate_arb
 from certify.provers.ball.local import prove_local
 from certify.reference import expressions as reference_expressions
@@ -280,14 +280,16 @@ def test_the_third_derivatives_of_the_format() -> None:
 # ------------------------------------------------------------------------------------------------- through the pipeline
 
 
-def scalar(dynamics: Expression, width: float | str = 3, gain: float = -1.0) -> tuple[System, TanhNetwork]:
+def scalar(dynamics: Expression, width: float | str = 3, gain: float = -1.0) -> tuple[System, PolicyNetwork]:
     system = System("s", (X,), (U,), {}, (dynamics,), (Number(0),), box(width), box(9))
-    network = TanhNetwork((np.array([[gain]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers(
+        (np.array([[gain]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none"
+    )
     return system, network
 
 
 # A loop under u = -x, and where its region of attraction ends.
-KNOWN: dict[str, tuple[Callable[[], tuple[System, TanhNetwork]], float]] = {
+KNOWN: dict[str, tuple[Callable[[], tuple[System, PolicyNetwork]], float]] = {
     "tanh": (lambda: scalar(X / 2 + tanh(U)), 1.9150080481545375),
     "exp": (lambda: scalar(X / 2 + exp(U) - 1), 1.5936242600400401),
     "atan": (lambda: scalar(X / 2 + atan(U)), 2.331122370414423),

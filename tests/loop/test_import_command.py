@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from certify.cli.main import _run
-from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_policy
 from certify.lyapunov import Neural, load_lyapunov
 from tests.support.foreign import TWO_STAGE, external, mlp, sb3, values
 
@@ -235,7 +235,7 @@ def eval_fraction(text: str) -> float:
 
 
 def test_options_of_other_programs_do_not_go_with_a_policy_file_of_this_one(run: Run) -> None:
-    network = TanhNetwork((np.ones((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    network = PolicyNetwork.of_layers((np.ones((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     save_policy("own.pt", Policy(network, "chain"))
     status, _, err = run("roa", "--policy", "own.pt", "--system", "plant.toml", "--states", "x0,x1", "--out", "o")
     assert status == 2 and "--states must be left out" in err
@@ -244,7 +244,7 @@ def test_options_of_other_programs_do_not_go_with_a_policy_file_of_this_one(run:
 
 
 def test_bounds_for_another_number_of_states_are_refused(run: Run) -> None:
-    network = TanhNetwork((np.ones((1, 3)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    network = PolicyNetwork.of_layers((np.ones((1, 3)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     save_policy("own.pt", Policy(network, "chain", valid=np.array([[-1.0, 1.0]] * 3)))
     status, _, err = run("roa", "--policy", "own.pt", "--system", "plant.toml", "--out", "o")
     assert status == 2 and "3 states" in err

@@ -15,7 +15,7 @@ import torch
 
 from certify.errors import InputError
 from certify.loop.plants import get_system
-from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_policy
 from certify.loop.policies.importers import Clip, Imported, ImportOptions, content_of, import_policy
 from tests.support.compiled import Constant, SetsItsState
 from tests.support.foreign import TWO_STAGE, Odd, external, mlp, plant, saved, sb3, two_stage, values
@@ -568,8 +568,8 @@ def test_the_policy_file_keeps_what_was_found(tmp_path: Path) -> None:
     assert (tmp_path / "again.pt").read_bytes() == (tmp_path / "out.pt").read_bytes()
 
 
-def network() -> TanhNetwork:
-    return TanhNetwork((np.ones((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+def network() -> PolicyNetwork:
+    return PolicyNetwork.of_layers((np.ones((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
 
 
 def test_bounds_of_validity_survive_the_file(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from certify.errors import InputError
 from certify.loop.expressions import Number, Symbol
 from certify.loop.plants import System
 from certify.loop.plants.toml import parse_expression
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.reference.rules import judge
 from certify.report import summary
 from tests.support.certificates import dump, grow, make, verdict
@@ -37,9 +37,9 @@ def plant(dynamics: dict[str, str], half: float = 2, bound: int = 6) -> System:
     )
 
 
-def gain(*row: float) -> TanhNetwork:
+def gain(*row: float) -> PolicyNetwork:
     """u = tanh(row x)."""
-    return TanhNetwork((np.array([row]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    return PolicyNetwork.of_layers((np.array([row]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
 
 
 @pytest.mark.parametrize("bias, size", [(0.3, 1.0), (0.1, 2.0)])
@@ -47,7 +47,7 @@ def test_what_was_proved_with_an_earlier_floor_is_accepted_with_the_last(
     tmp_path: Path, bias: float, size: float
 ) -> None:
     weights = np.array([[size, 0.5], [-0.5, size]]), np.array([[-0.5, -0.5]])
-    network = TanhNetwork(
+    network = PolicyNetwork.of_layers(
         weights, (np.array([bias, -bias]), np.array([bias / 2])), np.ones(1), np.zeros(1), "tanh", "none"
     )
     options = RoaOptions(claim="practical", level=0.3, max_boxes=20_000)

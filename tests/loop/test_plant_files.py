@@ -34,7 +34,7 @@ from certify.loop.plants import (
     residuals,
     shipped_system,
 )
-from certify.loop.policies import Policy, TanhNetwork, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, save_policy
 from certify.report import summary
 from tests.support.algebra import same
 from tests.support.loops import box
@@ -81,9 +81,9 @@ def write(folder: Path, text: str = TANK, name: str = "tank.toml") -> Path:
     return path
 
 
-def gain(system: System, *rows: tuple[float, ...]) -> TanhNetwork:
+def gain(system: System, *rows: tuple[float, ...]) -> PolicyNetwork:
     """u = u_eq + rows x, centred by its form."""
-    return TanhNetwork(
+    return PolicyNetwork.of_layers(
         (np.array(rows),), (np.zeros(len(rows)),), np.ones(system.m), np.zeros(system.m), "identity", "output"
     )
 

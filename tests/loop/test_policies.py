@@ -13,16 +13,16 @@ import pytest
 import torch
 
 from certify.errors import InputError
-from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_policy
 from tests.support import plain
 from tests.support.loops import pendulum_network
 
 U_EQ = (Fraction(1, 3),)
 
 
-def network(centre: str = "preactivation", squash: str = "tanh") -> TanhNetwork:
+def network(centre: str = "preactivation", squash: str = "tanh") -> PolicyNetwork:
     base = pendulum_network((5, 4))
-    return TanhNetwork(base.weights, base.biases, base.scale, np.array([0.25]), squash, centre)  # type: ignore[arg-type]
+    return PolicyNetwork.of_layers(base.weights, base.biases, base.scale, np.array([0.25]), squash, centre)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("centre", "squash"), [("preactivation", "tanh"), ("output", "tanh"), ("output", "identity")])
@@ -62,7 +62,7 @@ def test_file_round_trip_is_exact_and_repeatable(tmp_path: Path) -> None:
 
 def test_single_precision_means_what_it_says(tmp_path: Path) -> None:
     base = network()
-    single = TanhNetwork(
+    single = PolicyNetwork.of_layers(
         tuple(w.astype(np.float32) for w in base.weights), tuple(b.astype(np.float32) for b in base.biases),
         base.scale, base.offset,
     )  # fmt: skip
@@ -92,7 +92,7 @@ def test_the_hash_sees_every_part(change: str) -> None:
             parts["squash"] = "identity"
         case _:
             parts[change] = parts[change] * 2
-    assert TanhNetwork(**parts).sha256() != base.sha256()
+    assert PolicyNetwork.of_layers(**parts).sha256() != base.sha256()
 
 
 class _Executes:

@@ -28,7 +28,7 @@ from certify.loop.equilibrium import Rest, find_rest, seen_from
 from certify.loop.expressions import Expression, Number, atan, exp, sin, symbols
 from certify.loop.float32 import float_error
 from certify.loop.plants import System, domain_of_values, get_system, load_system
-from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_policy
 from certify.loop.rigorous import field_on, precision
 from certify.lyapunov.function import Quadratic
 from controllers.evaluation.proved_set import count_covered, require_same_loop, require_same_question
@@ -42,7 +42,7 @@ def scalar(f: Expression, weight: float, bias: float, clip: tuple[float, float] 
     x, u = symbols("x u")
     system = System("s", (x,), (u,), {}, (f,), (Number(0),), box(3), box(9))
     bounds = None if clip is None else (np.array([clip[0]]), np.array([clip[1]]))
-    network = TanhNetwork(
+    network = PolicyNetwork.of_layers(
         (np.array([[weight]]),), (np.array([bias]),), np.ones(1), np.zeros(1), "identity", "none", clip=bounds
     )
     return ClosedLoop(system, network)
@@ -155,8 +155,8 @@ def bent(centre: Literal["none", "output"] = "none", **changes: Any) -> ClosedLo
     )  # fmt: skip
     generator = np.random.default_rng(5)
     layers = (generator.standard_normal((5, 2)), np.array([[0.3, -0.2, 0.1, 0.4, -0.5]]))
-    network = TanhNetwork(layers, (generator.uniform(-1, 1, 5), np.array([0.25])), np.ones(1), np.zeros(1), "identity",
-                          centre)  # fmt: skip
+    biases = generator.uniform(-1, 1, 5), np.array([0.25])
+    network = PolicyNetwork.of_layers(layers, biases, np.ones(1), np.zeros(1), "identity", centre)
     return ClosedLoop(system, network)
 
 

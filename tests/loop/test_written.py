@@ -44,7 +44,7 @@ from certify.loop.expressions import (
 )
 from certify.loop.plants import System
 from certify.loop.plants.equations import parse_expression
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.loop.rigorous import evaluate_arb
 from certify.reference.expressions import equations
 from certify.report.mathml import typeset
@@ -52,7 +52,7 @@ from tests.support.algebra import same, to_sympy
 
 X, U, K, W = symbols("x u k w")
 HALF, LEVEL = Fraction(2), 1.9
-POLICY = TanhNetwork((np.array([[-0.5]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+POLICY = PolicyNetwork.of_layers((np.array([[-0.5]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
 
 # ------------------------------------------------------------------------------------------------------------- oracle
 

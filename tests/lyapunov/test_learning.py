@@ -14,7 +14,7 @@ from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, Symbol, symbols
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import Neural, Polynomial
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.learning import Learned, fit_polynomial, learn
@@ -51,8 +51,8 @@ def disc(half: float = 2.0, n: int = 2) -> ClosedLoop:
     return ClosedLoop(system, silent(n))
 
 
-def silent(n: int) -> TanhNetwork:
-    return TanhNetwork((np.zeros((1, n)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+def silent(n: int) -> PolicyNetwork:
+    return PolicyNetwork.of_layers((np.zeros((1, n)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
 
 
 def pushed(system: System) -> System:

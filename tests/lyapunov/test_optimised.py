@@ -15,7 +15,7 @@ from certify.errors import BackendError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, Number, Symbol, symbols
 from certify.loop.plants import System, get_system
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import domain_limit, extents, optimise_candidate, solve_lyapunov, volume
 from certify.lyapunov.optimised import _between
 from certify.lyapunov.programs import smallest_trace
@@ -36,7 +36,8 @@ def closed_loop(dynamics: tuple[Expression, ...], domain: tuple[str, ...], gain:
         input_bounds=box(bound),
     )
     return ClosedLoop(
-        system, TanhNetwork((np.array([gain]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+        system,
+        PolicyNetwork.of_layers((np.array([gain]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none"),
     )
 
 

@@ -27,14 +27,14 @@ from certify.errors import CertificateFormatError, InputError
 from certify.loop.activations import ACTIVATIONS
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import get_system
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.loop.policies.exact import at_origin
 from certify.loop.rigorous import evaluate_policy
 from certify.lyapunov import domain_limit
 from certify.provers.ball.local import prove_local
 from certify.provers.ball.models import paths
 from certify.provers.bounds.lines import LINES
-from certify.provers.bounds.policy import PolicyEnclosure
+from certify.provers.bounds.policy import policy_enclosure
 from tests.provers.test_models import beyond
 from tests.support.cases import case_of
 from tests.support.certificates import parse
@@ -46,7 +46,7 @@ BENT = [name for name in NEW if not ACTIVATIONS[name].is_smooth]
 PLANT = get_system("pendulum")
 
 
-def policy(name: str, widths: tuple[int, ...] = (8, 8), seed: int = 0) -> TanhNetwork:
+def policy(name: str, widths: tuple[int, ...] = (8, 8), seed: int = 0) -> PolicyNetwork:
     """One that stabilises the pendulum."""
     K, spread = np.array([[2.8, 0.95]]), [2.0, 8.0]
     return saturated_lqr(K, 6.0, 0.0, spread, widths, "preactivation", seed, name)
@@ -120,7 +120,7 @@ def test_policies_on_boxes(name: str, size: float) -> None:
     found = []
     for way in WAYS:
         with bounded(way):
-            found.append(PolicyEnclosure(closed)(x, error))
+            found.append(policy_enclosure(closed)(x, error))
     for a, b in zip(*found, strict=True):
         assert np.array_equal(a, b)
     mid, slopes, wide, _ = found[0]
@@ -157,10 +157,10 @@ def certificate(closed: ClosedLoop) -> str:
 def test_a_box_with_a_corner_in_it_has_no_smaller_error_than_the_corner(name: str, way: Way) -> None:
     """A unit that reads x itself: the lines around relu are half its height apart."""
     one, none = np.eye(1), np.zeros(1)
-    law = TanhNetwork((one, one), (none, none), np.ones(1), none, "identity", "none", activation=name)
+    law = PolicyNetwork.of_layers((one, one), (none, none), np.ones(1), none, "identity", "none", activation=name)
     closed = ClosedLoop(scalar_tanh()[0], law)
     with bounded(way):
-        mid, slopes, error, _ = PolicyEnclosure(closed)(np.array([[[0.0], [0.5]]]), np.zeros((1, 1)))
+        mid, slopes, error, _ = policy_enclosure(closed)(np.array([[[0.0], [0.5]]]), np.zeros((1, 1)))
     ends = np.array([-0.5, 0.0, 0.5])
     away = np.abs(ACTIVATIONS[name].pair(ends)[0] - mid[0, 0] - slopes[0, 0, 0] * ends / 0.5)
     assert np.all(away <= error[0, 0]) and (name != "relu" or error[0, 0] == pytest.approx(0.125))
@@ -208,7 +208,7 @@ def test_a_corner_at_the_operating_point_proves_nothing() -> None:
     law = policy("relu")
     first = law.biases[0] * (np.arange(8) > 0)
     biases = (first, *law.biases[1:])
-    case = case_of(PLANT, replace(law, biases=biases))
+    case = case_of(PLANT, law.with_layers(biases=biases))
     assert prove_local(case.problem, case.T, domain_limit(case.P, PLANT.domain)) is None
     result = certify_roa(PLANT, case.loop.network)
     assert result.verdict is Verdict.UNKNOWN and "a unit of relu has its corner at the operating point" in result.reason
@@ -246,7 +246,7 @@ def decreases(result: RoaResult, level: float) -> bool:
 def test_planted_violations_are_never_proved(name: str) -> None:
     """A law that pushes away is refuted; one with a spike in the middle of its set is proved below that alone."""
     law = policy(name)
-    away = replace(law, weights=(*law.weights[:-1], -law.weights[-1]))
+    away = law.with_layers(weights=(*law.weights[:-1], -law.weights[-1]))
     assert certify_roa(PLANT, away).verdict is not Verdict.PROVED
     weak = replace(law, scale=law.scale * 0.02)
     result = certify_roa(PLANT, weak)
@@ -274,5 +274,5 @@ def test_what_is_for_tanh_alone_says_so() -> None:
 def test_a_rational_policy_at_rest() -> None:
     """pi(0) of a relu policy without centring is decided exactly."""
     one = np.eye(1)
-    law = TanhNetwork((one, -one), (np.ones(1), np.ones(1)), np.ones(1), np.zeros(1), "identity", "none")
-    assert at_origin(replace(law, activation="relu")) == (Fraction(0),) and at_origin(law) == (None,)
+    law = PolicyNetwork.of_layers((one, -one), (np.ones(1), np.ones(1)), np.ones(1), np.zeros(1), "identity", "none")
+    assert at_origin(law.with_layers(activation="relu")) == (Fraction(0),) and at_origin(law) == (None,)

@@ -14,7 +14,7 @@ from certify.certificates.verdict import Stop
 from certify.effort import UNIT, Effort
 from certify.errors import InputError
 from certify.loop.plants import System, get_system
-from certify.loop.policies import TanhNetwork, bounded_by_form, load_policy
+from certify.loop.policies import PolicyNetwork, bounded_by_form, load_policy
 from certify.loop.rigorous import evaluate_policy, evaluate_vdot
 from certify.lyapunov import domain_limit
 from certify.lyapunov.function import Quadratic
@@ -183,7 +183,7 @@ def planted(seed: int) -> tuple[Case, np.ndarray]:
     first = np.array([-K / 600, steep * normal, steep * normal])
     bias = np.array([0.0, -steep * (at - width / 2), -steep * (at + width / 2)])
     height = np.copysign(0.75, place[1])
-    network = TanhNetwork(
+    network = PolicyNetwork.of_layers(
         (first, np.array([[100.0, height, -height]])), (bias, np.zeros(1)), np.array([6.0]), np.zeros(1)
     )
     return case_of(system, network), place

@@ -24,7 +24,7 @@ from certify.certificates.tree import LEAF
 from certify.loop.expressions import Number, cos, sin, symbols
 from certify.loop.expressions.tree import FUNCTIONS
 from certify.loop.plants import System, get_system
-from certify.loop.policies import TanhNetwork, load_policy
+from certify.loop.policies import PolicyNetwork, load_policy
 from certify.provers.base import Budget
 from certify.provers.bounds import compiled, kernels, loop_models, tape, taylor, vectors
 from certify.provers.bounds import policy as policies
@@ -121,7 +121,7 @@ def curved() -> Stepped:
         "curved", (x,), (u,), {}, (row,), (Number(0),), box(2), box(9), time="discrete",
         disturbances=tuple(uncertain), ranges=ranges,
     )  # fmt: skip
-    return stepped(plant, TanhNetwork((np.array([[0.3]]),), (np.zeros(1),), np.ones(1), np.zeros(1)))
+    return stepped(plant, PolicyNetwork.of_layers((np.array([[0.3]]),), (np.zeros(1),), np.ones(1), np.zeros(1)))
 
 
 def test_a_violation_s_level_is_the_same_whatever_others_there_are() -> None:

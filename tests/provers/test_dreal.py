@@ -33,7 +33,7 @@ from certify.errors import BackendError, InputError, SoundnessError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, symbols
 from certify.loop.plants import System, get_system
-from certify.loop.policies import Policy, TanhNetwork, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, save_policy
 from certify.lyapunov.function import Quadratic
 from certify.provers.base import Budget, Proof, Task
 from certify.provers.dreal import backend as dreal
@@ -467,7 +467,7 @@ def genuine_violation(case: Case, x: np.ndarray) -> bool:
     return confirm(case.problem, Witness(x, float(case.problem.V(x)), "vdot"))
 
 
-def destabilised() -> tuple[System, TanhNetwork, np.ndarray]:
+def destabilised() -> tuple[System, PolicyNetwork, np.ndarray]:
     """x' = -x + 3/10 x^5 + u x^4 - t x^9 under u = -0.3 x: the binary64 number leaves 3/10 - 0.3 > 0 of x^5.
 
     x'/x = -1 + d s - t s^2 with s = x^4, d = 3/10 - 0.3 and t = d^2/5 is 1/4 at s = 5/(2d).
@@ -485,7 +485,9 @@ def destabilised() -> tuple[System, TanhNetwork, np.ndarray]:
         domain=box(24000),
         input_bounds=box(10**6),
     )
-    network = TanhNetwork((np.array([[-0.3]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers(
+        (np.array([[-0.3]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none"
+    )
     return system, network, np.array([[0.5]])
 
 
@@ -509,7 +511,7 @@ def test_real_dreal_on_the_scalar_plant(real: Backend, tmp_path: Path) -> None:
 
 
 def test_real_dreal_on_the_pendulum(real: Backend, tmp_path: Path) -> None:
-    network: TanhNetwork = pendulum_network((12,))
+    network: PolicyNetwork = pendulum_network((12,))
     options = RoaOptions(engine="dreal", level=0.5, time_limit=60)
     result = certify_roa(get_system("pendulum"), network, tmp_path, options)
     assert result.verdict is Verdict.TRUSTED and result.to_dict()["checked"] == "TRUSTED"
@@ -557,7 +559,9 @@ def test_a_violation_contradicts_only_where_the_guards_hold(
     """xdot = 2x: Vdot > 0 everywhere, but a practical claim speaks of nothing below its floor."""
     x, u = symbols("x u")
     system = System("away", (x,), (u,), {}, (3 * x + u,), (Number(0),), box(3), box(9))
-    network = TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers(
+        (np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none"
+    )
     problem = Problem(ClosedLoop(system, network), Quadratic(np.eye(1)))
     answer = Answer("delta-sat", 0.1, "fake", {"x": (at, at)})
     monkeypatch.setattr("certify.provers.dreal.proof.decide", lambda *_: answer)

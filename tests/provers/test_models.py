@@ -23,7 +23,7 @@ from certify.effort import UNIT, Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import cos, sin, symbols
 from certify.loop.plants import System, get_system
-from certify.loop.policies import TanhNetwork, load_policy
+from certify.loop.policies import PolicyNetwork, load_policy
 from certify.lyapunov import domain_limit, leaves_domain
 from certify.provers.ball.decrease import Multipliers, best_multipliers, decay_of, rest_of
 from certify.provers.ball.local import prove_local
@@ -36,7 +36,7 @@ from tests.support.jets import remainders, seen
 from tests.support.loops import chain, pendulum_network, scalar_tanh, tank, valve
 
 
-def loop_of(name: str) -> tuple[System, TanhNetwork]:
+def loop_of(name: str) -> tuple[System, PolicyNetwork]:
     if name == "scalar":
         return scalar_tanh()
     return chain(3, [-1, -2, -3]) if name == "chain" else (get_system("pendulum"), pendulum_network())

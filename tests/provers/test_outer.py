@@ -21,7 +21,7 @@ from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, Number, cos, exp, sqrt, symbols
 from certify.loop.plants import System, corners
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import Neural, Symbolic
 from certify.lyapunov.function import Quadratic
 from certify.provers.base import Budget, Progress, Task
@@ -68,8 +68,10 @@ def plane(domain: Any = SQUARE, dynamics: Any = (-X + Y / 8, U - X / 8), **more:
     )
 
 
-def minus_y() -> TanhNetwork:
-    return TanhNetwork((np.array([[0.0, -1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+def minus_y() -> PolicyNetwork:
+    return PolicyNetwork.of_layers(
+        (np.array([[0.0, -1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none"
+    )
 
 
 def scalar(dynamics: Expression = X / 2 + U, domain: Any = LINE, **more: Any) -> Problem:

@@ -26,7 +26,7 @@ from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, get_system
 from certify.loop.plants.ode import rk4_step
-from certify.loop.policies import TanhNetwork, load_policy
+from certify.loop.policies import PolicyNetwork, load_policy
 from certify.lyapunov import domain_limit
 from certify.provers.ball.local import prove_local
 from certify.provers.ball.models import paths
@@ -186,12 +186,12 @@ def test_after_is_the_flow() -> None:
 # ------------------------------------------------------------------------------------------------------- whole runs
 
 
-def run(out: Path, plant: tuple[System, TanhNetwork], state: dict[str, Any], **change: Any) -> RoaResult:
+def run(out: Path, plant: tuple[System, PolicyNetwork], state: dict[str, Any], **change: Any) -> RoaResult:
     options = {"candidate": "lqr", "max_boxes": 1, "effort": 0.16} | change
     return certify_roa(*plant, out, RoaOptions(reach_from=state, **options))
 
 
-def shipped() -> tuple[System, TanhNetwork]:
+def shipped() -> tuple[System, PolicyNetwork]:
     return get_system("pendulum"), load_policy(POLICIES / "pendulum.pt").network
 
 

@@ -24,7 +24,7 @@ from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, symbols
 from certify.loop.plants import System, get_system
-from certify.loop.policies import TanhNetwork, load_policy
+from certify.loop.policies import PolicyNetwork, load_policy
 from certify.loop.rigorous import evaluate_vdot
 from certify.lyapunov import domain_limit
 from certify.provers.base import Budget, Proof, Task
@@ -46,16 +46,18 @@ def prove(case: Case, budget: Budget | None = None, exactly: float | None = None
     return BoundsEngine(case.T, ThreadRunner()).prove(task, budget or Budget(Effort(20 * UNIT)))
 
 
-def uncentred(seed: int = 0) -> tuple[System, TanhNetwork]:
+def uncentred(seed: int = 0) -> tuple[System, PolicyNetwork]:
     return get_system("pendulum"), dataclasses.replace(pendulum_network(seed=seed), centre="none")
 
 
-def off_the_origin(shift: Fraction) -> tuple[System, TanhNetwork]:
+def off_the_origin(shift: Fraction) -> tuple[System, PolicyNetwork]:
     """xdot = -x + shift: every trajectory converges to `shift`, so c0 cannot lie below shift^2 with V = x^2."""
     x, u = symbols("x u")
     drift = Fraction(shift.numerator, shift.denominator)
     system = System("off", (x,), (u,), {}, (u + drift,), (Number(0),), box(3), box(9))
-    return system, TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    return system, PolicyNetwork.of_layers(
+        (np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none"
+    )
 
 
 def test_the_floor_of_a_known_plant() -> None:
@@ -148,12 +150,14 @@ def test_fifty_planted_violations_are_never_proved() -> None:
     assert sum(_check_planted(seed) for seed in range(100)) >= 50
 
 
-def with_pole() -> tuple[System, TanhNetwork]:
+def with_pole() -> tuple[System, PolicyNetwork]:
     """xdot = -x (1 + 1e-9 / (x - 1/100)): well behaved far out, with a pole inside."""
     x, u = symbols("x u")
     pole = Fraction(1, 10**9) / (x - Fraction(1, 100))
     system = System("pole", (x,), (u,), {}, (u - x * pole,), (Number(0),), box(3), box(9))
-    return system, TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    return system, PolicyNetwork.of_layers(
+        (np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none"
+    )
 
 
 def test_a_pole_inside_the_floor_is_not_forgotten(tmp_path: Path) -> None:
@@ -174,7 +178,7 @@ def test_input_bounds_hold_inside_the_floor_too() -> None:
     system = System("bump", (x,), (u,), {}, (u - 2 * x,), (Number(0),), box(3), box(4))
     first, bias = np.array([[40.0], [40.0], [0.1]]), np.array([12.0, -12.0, 0.0])
     weights, biases = (first, np.array([[3.0, -3.0, -1.0]])), (bias, np.zeros(1))
-    network = TanhNetwork(weights, biases, np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers(weights, biases, np.ones(1), np.zeros(1), "identity", "none")
     case = case_of(system, network)
     assert float(case.loop.policy(np.zeros((1, 1)))[0, 0]) > 4
     assert prove(case, Budget(boxes=5000, effort=Effort(20 * UNIT))).claim is None
@@ -197,7 +201,7 @@ def hump() -> Case:
     bounds = ((Fraction(-9), Fraction(19, 10)),)
     system = System("hump", (x,), (u,), {}, (-x + u / 1000,), (Number(0),), box(9), bounds)
     weights, biases = (np.ones((2, 1)), np.array([[1.0, -1.0]])), (np.array([2.0, -2.0]), np.zeros(1))
-    network = TanhNetwork(weights, biases, np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers(weights, biases, np.ones(1), np.zeros(1), "identity", "none")
     return case_of(system, network)
 
 

@@ -19,7 +19,7 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, Symbol, numerical, symbols
 from certify.loop.plants import System, get_system, with_input_errors
 from certify.loop.plants.equations import parse_expression
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.loop.rigorous import eigenvalues, evaluate_increment, evaluate_vdot, instability
 from certify.lyapunov import choose_candidate, diagonalising_coordinates, slowest_decay, solve_lyapunov
 from certify.lyapunov.function import Quadratic
@@ -47,7 +47,7 @@ class Stepped:
         return self.problem.loop
 
 
-def stepped(system: System, network: TanhNetwork, rate: float = 0.0, P: np.ndarray | None = None) -> Stepped:
+def stepped(system: System, network: PolicyNetwork, rate: float = 0.0, P: np.ndarray | None = None) -> Stepped:
     loop = ClosedLoop(system, network)
     if P is None:
         P = solve_lyapunov(loop.mean_rate(), np.eye(system.n), loop.step)
@@ -66,17 +66,19 @@ def uncertain_pendulum() -> System:
     return with_input_errors(system, {str(system.inputs[0]): Fraction(1, 20)})
 
 
-def linear(gain: float, sample: tuple[Fraction, Fraction] | None) -> tuple[System, TanhNetwork]:
+def linear(gain: float, sample: tuple[Fraction, Fraction] | None) -> tuple[System, PolicyNetwork]:
     """xdot = u, u = -gain x: held over h, x+ = (1 - gain h) x."""
     system, network = scalar_tanh()
-    network = TanhNetwork((np.array([[-gain]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers(
+        (np.array([[-gain]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none"
+    )
     system = dataclasses.replace(
         system, dynamics=(system.inputs[0],), input_bounds=box(1000), domain=box(10), sample=sample
     )
     return system, network
 
 
-def alone(dynamics: str, time: str = "discrete", domain: str = "3") -> tuple[System, TanhNetwork]:
+def alone(dynamics: str, time: str = "discrete", domain: str = "3") -> tuple[System, PolicyNetwork]:
     """A plant of one state on which no input acts."""
     system, _ = scalar_tanh()
     system = dataclasses.replace(
@@ -85,7 +87,9 @@ def alone(dynamics: str, time: str = "discrete", domain: str = "3") -> tuple[Sys
         domain=box(domain),
         time=time,
     )
-    return system, TanhNetwork((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    return system, PolicyNetwork.of_layers(
+        (np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none"
+    )
 
 
 CASES = {
@@ -298,7 +302,7 @@ def drift(sample: tuple[Fraction, Fraction], speed: int) -> Stepped:
         domain=box(1, 10),
         sample=sample,
     )
-    network = TanhNetwork((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
     return Stepped(Problem(ClosedLoop(system, network), Quadratic(np.eye(2))), np.eye(2))
 
 

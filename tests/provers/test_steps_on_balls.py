@@ -19,7 +19,7 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, Number, Symbol, atan, cos, exp, sin, sqrt, symbols, symbols_of, tanh
 from certify.loop.plants import System, at_values, corners, get_system
 from certify.loop.plants.system import Interval
-from certify.loop.policies import TanhNetwork, load_policy
+from certify.loop.policies import PolicyNetwork, load_policy
 from certify.lyapunov import choose_candidate, diagonalising_coordinates, domain_limit
 from certify.lyapunov.function import Quadratic
 from certify.provers.ball.cells import cut, cuts_for
@@ -68,7 +68,7 @@ def linear(f: Expression, gain: str = "-1", **more: object) -> tuple[Problem, Ar
     if acting:
         system = system.with_ranges({"w": (Fraction(-1, 10), Fraction(1, 10))})
     gains = np.array([[float(Fraction(gain))]])
-    network = TanhNetwork((gains,), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers((gains,), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
     return Problem(ClosedLoop(system, network), Quadratic(np.eye(1))), np.eye(1)
 
 
@@ -150,7 +150,9 @@ def every_function() -> ClosedLoop:
     )
     system = System("all", (X, W), (U,), {"q": Fraction(1), "r": Fraction(1, 2)}, f, (Number(0),), box(3, 3), box(9))
     weights = np.array([[0.7, -1.1], [0.4, 0.9]]), np.array([[-0.8, 0.5]])
-    network = TanhNetwork(weights, (np.array([0.2, -0.1]), np.zeros(1)), np.ones(1), np.zeros(1), "tanh", "none")
+    network = PolicyNetwork.of_layers(
+        weights, (np.array([0.2, -0.1]), np.zeros(1)), np.ones(1), np.zeros(1), "tanh", "none"
+    )
     return ClosedLoop(
         system.with_ranges({"q": (Fraction(4, 5), Fraction(6, 5)), "r": (Fraction(2, 5), Fraction(3, 5))}), network
     )
@@ -412,7 +414,7 @@ def test_no_band_where_the_disturbance_is_stronger_than_the_input() -> None:
 def test_a_policy_that_is_not_centred_has_a_band_around_where_it_rests() -> None:
     """u = -x + 1/20: V = x^2 falls for |x| > 1/20 alone."""
     problem, T = linear(U)
-    network = dataclasses.replace(problem.loop.network, biases=(np.array([0.05]),))
+    network = problem.loop.network.with_layers(biases=(np.array([0.05]),))
     problem = Problem(ClosedLoop(problem.loop.system, network), problem.V)
     found = prove_band(problem, T, 0.25)
     assert found is not None and found[0] > 0.0025 and found[0] == pytest.approx(0.0025, rel=0.1)

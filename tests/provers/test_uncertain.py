@@ -15,7 +15,7 @@ from certify.certificates.verdict import Verdict
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, symbols
 from certify.loop.plants import System, at_values, corners, get_system, with_input_errors
-from certify.loop.policies import TanhNetwork, load_policy
+from certify.loop.policies import PolicyNetwork, load_policy
 from certify.loop.rigorous import evaluate_vdot
 from certify.lyapunov import diagonalising_coordinates
 from certify.lyapunov.function import Quadratic
@@ -32,17 +32,17 @@ def pendulum(ranges: dict[str, tuple[Fraction, Fraction]]) -> System:
     return get_system("pendulum").with_ranges(ranges)
 
 
-def gain(lo: str, hi: str, centre: str = "none") -> tuple[System, TanhNetwork]:
+def gain(lo: str, hi: str, centre: str = "none") -> tuple[System, PolicyNetwork]:
     """xdot = q x - tanh(x): the origin attracts |x| < x* with tanh(x*) = q x*, for q below 1."""
     x, u, q = symbols("x u q")
     system = System(
         "gain", (x,), (u,), {"q": (Fraction(lo) + Fraction(hi)) / 2}, (q * x + u,), (Number(0),), box(3), box(1)
     )
-    network = TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", centre)
+    network = PolicyNetwork.of_layers((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", centre)
     return system.with_ranges({"q": (Fraction(lo), Fraction(hi))}), network
 
 
-def problem_of(system: System, network: TanhNetwork) -> tuple[Problem, np.ndarray]:
+def problem_of(system: System, network: PolicyNetwork) -> tuple[Problem, np.ndarray]:
     loop = ClosedLoop(system, network)
     P, (A, _, _) = np.eye(system.n), loop.linearise()
     return Problem(loop, Quadratic(P)), diagonalising_coordinates(P, A)
@@ -128,7 +128,9 @@ def test_a_violation_is_judged_with_the_policy_of_the_nominal_plant() -> None:
     x, u, m = symbols("x u m")
     system = System("lift", (x,), (u,), {"m": Fraction(1)}, (u - m,), (m,), box(3), box(5))
     system = system.with_ranges({"m": (Fraction(1, 2), Fraction(3, 2))})
-    network = TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "output")
+    network = PolicyNetwork.of_layers(
+        (np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "output"
+    )
     problem, T = problem_of(system, network)
     found = falsify(problem, T, 1.0)  # x' = -x + 1 - m is 1/2 - x at m = 1/2
     assert found is not None and found.level < 0.01 and confirm(problem, found)

@@ -17,7 +17,7 @@ from certify.errors import InputError
 from certify.loop.expressions import Number, symbols
 from certify.loop.plants import System
 from certify.loop.plants.equations import parse_expression
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
 from certify.report import simulated_roa_fraction
 from certify.report.figures import draw
@@ -30,7 +30,7 @@ from certify.report.sampling import SETTLED, Runs, SimulatedRoa, edge_of, quadra
 from tests.support.loops import box
 
 ONE_LEAF = PartitionTree(np.eye(2), np.ones(2), bytes([255]))
-QUIET = TanhNetwork((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+QUIET = PolicyNetwork.of_layers((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
 
 
 def plane(first: str, second: str, half: float = 1.0) -> System:
@@ -178,10 +178,12 @@ def test_a_picture_is_the_same_on_a_machine_that_is_busy(monkeypatch: pytest.Mon
 
 
 def test_how_much_is_simulated_follows_from_the_policy_alone() -> None:
-    def policy(width: int, layers: int) -> TanhNetwork:
+    def policy(width: int, layers: int) -> PolicyNetwork:
         sizes = [6, *([width] * layers), 1]
         weights = tuple(np.zeros((b, a)) for a, b in pairwise(sizes))
-        return TanhNetwork(weights, tuple(np.zeros(b) for b in sizes[1:]), np.ones(1), np.zeros(1), "tanh", "none")
+        return PolicyNetwork.of_layers(
+            weights, tuple(np.zeros(b) for b in sizes[1:]), np.ones(1), np.zeros(1), "tanh", "none"
+        )
 
     small, large, huge = Detail.of(policy(16, 2), 3), Detail.of(policy(256, 5), 3), Detail.of(policy(2048, 4), 3)
     assert small == Detail(grid=101, starts=8, steps=500, rates=200)

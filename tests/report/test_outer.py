@@ -28,7 +28,7 @@ from certify.certificates.verdict import Stop, Verdict
 from certify.errors import InputError, SoundnessError
 from certify.loop.expressions import Number, exp, sqrt, symbols
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import Neural, Polynomial, Symbolic, sampled_volume
 from certify.lyapunov.function import Quadratic
 from certify.report import render_html, summary
@@ -361,7 +361,7 @@ def proved(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
         box(1),
         units={"x": "m", "y": "m"},
     )
-    law = TanhNetwork((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    law = PolicyNetwork.of_layers((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
     N = Polynomial(np.array([[2, 0], [0, 2]]), np.array([1.0, 0.25]))
     folder = tmp_path_factory.mktemp("run")
     result = certify(system, law, folder, P=np.eye(2), level=0.25, lyapunov=N, lyapunov_level=0.9)

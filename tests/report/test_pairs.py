@@ -20,7 +20,7 @@ from certify.cli.main import _run
 from certify.errors import InputError
 from certify.loop.expressions import Number, cos, symbols
 from certify.loop.plants import System, get_system
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import extents
 from certify.lyapunov.function import Quadratic
 from certify.report import render_html, summary
@@ -43,7 +43,7 @@ def vehicle() -> System:
 
 
 def drawable(P: np.ndarray, level: float, inner: float) -> Certificate:
-    network = TanhNetwork((np.zeros((1, 4)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    network = PolicyNetwork.of_layers((np.zeros((1, 4)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     return Certificate(vehicle(), network, Quadratic(P), Asymptotic(roa=level, local=inner), FOUR)
 
 

@@ -23,7 +23,7 @@ from certify.certificates.claims import Asymptotic, Reached
 from certify.certificates.verdict import Stop, Verdict
 from certify.loop.expressions import Number
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import extents, semi_axes
 from certify.lyapunov.function import Quadratic
 from certify.report import render_html, simulated_roa_fraction, summary
@@ -44,14 +44,14 @@ from tests.support.marks import slow_after
 FROM = {"p": Fraction(6, 5), "v": Fraction(1, 2)}
 
 
-def shifted_spring() -> tuple[System, TanhNetwork]:
+def shifted_spring() -> tuple[System, PolicyNetwork]:
     """The soft spring around p = 1/2, by the values of its states."""
     system, network = soft_spring()
     return replace(system, name="shifted", x_eq=(Fraction(1, 2), Number(0))), network
 
 
 def claimed(
-    system: System, network: TanhNetwork, start: np.ndarray, centre: Sequence[float], slabs: Sequence[Slab] = ()
+    system: System, network: PolicyNetwork, start: np.ndarray, centre: Sequence[float], slabs: Sequence[Slab] = ()
 ) -> Certificate:
     """A claim that nobody has checked, with V = x'x and c2 = 1/2."""
     n = system.n

@@ -44,7 +44,7 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, Symbol, sin, symbols
 from certify.loop.plants import System, get_system
 from certify.loop.plants.ode import rk4_step
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import domain_limit, solve_lyapunov, volume
 from certify.lyapunov.function import Quadratic
 from certify.report import render_html, simulated_roa_fraction, summary
@@ -84,7 +84,7 @@ class Case:
         return render_html(self.certificate, self.answer, self.result, self.path, sha256=self.sha256, size=len(raw))
 
 
-def certified(system: System, network: TanhNetwork, folder: Path) -> Case:
+def certified(system: System, network: PolicyNetwork, folder: Path) -> Case:
     result = certify_roa(system, network, folder, RoaOptions(candidate="lyapunov"), provenance={"numpy": "1.2.3-test"})
     assert result.certificate is not None and result.checker is not None
     return Case(read_certificate(result.certificate), dict(result.checker), result.to_dict(), result.certificate)
@@ -314,7 +314,7 @@ def test_a_set_that_is_too_large_is_contradicted() -> None:
 def test_stable_linear_plants_lose_only_what_leaves_the_domain() -> None:
     x, y, u = symbols("x y u")
     system = System("decay", (x, y), (u,), {}, (-x, -y + u), (Number(0),), box(1, 1), box(1))
-    network = TanhNetwork((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    network = PolicyNetwork.of_layers((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     roa = simulated_roa_fraction(system, network, np.eye(2), 1.0, points=60)
     assert roa.attracted.all()
     assert roa.fraction == pytest.approx(math.pi / 4, abs=0.01)
@@ -359,7 +359,7 @@ def test_paths_end_where_they_leave_the_domain() -> None:
 def test_the_step_resolves_a_plant_that_is_stiff_away_from_the_origin() -> None:
     x, u = symbols("x u")
     system = System("cubic", (x,), (u,), {}, (-x - x**3 + u,), (Number(0),), box(10), box(1))
-    network = TanhNetwork((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    network = PolicyNetwork.of_layers((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     step, _ = time_scales(Flow.of(system, network))
     assert 1 / 301 <= step < 2 / 301  # the Jacobian is -301 at the domain's edge, -1 at the origin
     assert simulated_roa_fraction(system, network, np.eye(1), 1.0).attracted.all()
@@ -573,7 +573,9 @@ def hostile_certificate() -> Certificate:
     hostile = {"name": HOSTILE, "states": (x, y), "inputs": (u,), "dynamics": (-x + u, -y + sin(x))}
     for field, value in hostile.items():
         object.__setattr__(system, field, value)
-    network = TanhNetwork((np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    network = PolicyNetwork.of_layers(
+        (np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none"
+    )
     return Certificate(system, network, *claimed(np.eye(2), 0.1, 0.5), ONE_LEAF, {HOSTILE: HOSTILE})
 
 
@@ -661,7 +663,9 @@ def test_long_fractions_are_rounded_and_the_page_says_so(scalar_case: Case) -> N
 def test_a_pole_in_the_domain_does_no_harm() -> None:
     x, y, u = symbols("x y u")
     system = System("pole", (x, y), (u,), {}, (-x, -y + x**2 / (1 - x) + u), (Number(0),), box(2, 2), box(2))
-    network = TanhNetwork((np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    network = PolicyNetwork.of_layers(
+        (np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none"
+    )
     certificate = Certificate(system, network, *claimed(np.eye(2), 0.01, 0.02), ONE_LEAF)
     pictures, roa = draw(certificate, accepted=False)
     assert len(pictures) == 5 and roa is not None and roa.contradictions == 0
@@ -746,7 +750,9 @@ def test_units_are_the_certificates_own(tmp_path: Path) -> None:
     x, v, u = symbols("range speed u")
     units = {"range": "km", "speed": "<b>kn</b>", "u": "kN"}
     plant = System("pendulum", (x, v), (u,), {}, (-x + u, -v), (Number(0),), box(1, 1), box(2), units=units)
-    network = TanhNetwork((np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    network = PolicyNetwork.of_layers(
+        (np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none"
+    )
     path = tmp_path / "certificate.json"
     write_atomically(
         path, raw(Certificate(plant, network, *claimed(np.eye(2), 0.1, 0.5), ONE_LEAF, {"policy": "p.pt"}))
@@ -877,7 +883,9 @@ def practical_case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     x, y, u = symbols("x y u")
     f = (Fraction(1, 4) - x + u, -y)
     system = System("drifting", (x, y), (u,), {}, f, (Number(0),), box(2, 2), box(1))
-    network = TanhNetwork((np.array([[1.0, 0.0]]),), (np.zeros(1),), np.full(1, 0.1), np.zeros(1), "tanh", "none")
+    network = PolicyNetwork.of_layers(
+        (np.array([[1.0, 0.0]]),), (np.zeros(1),), np.full(1, 0.1), np.zeros(1), "tanh", "none"
+    )
     path = tmp_path_factory.mktemp("practical") / "certificate.json"
     write_atomically(
         path,

@@ -30,7 +30,7 @@ from certify.checker import words as checker_words
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, Symbol, symbols
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
 from certify.report import render_html, summary
 from certify.report.claims import CLAIMS, words_for
@@ -57,11 +57,11 @@ CONTINUOUS_ONLY = re.compile(
 UNPROVED_SPEED = re.compile(r"how fast is not|how fast, and at what cost|how soon")
 
 
-def gain(k: str, n: int = 1) -> TanhNetwork:
+def gain(k: str, n: int = 1) -> PolicyNetwork:
     """u = -k x_1, as it is."""
     weight = np.zeros((1, n))
     weight[0, 0] = -float(F(k))
-    return TanhNetwork((weight,), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    return PolicyNetwork.of_layers((weight,), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
 
 
 def integrator(timing: TimingInWords, *, push: bool = False) -> System:
@@ -346,7 +346,9 @@ def test_a_run_may_pass_the_level_between_two_instants() -> None:
     # t turns once in a period and carries x out and back
     system = System("detour", (x, t), (u,), {}, (-x * t, Number(0)), (Number(0),), box(9, 9), box(1),
                     sample=(F(1), F(1)))  # fmt: skip
-    flow = Flow.of(system, TanhNetwork((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none"))
+    flow = Flow.of(
+        system, PolicyNetwork.of_layers((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    )
     path = simulate(flow, np.array([[1.0, 1.0]]), 0.25, 4)
     V = quadratic(np.eye(2), path)[:, 0]
     level = float(V[0])

@@ -24,7 +24,7 @@ from certify.certificates.verdict import Verdict
 from certify.loop.expressions import Number, symbols
 from certify.loop.plants import System
 from certify.loop.plants.equations import parse_expression
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import extents, semi_axes, volume
 from certify.lyapunov.function import Quadratic
 from certify.report import render_html, simulated_roa_fraction, summary
@@ -43,21 +43,21 @@ from tests.report.test_report import Page, exactly
 from tests.support.loops import box, chain, scalar_tanh
 from tests.support.marks import slow_after
 
-QUIET = TanhNetwork((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+QUIET = PolicyNetwork.of_layers((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
 
 
-def soft_spring() -> tuple[System, TanhNetwork]:
+def soft_spring() -> tuple[System, PolicyNetwork]:
     """p' = v, v' = -p + p^3/4 - 2 v + u under one tanh."""
     p, v, u = symbols("p v u")
     f = (v, -p + p**3 / 4 - 2 * v + u)
     units = {"p": "m", "v": "m/s", "u": "N"}
     system = System("soft_spring", (p, v), (u,), {}, f, (Number(0),), box(2, 2), box(1), units=units)
     weights = (np.array([[-0.3, -0.2]]),)
-    return system, TanhNetwork(weights, (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    return system, PolicyNetwork.of_layers(weights, (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
 
 
 def enlarged(
-    system: System, network: TanhNetwork, start: np.ndarray, slabs: Sequence[Slab] = (), level: float = 0.5
+    system: System, network: PolicyNetwork, start: np.ndarray, slabs: Sequence[Slab] = (), level: float = 0.5
 ) -> Certificate:
     """A claim that nobody has checked, with V = x'x."""
     n = system.n

@@ -20,7 +20,7 @@ from certify.certificates.claims import Asymptotic, Practical
 from certify.certificates.verdict import Verdict
 from certify.loop.expressions import Number, cos, sin, symbols
 from certify.loop.plants import System, at_values, with_input_errors
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
 from certify.report import render_html, summary
 from certify.report.figures.paper import PaperOptions, paper_figure
@@ -33,7 +33,7 @@ F = Fraction
 HALF = ((F(-1), F(1)),)
 
 
-def spring() -> tuple[System, TanhNetwork]:
+def spring() -> tuple[System, PolicyNetwork]:
     """The soft spring with a stiffness, and a wind."""
     system, network = soft_spring()
     p, v, u, k, wind = symbols("p v u k wind")
@@ -47,7 +47,7 @@ def spring() -> tuple[System, TanhNetwork]:
     )  # fmt: skip
 
 
-def claimed(system: System, network: TanhNetwork, *, practical: bool = False) -> Certificate:
+def claimed(system: System, network: PolicyNetwork, *, practical: bool = False) -> Certificate:
     """A claim that nobody has checked."""
     n = system.n
     claim = Practical(roa=0.5, local=0.1, floor=0.1) if practical else Asymptotic(roa=0.5, local=0.5)
@@ -188,7 +188,7 @@ def test_a_name_alone_covers_no_rounding() -> None:
 def test_inputs_without_an_error_must_be_exact() -> None:
     x, a, b = symbols("x a b")
     system = System("two", (x,), (a, b), {}, (-x + a - b,), (Number(0),) * 2, HALF, HALF * 2)
-    network = TanhNetwork((np.zeros((2, 1)),), (np.zeros(2),), np.ones(2), np.zeros(2), "tanh", "none")
+    network = PolicyNetwork.of_layers((np.zeros((2, 1)),), (np.zeros(2),), np.ones(2), np.zeros(2), "tanh", "none")
     said = outside(page(claimed(with_input_errors(system, {"b": F(1, 100)}), network, practical=True)))
     assert "error_b(t) within ±0.01" in said and "a must be exact." in said
 
@@ -197,7 +197,7 @@ def test_names_in_equations_are_typeset_as_they_are() -> None:
     """A quantity called I or lambda is no unit and no keyword, and its markup is escaped like every other name."""
     x, u, i = symbols("x u I")
     system = System("s", (x,), (u,), {"I": F(2)}, (-x / i + u,), (Number(0),), HALF, HALF)
-    network = TanhNetwork((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    network = PolicyNetwork.of_layers((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     html = render_html(claimed(system.with_ranges({"I": (F(1), F(3))}), network), None, None, Path("c.json"))
     assert "<mi>I</mi>" in html and "I(t) in [1, 3]" in html
 

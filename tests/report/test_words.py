@@ -21,7 +21,7 @@ from certify.certificates import read_certificate
 from certify.certificates.verdict import Stop
 from certify.cli.main import _run
 from certify.loop.plants import load_system
-from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_policy
 from certify.report import summary
 from certify.report.figures.portrait import keys
 from certify.report.figures.scene import Scene
@@ -46,14 +46,14 @@ def bent(system: str = "pendulum") -> Policy:
     first = np.vstack([s * K, [[3.0, 0.0]], [[3.0, 1e-9]]])
     last = np.array([[1 / s, 300.0, -300.0]])
     layers, biases = (first, last), (np.zeros(3), np.zeros(1))
-    return Policy(TanhNetwork(layers, biases, np.ones(1), np.zeros(1), "identity", "none"), system, {})
+    return Policy(PolicyNetwork.of_layers(layers, biases, np.ones(1), np.zeros(1), "identity", "none"), system, {})
 
 
 @pytest.fixture(scope="module")
 def beside(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
     """The levitated ball under a policy that is not centred: its loop rests half a millimetre below where it should."""
     stored = load_policy(EXAMPLES / "policies" / "maglev.pt").network
-    off = replace(stored, centre="none", biases=(*stored.biases[:-1], stored.biases[-1] + 0.01))
+    off = stored.with_layers(centre="none", biases=(*stored.biases[:-1], stored.biases[-1] + 0.01))
     return certify_roa(load_system(MAGLEV), off, tmp_path_factory.mktemp("beside"), RoaOptions(effort=0.4))
 
 
@@ -151,8 +151,10 @@ def test_flattening_is_not_suggested_to_whom_it_cannot_help(tmp_path: Path) -> N
     assert not diagnose(replace(short, tried=()), RoaOptions(), None).next.flattens
     assert not diagnose(replace(short, stop=Stop.WITNESS), RoaOptions(), None).next.flattens
     K = np.array([[-8.0, -2.0]])
-    linear = TanhNetwork((K,), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
-    flat = TanhNetwork((1e-3 * K, np.array([[1e3]])), (np.zeros(1),) * 2, np.ones(1), np.zeros(1), "identity", "none")
+    linear = PolicyNetwork.of_layers((K,), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    flat = PolicyNetwork.of_layers(
+        (1e-3 * K, np.array([[1e3]])), (np.zeros(1),) * 2, np.ones(1), np.zeros(1), "identity", "none"
+    )
     for network in (linear, flat):
         assert not diagnose(replace(short, network=network), RoaOptions(), None).next.flattens
 

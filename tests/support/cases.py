@@ -9,7 +9,7 @@ import numpy as np
 from certify.certificates.claims import Problem
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import diagonalising_coordinates, solve_lyapunov
 from certify.lyapunov.function import Quadratic
 
@@ -30,7 +30,7 @@ class Case:
         return self.problem.V.P
 
 
-def case_of(system: System, network: TanhNetwork, P: np.ndarray | None = None) -> Case:
+def case_of(system: System, network: PolicyNetwork, P: np.ndarray | None = None) -> Case:
     """V from the Lyapunov equation with Q = I, unless P is given."""
     loop = ClosedLoop(system, network)
     A, _, _ = loop.linearise()

@@ -10,7 +10,7 @@ import numpy as np
 from certify.loop.expressions import Expression, Number, Operation, Symbol, function, nodes, sin, symbols, tanh
 from certify.loop.plants import System
 from certify.loop.plants.equations import parse_expression
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from tests.support.loops import box
 
 X, Y, U = symbols("x y u")
@@ -78,7 +78,7 @@ def plant(states: str, *equations: str, half: float | str = 3, bound: float = 4,
     )  # fmt: skip
 
 
-def regulator(*gain: float, scale: float = 4.0) -> TanhNetwork:
+def regulator(*gain: float, scale: float = 4.0) -> PolicyNetwork:
     """u = -scale tanh(gain.x / scale)."""
     layer = -np.array([gain]) / scale
-    return TanhNetwork((layer,), (np.zeros(1),), np.array([scale]), np.zeros(1), "tanh", "none")
+    return PolicyNetwork.of_layers((layer,), (np.zeros(1),), np.array([scale]), np.zeros(1), "tanh", "none")

@@ -11,7 +11,7 @@ import scipy.linalg
 from certify.loop.activations import ACTIVATIONS
 from certify.loop.expressions import Number, Symbol, atan, exp, sqrt, symbols, tanh
 from certify.loop.plants import System
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 
 
 def box(*half_widths: float | str) -> tuple[tuple[Fraction, Fraction], ...]:
@@ -19,7 +19,7 @@ def box(*half_widths: float | str) -> tuple[tuple[Fraction, Fraction], ...]:
     return tuple((-Fraction(d), Fraction(d)) for d in half_widths)
 
 
-def scalar_tanh() -> tuple[System, TanhNetwork]:
+def scalar_tanh() -> tuple[System, PolicyNetwork]:
     """xdot = x/2 - tanh(x): the origin attracts exactly |x| < 1.915008048..."""
     x, u = symbols("x u")
     system = System(
@@ -32,20 +32,22 @@ def scalar_tanh() -> tuple[System, TanhNetwork]:
         domain=box(3),
         input_bounds=box(1),
     )
-    network = TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    network = PolicyNetwork.of_layers((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     return system, network
 
 
-def scalar_clip() -> tuple[System, TanhNetwork]:
+def scalar_clip() -> tuple[System, PolicyNetwork]:
     """xdot = x/2 - 2 clip(x, -1/2, 1/2): the origin attracts exactly |x| < 2, and the clip acts for |x| > 1/2."""
     system, _ = scalar_tanh()
     x, u = system.states[0], system.inputs[0]
     ends = np.array([-0.5]), np.array([0.5])
-    network = TanhNetwork((np.array([[1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none", ends)
+    network = PolicyNetwork.of_layers(
+        (np.array([[1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none", ends
+    )
     return dataclasses.replace(system, name="saturated", dynamics=(x / 2 - 2 * u,)), network
 
 
-def tank() -> tuple[System, TanhNetwork]:
+def tank() -> tuple[System, PolicyNetwork]:
     """xdot = x/9 + u - sqrt(16 + x), u = 4: the origin attracts, and x > -16 leaves it from x = 9 on."""
     x, u = symbols("x u")
     system = System(
@@ -58,11 +60,13 @@ def tank() -> tuple[System, TanhNetwork]:
         domain=box(15),
         input_bounds=box(5),
     )
-    network = TanhNetwork((np.zeros((1, 1)),), (np.array([4.0]),), np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers(
+        (np.zeros((1, 1)),), (np.array([4.0]),), np.ones(1), np.zeros(1), "identity", "none"
+    )
     return system, network
 
 
-def valve() -> tuple[System, TanhNetwork]:
+def valve() -> tuple[System, PolicyNetwork]:
     """Two states and every function of equations beside sin, cos and tan, at points where they are known exactly."""
     x, y, u = symbols("x y u")
     system = System(
@@ -79,11 +83,13 @@ def valve() -> tuple[System, TanhNetwork]:
         input_bounds=box(9),
     )
     gain = np.array([[-1.5, -1.0]])
-    network = TanhNetwork((gain,), (np.zeros(1),), np.full(1, 2.0), np.array([1.0]), "tanh", "preactivation")
+    network = PolicyNetwork.of_layers(
+        (gain,), (np.zeros(1),), np.full(1, 2.0), np.array([1.0]), "tanh", "preactivation"
+    )
     return system, network
 
 
-def chain(n: int, poles: list[float]) -> tuple[System, TanhNetwork]:
+def chain(n: int, poles: list[float]) -> tuple[System, PolicyNetwork]:
     """An integrator chain of n states under linear feedback that places `poles` exactly (up to integers)."""
     coefficients = np.poly(poles)[:0:-1].real.round(9)  # of s^0 .. s^(n-1)
     x = symbols(f"x{i}" for i in range(1, n + 1))
@@ -98,7 +104,9 @@ def chain(n: int, poles: list[float]) -> tuple[System, TanhNetwork]:
         domain=box(*[1 + Fraction(i, 2) for i in range(n)]),
         input_bounds=box(10_000),
     )
-    network = TanhNetwork((-coefficients[None, :],), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers(
+        (-coefficients[None, :],), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none"
+    )
     return system, network
 
 
@@ -111,7 +119,7 @@ def saturated_lqr(
     centre: str,
     seed: int,
     activation: str = "tanh",
-) -> TanhNetwork:
+) -> PolicyNetwork:
     """A policy near u = offset + scale tanh(-Kx/scale): random features, last layer by least squares.
 
     K (m, n); spread (n,): half-widths of the states over which it is fitted.
@@ -132,13 +140,13 @@ def saturated_lqr(
         h, h0 = phi(h @ W.T + b), phi(h0 @ W.T + b)
     importance = np.where(np.arange(len(x)) < 4000, 1.0, 3000.0)[:, None]
     last, *_ = np.linalg.lstsq((h - h0) * importance, -(x @ K.T) / scale * importance, rcond=1e-6)
-    return TanhNetwork(
+    return PolicyNetwork.of_layers(
         *((*weights, last.T), (*biases, np.full(m, 0.1)), np.full(m, scale), np.full(m, offset), "tanh", centre),
         activation=activation,
     )
 
 
-def pendulum_network(widths: tuple[int, ...] = (16, 16), centre: str = "preactivation", seed: int = 0) -> TanhNetwork:
+def pendulum_network(widths: tuple[int, ...] = (16, 16), centre: str = "preactivation", seed: int = 0) -> PolicyNetwork:
     """A policy for the pendulum that stabilises it."""
     return saturated_lqr(np.array([[2.8, 0.95]]), 6.0, 0.0, [2.0, 8.0], widths, centre, seed)
 

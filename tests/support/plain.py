@@ -20,7 +20,7 @@ from certify.checker.networks import Affine, Map, Network, Step
 from certify.checker.outer import Function
 
 if TYPE_CHECKING:
-    from certify.loop.policies import TanhNetwork
+    from certify.loop.policies import PolicyNetwork
 
 Array = NDArray[np.float64]
 Pair = tuple[Any, Any]
@@ -197,7 +197,7 @@ def chain(weights: Sequence[Array], biases: Sequence[Array], name: str = "policy
     return Network(name, weights[0].shape[1], tuple(steps))
 
 
-def policy(given: TanhNetwork) -> Policy:
+def policy(given: PolicyNetwork) -> Policy:
     """A policy of the producer as the checker has it."""
     origin = given.origin if given.is_moved else None
     own = given.scale, given.offset, given.squash, given.centre, given.clip, origin

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 
 Array = np.ndarray[Any, np.dtype[Any]]
 f32 = np.float32
@@ -29,7 +29,7 @@ class Machine:
     folded: bool = True
     tanh: Callable[[Array], Array] = np.tanh
 
-    def __call__(self, network: TanhNetwork, u_eq: Sequence[Fraction], x: Array) -> Array:
+    def __call__(self, network: PolicyNetwork, u_eq: Sequence[Fraction], x: Array) -> Array:
         """The inputs (N, m) for states (N, n), which are rounded first."""
         h = self._kept(x.astype(f32))
         without = network.folded(u_eq)
@@ -101,10 +101,10 @@ def off_by(ulps: float) -> Callable[[Array], Array]:
     return tanh
 
 
-def by_torch(network: TanhNetwork, u_eq: Sequence[Fraction], x: Array) -> Array:
+def by_torch(network: PolicyNetwork, u_eq: Sequence[Fraction], x: Array) -> Array:
     """What torch makes of the policy in float32, with its own products and its own tanh."""
     without = network.folded(u_eq)
-    single = TanhNetwork(  # its numbers stay what they are; the tensors made of them are float32
+    single = PolicyNetwork.of_layers(  # its numbers stay what they are; the tensors made of them are float32
         without.weights, without.biases, without.scale, without.offset, without.squash, "none", without.clip
     )
     return single(torch.tensor(x, dtype=torch.float32), u_eq).numpy()

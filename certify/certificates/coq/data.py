@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates.coq.expression import Expression, from_tree, rational
-from certify.certificates.encoding import layers_of, network_named
+from certify.certificates.encoding import network_named
 from certify.certificates.formats import SCHEMA, other_version
 from certify.errors import CertificateFormatError, InputError
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 
 Array = NDArray[np.float64]
 Interval = tuple[Fraction, Fraction]
@@ -71,7 +71,7 @@ class Claimed:
     domain: tuple[Interval, ...]
     u_eq: tuple[Fraction, ...]
     bounds: tuple[Interval, ...]
-    network: TanhNetwork
+    network: PolicyNetwork
     P: Array
     level: float
     rate: float
@@ -171,8 +171,8 @@ def _require_supported(claim: Any, networks: Any, plant: Any, policy: Any, lyapu
             raise InputError(f"the certificate must be one that Coq's statement covers; found {what[:80]}. {_WHAT_IS}.")
 
 
-def _network(policy: Mapping[str, Any], stated: Mapping[str, Any], n: int, m: int) -> TanhNetwork:
-    layers, steps = layers_of(stated), stated["steps"]
+def _network(policy: Mapping[str, Any], stated: Mapping[str, Any], n: int, m: int) -> PolicyNetwork:
+    layers, steps = _layers(stated), stated["steps"]
     if set(stated) != set(_NETWORK_KEYS) or not isinstance(steps, list) or len(steps) > _MOST_STEPS:
         raise CertificateFormatError(
             f"the policy's network must have exactly the keys {', '.join(_NETWORK_KEYS)}, and a list of at most "
@@ -195,7 +195,7 @@ def _network(policy: Mapping[str, Any], stated: Mapping[str, Any], n: int, m: in
         raise CertificateFormatError(f"a layer must have at most {_MOST_ROWS} rows; found the shapes {shapes}.")
     if shapes[0][1] != n or shapes[-1][0] != m or any(b[1] != a[0] for a, b in pairwise(shapes)):
         raise CertificateFormatError(f"the layers must lead from {n} states to {m} inputs; found the shapes {shapes}.")
-    return TanhNetwork(
+    return PolicyNetwork.of_layers(
         tuple(_array(layer["weight"], shape, "a weight") for layer, shape in zip(layers, shapes, strict=True)),
         tuple(_array(layer["bias"], shape[:1], "a bias") for layer, shape in zip(layers, shapes, strict=True)),
         scale=_array(policy["scale"], (m,), "scale"),
@@ -203,6 +203,18 @@ def _network(policy: Mapping[str, Any], stated: Mapping[str, Any], n: int, m: in
         squash=policy["squash"],
         centre=policy["centre"],
     )
+
+
+def _layers(network: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The affine steps of a network that has tanh between them, each of the vector just before."""
+    kinds = [(step["kind"], step["of"], step.get("function", "tanh")) for step in network["steps"]]
+    expected = [(("affine", "map")[k % 2], [k], "tanh") for k in range(len(kinds))]
+    if kinds != expected or len(kinds) % 2 == 0:
+        raise CertificateFormatError(
+            f"the network {network['name']} must be of affine steps with tanh between them, each of the vector just "
+            "before; found others, which the checkers read but Coq's statement does not yet."
+        )
+    return list(network["steps"][::2])
 
 
 def _names(value: Any, name: str) -> dict[str, int]:

@@ -1,9 +1,17 @@
-"""Tanh policies: exact layers, centring, and the policy file."""
+"""Policies: exact networks, centring, and the policy file."""
 
 from __future__ import annotations
 
 from certify.loop.policies.exact import bounded_by_form, require_centred
 from certify.loop.policies.file import Policy, load_policy, save_policy
-from certify.loop.policies.network import Centre, TanhNetwork
+from certify.loop.policies.network import Centre, PolicyNetwork
 
-__all__ = ["Centre", "Policy", "TanhNetwork", "bounded_by_form", "load_policy", "require_centred", "save_policy"]
+__all__ = [
+    "Centre",
+    "Policy",
+    "PolicyNetwork",
+    "bounded_by_form",
+    "load_policy",
+    "require_centred",
+    "save_policy",
+]

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 
 import numpy as np
 
 from certify.errors import InputError
 from certify.loop.activations import ACTIVATIONS
-from certify.loop.policies.network import TanhNetwork
+from certify.loop.expressions import Expression, Symbol, value_if_rational
+from certify.loop.networks import Affine, Algebra, Clip, Concat, Map, Observe, Sum
+from certify.loop.policies.network import PolicyNetwork
 
+Exact = list[Fraction | None]
 _NEAR = 1e-9
 _MOST_BITS = 2**16  # of a number, beyond which it counts as unknown: sums of fractions grow from layer to layer
 
 
-def bounded_by_form(network: TanhNetwork, bounds: Sequence[tuple[Fraction, Fraction]]) -> bool:
+def bounded_by_form(network: PolicyNetwork, bounds: Sequence[tuple[Fraction, Fraction]]) -> bool:
     """True if squash, centring and clip keep every input in its bounds `(lo, hi)`, whatever the state.
 
     The clip comes last and is monotone: it maps a range [a, b] to the range between the clipped a and b. That need not
@@ -35,24 +38,54 @@ def bounded_by_form(network: TanhNetwork, bounds: Sequence[tuple[Fraction, Fract
     return all(lo <= a and b <= hi for (a, b), (lo, hi) in zip(ranges, bounds, strict=True))
 
 
-def raw_at_origin(network: TanhNetwork) -> tuple[Fraction | None, ...]:
+def raw_at_origin(network: PolicyNetwork) -> tuple[Fraction | None, ...]:
     """raw(0) as rationals, (m,), x = 0 being the network's origin; None where a function has no rational value.
 
     A weight of exact 0 removes an unknown value.
     """
-    h: list[Fraction | None] = [Fraction(float(v)) for v in network.origin]
-    last, phi, squash = len(network.weights) - 1, network.phi, ACTIVATIONS["tanh"]
-    for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
-        y = [_affine(row, h, float(c)) for row, c in zip(W, b, strict=True)]
-        of = phi if k < last else squash
-        h = [None if v is None else of.exact(v) for v in y] if k < last or network.squash == "tanh" else y
+    h = _Rationals().run(network.network, [Fraction(float(v)) for v in network.origin])
+    if network.squash == "tanh":
+        h = [None if v is None else ACTIVATIONS["tanh"].exact(v) for v in h]
     return tuple(
         None if v is None else Fraction(float(s)) * v + Fraction(float(o))
         for v, s, o in zip(h, network.scale, network.offset, strict=True)
     )
 
 
-def at_origin(network: TanhNetwork) -> tuple[Fraction | None, ...]:
+class _Rationals(Algebra[Exact]):
+    """Vectors of rationals, None for a number that rationals do not know."""
+
+    def affine(self, step: Affine, v: Exact) -> Exact:
+        return [_affine(row, v, float(c)) for row, c in zip(step.weight, step.bias, strict=True)]
+
+    def map(self, step: Map, v: Exact) -> Exact:
+        return [None if q is None else step.phi.exact(q) for q in v]
+
+    def clip(self, step: Clip, v: Exact) -> Exact:
+        ends = ([Fraction(float(e)) for e in end] for end in (step.lo, step.hi))
+        return [None if q is None else min(max(q, lo), hi) for q, lo, hi in zip(v, *ends, strict=True)]
+
+    def sum(self, step: Sum, *vectors: Exact) -> Exact:
+        return [None if None in row else sum(q for q in row if q is not None) for row in zip(*vectors, strict=True)]
+
+    def concat(self, step: Concat, *vectors: Exact) -> Exact:
+        return [q for v in vectors for q in v]
+
+    def observe(self, step: Observe, v: Exact) -> Exact:
+        known = {s: q for s, q in zip(step.symbols, v, strict=True) if q is not None}
+        unknown = [s for s in step.symbols if s not in known]
+        return [_expression(e, known, unknown) for e in step.expressions]
+
+
+def _expression(e: Expression, known: Mapping[Symbol, Fraction], unknown: Sequence[Symbol]) -> Fraction | None:
+    try:
+        value = value_if_rational(e, known, unknown)
+    except InputError:  # it divides by 0, or the like
+        return None
+    return None if isinstance(value, str) else value
+
+
+def at_origin(network: PolicyNetwork) -> tuple[Fraction | None, ...]:
     """pi(0) of a policy without centring as rationals, (m,); None where raw(0) is not known."""
     raw = raw_at_origin(network)
     if network.clip is None:
@@ -61,7 +94,7 @@ def at_origin(network: TanhNetwork) -> tuple[Fraction | None, ...]:
     return tuple(None if v is None else min(max(v, lo), hi) for v, lo, hi in zip(raw, *ends, strict=True))
 
 
-def require_centred(network: TanhNetwork, u_eq: Sequence[Fraction], names: Sequence[str] = ()) -> None:
+def require_centred(network: PolicyNetwork, u_eq: Sequence[Fraction], names: Sequence[str] = ()) -> None:
     """Refuse a policy whose `pi(0) = u_eq` does not hold exactly; `names` are what the message calls its inputs.
 
     Raises
@@ -85,17 +118,24 @@ def require_centred(network: TanhNetwork, u_eq: Sequence[Fraction], names: Seque
             )
 
 
-def _found(network: TanhNetwork, value: Fraction | None, about: float, wanted: float) -> str:
+def _found(network: PolicyNetwork, value: Fraction | None, about: float, wanted: float) -> str:
     """pi(0) of an input in words, `about` being it in floats."""
     if value is not None:
         return f"{float(value)!r}, exactly {_short(value)}"
     near = math.isclose(about, wanted, rel_tol=_NEAR, abs_tol=_NEAR)
-    why = f"{network.activation} at the operating point gives no fraction"
+    why = f"{_inside(network)} at the operating point gives no fraction"
     undecided = f", and whether exactly that cannot be decided: {why}" if near else ""
     return f"about {about:.9g}{undecided}"
 
 
-def _centrings(network: TanhNetwork, u_eq: Sequence[Fraction]) -> str:
+def _inside(network: PolicyNetwork) -> str:
+    """What is in the network that rationals may not know."""
+    return (
+        " or ".join([*network.network.functions, *(["an observation"] if network.network.operations else [])]) or "tanh"
+    )
+
+
+def _centrings(network: PolicyNetwork, u_eq: Sequence[Fraction]) -> str:
     """The options that centre it: inside the squash only if u_eq is in its range."""
     reaches = zip(u_eq, network.scale.tolist(), network.offset.tolist(), strict=True)
     inside = network.squash == "tanh" and all(abs(float(u) - o) < abs(s) for u, s, o in reaches)

@@ -1,14 +1,15 @@
 """The policy file: plain tensors only. It is `certify-policy/1`, with a clip or bounds of validity `certify-policy/2`,
-with another activation than tanh `certify-policy/3`.
+with another activation than tanh `certify-policy/3`, and with other steps than layers `certify-policy/4`.
 
 Nothing in a file is executed, and equal policies give equal bytes (see `certify.loop.files.plain`).
 """
 
 from __future__ import annotations
 
+import json
 import shlex
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -17,17 +18,25 @@ from typing import Any, cast
 
 import numpy as np
 
-from certify.errors import InputError
+from certify.errors import CertificateFormatError, InputError
 from certify.loop.activations import ACTIVATIONS
+from certify.loop.expressions import Symbol, from_tree, to_tree
+from certify.loop.files.arrays import Numbers
 from certify.loop.files.plain import array_in, layers_in, origin_in, read_plain, require_keys, tensors, write_plain
-from certify.loop.policies.network import Array, Centre, Squash, TanhNetwork
+from certify.loop.networks import Affine, Clip, Concat, Map, Network, Observe, Step, Sum, layered
+from certify.loop.policies.network import Array, Centre, PolicyNetwork, Squash
 
 FORMAT = "certify-policy/1"
 # The same with `output.clip`, a pair of tensors, or `valid`, a tensor (n, 2), or both; others stay version 1.
 SECOND = "certify-policy/2"
 # The same with another `activation`.
 THIRD = "certify-policy/3"
-_KEYS = {"format", "activation", "weights", "biases", "output", "centre", "system"}
+# The same with `reads` and `steps` in the place of `activation`, `weights` and `biases`.
+FOURTH = "certify-policy/4"
+_LAYERS = {"activation", "weights", "biases"}
+_KEYS = {"format", "output", "centre", "system"}
+_ARRAYS = {"affine": ("weight", "bias"), "clip": ("lo", "hi")}  # of a step
+_PARTS = {"map": {"function"}, "observe": {"names", "expressions"}}  # and what else it has
 _OPTIONAL = {"training", "beta", "valid"}
 _WHAT = "policy file"
 _START = 4096
@@ -59,7 +68,7 @@ class Policy:
     InputError : the bounds are not n pairs lo < 0 < hi, or bound nothing.
     """
 
-    network: TanhNetwork
+    network: PolicyNetwork
     system: str
     parameters: Mapping[str, float | int | str] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
@@ -109,17 +118,15 @@ def save_policy(path: str | Path, policy: Policy) -> None:
     ------
     InputError : the file cannot be written.
     """
-    network, depth = policy.network, len(policy.network.weights)
+    network = policy.network
     if network.is_moved:
         raise InputError("a policy must be written as its layers read it; found one that is looked at from elsewhere.")
-    arrays = (*network.weights, *network.biases, network.scale, network.offset, *(network.clip or ()))
-    numbers = tensors(arrays)
-    scale, offset, *clip = numbers[2 * depth :]
+    of_steps = [a for step in network.network.steps for a in step.arrays]
+    numbers = tensors((*of_steps, network.scale, network.offset, *(network.clip or ())))
+    scale, offset, *clip = numbers[len(of_steps) :]
     data: dict[str, Any] = {
         "format": _format_of(policy),
-        "activation": network.activation,
-        "weights": numbers[:depth],
-        "biases": numbers[depth : 2 * depth],
+        **_program(network.network, iter(numbers)),
         "output": {"squash": network.squash, "scale": scale, "offset": offset},
         "centre": network.centre,
         "system": {"name": policy.system, "parameters": dict(policy.parameters)},
@@ -134,8 +141,29 @@ def save_policy(path: str | Path, policy: Policy) -> None:
     write_plain(path, data, _WHAT)
 
 
+def _program(network: Network, numbers: Iterator[Numbers]) -> dict[str, Any]:
+    """The steps, whose arrays come as numbers in their order; of a chain its layers."""
+    if network.is_chain:
+        of_layers = [(next(numbers), next(numbers)) for _ in network.affine]
+        weights, biases = (list(column) for column in zip(*of_layers, strict=True))
+        return {"activation": next(iter(network.functions), "tanh"), "weights": weights, "biases": biases}
+    steps = []
+    for step in network.steps:
+        part: dict[str, Any] = {"kind": step.kind, "of": list(step.of)}
+        part |= {name: next(numbers) for name in _ARRAYS.get(step.kind, ())}
+        if isinstance(step, Map):
+            part["function"] = step.function
+        if isinstance(step, Observe):
+            part["names"] = [s.name for s in step.symbols]
+            part["expressions"] = json.dumps([to_tree(e) for e in step.expressions])
+        steps.append(part)
+    return {"reads": network.reads, "steps": steps}
+
+
 def _format_of(policy: Policy) -> str:
     """The oldest version of the format that holds it."""
+    if not policy.network.network.is_chain:
+        return FOURTH
     if policy.network.activation != "tanh":
         return THIRD
     return FORMAT if policy.network.clip is None and policy.valid is None else SECOND
@@ -153,8 +181,8 @@ def load_policy(path: str | Path) -> Policy:
 
     Raises
     ------
-    InputError : the file is missing, is not an archive of plain tensors, does not follow `certify-policy/1`,
-        `certify-policy/2` or `certify-policy/3`, or is another program's; then the message says how to import it.
+    InputError : the file is missing, is not an archive of plain tensors, follows none of the four
+        versions, or is another program's; then the message says how to import it.
     """
     try:
         data = read_plain(path, _WHAT)
@@ -216,39 +244,88 @@ def _to_import(path: Path, found: str) -> str:
 
 def _policy(data: Any) -> Policy:
     found = data.get("format") if isinstance(data, dict) else type(data).__name__
-    if not isinstance(data, dict) or found not in (FORMAT, SECOND, THIRD):
-        raise InputError(f"`format` must be {FORMAT!r}, {SECOND!r} or {THIRD!r}; found {found!r}.")
+    if not isinstance(data, dict) or found not in (FORMAT, SECOND, THIRD, FOURTH):
+        raise InputError(f"`format` must be {FORMAT!r}, {SECOND!r}, {THIRD!r} or {FOURTH!r}; found {found!r}.")
     keys, output = set(data), data.get("output")
     parts = {"squash", "scale", "offset"}
     if found == SECOND and isinstance(output, dict) and ("clip" in output or "valid" not in keys):
         parts |= {"clip"}  # one of the two is what makes a file version 2
-    if found == THIRD and isinstance(output, dict) and "clip" in output:
+    if found in (THIRD, FOURTH) and isinstance(output, dict) and "clip" in output:
         parts |= {"clip"}
     if found == FORMAT and "valid" in keys:
         raise InputError(f"`valid` must go with format {SECOND!r}; found {FORMAT!r}.")
-    require_keys(data, _KEYS, _OPTIONAL)
-    _require_activation(found, data["activation"])
+    require_keys(data, _KEYS | ({"reads", "steps"} if found == FOURTH else _LAYERS), _OPTIONAL)
     if not isinstance(output, dict) or set(output) != parts:
         raise InputError(f"`output` of {found} must be a dictionary with exactly {', '.join(sorted(parts))}.")
     clip = output.get("clip", ())
     if not isinstance(clip, list | tuple) or len(clip) != (2 if "clip" in parts else 0):
         raise InputError("`output.clip` must be a list of two tensors, lo and hi.")
     system, parameters, training = origin_in(data)
-    weights, biases = layers_in(data)
-    network = TanhNetwork(
-        weights=weights,
-        biases=biases,
+    network = PolicyNetwork(
+        _read_steps(data) if found == FOURTH else _read_layers(data),
         scale=array_in(output["scale"], "output.scale"),
         offset=array_in(output["offset"], "output.offset"),
         squash=cast(Squash, output["squash"]),
         centre=cast(Centre, data["centre"]),
         clip=cast(Any, tuple(array_in(end, "output.clip") for end in clip) or None),
-        activation=data["activation"],
     )
-    if network.activation != data["activation"]:
-        raise InputError(f"`activation` must be 'tanh' of a policy with one layer; found {data['activation']!r}.")
     beta = array_in(data["beta"], "beta") if "beta" in data else None
     if beta is not None and (beta.shape != (network.m,) or network.centre != "preactivation"):
         raise InputError(f"`beta` must have shape ({network.m},) and goes with centre 'preactivation'.")
     valid = array_in(data["valid"], "valid") if "valid" in data else None
     return Policy(network, system, parameters, training, beta, valid)
+
+
+def _read_layers(data: Mapping[str, Any]) -> Network:
+    version, function = data["format"], data["activation"]
+    _require_activation(version, function)
+    weights, biases = layers_in(data)
+    network = Network(int(np.shape(weights[0])[-1]) if weights else 0, layered(weights, biases, function, "the policy"))
+    if len(weights) == 1 and function != "tanh":
+        raise InputError(f"`activation` must be 'tanh' of a policy with one layer; found {function!r}.")
+    return network
+
+
+def _read_steps(data: Mapping[str, Any]) -> Network:
+    reads, steps = data["reads"], data["steps"]
+    if type(reads) is not int or reads < 1 or not isinstance(steps, list):
+        raise InputError("`reads` must be a number of states, `steps` a list.")
+    network = Network(reads, tuple(_read_step(step, f"steps[{k}]") for k, step in enumerate(steps)))
+    if network.is_chain:
+        raise InputError(f"layers with a function between them must go with format {THIRD!r} or an earlier one.")
+    return network
+
+
+def _read_step(step: Any, name: str) -> Step:
+    kind = step.get("kind") if isinstance(step, dict) else None
+    kinds: dict[Any, type[Step]] = {of.kind: of for of in (Affine, Map, Clip, Sum, Concat, Observe)}
+    if not isinstance(kind, str) or kind not in kinds:
+        raise InputError(f"`{name}.kind` must be one of {', '.join(kinds)}; found {kind!r}.")
+    arrays = _ARRAYS.get(kind, ())
+    require_keys(step, {"kind", "of", *arrays} | _PARTS.get(kind, set()), set())
+    of = step["of"]
+    if not isinstance(of, list) or not all(type(i) is int for i in of):
+        raise InputError(f"`{name}.of` must be a list of numbers of vectors; found {of!r:.60}.")
+    if len(of) != 1 and kind not in ("sum", "concat"):
+        raise InputError(f"`{name}.of` must be one vector; found {of!r:.60}.")
+    if kind == "map" and step["function"] not in ACTIVATIONS:
+        raise InputError(f"`{name}.function` must be one of {', '.join(ACTIVATIONS)}; found {step['function']!r:.60}.")
+    others = [array_in(step[part], f"{name}.{part}") for part in arrays]
+    if kind == "map":
+        others = [step["function"]]
+    if kind == "observe":
+        others = _read_observation(step, name)
+    return kinds[kind](tuple(of), *others)
+
+
+def _read_observation(step: Mapping[str, Any], name: str) -> list[Any]:
+    names, text = step["names"], step["expressions"]
+    if not isinstance(names, list) or not all(isinstance(s, str) and s.isidentifier() for s in names):
+        raise InputError(f"`{name}.names` must be a list of names; found {names!r:.60}.")
+    symbols = {s: Symbol(s) for s in names}
+    try:
+        trees = json.loads(text)
+        expressions = tuple(from_tree(tree, symbols) for tree in trees)
+    except (ValueError, TypeError, RecursionError, CertificateFormatError) as error:
+        raise InputError(f"`{name}.expressions` must be a text of expressions as lists: {error}.") from error
+    return [tuple(map(Symbol, names)), expressions]

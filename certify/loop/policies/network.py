@@ -1,5 +1,8 @@
 """The policy `u = pi(x)`: a network with exact binary64 numbers and a centring that gives pi(0) = u_eq.
 
+`net` is a program of steps: layers with a function between them, and before, between or beside them observations,
+clips, sums (skip connections) and branches (`certify.loop.networks`).
+
 `raw(x) = scale * tanh(net(x)) + offset` with squash `tanh`, or `scale * net(x) + offset` with squash
 `identity`. Centring makes pi(0) = u_eq by its form:
 
@@ -12,8 +15,8 @@ So `pi(x) = scale * squash(net(x) + shift) + offset'` with numbers shift and off
 arithmetic: floats, Arb balls and the terms of formulas put their own numbers into the same lines. With a `clip` (lo,
 hi) the policy is `min(max(., lo), hi)` of that: the last step, after the centring; it must be inactive at 0.
 
-An uncentred policy may have its loop's equilibrium as `origin`: the layers then read `origin + x`, exactly, with x the
-deviation from there. The network's numbers, and so its hash, do not change.
+An uncentred policy may have its loop's equilibrium as `origin`: the network then reads `origin + x`, exactly, with x
+the deviation from there. The network's numbers, and so its hash, do not change.
 """
 
 from __future__ import annotations
@@ -27,9 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.loop.activations import Activation, activation
+from certify.loop.networks import Network, frozen, layered, like, sha256_of, tangent_at, tanh, values
 from certify.loop.policies.arithmetic import Arithmetic
-from certify.loop.policies.layers import frozen, frozen_layers, like, sha256_of, tanh, through, widths
 
 Squash = Literal["tanh", "identity"]
 Centre = Literal["output", "preactivation", "none"]
@@ -38,40 +40,63 @@ _WHOSE = "the policy"  # in messages
 
 
 @dataclass(frozen=True, slots=True)
-class TanhNetwork:
-    """Affine layers with a function between them; float32 weights are converted, which is exact.
+class PolicyNetwork:
+    """A network of the states with its squash, centring, scale, offset and clip.
+
+    `of_layers` makes one of weights and biases.
 
     Parameters
     ----------
-    weights : arrays of shape (out, in); the first `in` is n, the last `out` is m.
-    biases : arrays of shape (out,).
-    squash, centre : see the module's docstring.
+    network : the program; it reads the n states and makes m numbers.
     scale, offset : arrays of shape (m,), in the input's units; scale is nonzero.
+    squash, centre : see the module's docstring.
     clip : (lo, hi), arrays of shape (m,) in the input's units with lo < hi, which limit each input; or None.
-    origin : the state that the layers read at x = 0, shape (n,); empty for 0.
-    activation : the function between layers, by its name in `certify.loop.activations`; tanh where there is one layer.
+    origin : the state that the network reads at x = 0, shape (n,); empty for 0.
 
     Raises
     ------
-    InputError : shapes do not chain, a number is not finite, an option is unknown, or the origin of a policy that is
+    InputError : shapes do not match, a number is not finite, an option is unknown, or the origin of a policy that is
         centred is not 0.
     """
 
-    weights: tuple[Array, ...]
-    biases: tuple[Array, ...]
+    network: Network
     scale: Array
     offset: Array
     squash: Squash = "tanh"
     centre: Centre = "preactivation"
     clip: tuple[Array, Array] | None = None
     origin: Array = field(default_factory=lambda: np.zeros(0))
-    activation: str = "tanh"
+
+    @classmethod
+    def of_layers(
+        cls,
+        weights: Sequence[Any],
+        biases: Sequence[Any],
+        scale: Any,
+        offset: Any,
+        squash: Squash = "tanh",
+        centre: Centre = "preactivation",
+        clip: tuple[Any, Any] | None = None,
+        origin: Any = (),
+        activation: str = "tanh",
+    ) -> PolicyNetwork:
+        """The policy of layers with a function between them; float32 weights are converted, which is exact.
+
+        Parameters
+        ----------
+        weights : arrays of shape (out, in); the first `in` is n, the last `out` is m.
+        biases : arrays of shape (out,).
+        scale, offset, squash, centre, clip, origin : as `PolicyNetwork` has them.
+        activation : the function's name in `certify.loop.activations`; without a meaning where there is one layer.
+
+        Raises
+        ------
+        InputError : shapes do not chain, a number is not finite, or as `PolicyNetwork`.
+        """
+        at = np.asarray(origin, dtype=np.float64)
+        return cls(_layers(weights, biases, activation), scale, offset, squash, centre, clip, at)
 
     def __post_init__(self) -> None:
-        weights, biases = frozen_layers(self.weights, self.biases, _WHOSE)
-        function = activation(self.activation).name if len(weights) > 1 else "tanh"
-        for name, value in (("weights", weights), ("biases", biases), ("activation", function)):
-            object.__setattr__(self, name, value)
         for name in ("scale", "offset"):
             object.__setattr__(self, name, frozen(getattr(self, name), name, _WHOSE))
         if self.squash not in get_args(Squash):
@@ -96,29 +121,33 @@ class TanhNetwork:
             raise InputError(f"`origin` must be 0 of a policy that is centred; found {self.origin.tolist()}.")
 
     @property
-    def phi(self) -> Activation:
-        """The function between layers."""
-        return activation(self.activation)
-
-    @property
     def is_moved(self) -> bool:
-        """True if the layers read another state than 0 at x = 0."""
+        """True if the network reads another state than 0 at x = 0."""
         return bool(np.any(self.origin != 0))
 
     @property
     def n(self) -> int:
         """Number of states that the network reads."""
-        return int(self.weights[0].shape[1])
+        return self.network.reads
 
     @property
     def m(self) -> int:
         """Number of inputs that the network commands."""
-        return int(self.weights[-1].shape[0])
+        return self.network.gives
 
     @property
     def layers(self) -> tuple[int, ...]:
-        """Widths from state to input, such as (2, 16, 16, 1)."""
-        return widths(self.weights)
+        """Widths from what the first layer reads to the input, such as (2, 16, 16, 1)."""
+        return self.network.widths
+
+    @property
+    def words(self) -> str:
+        """Widths and functions, such as `2-16-16-1 tanh`, for people."""
+        network, text = self.network, "-".join(map(str, self.layers))
+        text += "".join(f" {name}" for name in network.functions)
+        if network.observation is not None:
+            text += f" of {', '.join(map(str, network.observation.expressions))}"
+        return text if network.is_observed_chain else f"{text}, {len(network.steps)} steps"
 
     def ratios(self, u_eq: Sequence[Fraction]) -> tuple[Fraction, ...]:
         """`(u_eq - offset) / scale`, exactly, (m,): the value of tanh at the origin with preactivation centring.
@@ -144,7 +173,7 @@ class TanhNetwork:
 
     def net(self, x: Any) -> Any:
         """`net(x)`, last axis n to m, in the arithmetic of x (numpy array or torch tensor)."""
-        return through(self.weights, self.biases, x + like(self.origin, x) if self.is_moved else x, self.phi)
+        return values(self.network, x + like(self.origin, x) if self.is_moved else x)
 
     def __call__(self, x: Any, u_eq: Sequence[Fraction]) -> Any:
         """pi(x) in float64, shape (..., n) to (..., m); for simulation and search, not for proofs."""
@@ -205,16 +234,15 @@ class TanhNetwork:
             offset = [number(u) - number(Fraction(float(s))) * self.squashed(v, arithmetic) for u, s, v in each]
         return shift, offset
 
-    def folded(self, u_eq: Sequence[Fraction]) -> TanhNetwork:
+    def folded(self, u_eq: Sequence[Fraction]) -> PolicyNetwork:
         """A network without centring that reads x and is pi up to rounding: for search and simulation."""
         if self.is_moved:
-            biases = (self.biases[0] + self.weights[0] @ self.origin, *self.biases[1:])
-            return replace(self, biases=biases, origin=np.zeros(self.n))
+            return replace(self, network=self.network.read_at(self.origin), origin=np.zeros(self.n))
         if self.centre == "none":
             return self
         shift, offset = self.centring(u_eq, self.net(np.zeros(self.n)).tolist(), _ARRAYS)
-        last = self.biases[-1] + np.array(shift)
-        return replace(self, biases=(*self.biases[:-1], last), offset=np.array(offset), centre="none")
+        network = self.network.shifted(np.array(shift)) if any(shift) else self.network
+        return replace(self, network=network, offset=np.array(offset), centre="none")
 
     def jacobian_at_origin(self, u_eq: Sequence[Fraction]) -> Array:
         """`d pi / d x` at 0 in float64, shape (m, n).
@@ -223,27 +251,63 @@ class TanhNetwork:
         ------
         InputError : the clip may act at the origin.
         """
-        x, jacobian = self.origin, np.eye(self.n)
-        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            if k:
-                x, slope = self.phi.pair(x)
-                jacobian = slope[:, None] * jacobian
-            x, jacobian = weight @ x + bias, weight @ jacobian
-        squashed = self.squashed(self.beta(u_eq) if self.centre == "preactivation" else x)
+        at = tangent_at(self.network, self.origin)
+        squashed = self.squashed(self.beta(u_eq) if self.centre == "preactivation" else at.y)
         self.require_unclipped(u_eq if self.centre != "none" else (self.scale * squashed + self.offset).tolist())
-        return np.asarray(self.scale[:, None] * ((self.squash_slope(squashed) * np.ones(self.m))[:, None] * jacobian))
+        return np.asarray(self.scale[:, None] * ((self.squash_slope(squashed) * np.ones(self.m))[:, None] * at.J))
+
+    def require_layers(self, what: str) -> None:
+        """Reject a network that is not layers of the states with one function between them.
+
+        Raises
+        ------
+        InputError : it has other steps, which `what` does not read yet.
+        """
+        if not self.network.is_chain:
+            kinds = ", ".join(dict.fromkeys(step.kind for step in self.network.steps))
+            raise InputError(
+                f"{what} needs a policy of layers that read the states, with one function between them; found the "
+                f"steps {kinds}. `certify roa` proves such a policy."
+            )
+
+    @property
+    def activation(self) -> str:
+        """The function between the layers of a chain, tanh where there is one layer."""
+        return next(iter(self.network.functions), "tanh")
+
+    @property
+    def weights(self) -> tuple[Array, ...]:
+        """The matrices of the layers."""
+        return tuple(step.weight for step in self.network.affine)
+
+    @property
+    def biases(self) -> tuple[Array, ...]:
+        """The biases of the layers."""
+        return tuple(step.bias for step in self.network.affine)
+
+    def with_layers(
+        self,
+        weights: Sequence[Any] | None = None,
+        biases: Sequence[Any] | None = None,
+        activation: str | None = None,
+        **others: Any,
+    ) -> PolicyNetwork:
+        """The same policy with other numbers in its layers, or another function between them; `others` are further
+        fields."""
+        self.require_layers("to replace its layers one")
+        given = (weights or self.weights, biases or self.biases, activation or self.activation)
+        return replace(self, network=_layers(*given), **others)
 
     def sha256(self) -> str:
         """Hash of the canonical bytes as FORMAT.md has them; the origin is not part of them."""
-        pairs = [a for pair in zip(self.weights, self.biases, strict=True) for a in pair]
+        arrays = [a for step in self.network.steps for a in step.arrays]
         head, rest = f"certify-policy/1\0{self.squash}\0{self.centre}\0", (self.scale, self.offset, *(self.clip or ()))
-        return sha256_of(head.encode(), (*pairs, *rest), _in_words(self))
+        return sha256_of(head.encode(), (*arrays, *rest), self.network.words())
 
 
-def _in_words(network: TanhNetwork) -> str:
-    """The steps as the hash has them; nothing where tanh is the only function."""
-    steps = range(0 if network.activation == "tanh" else 2 * len(network.weights) - 1)
-    return "".join(f"map {k} {network.activation}\0" if k % 2 else f"affine {k}\0" for k in steps)
+def _layers(weights: Sequence[Any], biases: Sequence[Any], function: str) -> Network:
+    steps = layered(weights, biases, function, _WHOSE)
+    return Network(int(np.shape(weights[0])[1]), steps)
 
 
 class _Arrays:

@@ -14,16 +14,18 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates.limits import numbers_of_a_jet
 from certify.errors import InputError
-from certify.loop.activations import ACTIVATIONS, Activation
+from certify.loop.activations import CERTAIN
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import evaluate, nodes
+from certify.loop.networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Sum
+from certify.loop.networks.floats import evaluated, jacobian
 from certify.loop.policies import bounded_by_form
 from certify.provers.ball.jets import Jet, Jets, basis, beyond_tangent, remainder, sizes
 from certify.provers.ball.ranged import RangedJet
@@ -111,14 +113,25 @@ class Models:
 
 
 @dataclass(frozen=True, slots=True)
-class _Layer:
-    """`y = y(m) + X [x - m, A]`: A stacks what every unit before this layer adds to its tangent at m. `phi` is the
-    function behind the layer, None behind the last of a policy without a squash."""
+class _Vector:
+    """A vector of the network, `y + X [x - m, A]`: A stacks what every unit so far adds to its tangent at m. If it has
+    units of its `own`, their columns are the identity and come last, not in X. `wrong` is about what a checker does not
+    know of y for its roundings."""
 
     y: Array
     X: Array
-    W: Array  # the last columns of X, those of the layer just before
-    phi: Activation | None
+    wrong: Array
+    own: bool = False
+
+    def among(self, columns: int) -> Array:
+        """X with the columns of its own units, and of zeros up to so many."""
+        X = np.concatenate([self.X, np.eye(len(self.y))], axis=1) if self.own else self.X
+        return np.pad(X, ((0, 0), (0, columns - X.shape[1]))) if X.shape[1] < columns else X
+
+    @property
+    def columns(self) -> int:
+        """The number of columns, those of its own units among them."""
+        return int(self.X.shape[1]) + (len(self.y) if self.own else 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,18 +195,18 @@ class Paths:
     middle: Array
     u: Array
     rounding: Array
-    layers: tuple[_Layer, ...]
+    network: Network
+    vectors: tuple[_Vector, ...]
 
     @property
     def operations(self) -> float:
         """Operations of models on a ball, about, as an `Effort` counts them."""
-        n, found, before = self.loop.system.n, _CALL * len(self.layers), 0
+        n, found = self.loop.system.n, 0.0
         second, numbers = n * (n + 1) / 2, float(numbers_of_a_jet(n))
-        for layer in self.layers:
-            rows, columns = layer.W.shape
-            found += _ENTRY * rows * (columns * numbers + before * second + 8 * numbers)
-            before += rows
-        return found + sum(1 for _ in nodes(*self.loop.dynamics)) * (_EACH + 32 * numbers)
+        for rows, columns, before in shapes(self.network):
+            found += _CALL + _ENTRY * rows * (columns * numbers + before * second + 8 * numbers)
+        equations = sum(1 for _ in nodes(*self.loop.dynamics)) + self.network.operations
+        return found + equations * (_EACH + 32 * numbers)
 
     def models(self, J: Array) -> Models:
         """F on the ball x = middle + J d, ||d|| <= 1; J is (n, k)."""
@@ -221,25 +234,157 @@ class Paths:
         return Driven(G, Q, K, errors, each, R, R @ R, curve, _room(loop, self.u), self.rounding)
 
     def _policy(self, J: Array) -> _Policy:
-        n, k = J.shape
-        form = basis(k)
-        Q, K, R = (np.zeros((rows, len(of))) for rows, of in ((n, form.eye), (n, form.scale3), (0, form.eye)))
-        for layer in self.layers:
-            G, M = layer.X[:, :n] @ J, layer.X[:, n:]
-            Q, K = layer.W @ Q, layer.W @ K
-            if layer.phi is None:
-                return _Policy(G, Q, K, M, R)
-            E = np.abs(M) @ R
-            size = sizes(G, Q, K, E)
-            _, slope, second, third, fourth = layer.phi.around(layer.y, size.radius)
-            squares = form.square(G)
-            H, cubic = beyond_tangent(G, squares, Q, K, second, third)
-            rest = remainder(squares, size, E, np.abs(second), np.abs(third), fourth)
-            R = np.concatenate([R, rest])
-            Q, K = slope[:, None] * Q + H, slope[:, None] * K + cubic
-        return _Policy(slope[:, None] * G, Q, K, np.concatenate([slope[:, None] * M, np.eye(len(G))], axis=1), R)
+        ball = _OnBall(self, J)
+        return ball.policy(ball.run(self.network, ball.argument()))
 
 
+class _Part(NamedTuple):
+    """A vector on a ball: what it is along all paths, and its Q and K, rows in their basis."""
+
+    at: _Vector
+    Q: Array
+    K: Array
+
+
+class _OnBall(Algebra[_Part]):
+    """The network on a ball x = middle + J d. R has the remainders of all units so far, a row each."""
+
+    def __init__(self, known: Paths, J: Array) -> None:
+        self.J, self.form, self.R = J, basis(J.shape[1]), np.zeros((0, len(basis(J.shape[1]).eye)))
+        self._vectors = iter(known.vectors)
+
+    def argument(self) -> _Part:
+        """The states."""
+        n = len(self.J)
+        return _Part(next(self._vectors), np.zeros((n, len(self.form.eye))), np.zeros((n, len(self.form.scale3))))
+
+    def policy(self, v: _Part) -> _Policy:
+        """The models of the network's value."""
+        G, M, _ = self._reached(v)
+        return _Policy(G, v.Q, v.K, np.pad(M, ((0, 0), (0, len(self.R) - M.shape[1]))), self.R)
+
+    def _reached(self, v: _Part) -> tuple[Array, Array, Array]:
+        """A vector's gradients, the numbers M with which units reach it, and the bound E of their errors there."""
+        X, n = v.at.among(0), len(self.J)
+        M = X[:, n:]
+        return X[:, :n] @ self.J, M, np.abs(M) @ self.R[: M.shape[1]]
+
+    def affine(self, step: Affine, v: _Part) -> _Part:
+        return _Part(next(self._vectors), step.weight @ v.Q, step.weight @ v.K)
+
+    def map(self, step: Map, v: _Part) -> _Part:
+        G, _, E = self._reached(v)
+        size = sizes(G, v.Q, v.K, E)
+        _, slope, second, third, fourth = step.phi.around(v.at.y, size.radius)
+        squares = self.form.square(G)
+        H, cubic = beyond_tangent(G, squares, v.Q, v.K, second, third)
+        rest = remainder(squares, size, E, np.abs(second), np.abs(third), fourth)
+        self.R = np.concatenate([self.R, rest])
+        return _Part(next(self._vectors), slope[:, None] * v.Q + H, slope[:, None] * v.K + cubic)
+
+    def clip(self, step: Clip, v: _Part) -> _Part:
+        """Entries that are certainly not clipped stay, those that certainly are become constant, others NaN."""
+        G, _, E = self._reached(v)
+        reach = sizes(G, v.Q, v.K, E).radius * CERTAIN
+        lo, hi = v.at.y - reach, v.at.y + reach
+        constant = (hi < step.lo) | (lo > step.hi)
+        slope = np.where((lo > step.lo) & (hi < step.hi), 1.0, np.where(constant, 0.0, np.nan))
+        return _Part(next(self._vectors), slope[:, None] * v.Q, slope[:, None] * v.K)
+
+    def sum(self, step: Sum, *vectors: _Part) -> _Part:
+        Q, K = (np.sum([getattr(v, part) for v in vectors], axis=0) for part in ("Q", "K"))
+        return _Part(next(self._vectors), Q, K)
+
+    def concat(self, step: Concat, *vectors: _Part) -> _Part:
+        Q, K = (np.concatenate([getattr(v, part) for v in vectors]) for part in ("Q", "K"))
+        return _Part(next(self._vectors), Q, K)
+
+    def observe(self, step: Observe, v: _Part) -> _Part:
+        """Jets of the expressions, whose terms beyond their tangents become those of units."""
+        G, _, E = self._reached(v)
+        algebra, none = Jets(1, self.J.shape[1], np.zeros((0, len(self.form.eye)))), np.zeros((1, 0))
+        entries = [
+            Jet(float(v.at.y[i]), G[i][None], v.Q[i][None], v.K[i][None], none, E[i][None], none.T @ E[:1])
+            for i in range(len(G))
+        ]
+        values, shared = dict(zip(step.symbols, entries, strict=True)), dict[Any, Jet]()
+        made = [evaluate(e, values, algebra, shared) for e in step.expressions]
+        Q, K, rest = (np.concatenate([getattr(jet, part) for jet in made]) for part in ("Q", "K", "E"))
+        self.R = np.concatenate([self.R, rest])
+        return _Part(next(self._vectors), Q, K)
+
+
+class _Along(Algebra[_Vector]):
+    """The network's linearisation at a state; `vectors` are all that it made."""
+
+    def __init__(self, n: int, at: Array) -> None:
+        self.n = n
+        self.vectors = [_Vector(at, np.eye(n), np.zeros(n))]
+
+    def _made(self, y: Array, X: Array, wrong: Array, own: bool = False) -> _Vector:
+        self.vectors.append(_Vector(y, X, wrong, own))
+        return self.vectors[-1]
+
+    def affine(self, step: Affine, v: _Vector) -> _Vector:
+        W, b = step.weight, step.bias
+        y, X = W @ v.y + b, W @ v.X
+        terms = _UNIT * (W.shape[1] + 2) * np.linalg.norm(W, axis=1) * np.linalg.norm(v.y)
+        wrong = np.abs(W) @ v.wrong + terms + _ROUNDED * (np.abs(y) + np.abs(b))
+        return self._made(y, np.concatenate([X, W], axis=1) if v.own else X, wrong)
+
+    def map(self, step: Map, v: _Vector) -> _Vector:
+        y, slope = step.phi.pair(v.y)
+        X = slope[:, None] * self._all(v)
+        return self._made(y, X, step.phi.steepest * v.wrong + _ROUNDED * np.abs(y), own=True)
+
+    def clip(self, step: Clip, v: _Vector) -> _Vector:
+        inside = (v.y > step.lo) & (v.y < step.hi)
+        y = np.minimum(np.maximum(v.y, step.lo), step.hi)
+        return self._made(y, np.where(inside[:, None], self._all(v), 0.0), v.wrong)
+
+    def sum(self, step: Sum, *vectors: _Vector) -> _Vector:
+        most = max(v.columns for v in vectors)
+        y, wrong = (np.sum([getattr(v, part) for v in vectors], axis=0) for part in ("y", "wrong"))
+        size = np.sum([np.abs(v.y) for v in vectors], axis=0)
+        return self._made(y, np.sum([v.among(most) for v in vectors], axis=0), wrong + _ROUNDED * size)
+
+    def concat(self, step: Concat, *vectors: _Vector) -> _Vector:
+        most = max(v.columns for v in vectors)
+        y, wrong = (np.concatenate([getattr(v, part) for v in vectors]) for part in ("y", "wrong"))
+        return self._made(y, np.concatenate([v.among(most) for v in vectors]), wrong)
+
+    def observe(self, step: Observe, v: _Vector) -> _Vector:
+        D, y = jacobian(step, v.y), evaluated(step.expressions, step.symbols, v.y)
+        X = np.zeros((len(y), self._units))
+        X[:, : self.n] = D @ v.X[:, : self.n]
+        wrong = np.abs(D) @ v.wrong + _ROUNDED * (np.abs(y) + np.abs(D) @ np.abs(v.y))
+        return self._made(y, X, wrong, own=True)
+
+    def _all(self, v: _Vector) -> Array:
+        """X among all units so far, so that those of the next step are the next ones."""
+        return v.among(self._units)
+
+    @property
+    def _units(self) -> int:
+        """The number of columns that all units so far take."""
+        return max(v.columns for v in self.vectors)
+
+
+def shapes(network: Network) -> list[tuple[int, int, int]]:
+    """The rows of each step that takes time, the columns that it has of its own, and the units before it (FORMAT.md,
+    limits)."""
+    found, before = list[tuple[int, int, int]](), 0
+    for k, step in enumerate(network.steps):
+        rows = network.sizes[k + 1]
+        if isinstance(step, Affine):
+            found.append((rows, step.weight.shape[1], before))
+        elif not (isinstance(step, Map) and step.of == (k,) and k and isinstance(network.steps[k - 1], Affine)):
+            found.append((rows, len(step.of), before))
+        before += rows if isinstance(step, Map | Clip | Observe) else 0
+    return found
+
+
+@np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
 def paths(loop: ClosedLoop, at: Array | None = None, resting: bool = True) -> Paths:
     """Follow the states and every unit's output through the network's linearisation at a state, (n,), the origin if
     none is given; if that is not `resting`, the inputs there are what the policy says, else u_eq.
@@ -248,45 +393,38 @@ def paths(loop: ClosedLoop, at: Array | None = None, resting: bool = True) -> Pa
     ------
     InputError : the network is larger than the checker's rules allow.
     """
-    network = loop.network
-    n, last = network.n, len(network.weights) - 1
-    columns = k = n if at is None else n + 1
-    numbers, products = numbers_of_a_jet(k), 0
-    for W in network.weights[1:]:
-        columns += W.shape[1]
-        products += len(W) * columns * (numbers + W.shape[1])
-        if columns * (len(W) + numbers) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
-            raise InputError("The network is too large for the local proof: use fewer or narrower layers.")
-    folded, middle = loop.folded, np.zeros(n) if at is None else at
-    h, X, wrong = middle, np.eye(n), np.zeros(n)
-    layers = []
-    for number, (W, b) in enumerate(zip(folded.weights, folded.biases, strict=True)):
-        y, X = W @ h + b, W @ X
-        terms = _UNIT * (W.shape[1] + 2) * np.linalg.norm(W, axis=1) * np.linalg.norm(h)
-        wrong = np.abs(W) @ wrong + terms + _ROUNDED * (np.abs(y) + np.abs(b))
-        if number:
-            X = np.concatenate([X, W], axis=1)
-        phi = network.phi if number < last else ACTIVATIONS["tanh"] if network.squash == "tanh" else None
-        layers.append(_Layer(y, X, W, phi))
-        h = y
-        if phi is not None:
-            h, slope = phi.pair(y)
-            X, wrong = slope[:, None] * X, phi.steepest * wrong + _ROUNDED * np.abs(h)
+    folded, n = loop.folded, loop.network.n
+    network = folded.network
+    if folded.squash == "tanh":
+        network = Network(n, (*network.steps, Map((len(network.steps),), "tanh")))
+    _require_small(network, n if at is None else n + 1)
+    middle = np.zeros(n) if at is None else at
+    along = _Along(n, middle)
+    value = along.run(network, along.vectors[0])
     u = np.array([float(q) for q in loop.u_eq])
-    wrong = np.abs(folded.scale) * wrong
-    if at is not None or (not resting and network.centre == "none"):
-        u = folded.scale * h + folded.offset
+    wrong = np.abs(folded.scale) * value.wrong
+    if at is not None or (not resting and loop.network.centre == "none"):
+        u = folded.scale * value.y + folded.offset
     else:
         wrong = np.zeros_like(u)
     rounding = np.zeros_like(u) if resting else wrong + _ROUNDED * (np.abs(u) + np.abs(folded.offset))
-    return Paths(loop, middle, u, rounding, tuple(layers))
+    return Paths(loop, middle, u, rounding, network, tuple(along.vectors))
+
+
+def _require_small(network: Network, k: int) -> None:
+    numbers, products = numbers_of_a_jet(k), 0
+    for rows, width, before in shapes(network):
+        columns = k + before
+        products += rows * columns * (width + numbers) if before else 0
+        if before and (columns * (rows + numbers) > _MOST_NUMBERS or products > _MOST_PRODUCTS):
+            raise InputError("The network is too large for the local proof: use fewer or narrower layers.")
 
 
 def corner_of(known: Paths) -> str | None:
     """The activation with a corner at the paths' middle itself, where no ball around that has a model; or None."""
-    for layer in known.layers:
-        if layer.phi is not None and not layer.phi.is_smooth and np.any(np.abs(layer.y) <= _AT_CORNER):
-            return layer.phi.name
+    for step in (step for step in known.network.steps if isinstance(step, Map)):
+        if not step.phi.is_smooth and np.any(np.abs(known.vectors[step.of[0]].y) <= _AT_CORNER):
+            return step.function
     return None
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from certify.provers.bounds.flow import Flow
 from certify.provers.bounds.loop import LoopModels, loop_models
 from certify.provers.bounds.neural import NeuralEnclosure, NeuralModels
-from certify.provers.bounds.policy import PolicyEnclosure, operations_of_policy
+from certify.provers.bounds.policy import operations_of_policy, policy_enclosure
 from certify.provers.bounds.symbolic import SymbolicEnclosure, SymbolicModels
 from certify.provers.bounds.taylor import Models, Taylor, upper_bound
 
@@ -19,11 +19,11 @@ __all__ = [
     "Models",
     "NeuralEnclosure",
     "NeuralModels",
-    "PolicyEnclosure",
     "SymbolicEnclosure",
     "SymbolicModels",
     "Taylor",
     "loop_models",
     "operations_of_policy",
+    "policy_enclosure",
     "upper_bound",
 ]

@@ -16,7 +16,6 @@ import numpy as np
 from certify.provers.bounds.arrays import Array
 from certify.provers.bounds.compiled import Loops
 from certify.provers.bounds.lines import LINES
-from certify.provers.bounds.taylor import TINY
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,22 +62,23 @@ class FusedLayers:
 
     Parameters
     ----------
+    n : box coordinates.
     scale : of the outputs (m,), by which errors are weighed.
     activation : the function's name.
     """
 
     def __init__(
-        self, layers: Sequence[Layer], squash: bool, scale: Array, batch: int, activation: str = "tanh"
+        self, layers: Sequence[Layer], n: int, squash: bool, scale: Array, batch: int, activation: str = "tanh"
     ) -> None:
         self.squash, self.scale, self.batch, self.around = squash, scale, batch, LINES.get(activation)
-        n, m = layers[0].W.shape[1], len(scale)
+        reads, m = layers[0].W.shape[1], len(scale)
         units = max(len(layer.W) for layer in layers)
-        widest = max(n, units)
+        widest = max(reads, units)
 
         def numbers(*shape: int) -> Array:
             return np.empty((*shape, batch))
 
-        self._x, self._x_errors = numbers(n, n + 1), numbers(n, 2)
+        self._x, self._x_errors = numbers(reads, n + 1), numbers(reads, 2)
         self._size, self._fresh, self._ball, self._share = numbers(), numbers(), numbers(), numbers(n)
         forms, weights = [numbers(units, n + 1) for _ in range(2)], [numbers(widest, m) for _ in range(2)]
         through, ends, values = numbers(units, 2), numbers(2 * units), numbers(2 * units)
@@ -108,7 +108,8 @@ class FusedLayers:
         self._result = numbers(m)
 
     def __call__(self, loops: Loops, x: Array, x_error: Array) -> tuple[Array, Array, Array]:
-        """The affine form (m, n + 1, B) behind the last layer, the scaled error (m, B) and `share` (n, B)."""
+        """The affine form (m, n + 1, B) behind the last layer, the scaled error (m, B), and what each axis adds to the
+        bends of the first layer, (n, B); x is (reads, n + 1, B), its error (reads, B)."""
         self._x[:] = x
         self._x_errors[:, 0], self._x_errors[:, 1] = x_error, 0.0
         np.square(np.abs(x).sum(1)).sum(0, out=self._size)
@@ -130,8 +131,7 @@ class FusedLayers:
             else:
                 each.slope[:], each.t[:], each.p[:] = self.around(*each.ends)
             loops.bend(*each.bend)
-        share = self._share + TINY
-        return self._form.copy(), self._error_backwards(loops, x_error), share / share.sum(0)
+        return self._form.copy(), self._error_backwards(loops, x_error), self._share.copy()
 
     def _error_backwards(self, loops: Loops, x_error: Array) -> Array:
         """The sum of all errors on the way in the outputs (m, B), by the magnitudes of their weights."""

@@ -21,6 +21,39 @@ Lines = tuple[Array, Array, Array]
 _PARTS = 8  # points of a range at which a function is looked at, as many as the checker has
 
 
+def lines_of(function: str) -> Callable[[Array, Array], Lines]:
+    """The lines of an activation, by its name."""
+    return _tanh if function == "tanh" else LINES[function]
+
+
+def clip_lines(lo: Array, hi: Array, least: Array, most: Array) -> Lines:
+    """Lines of `min(max(v, least), most)`; where that certainly is v, it is its own.
+
+    Between its corners clip(v) - s v is linear, so that its extremes lie at the ends of v's range or at the corners in
+    it; s is the chord's slope.
+    """
+
+    def clip(v: Array) -> Array:
+        return np.minimum(np.maximum(v, least), most)
+
+    inside = (lo >= least) & (hi <= most)
+    slope = np.where(inside, 1.0, ((clip(hi) - clip(lo)) / (hi - lo)).clip(0.0, 1.0))
+    points = np.stack([lo, hi, *(np.minimum(np.maximum(end, lo), hi) for end in (least, most))])
+    above = clip(points) - slope * points
+    size = (np.abs(clip(points)) + slope * np.abs(points)).max(0)
+    upper, lower = above.max(0), above.min(0)
+    gap = (upper - lower) / 2 + 4 * EPS * size + TINY
+    return slope, np.where(inside, 0.0, (upper + lower) / 2), np.where(inside, 0.0, gap)
+
+
+def _tanh(lo: Array, hi: Array) -> Lines:
+    """The chord's slope, by `kernels.relaxed`."""
+    values = np.tanh(lo), np.tanh(hi)
+    s, t = chord(lo, hi, *values)
+    m, gap = relaxed((lo, hi), values, s, np.arctanh(t), t, 0.5 * (lo + hi))
+    return s, m, gap
+
+
 def _by_parts(phi: Activation, lo: Array, hi: Array) -> Lines:
     """From values and slopes at points of the range: every v is within `half` of a point p, and there phi(v) - s v is
     within |phi'(p) - s| half + bend half^2 of its value at p. s is near the chord's slope.
@@ -52,10 +85,7 @@ def _relu(lo: Array, hi: Array) -> Lines:
 
 def _sigmoid(lo: Array, hi: Array) -> Lines:
     """(1 + tanh(v/2))/2, by the lines of tanh."""
-    ends = 0.5 * lo, 0.5 * hi
-    values = np.tanh(ends[0]), np.tanh(ends[1])
-    s, t = chord(*ends, *values)
-    m, gap = relaxed(ends, values, s, np.arctanh(t), t, 0.5 * (ends[0] + ends[1]))
+    s, m, gap = _tanh(0.5 * lo, 0.5 * hi)
     return 0.25 * s, 0.5 + 0.5 * m, 0.5 * gap + EPS
 
 

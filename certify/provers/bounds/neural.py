@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.neural import Neural
 from certify.provers.bounds.arrays import Array, Index, chosen, is_whole
 from certify.provers.bounds.policy import LayersEnclosure
@@ -121,7 +121,7 @@ class NeuralEnclosure:
         self.magnitudes = [np.abs(w) for w in self.weights]
         self.units = max(function.widths)
         one, zero = np.ones(1), np.zeros(1)
-        network = TanhNetwork(function.weights, function.biases, one, zero, "identity", "none")
+        network = PolicyNetwork.of_layers(function.weights, function.biases, one, zero, "identity", "none")
         self.lines = LayersEnclosure(network, (zero, zero, zero, zero))
         reach = self.magnitudes[-1]
         for magnitude in reversed(self.magnitudes[1:-1]):

@@ -10,58 +10,43 @@ by two parallel lines as well; where it certainly does nothing, nothing changes.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
 
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.policies import TanhNetwork
+from certify.loop.networks import Affine
+from certify.loop.policies import PolicyNetwork
 from certify.loop.rigorous import centring_with_errors
 from certify.provers.bounds.arrays import Array, joined
 from certify.provers.bounds.compiled import loops
 from certify.provers.bounds.fused import FusedLayers, Layer
+from certify.provers.bounds.lines import clip_lines
+from certify.provers.bounds.steps import StepsOnBoxes, observed
 from certify.provers.bounds.taylor import EPS, TINY
 
-_ENTRY, _NEURON = 0.05, 25.0  # operations of an entry of a product, of a relaxation
+_ENTRY, _NEURON, _OBSERVATION = 0.05, 25.0, 4.0  # operations of an entry of a product, of a relaxation, a model
 _NUMBERS = 2**15  # units of a layer times boxes at a time, which stay in a core's cache
 _MOST = 512  # boxes at a time
 
 
-class LayersEnclosure:
+Parts = tuple[Array, Array, Array]
+
+
+class Enclosure(ABC):
     """Affine enclosures of a network over batches of boxes.
 
     Parameters
     ----------
-    centring : what is added to the last layer's bias and to the output, each with its error, (m,) each.
+    centring : what is added to the last layer's value and to the output, each with its error, (m,) each.
     """
 
-    @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
-    def __init__(self, network: TanhNetwork, centring: Sequence[Array]) -> None:
-        weights, biases = ([v.copy() for v in each] for each in (network.weights, network.biases))
-        magnitudes, bias_errors = [np.abs(w) for w in weights], [np.zeros_like(b) for b in biases]
-        if network.is_moved:
-            at = network.origin
-            biases[0] = biases[0] + weights[0] @ at
-            size = magnitudes[0] @ np.abs(at) + np.abs(biases[0])
-            bias_errors[0] = (len(at) + 2) * EPS * size + TINY
-        rows = [np.linalg.norm(w, axis=1) for w in weights]
-        norms = [float(np.linalg.norm(w, 2)) * min(w.shape) ** (1 / 128) for w in weights]
-        self.squash = network.squash == "tanh"
-        self.scale, self.activation = network.scale, network.activation
-        shift, shift_error, self.offset, self.offset_error = centring
-        bias = biases[-1]
-        biases[-1] = bias + shift
-        made = np.where(shift == 0, 0.0, shift_error + EPS * (np.abs(bias) + np.abs(shift)))
-        bias_errors[-1] = bias_errors[-1] + made
-        columns = (weights, magnitudes, biases, bias_errors, rows, norms)
-        self.layers = [Layer(*row) for row in zip(*columns, strict=True)]
-        self.units = sum(network.layers[1:])
+    def __init__(self, network: PolicyNetwork, centring: Sequence[Array]) -> None:
+        self.squash, self.scale = network.squash == "tanh", network.scale
+        self.shift, self.shift_error, self.offset, self.offset_error = centring
         self.clip = None if network.clip is None else tuple(end[:, None] for end in network.clip)
-        self.piece = min(_MOST, 2 ** ((_NUMBERS // max(network.layers)) | 1).bit_length() // 2)
-        self._spare: list[FusedLayers] = []
-
-    def __getstate__(self) -> dict[str, object]:
-        return {**vars(self), "_spare": []}
+        self.piece = min(_MOST, 2 ** ((_NUMBERS // max(network.network.sizes)) | 1).bit_length() // 2)
 
     @np.errstate(all="ignore")
     def __call__(self, x: Array, x_error: Array) -> tuple[Array, Array, Array, Array]:
@@ -84,58 +69,124 @@ class LayersEnclosure:
         error = (rounding + error) * (1 + 1e-12)
         if self.clip is not None:
             mid, slopes, error = clipped(mid, slopes, error, *self.clip)
-        return mid, slopes, error, share
+        return mid, slopes, error, share / share.sum(0)
 
-    def _in_pieces(self, x: Array, x_error: Array) -> tuple[Array, Array, Array]:
-        """The layers on as many boxes at a time as stay in a core's cache, with the last repeated to make them up."""
+    def _in_pieces(self, x: Array, x_error: Array) -> Parts:
+        """As many boxes at a time as stay in a core's cache, with the last repeated to make them up."""
         batch, parts = x.shape[2], []
+        for first in range(0, batch, self.piece):
+            index = np.arange(first, first + self.piece).clip(max=batch - 1)
+            parts.append(self._inside(x.take(index, -1), x_error.take(index, -1), batch))
+        h, error, share = (joined(column)[..., :batch] for column in zip(*parts, strict=True))
+        return h, error, share + TINY
+
+    @abstractmethod
+    def _inside(self, x: Array, x_error: Array, batch: int) -> Parts:
+        """The affine form (m, n + 1, B) of what is scaled, its scaled error (m, B), and what each axis adds to the
+        bends, (n, B); `batch` is the number of boxes in all pieces."""
+
+
+class LayersEnclosure(Enclosure):
+    """Layers with one function between them, maybe behind an observation."""
+
+    @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
+    def __init__(self, network: PolicyNetwork, centring: Sequence[Array]) -> None:
+        super().__init__(network, centring)
+        self.n, self.observation, self.origin = network.n, network.network.observation, None
+        weights, biases = ([v.copy() for v in each] for each in (network.weights, network.biases))
+        magnitudes, bias_errors = [np.abs(w) for w in weights], [np.zeros_like(b) for b in biases]
+        if network.is_moved and self.observation is not None:
+            self.origin = network.origin
+        elif network.is_moved:
+            at = network.origin
+            biases[0] = biases[0] + weights[0] @ at
+            size = magnitudes[0] @ np.abs(at) + np.abs(biases[0])
+            bias_errors[0] = (len(at) + 2) * EPS * size + TINY
+        rows = [np.linalg.norm(w, axis=1) for w in weights]
+        norms = [norm_of(w) for w in weights]
+        self.activation = network.activation
+        bias = biases[-1]
+        biases[-1] = bias + self.shift
+        made = np.where(self.shift == 0, 0.0, self.shift_error + EPS * (np.abs(bias) + np.abs(self.shift)))
+        bias_errors[-1] = bias_errors[-1] + made
+        columns = (weights, magnitudes, biases, bias_errors, rows, norms)
+        self.layers = [Layer(*row) for row in zip(*columns, strict=True)]
+        self.units = sum(network.layers[1:])
+        self._spare: list[FusedLayers] = []
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**vars(self), "_spare": []}
+
+    def _inside(self, x: Array, x_error: Array, batch: int) -> Parts:
+        bent = None
+        if self.observation is not None:
+            if self.origin is not None:
+                x, x_error = moved(x, x_error, self.origin)
+            x, x_error, bent = observed(self.observation, x, x_error)
         try:
             layers = self._spare.pop()
         except IndexError:
-            layers = FusedLayers(self.layers, self.squash, self.scale, self.piece, self.activation)
-        how = loops(self.units * batch)
-        for first in range(0, batch, self.piece):
-            index = np.arange(first, first + self.piece).clip(max=batch - 1)
-            parts.append(layers(how, x.take(index, -1), x_error.take(index, -1)))
+            layers = FusedLayers(self.layers, self.n, self.squash, self.scale, self.piece, self.activation)
+        form, error, share = layers(loops(self.units * batch), x, x_error)
         self._spare.append(layers)
-        h, error, share = (joined(column)[..., :batch] for column in zip(*parts, strict=True))
-        return h, error, share
+        if bent is not None:
+            share = share + (self.layers[0].magnitude.sum(0)[:, None, None] * bent).sum(0)
+        return form, error, share
 
 
-def operations_of_policy(network: TanhNetwork) -> float:
+class StepsEnclosure(Enclosure):
+    """A network of any steps."""
+
+    def __init__(self, network: PolicyNetwork, centring: Sequence[Array]) -> None:
+        super().__init__(network, centring)
+        self.network, self.origin = network.network, network.origin if network.is_moved else None
+        self.norms = {k: norm_of(step.weight) for k, step in enumerate(self.network.steps) if isinstance(step, Affine)}
+
+    def _inside(self, x: Array, x_error: Array, batch: int) -> Parts:
+        if self.origin is not None:
+            x, x_error = moved(x, x_error, self.origin)
+        boxes = StepsOnBoxes({self.network.steps[k]: norm for k, norm in self.norms.items()})
+        value = boxes.value(self.network, x, x_error)
+        if np.any(self.shift):
+            value = boxes.shifted(value, self.shift, self.shift_error)
+        if self.squash:
+            value = boxes.squashed(value)
+        return value.h, boxes.backwards(np.diag(self.scale)), boxes.share
+
+
+def norm_of(weight: Array) -> float:
+    """At or above the 2-norm of a matrix."""
+    return float(np.linalg.norm(weight, 2) * min(weight.shape) ** (1 / 128))
+
+
+def moved(x: Array, x_error: Array, origin: Array) -> tuple[Array, Array]:
+    """States as forms with their origin added."""
+    at, h = origin[:, None], x.copy()
+    h[:, 0] += at
+    return h, x_error + EPS * (np.abs(x[:, 0]) + np.abs(at)) + TINY
+
+
+def operations_of_policy(network: PolicyNetwork) -> float:
     """Operations to enclose a network on a box, about, as an `Effort` counts them."""
-    entries, neurons = sum(W.size for W in network.weights), sum(len(b) for b in network.biases)
-    return _ENTRY * entries * (network.n + network.m + 3) + _NEURON * neurons
+    of = network.network
+    observations = _OBSERVATION * of.operations * (1 + network.n) ** 2
+    return _ENTRY * of.entries * (network.n + network.m + 3) + _NEURON * of.units + observations
 
 
-class PolicyEnclosure(LayersEnclosure):
+def policy_enclosure(loop: ClosedLoop) -> Enclosure:
     """Affine enclosures of pi."""
-
-    def __init__(self, loop: ClosedLoop) -> None:
-        super().__init__(loop.network, centring_with_errors(loop))
+    kind = LayersEnclosure if loop.network.network.is_observed_chain else StepsEnclosure
+    return kind(loop.network, centring_with_errors(loop))
 
 
 def clipped(mid: Array, slopes: Array, error: Array, least: Array, most: Array) -> tuple[Array, Array, Array]:
-    """`min(max(v, least), most)` of affine forms v = mid + slopes.d within error, again as affine forms.
-
-    Between its corners clip(v) - s v is linear, so that its extremes lie at the ends of v's range or at the corners in
-    it; s is the chord's slope.
-    """
+    """`min(max(v, least), most)` of affine forms v = mid + slopes.d within error, again as affine forms."""
     spread = np.abs(slopes).sum(1)
     reach = (spread + error) * (1 + 8 * EPS * (1 + slopes.shape[1])) + EPS * np.abs(mid) + TINY
     lo, hi = mid - reach, mid + reach
     inside = (lo >= least) & (hi <= most)
-
-    def clip(v: Array) -> Array:
-        return np.minimum(np.maximum(v, least), most)
-
-    slope = ((clip(hi) - clip(lo)) / (hi - lo)).clip(0.0, 1.0)
-    points = np.stack([lo, hi, *(np.minimum(np.maximum(end, lo), hi) for end in (least, most))])
-    above = clip(points) - slope * points
-    size = (np.abs(clip(points)) + slope * np.abs(points)).max(0)
-    upper, lower = above.max(0), above.min(0)
-    shift, gap = (upper + lower) / 2, (upper - lower) / 2
-    wide = slope * error + gap + 4 * EPS * (size + slope * (np.abs(mid) + spread)) + TINY
+    slope, shift, gap = clip_lines(lo, hi, least, most)
+    wide = slope * error + gap + 4 * EPS * (slope * (np.abs(mid) + spread) + np.abs(shift)) + TINY
     return (
         np.where(inside, mid, slope * mid + shift),
         np.where(inside[:, None], slopes, slope[:, None] * slopes),

@@ -25,7 +25,15 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, evaluate, nodes
 from certify.loop.plants import System
 from certify.loop.policies import bounded_by_form
-from certify.provers.bounds import Flow, Models, PolicyEnclosure, Taylor, loop_models, operations_of_policy, upper_bound
+from certify.provers.bounds import (
+    Flow,
+    Models,
+    Taylor,
+    loop_models,
+    operations_of_policy,
+    policy_enclosure,
+    upper_bound,
+)
 from certify.provers.bounds.arrays import Array, Mask, chosen, product
 from certify.provers.bounds.compiled import loops
 from certify.provers.bounds.loop import played
@@ -78,7 +86,7 @@ class VdotBound:
         self.P = problem.V.P
         self.V = FormBound(self.P, T)
         self.operations = operations_of_box(loop, order)
-        self.policy = PolicyEnclosure(loop)
+        self.policy = policy_enclosure(loop)
         self.piece = _PIECES * self.policy.piece
         self.dynamics: tuple[Expression, ...] = loop.system.uncertain_dynamics()
         self.check_inputs = not bounded_by_form(loop.network, loop.system.input_bounds)

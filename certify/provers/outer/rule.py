@@ -22,12 +22,12 @@ from certify.provers.bounds import (
     Models,
     NeuralEnclosure,
     NeuralModels,
-    PolicyEnclosure,
     SymbolicEnclosure,
     SymbolicModels,
     Taylor,
     loop_models,
     operations_of_policy,
+    policy_enclosure,
     upper_bound,
 )
 from certify.provers.bounds.arrays import Array, Index, Mask, chosen, is_whole, joined, product
@@ -66,7 +66,7 @@ class FallBound:
         self.T = np.ascontiguousarray(T)
         self.V = FormBound(problem.V.P, T)
         self.N = enclosure_of(function)
-        self.policy = PolicyEnclosure(problem.loop)
+        self.policy = policy_enclosure(problem.loop)
         self.dynamics = self.system.uncertain_dynamics()
         self.check_inputs = not bounded_by_form(problem.loop.network, self.system.input_bounds)
         self.ends = np.array([[float(end) for end in pair] for pair in self.system.domain]).T[:, :, None]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from certify.certificates import Certificate, PartitionTree, leaves
 from certify.effort import Effort
 from certify.errors import CertificateFormatError
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import extents
 from certify.report.claims import words_for
 from certify.report.figures.geometry import Box
@@ -71,7 +71,7 @@ class Detail:
     rates: int
 
     @classmethod
-    def of(cls, network: TanhNetwork, planes: int) -> Detail:
+    def of(cls, network: PolicyNetwork, planes: int) -> Detail:
         """The amounts that a policy's cost allows in so many planes."""
         cost = cost_of(network)
         steps = _RUNS / (4 * cost)  # of all trajectories together

@@ -28,7 +28,7 @@ from torch import nn
 from certify.certificates import write_atomically
 from certify.errors import InputError
 from certify.loop.plants import System
-from certify.loop.policies import Policy, TanhNetwork, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, save_policy
 from controllers.comparison.run_files import MODEL, POLICY
 from controllers.comparison.stable_baselines.model import ROLLOUT, Algorithm, as_trained, new_model
 from controllers.comparison.trained import Trained
@@ -118,7 +118,7 @@ class Sb3Learner:
         """The policy as it is."""
         return as_trained(self.algorithm, self.model.policy, self.system, self.steps_done, self.options.seed)
 
-    def network(self) -> TanhNetwork:
+    def network(self) -> PolicyNetwork:
         """The mean action as an exact tanh network, not centred: PPO's is clipped, SAC's is squashed by tanh."""
         policy, interface = self.model.policy, Interface(self.system)
         if self.algorithm == "ppo":
@@ -129,7 +129,7 @@ class Sb3Learner:
         weights = [layer.weight.detach().double().numpy() for layer in affine]
         weights[0] = weights[0] * interface.state_factors  # powers of two: exact
         u_lo, u_hi = np.array(self.system.input_bounds, dtype=np.float64).T
-        return TanhNetwork(
+        return PolicyNetwork.of_layers(
             weights=tuple(weights),
             biases=tuple(layer.bias.detach().double().numpy() for layer in affine),
             scale=interface.scale,

@@ -254,7 +254,7 @@ def test_evaluate_refuses_a_certificate_of_another_policy(certificate, tmp_path)
     last[0, -1] = np.nextafter(last[0, -1], np.inf)
     weights = (*policy.network.weights[:-1], last)
     moved = tmp_path / "moved.pt"
-    save_policy(moved, dataclasses.replace(policy, network=dataclasses.replace(policy.network, weights=weights)))
+    save_policy(moved, dataclasses.replace(policy, network=policy.network.with_layers(weights=weights)))
     done = _evaluate(moved, "--states", 5, "--certificate", certificate)
     assert done.exit_code == 2
     assert "must be about the policy that is evaluated" in json.loads(done.stdout)["error"]

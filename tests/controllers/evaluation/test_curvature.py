@@ -10,7 +10,7 @@ import torch
 
 from certify.errors import InputError
 from certify.loop.plants import get_system
-from certify.loop.policies import TanhNetwork
+from certify.loop.policies import PolicyNetwork
 from controllers.commands.evaluate import _table
 from controllers.evaluation.curvature import curvature
 from controllers.evaluation.evaluation import evaluate
@@ -51,7 +51,9 @@ def test_the_jacobian_anywhere_is_that_of_the_exported_policy(plant, centre):
 
 def test_curvature_of_a_known_function():
     # pi(x) = 6 tanh(x_1 + beta) - 6 tanh(beta): near 0, |pi''| = 12 |tanh(beta)| / cosh(beta)^2.
-    network = TanhNetwork((np.array([[1.0, 0.0]]),), (np.array([0.7]),), np.array([6.0]), np.zeros(1), "tanh", "output")
+    network = PolicyNetwork.of_layers(
+        (np.array([[1.0, 0.0]]),), (np.array([0.7]),), np.array([6.0]), np.zeros(1), "tanh", "output"
+    )
     second = 12 * np.tanh(0.7) / np.cosh(0.7) ** 2
     assert curvature(network, PENDULUM, 1e-3) == pytest.approx(second, rel=1e-2)
     straight = replace(network, squash="identity")

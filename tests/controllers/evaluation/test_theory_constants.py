@@ -19,7 +19,7 @@ from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, Symbol, substitute, symbols
 from certify.loop.plants import System, get_system, in_floats, with_input_errors
-from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_policy
 from certify.loop.rigorous import is_definite
 from controllers.cli import app
 from controllers.evaluation import theory_constants as module
@@ -39,7 +39,9 @@ def _scalar(a=1.0, b=2.0, gain=1.5, K=1.5, weight=3.0):
     rate = Fraction(str(a)) * x + Fraction(str(b)) * u
     system = System("line", (x,), (u,), {}, (rate,), (Number(0),), ((-3, 3),), ((-1, 1),))
     layers = (np.array([[0.5]]), np.array([[-2.0 * gain]]))
-    network = TanhNetwork(layers, (np.zeros(1), np.zeros(1)), np.ones(1), np.zeros(1), "tanh", "preactivation")
+    network = PolicyNetwork.of_layers(
+        layers, (np.zeros(1), np.zeros(1)), np.ones(1), np.zeros(1), "tanh", "preactivation"
+    )
     training = {"dt": DT, "gamma": GAMMA, "reward_weights": [weight], "K": [[K]]}
     options = replace(preset("pendulum"), reward_weights=(weight,), state_weights=(1.0,))
     return Policy(network, "line", {}, training), (
@@ -208,7 +210,7 @@ def test_a_record_that_cannot_be_used_is_refused(change, message):
 
 def test_a_policy_that_does_not_rest_at_the_origin_is_refused():
     policy, own = _scalar()
-    off = replace(policy.network, biases=(np.ones(1), np.zeros(1)), centre="none")
+    off = policy.network.with_layers(biases=(np.ones(1), np.zeros(1)), centre="none")
     with pytest.raises(InputError, match="centr"):
         _constants(replace(policy, network=off), own)
 

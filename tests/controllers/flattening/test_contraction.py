@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from certify.errors import InputError
-from certify.loop.policies import TanhNetwork, load_policy, require_centred
+from certify.loop.policies import PolicyNetwork, load_policy, require_centred
 from controllers.flattening.bend import bend
 from controllers.flattening.contraction import contracted, with_value_at_origin
 from controllers.training.departure import departure_of
@@ -18,12 +18,12 @@ from controllers.training.departure import departure_of
 U_EQ = (Fraction(1, 3), Fraction(-1, 5))
 
 
-def _network(squash="tanh", centre="preactivation", bias=0.7, clip=None) -> TanhNetwork:
+def _network(squash="tanh", centre="preactivation", bias=0.7, clip=None) -> PolicyNetwork:
     generator = np.random.default_rng(4)
     layers = (3, 7, 6, 5, 2)
     weights = tuple(generator.normal(size=(b, a)) for a, b in pairwise(layers))
     biases = tuple(bias * generator.normal(size=len(W)) for W in weights)
-    return TanhNetwork(weights, biases, np.array([2.0, 3.0]), np.array([0.1, 0.0]), squash, centre, clip)
+    return PolicyNetwork.of_layers(weights, biases, np.array([2.0, 3.0]), np.array([0.1, 0.0]), squash, centre, clip)
 
 
 @pytest.mark.parametrize(
@@ -66,14 +66,14 @@ def test_zero_biases_stay_zero_and_with_them_the_exact_centring():
     new = contracted(network, 0.3)
     assert not any(np.any(b) for b in new.biases)
     require_centred(new, u_eq)
-    shifted = replace(network, squash="identity", biases=(*network.biases[:-1], np.array([0.1, 0.2])))
+    shifted = network.with_layers(squash="identity", biases=(*network.biases[:-1], np.array([0.1, 0.2])))
     np.testing.assert_array_equal(contracted(shifted, 0.3).biases[-1], shifted.biases[-1])  # 0.1 is no float32
 
 
 def test_a_saturated_unit_passes_nothing_on():
     network = _network()
     biases = (np.where(np.arange(7) == 2, 80.0, network.biases[0]), *network.biases[1:])
-    stuck = replace(network, biases=biases)
+    stuck = network.with_layers(biases=biases)
     new = contracted(stuck, 0.25)
     assert np.all(np.isfinite(new.weights[1])) and not np.any(new.weights[1][:, 2])
     np.testing.assert_allclose(new.jacobian_at_origin(U_EQ), stuck.jacobian_at_origin(U_EQ), rtol=1e-3, atol=1e-5)

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from certify.cli.main import command_line
 from certify.errors import InputError
 from certify.loop.plants import get_system
-from certify.loop.policies import Policy, TanhNetwork, load_policy, require_centred, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, load_policy, require_centred, save_policy
 from controllers.cli import app
 from controllers.evaluation.curvature import curvature
 from controllers.evaluation.evaluation import evaluate
@@ -49,7 +49,7 @@ f = [-4, 4]
 runner = CliRunner()
 
 
-def curved(centre="preactivation", squash="tanh", scale=6.0, bias=0.5, clip=None, gain=GAIN, seed=2) -> TanhNetwork:
+def curved(centre="preactivation", squash="tanh", scale=6.0, bias=0.5, clip=None, gain=GAIN, seed=2) -> PolicyNetwork:
     """A 2-12-12-1 policy with bent hidden units whose outputs are fitted to -gain x, so that it holds the plant."""
     generator = np.random.default_rng(seed)
     W0, W1 = generator.normal(size=(12, 2)) * [1.0, 0.25], generator.normal(size=(12, 12))
@@ -59,7 +59,9 @@ def curved(centre="preactivation", squash="tanh", scale=6.0, bias=0.5, clip=None
     at_0 = np.tanh(np.tanh(b0) @ W1.T + b1)
     last = np.linalg.lstsq(h - at_0, -x @ gain.T, rcond=None)[0].T
     rounded = [a.astype(np.float32).astype(float) for a in (W0, W1, last, b0, b1, -last @ at_0)]
-    return TanhNetwork(tuple(rounded[:3]), tuple(rounded[3:]), np.array([scale]), np.zeros(1), squash, centre, clip)
+    return PolicyNetwork.of_layers(
+        tuple(rounded[:3]), tuple(rounded[3:]), np.array([scale]), np.zeros(1), squash, centre, clip
+    )
 
 
 def _record(**changes):
@@ -173,7 +175,7 @@ def test_a_policy_without_centring_keeps_its_value_at_the_origin():
     np.testing.assert_allclose(found.policy.network(zero, u_eq), teacher(zero, u_eq), atol=1e-5)
 
 
-def _chattering(centre="preactivation", bias=0.5) -> TanhNetwork:
+def _chattering(centre="preactivation", bias=0.5) -> PolicyNetwork:
     """A policy with sixty times the gain: with actions held over 0.02 s its loop never comes to rest."""
     steep = curved(centre, bias=bias)
     return replace(
@@ -361,7 +363,7 @@ def test_a_loop_that_diverges_has_nothing_to_compare_with(monkeypatch):
         (Policy(curved(), "pendulum", training={"state_weights": [1.0]}), {}, "`training.state_weights`"),
         (Policy(curved(gain=0 * GAIN), "pendulum"), {}, "its inputs never leave"),
         (
-            Policy(TanhNetwork((-GAIN,), (np.zeros(1),), np.array([6.0]), np.zeros(1)), "pendulum"),
+            Policy(PolicyNetwork.of_layers((-GAIN,), (np.zeros(1),), np.array([6.0]), np.zeros(1)), "pendulum"),
             {},
             "must have hidden units",
         ),

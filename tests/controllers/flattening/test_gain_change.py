@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from certify.errors import InputError
-from certify.loop.policies import TanhNetwork, require_centred
+from certify.loop.policies import PolicyNetwork, require_centred
 from controllers.flattening.gain_change import regained
 
 U_EQ = (Fraction(1, 4), Fraction(-1, 8))
@@ -18,7 +18,7 @@ BOX = np.array([0.5, 2.0, 0.1])
 J = np.array([[1.0, -0.25, 3.0], [0.5, 2.0, -1.0]])
 
 
-def network(centre="preactivation", squash="tanh", bias=0.4, clip=None, seed=3) -> TanhNetwork:
+def network(centre="preactivation", squash="tanh", bias=0.4, clip=None, seed=3) -> PolicyNetwork:
     """A bent 3-9-9-2 policy with numbers of single precision."""
     generator = np.random.default_rng(seed)
     sizes = (3, 9, 9, 2)
@@ -26,7 +26,7 @@ def network(centre="preactivation", squash="tanh", bias=0.4, clip=None, seed=3) 
     biases = [bias * generator.normal(size=b) for b in sizes[1:]]
     single = [a.astype(np.float32).astype(float) for a in (*weights, *biases)]
     scale, offset = np.array([2.0, 3.0]), np.array([0.5, 0.0])
-    return TanhNetwork(tuple(single[:3]), tuple(single[3:]), scale, offset, squash, centre, clip)
+    return PolicyNetwork.of_layers(tuple(single[:3]), tuple(single[3:]), scale, offset, squash, centre, clip)
 
 
 @pytest.mark.parametrize(
@@ -79,10 +79,10 @@ def test_zero_biases_stay_exact_centring():
 def test_inputs_that_depend_on_each_other_are_refused():
     old = network()
     double = np.stack([old.weights[-1][0], 2 * old.weights[-1][0]])
-    dependent = replace(old, weights=(*old.weights[:-1], double))
+    dependent = old.with_layers(weights=(*old.weights[:-1], double))
     with pytest.raises(InputError, match=r"2 inputs must act independently at the origin; .* rank 1\. Keep its gain"):
         regained(dependent, U_EQ, J, BOX)
-    silent = replace(old, weights=(*old.weights[:-1], np.zeros((2, 9))))
+    silent = old.with_layers(weights=(*old.weights[:-1], np.zeros((2, 9))))
     with pytest.raises(InputError, match="rank 0"):
         regained(silent, U_EQ, J, BOX)
 

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from certify.certificates.verdict import Verdict
 from certify.errors import InputError
 from certify.loop.plants import get_system, with_input_errors
-from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_policy
 from controllers.cli import app
 from controllers.evaluation.settling import MONITORING, settle
 from controllers.history.gain_distance import Distances, distances
@@ -61,7 +61,7 @@ def run(tmp_path_factory):
 
 def _law(gain, **record):
     """The policy u = -gain x with this record."""
-    network = TanhNetwork((-np.asarray(gain),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    network = PolicyNetwork.of_layers((-np.asarray(gain),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
     options = {"dt": 0.02, "state_weights": [1.0, 0.5], "input_weights": [1.0], "seed": 4}
     return Policy(network, "pendulum", {"m": "0.15", "l": "0.5", "b": "0.1", "g": "9.81"}, training=options | record)
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from certify.errors import InputError
 from certify.loop.plants import get_system
-from certify.loop.policies import TanhNetwork, load_policy
+from certify.loop.policies import PolicyNetwork, load_policy
 from controllers.cli import app
 from controllers.options import preset
 from controllers.training.departure import departure, departure_of, linearised
@@ -24,14 +24,16 @@ PENDULUM = get_system("pendulum")
 runner = CliRunner()
 
 
-def _network(layers=(3, 6, 5, 2), seed=0, bias=0.6) -> TanhNetwork:
+def _network(layers=(3, 6, 5, 2), seed=0, bias=0.6) -> PolicyNetwork:
     generator = np.random.default_rng(seed)
     weights = tuple(generator.normal(size=(b, a)) for a, b in pairwise(layers))
     biases = tuple(bias * generator.normal(size=len(W)) for W in weights)
-    return TanhNetwork(weights, biases, np.full(layers[-1], 2.0), np.zeros(layers[-1]), "tanh", "preactivation")
+    return PolicyNetwork.of_layers(
+        weights, biases, np.full(layers[-1], 2.0), np.zeros(layers[-1]), "tanh", "preactivation"
+    )
 
 
-def _by_differences(network: TanhNetwork, box: np.ndarray) -> float:
+def _by_differences(network: PolicyNetwork, box: np.ndarray) -> float:
     """The same sum unit by unit: ranges and gains by differences of the network cut in two, quotients at both ends."""
 
     def upto(x, k):  # values before the k-th tanh
@@ -68,25 +70,33 @@ def test_it_is_the_sum_over_units_by_another_computation(layers):
 
 
 def test_one_unit_at_rest_by_hand():
-    network = TanhNetwork((np.array([[2.0, 0.0]]), np.array([[-5.0]])), (np.zeros(1),) * 2, np.ones(1), np.zeros(1))
+    network = PolicyNetwork.of_layers(
+        (np.array([[2.0, 0.0]]), np.array([[-5.0]])), (np.zeros(1),) * 2, np.ones(1), np.zeros(1)
+    )
     v = 2.0 * 0.3
     assert departure_of(network, [0.3, 7.0]) == pytest.approx((v - np.tanh(v)) / v, rel=1e-12)
-    tiny = replace(network, weights=(np.array([[1e-4, 0.0]]), network.weights[1]))
+    tiny = network.with_layers(weights=(np.array([[1e-4, 0.0]]), network.weights[1]))
     assert departure_of(tiny, [1.0, 1.0]) == pytest.approx(1e-8 / 3, rel=1e-6)  # single precision sees nothing of it
 
 
 def test_an_affine_network_departs_by_nothing_and_a_dead_one_is_no_accident():
-    affine = TanhNetwork((np.array([[1.0, 2.0]]),), (np.ones(1),), np.ones(1), np.zeros(1), "identity", "output")
+    affine = PolicyNetwork.of_layers(
+        (np.array([[1.0, 2.0]]),), (np.ones(1),), np.ones(1), np.zeros(1), "identity", "output"
+    )
     assert departure_of(affine, [1.0, 1.0]) == 0.0
-    dead = TanhNetwork((np.zeros((3, 2)), np.ones((1, 3))), (np.zeros(3), np.zeros(1)), np.ones(1), np.zeros(1))
+    dead = PolicyNetwork.of_layers(
+        (np.zeros((3, 2)), np.ones((1, 3))), (np.zeros(3), np.zeros(1)), np.ones(1), np.zeros(1)
+    )
     assert departure_of(dead, [1.0, 1.0]) == 0.0
 
 
 def test_units_that_cancel_count_twice():
     """Two equal units with opposite gains do nothing together, and bounds that add magnitudes do not see that."""
     W = np.array([[1.0], [1.0], [1.0]])
-    one = TanhNetwork((W[:1], np.array([[1.0]])), (np.zeros(1),) * 2, np.ones(1), np.zeros(1))
-    three = TanhNetwork((W, np.array([[1.0, 4.0, -4.0]])), (np.zeros(3), np.zeros(1)), np.ones(1), np.zeros(1))
+    one = PolicyNetwork.of_layers((W[:1], np.array([[1.0]])), (np.zeros(1),) * 2, np.ones(1), np.zeros(1))
+    three = PolicyNetwork.of_layers(
+        (W, np.array([[1.0, 4.0, -4.0]])), (np.zeros(3), np.zeros(1)), np.ones(1), np.zeros(1)
+    )
     x = np.linspace(-1, 1, 5)[:, None]
     np.testing.assert_allclose(three.net(x), one.net(x), atol=1e-14)
     assert departure_of(three, [1.0]) == pytest.approx(9 * departure_of(one, [1.0]))
@@ -125,7 +135,7 @@ def test_its_gradient_is_that_of_differences():
 def test_doing_less_is_no_way_to_lower_it():
     """A term that falls with the gains would train a policy to let go of the plant."""
     network, box = _network(), [0.4, 0.7, 0.2]
-    less = replace(network, weights=(*network.weights[:-1], 0.1 * network.weights[-1]))
+    less = network.with_layers(weights=(*network.weights[:-1], 0.1 * network.weights[-1]))
     assert departure_of(less, box) == pytest.approx(departure_of(network, box), rel=1e-12)
     weights, biases = _tensors(network, requires_grad=True)
     departure(weights, biases, torch.tensor(box, dtype=torch.float64)).backward()

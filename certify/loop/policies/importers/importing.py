@@ -29,7 +29,7 @@ from certify.loop.policies.importers.options import ImportOptions
 from certify.loop.policies.importers.reading import Evaluate, Reading
 from certify.loop.policies.importers.recognising import Content, kind_of, read_kind
 from certify.loop.policies.importers.steps import Clip, Diagonal, Normalise, Step, spread
-from certify.loop.policies.network import Array, Centre, TanhNetwork
+from certify.loop.policies.network import Array, Centre, PolicyNetwork
 
 if TYPE_CHECKING:
     from certify.loop.plants import System
@@ -257,12 +257,12 @@ def _action(options: ImportOptions, m: int) -> tuple[Step, ...]:
 
 def _network(
     folded: Folded, index: list[int], n: int, reading: Reading, options: ImportOptions
-) -> tuple[TanhNetwork, Array | None]:
+) -> tuple[PolicyNetwork, Array | None]:
     """The network over the plant's states, and the states where no observation is clipped, (n, 2), rounded inwards."""
     first = over_states(folded.weights[0], index, n)
     centre: Centre = "preactivation" if reading.beta is not None else options.centre or "none"
     weights, clip = (first, *folded.weights[1:]), folded.clip
-    network = TanhNetwork(
+    network = PolicyNetwork.of_layers(
         *(weights, folded.biases, folded.scale, folded.offset, folded.squash, centre, clip),
         activation=folded.activation,
     )
@@ -289,14 +289,14 @@ def _parameters(plant: System) -> dict[str, str]:
     return {name: str(value) for name, value in plant.parameters.items()}
 
 
-def centring_changes(network: TanhNetwork, plant: System) -> dict[Centre, float]:
+def centring_changes(network: PolicyNetwork, plant: System) -> dict[Centre, float]:
     """The largest change of u that each possible centring would cause, over samples of the domain."""
     x, u_eq = sample(plant, None), plant.exact_u_eq()
     bare = replace(network, centre="none")
     return _centrings(bare, u_eq, x, bare(x, u_eq))
 
 
-def _centrings(bare: TanhNetwork, u_eq: tuple[Fraction, ...], x: Array, values: Array) -> dict[Centre, float]:
+def _centrings(bare: PolicyNetwork, u_eq: tuple[Fraction, ...], x: Array, values: Array) -> dict[Centre, float]:
     """The largest change of u that each centring would cause, over the states."""
     changes: dict[Centre, float] = {}
     centres: tuple[Centre, ...] = ("output", "preactivation")
@@ -309,7 +309,7 @@ def _centrings(bare: TanhNetwork, u_eq: tuple[Fraction, ...], x: Array, values: 
     return changes
 
 
-def _formula(normaliser: tuple[Step, ...], network: TanhNetwork, folded: Folded, reading: Reading) -> str:
+def _formula(normaliser: tuple[Step, ...], network: PolicyNetwork, folded: Folded, reading: Reading) -> str:
     """The file's policy in the plant's units."""
     observation = "o"
     if normaliser:

@@ -1,0 +1,31 @@
+"""Networks: vector functions written as steps, read by one interpreter over an algebra."""
+
+from __future__ import annotations
+
+from certify.loop.networks.floats import Gradients, Tangent, tangent_at, values
+from certify.loop.networks.layers import frozen, frozen_layers, like, sha256_of, tanh, through, widths
+from certify.loop.networks.steps import Affine, Algebra, Clip, Concat, Map, Network, Observe, Step, Sum, layered
+
+__all__ = [
+    "Affine",
+    "Algebra",
+    "Clip",
+    "Concat",
+    "Gradients",
+    "Map",
+    "Network",
+    "Observe",
+    "Step",
+    "Sum",
+    "Tangent",
+    "frozen",
+    "frozen_layers",
+    "layered",
+    "like",
+    "sha256_of",
+    "tangent_at",
+    "tanh",
+    "through",
+    "values",
+    "widths",
+]

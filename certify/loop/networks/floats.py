@@ -1,0 +1,157 @@
+"""Networks in floating point: values of arrays and tensors, and derivatives; nothing is proved with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, reduce
+from typing import Any
+
+import numpy as np
+
+from certify.loop.expressions import Expression, Symbol, numerical
+from certify.loop.networks.layers import like
+from certify.loop.networks.steps import Affine, Algebra, Array, Clip, Concat, Map, Network, Observe, Sum
+
+
+class _Values(Algebra[Any]):
+    """Arrays or tensors, entries along the last axis."""
+
+    def affine(self, step: Affine, v: Any) -> Any:
+        return v @ like(step.weight.T, v) + like(step.bias, v)
+
+    def map(self, step: Map, v: Any) -> Any:
+        return step.phi(v)
+
+    def clip(self, step: Clip, v: Any) -> Any:
+        lo, hi = like(step.lo, v), like(step.hi, v)
+        return np.minimum(np.maximum(v, lo), hi) if isinstance(v, np.ndarray) else v.clamp(lo, hi)
+
+    def sum(self, step: Sum, *vectors: Any) -> Any:
+        return reduce(lambda a, b: a + b, vectors)
+
+    def concat(self, step: Concat, *vectors: Any) -> Any:
+        return joined(vectors)
+
+    def observe(self, step: Observe, v: Any) -> Any:
+        return evaluated(step.expressions, step.symbols, v)
+
+
+_VALUES = _Values()
+
+
+def values(network: Network, x: Any) -> Any:
+    """The network's value at x (..., reads), in the arithmetic of x: (..., gives)."""
+    return _VALUES.run(network, x)
+
+
+def joined(vectors: tuple[Any, ...]) -> Any:
+    """Arrays or tensors one behind the other, along the last axis."""
+    if isinstance(vectors[0], np.ndarray):
+        return np.concatenate(vectors, axis=-1)
+    import torch
+
+    return torch.cat(vectors, dim=-1)
+
+
+def evaluated(expressions: tuple[Expression, ...], symbols: tuple[Symbol, ...], v: Any) -> Any:
+    """Expressions of the last axis of v."""
+    module = "numpy" if isinstance(v, np.ndarray) else "torch"
+    found = _compiled(expressions, symbols, module)(*(v[..., i] for i in range(len(symbols))))
+    if isinstance(v, np.ndarray):
+        return np.stack([np.broadcast_to(np.asarray(e, dtype=v.dtype), v.shape[:-1]) for e in found], axis=-1)
+    import torch
+
+    columns = (torch.as_tensor(e, dtype=v.dtype, device=v.device).expand(v.shape[:-1]) for e in found)
+    return torch.stack(list(columns), dim=-1)
+
+
+@cache
+def _compiled(expressions: tuple[Expression, ...], symbols: tuple[Symbol, ...], module: Any) -> Any:
+    return numerical(expressions, symbols, module)
+
+
+def jacobian(step: Observe, v: Array) -> Array:
+    """The derivatives of observations at v (..., k), (..., w, k)."""
+    flat = evaluated(step.slopes, step.symbols, v)
+    return np.asarray(flat.reshape(*v.shape[:-1], len(step.expressions), len(step.symbols)))
+
+
+@dataclass(frozen=True, slots=True)
+class Tangent:
+    """A vector's value y (w,) at one state, and its Jacobian J (w, k)."""
+
+    y: Array
+    J: Array
+
+
+class _Tangents(Algebra[Tangent]):
+    def affine(self, step: Affine, v: Tangent) -> Tangent:
+        return Tangent(step.weight @ v.y + step.bias, step.weight @ v.J)
+
+    def map(self, step: Map, v: Tangent) -> Tangent:
+        y, slope = step.phi.pair(v.y)
+        return Tangent(y, slope[:, None] * v.J)
+
+    def clip(self, step: Clip, v: Tangent) -> Tangent:
+        inside = (v.y > step.lo) & (v.y < step.hi)
+        return Tangent(np.minimum(np.maximum(v.y, step.lo), step.hi), np.where(inside[:, None], v.J, 0.0))
+
+    def sum(self, step: Sum, *vectors: Tangent) -> Tangent:
+        return Tangent(np.sum([v.y for v in vectors], axis=0), np.sum([v.J for v in vectors], axis=0))
+
+    def concat(self, step: Concat, *vectors: Tangent) -> Tangent:
+        return Tangent(np.concatenate([v.y for v in vectors]), np.concatenate([v.J for v in vectors]))
+
+    def observe(self, step: Observe, v: Tangent) -> Tangent:
+        return Tangent(evaluated(step.expressions, step.symbols, v.y), jacobian(step, v.y) @ v.J)
+
+
+def tangent_at(network: Network, x: Array) -> Tangent:
+    """The network's value (gives,) and Jacobian (gives, reads) at a state (reads,)."""
+    return _Tangents().run(network, Tangent(x, np.eye(network.reads)))
+
+
+class Gradients(_Values):
+    """A network's values at states x (B, reads), `value` (B, gives), and derivatives of numbers that follow from it."""
+
+    def __init__(self, network: Network, x: Array) -> None:
+        self.network = network
+        self._slopes: list[Array] = []  # of each step, where it is no matrix of numbers
+        self.value: Array = self.run(network, x)
+
+    def map(self, step: Map, v: Array) -> Array:
+        y, slope = step.phi.pair(v)
+        self._slopes.append(slope)
+        return y
+
+    def clip(self, step: Clip, v: Array) -> Array:
+        self._slopes.append(np.where((v > step.lo) & (v < step.hi), 1.0, 0.0))
+        return np.asarray(super().clip(step, v))
+
+    def observe(self, step: Observe, v: Array) -> Array:
+        self._slopes.append(jacobian(step, v))
+        return np.asarray(super().observe(step, v))
+
+    def backwards(self, slope: Array) -> Array:
+        """The derivative (B, reads) by x of a number whose derivative by the value is `slope` (B, gives)."""
+        steps, local = self.network.steps, list(self._slopes)
+        arriving: dict[int, Array] = {len(steps): slope}
+        for k, step in reversed(list(enumerate(steps, 1))):
+            own = arriving.pop(k)
+            for i, part in zip(step.of, self._before(step, own, local), strict=True):
+                arriving[i] = arriving[i] + part if i in arriving else part
+        return arriving[0]
+
+    def _before(self, step: Any, own: Array, local: list[Array]) -> list[Array]:
+        """What arrives at each vector that a step reads."""
+        match step:
+            case Affine():
+                return [own @ step.weight]
+            case Sum():
+                return [own] * len(step.of)
+            case Concat():
+                ends = np.cumsum([self.network.sizes[i] for i in step.of])[:-1]
+                return np.split(own, ends, axis=-1)
+            case Observe():
+                return [np.einsum("bw,bwk->bk", own, local.pop())]
+        return [own * local.pop()]
