@@ -319,7 +319,7 @@ HOSTILE = {
     "norm_obs": (np.bool_(False), "true or false"),
     "epsilon": (np.array([1.0, 2.0]), "must be one number"),
     "clip_obs": ("10", "must be a number"),
-    "obs_rms": ({"a": 1}, "must hold obs_rms of one array"),
+    "obs_rms": ({"a": 1}, "must hold obs_rms of arrays"),
 }
 
 

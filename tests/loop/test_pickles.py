@@ -21,9 +21,8 @@ from hypothesis import strategies as st
 from certify.errors import InputError
 from certify.loop.files.archives import MAX_BYTES, Archive
 from certify.loop.files.arrays import array_of
-from certify.loop.files.pickles import Call, Name, brief, read_pickle
 from certify.loop.files.legacy import BEGINNING
-from certify.loop.files.torchfile import TorchFile
+from certify.loop.files.pickles import Call, Name, brief, read_pickle
 from certify.loop.policies.importers.tensors import load_tensors
 
 SCALARS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
