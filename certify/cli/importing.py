@@ -22,7 +22,7 @@ _PANEL = "Policies of other programs"
 _KINDS = "state-dict, torchscript, onnx, sb3, safetensors or two-stage; auto looks at the file."
 _HELP = {
     "kind": _KINDS,
-    "states": "The plant's states in the order in which the network reads them, as in x,theta.",
+    "states": "What the network reads, in its order: states, or expressions as in 'cos(theta),sin(theta),theta_dot'.",
     "prefix": "Keys of a state_dict's layers up to their numbers, as in actor.pi_net.fcs.",
     "activation": "Between the layers of a state_dict: tanh, relu, elu, silu, gelu and others; docs/import.md has all.",
     "squash": "After the last layer of a state_dict: identity, tanh or relu-tanh.",
@@ -83,7 +83,7 @@ def _parsed(texts: Mapping[str, Any]) -> ImportOptions:
         prefix=texts.get("prefix"),
         activation=texts.get("activation"),
         squash=texts.get("squash"),
-        states=None if states is None else tuple(name.strip() for name in states.split(",")),
+        states=None if states is None else tuple(_parts(states)),
         normaliser=None if normaliser is None else "none" if normaliser == "none" else Path(normaliser),
         epsilon=None if epsilon is None else epsilon[0],
         action_scale=rationals("action_scale", "--action-scale"),
@@ -94,6 +94,19 @@ def _parsed(texts: Mapping[str, Any]) -> ImportOptions:
         ignore=tuple(texts.get("ignore") or ()) or None,
         output=texts.get("output"),
     )
+
+
+def _parts(text: str) -> Iterator[str]:
+    """The parts between commas that stand in no brackets."""
+    part, depth = "", 0
+    for letter in text:
+        depth += (letter == "(") - (letter == ")")
+        if letter == "," and depth == 0:
+            yield part.strip()
+            part = ""
+        else:
+            part += letter
+    yield part.strip()
 
 
 def _clip(text: str | None) -> Any:

@@ -21,7 +21,7 @@ from certify.loop.policies.importers.comparing import Difference, compare_readin
 from certify.loop.policies.importers.folding import fold
 from certify.loop.policies.importers.importing import read_bytes
 from certify.loop.policies.importers.normalisers import rsl_normaliser
-from certify.loop.policies.importers.observing import index_of, over_states, require_equilibrium, sample, shift
+from certify.loop.policies.importers.observing import observed, over_states, require_equilibrium, sample, shift
 from certify.loop.policies.importers.options import ImportOptions
 from certify.loop.policies.importers.recognising import Content, kind_of, tensors_in
 from certify.loop.policies.importers.state_dict import read_lyapunov
@@ -104,19 +104,22 @@ def _imported(raw: bytes, name: str, plant: System, options: ImportOptions, pref
     _require_answers(kind, options, prefix, plant, tensors)
     reading = read_lyapunov(tensors, prefix, options)
     states = options.states if options.states is not None else tuple(s.name for s in plant.states)
-    index = index_of(states, plant)
+    reads = observed(states, plant, options)
+    if reads.index is None:
+        raise InputError(f"it must read states themselves; --states names {', '.join(states)}.")
     if (reading.n, reading.m) != (len(states), 1):
         raise InputError(
             f"it must read the {len(states)} states {', '.join(states)} and have one output; "
             f"{reading.words} reads {reading.n} and has {reading.m}. Name what it reads with --states."
         )
-    x_eq = [plant.exact_x_eq()[i] for i in index]
+    x_eq = [plant.exact_x_eq()[i] for i in reads.index]
     before = shift(x_eq, options)
     require_equilibrium(reading, x_eq if before else [Fraction(0)] * len(states))
-    folded = fold((*before, *reading.steps), len(states))
-    function = Neural((over_states(folded.weights[0], index, plant.n), *folded.weights[1:]), folded.biases)
+    layers = fold((*before, *reading.steps), len(states)).network.affine
+    first, biases = over_states(layers[0].weight, reads.index, plant.n), tuple(step.bias for step in layers)
+    function = Neural((first, *(step.weight for step in layers[1:])), biases)
     x = sample(plant, None)
-    difference = compare_reading(reading, before, (), x[:, index], function(x)[:, None])
+    difference = compare_reading(reading, before, (), reads(x), function(x)[:, None])
     record = {
         "file": name,
         "sha256": hashlib.sha256(raw).hexdigest(),

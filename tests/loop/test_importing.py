@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import pickle
 import warnings
 from dataclasses import replace
 from fractions import Fraction
@@ -318,7 +319,7 @@ HOSTILE = {
     "norm_obs": (np.bool_(False), "true or false"),
     "epsilon": (np.array([1.0, 2.0]), "must be one number"),
     "clip_obs": ("10", "must be a number"),
-    "obs_rms": ({"a": 1}, "must hold obs_rms of one array"),
+    "obs_rms": ({"a": 1}, "must hold obs_rms of arrays"),
 }
 
 
@@ -626,8 +627,9 @@ def test_a_format_that_holds_itself_is_no_format(tmp_path: Path) -> None:
 def test_what_a_file_is_follows_from_its_bytes(tmp_path: Path) -> None:
     buffer = io.BytesIO()
     torch.save(STATE, buffer, _use_new_zipfile_serialization=False)
+    assert content_of(buffer.getvalue(), "p.pt") == "state-dict"
     for raw, message in (
-        (buffer.getvalue(), "before version 1.6"),
+        (pickle.dumps(STATE), "a bare pickle"),
         (b"noise", "none of these"),
         (b"", "none of these"),
         (b"PK\x03\x04noise", "no zip archive"),

@@ -21,8 +21,8 @@ from hypothesis import strategies as st
 from certify.errors import InputError
 from certify.loop.files.archives import MAX_BYTES, Archive
 from certify.loop.files.arrays import array_of
+from certify.loop.files.legacy import BEGINNING
 from certify.loop.files.pickles import Call, Name, brief, read_pickle
-from certify.loop.files.torchfile import TorchFile
 from certify.loop.policies.importers.tensors import load_tensors
 
 SCALARS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
@@ -322,11 +322,62 @@ def test_many_views_of_one_storage_are_refused(monkeypatch: pytest.MonkeyPatch) 
         load_tensors(buffer.getvalue(), "f")
 
 
-def test_legacy_files_are_refused_by_name() -> None:
+def legacy(value: Any) -> bytes:
+    """A file in the format of torch before version 1.6."""
     buffer = io.BytesIO()
-    torch.save({"w": torch.ones(2)}, buffer, _use_new_zipfile_serialization=False)
-    with pytest.raises(InputError, match=r"before version 1\.6"):
-        TorchFile(buffer.getvalue(), "f")
+    torch.save(value, buffer, _use_new_zipfile_serialization=False)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize("name", TENSORS)
+def test_files_of_old_torch_are_read_as_torch_reads_them(name: str) -> None:
+    base = torch.arange(12.0)
+    raw = legacy({"a": {"b": TENSORS[name], "shared": base[2:5]}, "c": base.reshape(3, 4).T, "n": 3})
+    assert raw.startswith(BEGINNING)
+    read, theirs = load_tensors(raw, "f"), torch.load(io.BytesIO(raw), weights_only=True)
+    expected = {"a.b": theirs["a"]["b"].detach(), "a.shared": theirs["a"]["shared"], "c": theirs["c"]}
+    assert set(read) == set(expected)
+    for key, tensor in expected.items():
+        narrow = tensor.dtype in (torch.float16, torch.bfloat16)
+        assert np.array_equal(read[key], (tensor.float() if narrow else tensor).numpy())
+
+
+def test_nothing_in_a_file_of_old_torch_is_called(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    raw = legacy({"w": torch.ones(2), "evil": Asks(os.system, "touch executed")})
+    assert np.array_equal(load_tensors(raw, "f")["w"], [1, 1]) and not Path("executed").exists()
+
+
+def test_damaged_files_of_old_torch_are_refused() -> None:
+    raw = legacy({"w": torch.ones(2), "v": torch.zeros(3, dtype=torch.float64)})
+    for end in range(len(BEGINNING), len(raw)):
+        with pytest.raises(InputError):
+            load_tensors(raw[:end], "f")
+    for old, new in (
+        (b"M\xe9\x03.", b"M\xe8\x03."),  # the protocol
+        (b"little_endianq\x02\x88", b"little_endianq\x02\x89"),
+        (b"FloatStorage", b"QInt8Storage"),
+        (b"FloatStorage", b"ShortStorage"),
+        (struct.pack("<q", 2), struct.pack("<q", -2)),
+        (struct.pack("<q", 2), struct.pack("<q", 2**62)),
+        (b"storage", b"modules"),
+    ):
+        assert old in raw
+        with pytest.raises(InputError):
+            load_tensors(raw.replace(old, new, 1), "f")
+    with pytest.raises(InputError, match="more behind"):
+        load_tensors(raw + b"\0", "f")
+    with pytest.raises(InputError, match="plain storages only"):
+        load_tensors(legacy(torch.nn.Linear(1, 1)), "f")
+
+
+@given(st.data())
+def test_a_file_of_old_torch_with_changed_bytes_is_refused_or_read(data: st.DataObject) -> None:
+    raw = bytearray(legacy({"w": torch.ones(2), "v": [torch.zeros(3, 2)]}))
+    for _ in range(data.draw(st.integers(1, 4))):
+        raw[data.draw(st.integers(len(BEGINNING), len(raw) - 1))] = data.draw(st.integers(0, 255))
+    with contextlib.suppress(InputError):
+        load_tensors(bytes(raw), "f")
 
 
 def test_zip_bombs_are_not_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:

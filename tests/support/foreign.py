@@ -107,7 +107,25 @@ class Odd(Toy):
     action_space = gymnasium.spaces.Box(-0.1, 0.3, (1,), np.float64)
 
 
-def sb3(kind: str, folder: Path, world: type[Toy] = Toy, **policy: Any) -> tuple[Any, Any, Path, Path]:
+class Several(Toy):
+    """A dictionary of observations, which `Dict` puts in the order of their names."""
+
+    observation_space = gymnasium.spaces.Dict(
+        {"speed": gymnasium.spaces.Box(-9, 9, (1,), np.float32), "place": gymnasium.spaces.Box(-9, 9, (1,), np.float32)}
+    )
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset()
+        return {"speed": self.x[1:], "place": self.x[:1]}, {}
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        super().step(action)
+        return {"speed": self.x[1:], "place": self.x[:1]}, 0.0, False, False, {}
+
+
+def sb3(
+    kind: str, folder: Path, world: type[Toy] = Toy, *, sde: bool | None = None, **policy: Any
+) -> tuple[Any, Any, Path, Path]:
     """(model, normaliser, file of the model, file of the normaliser) of stable-baselines3, untrained."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -116,7 +134,9 @@ def sb3(kind: str, folder: Path, world: type[Toy] = Toy, **policy: Any) -> tuple
 
         environment = VecNormalize(DummyVecEnv([world]))
         algorithm = vars(stable_baselines3)[kind]
-        model = algorithm("MlpPolicy", environment, policy_kwargs=policy or None, seed=1, device="cpu")
+        of = "MultiInputPolicy" if world is Several else "MlpPolicy"
+        given: dict[str, Any] = {} if sde is None else {"use_sde": sde}
+        model = algorithm(of, environment, policy_kwargs=policy or None, seed=1, device="cpu", **given)
         environment.reset()
         for _ in range(20):
             environment.step(np.zeros((1, 1)))

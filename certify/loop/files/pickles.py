@@ -8,6 +8,7 @@ Python's own `Unpickler` with a `find_class` is not enough: it sets the attribut
 
 from __future__ import annotations
 
+import io
 import pickletools
 from dataclasses import dataclass, field
 from typing import Any
@@ -69,13 +70,23 @@ def read_pickle(raw: bytes, what: str) -> Any:
     ------
     InputError : it is damaged, or uses an opcode that plain data does not need.
     """
+    return read_next(io.BytesIO(raw), what)[0]
+
+
+def read_next(stream: io.BytesIO, what: str) -> tuple[Any, list[Persistent]]:
+    """The value of the pickle at which a stream stands, and all references in it; the stream then stands behind it.
+
+    Raises
+    ------
+    InputError : as `read_pickle`.
+    """
     machine = _Machine()
     try:
-        for count, (opcode, argument, _) in enumerate(pickletools.genops(raw)):
+        for count, (opcode, argument, _) in enumerate(pickletools.genops(stream)):
             if count > _MAX_OPCODES:
                 raise InputError(f"{what} must have at most {_MAX_OPCODES} steps; it has more.")
             if opcode.name == "STOP":
-                return machine.pop()
+                return machine.pop(), machine.references
             machine.step(opcode.name, argument)
     except InputError as error:
         raise InputError(f"{what} cannot be read, and nothing in it was executed: {error}") from error
@@ -91,6 +102,7 @@ class _Machine:
         self.stack: list[Any] = []
         self.marks: list[list[Any]] = []
         self.memo: dict[int, Any] = {}
+        self.references: list[Persistent] = []
 
     def pop(self) -> Any:
         return self.stack.pop()
@@ -204,10 +216,9 @@ class _Machine:
                     stack[-1].states.append(state)
                 elif not isinstance(stack[-1], dict):  # an ordered dictionary may carry attributes: nobody needs them
                     raise InputError(f"it gives a state to {brief(stack[-1])}.")
-            case "PERSID":
-                stack.append(Persistent(argument))
-            case "BINPERSID":
-                stack.append(Persistent(self.pop()))
+            case "PERSID" | "BINPERSID":
+                self.references.append(Persistent(argument if name == "PERSID" else self.pop()))
+                stack.append(self.references[-1])
             case _:
                 raise InputError(f"it uses {name}, which plain data does not need.")
 

@@ -18,6 +18,7 @@ import numpy as np
 from certify.errors import InputError
 from certify.loop.files.archives import Archive
 from certify.loop.files.arrays import Numbers, product
+from certify.loop.files.legacy import BEGINNING, Legacy
 from certify.loop.files.pickles import Call, Name, Persistent, brief, read_pickle
 
 _MAX_NUMBERS = 2**26
@@ -29,11 +30,10 @@ _DTYPES = {
     "float32": "f4", "float64": "f8", "float16": "f2", "bfloat16": "bf16",
     "int64": "i8", "int32": "i4", "int16": "i2", "int8": "i1", "uint8": "u1", "bool": "b1",
 }  # fmt: skip
-_LEGACY = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19."  # the pickled magic number with which such a file begins
 
 
 class TorchFile:
-    """A zip file of torch, read without running anything in it.
+    """A zip file of torch, or a file of torch before version 1.6, read without running anything in it.
 
     Parameters
     ----------
@@ -43,17 +43,16 @@ class TorchFile:
 
     Raises
     ------
-    InputError : it is a file of before torch 1.6, is damaged, or holds no pickle.
+    InputError : it is damaged, or holds no pickle.
     """
 
     def __init__(self, raw: bytes, what: str, archive: Archive | None = None) -> None:
-        if raw.startswith(_LEGACY):
-            raise InputError(
-                f"{what} has torch's format of before version 1.6, which cannot be read without running it; "
-                "load it where you trust it and write it again with torch.save."
-            )
         self.what = what
-        self.archive = archive if archive is not None else Archive(raw, what)
+        self.archive: Archive | Legacy
+        if archive is not None:
+            self.archive = archive
+        else:
+            self.archive = Legacy(raw, what) if raw.startswith(BEGINNING) else Archive(raw, what)
         roots = [name.removesuffix("data.pkl") for name in self.archive.names if _depth(name) == 1]
         roots = [root for root in roots if f"{root}data.pkl" in self.archive]
         if len(set(roots)) != 1:
@@ -124,6 +123,8 @@ class TorchFile:
         return result
 
     def _storage(self, reference: Any, dtype: Any, what: str, folder: str) -> Numbers:
+        if isinstance(self.archive, Legacy) and isinstance(reference, tuple) and reference[5:] == (None,):
+            reference = reference[:5]  # it is no view of another storage
         if not isinstance(reference, tuple) or len(reference) != 5 or reference[0] != "storage":
             raise InputError(f"tensor {what} must name a storage of the file; it names something else.")
         _, kind, key, _, count = reference

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -267,8 +267,11 @@ class Network:
         if isinstance(first, Affine) and not any(0 in step.of for step in self.steps[1:]):
             moved = Affine(first.of, first.weight, first.bias + first.weight @ origin)
             return Network(self.reads, (moved, *self.steps[1:]))
-        steps = [_later(step) for step in self.steps]
-        return Network(self.reads, (Affine((0,), np.eye(self.reads), origin), *steps))
+        return self.behind(self.reads, Affine((0,), np.eye(self.reads), origin))
+
+    def behind(self, reads: int, first: Step) -> Network:
+        """The network of what a step makes of `reads` numbers."""
+        return Network(reads, (first, *(replace(step, of=tuple(i + 1 for i in step.of)) for step in self.steps)))
 
 
 def layered(
@@ -293,13 +296,6 @@ def _is_chain(steps: Sequence[Step], behind: int) -> bool:
     straight = all(step.of == (k,) for k, step in enumerate(steps, behind))
     functions = {step.function for step in steps if isinstance(step, Map)}
     return len(steps) % 2 == 1 and kinds and straight and len(functions) <= 1
-
-
-def _later(step: Step) -> Step:
-    """The step where each vector has the next number."""
-    from dataclasses import replace
-
-    return replace(step, of=tuple(i + 1 for i in step.of))
 
 
 def _in_words(step: Step) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 from certify.errors import InputError
 from certify.loop.activations import ACTIVATIONS
 from certify.loop.policies.importers.reading import Reading
-from certify.loop.policies.importers.steps import Activate, Affine, Clip, Diagonal, Normalise, Step, Tanh
+from certify.loop.policies.importers.steps import Activate, Affine, Branches, Clip, Diagonal, Normalise, Step, Tanh
 from certify.loop.policies.network import Array
 
 SAMPLES = 10_000
@@ -52,7 +52,12 @@ def apply(steps: Sequence[Step], x: Array) -> Array:
 
 
 def compare_reading(
-    reading: Reading, before: tuple[Step, ...], after: tuple[Step, ...], observed: Array, ours: Array
+    reading: Reading,
+    before: tuple[Step, ...],
+    after: tuple[Step, ...],
+    observed: Array,
+    ours: Array,
+    inexact: bool = False,
 ) -> Difference:
     """Compare with the framework in the file's precision, and with the same operations in double precision.
 
@@ -63,18 +68,26 @@ def compare_reading(
     before, after : the steps before and after the reading's own steps.
     observed : the network's inputs, without `before`, (k, n).
     ours : the folded network's values at the same states, (k, m).
+    inexact : True if `observed` are no numbers of single precision, and so are rounded for the framework.
 
     Raises
     ------
     InputError : they differ by more than rounding, or the framework cannot evaluate the network.
     """
-    single, double = (_against(reading, before, after, observed, ours, twice) for twice in (reading.double, True))
+    chains = before, after
+    single, double = (_against(reading, chains, observed, ours, twice, inexact) for twice in (reading.double, True))
     return Difference(single.states, single.largest, single.explained, double.largest)
 
 
 def _against(
-    reading: Reading, before: tuple[Step, ...], after: tuple[Step, ...], observed: Array, ours: Array, double: bool
+    reading: Reading,
+    chains: tuple[tuple[Step, ...], tuple[Step, ...]],
+    observed: Array,
+    ours: Array,
+    double: bool,
+    inexact: bool,
 ) -> Difference:
+    before, after = chains
     given = apply(before, observed)
     given = given if double else given.astype(np.float32)
     try:
@@ -82,7 +95,7 @@ def _against(
     except (RuntimeError, ValueError, TypeError, LookupError, AttributeError) as error:
         raise InputError(f"the framework cannot evaluate the network itself: {error}.") from error
     if reading.beta is None:
-        return compare(ours, theirs, rounding((*before, *reading.steps, *after), observed, double))
+        return compare(ours, theirs, rounding((*before, *reading.steps, *after), observed, double, inexact))
     end = max(k for k, step in enumerate(reading.steps) if isinstance(step, Tanh))
     head, tail = (*before, *reading.steps[:end]), (*reading.steps[end:], *after)
     return compare(ours, theirs, rounding_centred(head, tail, observed, reading.beta, double))
@@ -112,9 +125,11 @@ def compare(ours: Array, theirs: Any, bound: Array) -> Difference:
     return Difference(len(ours), float(off[j]), float(bound[j]), float(off[j]))
 
 
-def rounding(steps: Sequence[Step], x: Array, double: bool) -> Array:
-    """A bound of the rounding error of the action at states (k, n), shape (k, m)."""
-    return _SLACK * _run(steps, x, np.zeros_like(x), _DOUBLE if double else _SINGLE)[1]
+def rounding(steps: Sequence[Step], x: Array, double: bool, inexact: bool = False) -> Array:
+    """A bound of the rounding error of the action at observations (k, n), which are `inexact` numbers or exact ones,
+    shape (k, m)."""
+    unit = _DOUBLE if double else _SINGLE
+    return _SLACK * _run(steps, x, 4 * unit * np.abs(x) if inexact else np.zeros_like(x), unit)[1]
 
 
 def rounding_centred(before: Sequence[Step], after: Sequence[Step], x: Array, beta: Array, double: bool) -> Array:
@@ -161,6 +176,14 @@ def _run(steps: Sequence[Step], x: Array, error: Array, unit: float) -> tuple[Ar
                 h = value
             case Clip():
                 h = np.clip(h, _ends(step.lo, -np.inf), _ends(step.hi, np.inf))
+            case Branches():
+                ends = [_run(chain, h, e, unit) for chain in step.of]
+                if step.kind == "concat":
+                    h, e = (np.concatenate(parts, axis=1) for parts in zip(*ends, strict=True))
+                    continue
+                sizes = sum(np.abs(v) + w for v, w in ends)
+                h, e = (np.sum(parts, axis=0) for parts in zip(*ends, strict=True))
+                e = e + len(ends) * unit * sizes
     return h, e
 
 

@@ -1,13 +1,13 @@
-"""Fold a file's steps into the form of a proof: layers with an activation between them, then scale, offset and a clip.
+"""Fold a file's steps into the form of a proof: a network, then squash, scale, offset and a clip.
 
-Each number of the network is computed from the steps exactly, in rationals, and rounded once to the nearest
-binary64; where a normaliser divides by the square root of a rational that is no square, the number is enclosed in Arb
-until both ends of the enclosure round to the same binary64. So the policy that is proved is the folded one, and it
-differs from the file's real-number policy by at most half a unit in the last place of each weight, bias, scale and
-offset. A layer that stands alone keeps its numbers as they are.
+Affine steps that follow each other become one layer, whose numbers are computed exactly, in rationals, and rounded once
+to the nearest binary64; where a normaliser divides by the square root of a rational that is no square, the number is
+enclosed in Arb until both ends of the enclosure round to the same binary64. So the policy that is proved is the folded
+one, and it differs from the file's real-number policy by at most half a unit in the last place of each weight, bias,
+scale and offset. A layer that stands alone keeps its numbers as they are.
 
-A clip of the observation does not fold. It is inactive on a box of states, which is returned with the network: inside
-the box the folded policy is the real one.
+A clip of the observation is inactive on a box of states, which is returned with the network: inside the box the folded
+policy is the real one. With `keep_clips` the clip is a step of the network instead.
 """
 
 from __future__ import annotations
@@ -21,12 +21,22 @@ import flint
 import numpy as np
 
 from certify.errors import InputError
-from certify.loop.policies.importers.options import WITH_TANH
-from certify.loop.policies.importers.steps import Activate, Affine, Clip, Diagonal, Normalise, Step, Tanh, spread
+from certify.loop import networks
+from certify.loop.networks import Network
+from certify.loop.policies.importers.steps import (
+    Activate,
+    Affine,
+    Branches,
+    Clip,
+    Diagonal,
+    Normalise,
+    Step,
+    Tanh,
+    spread,
+)
 from certify.loop.policies.network import Array, Squash
 
 Bounds = tuple[Fraction | None, Fraction | None]
-_IN_A_ROW = "between two activations there must be a layer; the file has two in a row."
 _BITS = (128, 512, 2048, 8192)
 _ROOT_BITS = 128
 _NO_BOUNDS: Bounds = (None, None)
@@ -38,86 +48,141 @@ class Folded:
 
     Parameters
     ----------
-    weights, biases : the layers, shapes (out, in) and (out,).
+    network : net, which reads the n observations.
     scale, offset : shape (m,).
     squash : `tanh` or `identity`.
-    activation : between the layers.
     clip : (lo, hi), shapes (m,), or None.
     inactive : for each observation the exact bounds within which no clip of it acts, rounded inwards where they are no
         rationals; None for a side without a bound.
     """
 
-    weights: tuple[Array, ...]
-    biases: tuple[Array, ...]
+    network: Network
     scale: Array
     offset: Array
     squash: Squash
     clip: tuple[Array, Array] | None
     inactive: tuple[Bounds, ...]
-    activation: str = "tanh"
 
 
-def fold(steps: Sequence[Step], n: int) -> Folded:
+def fold(steps: Sequence[Step], n: int, keep_clips: bool = False) -> Folded:
     """Fold the steps from n observations to the action.
 
     Raises
     ------
-    InputError : the steps are no network with one activation and a clip at its ends, or their shapes do not chain.
+    InputError : their shapes do not chain, there is no layer, or an action has no bounds where it is clipped.
     """
-    steps, activation = _one_activation(steps)
-    first = next((k for k, step in enumerate(steps) if isinstance(step, Affine)), None)
-    if first is None:
+    inner = [k for k, step in enumerate(steps) if isinstance(step, Affine | Activate | Branches)]
+    if not inner:
         raise InputError("a policy must have a layer; the file has none.")
-    head, inactive = _head(steps[:first], n)
-    *hidden, last = _segments(steps[first:])
-    tail = last
-    layers: list[tuple[Array, Array]] = []
-    width = n
-    for k, segment in enumerate(hidden):
-        if not k:
-            layers.append(_layer(head, segment, width))
-        elif any(isinstance(step, Affine) for step in segment):
-            layers.append(_layer(None, segment, width))
+    ends = [k for k, step in enumerate(steps) if isinstance(step, Tanh) and k > inner[-1]]
+    body, tail = steps[: ends[-1] if ends else inner[-1] + 1], steps[ends[-1] + 1 if ends else inner[-1] + 1 :]
+    squash: Squash = "tanh" if ends else "identity"
+    if not ends and any(isinstance(step, Clip) and None in (*step.lo, *step.hi) for step in tail):
+        body, tail = steps, ()
+    program = _Program(n)
+    inactive = program.begin(body, n, keep_clips)
+    network = Network(n, tuple(program.steps))
+    scale, offset, clip = _tail(tail, network.gives, squash)
+    return Folded(network, scale, offset, squash, clip, tuple(inactive))
+
+
+class _Program:
+    """The steps of a network, made one after the other; `sizes` are those of its vectors."""
+
+    def __init__(self, n: int) -> None:
+        self.steps: list[networks.Step] = []
+        self.sizes = [n]
+
+    def begin(self, chain: Sequence[Step], n: int, keep_clips: bool) -> list[Bounds]:
+        """The whole chain, whose first steps are those of a normaliser; the bounds within which no clip acts."""
+        first = next((k for k, s in enumerate(chain) if not isinstance(s, Diagonal | Normalise | Clip)), len(chain))
+        front, rest = chain[:first], chain[first:]
+        if keep_clips:
+            front = [part for step in front for part in _apart(step)]
+            last = max((k for k, step in enumerate(front) if isinstance(step, Clip)), default=-1)
+            number = self._front(front[: last + 1])
+            self.follow((*front[last + 1 :], *rest), number)
+            return [_NO_BOUNDS] * n
+        head, bounds = _head(front, n)
+        run = next((k for k, step in enumerate(rest) if not isinstance(step, Affine | Diagonal)), len(rest))
+        if run:
+            number = self._affine(0, *_layer(head, rest[:run], n))
         else:
-            raise InputError(_IN_A_ROW)
-        width = len(layers[-1][1])
-    ends = [k for k, step in enumerate(last) if isinstance(step, Affine)]
-    squash: Squash = "tanh"
-    if ends:
-        layers.append(_layer(head if not hidden else None, last[: ends[-1] + 1], width))
-        width, squash, tail = len(layers[-1][1]), "identity", last[ends[-1] + 1 :]
-    scale, offset, clip = _tail(tail, width, squash)
-    weights, biases = tuple(w for w, _ in layers), tuple(b for _, b in layers)
-    return Folded(weights, biases, scale, offset, squash, clip, tuple(inactive), activation)
+            number = 0 if head.is_nothing else self._affine(0, *_behind(head, _matrix(np.eye(n)), [Fraction(0)] * n))
+        self.follow(rest[run:], number)
+        return bounds
+
+    def _front(self, steps: Sequence[Step]) -> int:
+        """A normaliser with its clips, which stay."""
+        number, done = 0, 0
+        for k, step in enumerate(steps):
+            if isinstance(step, Clip):
+                n = self.sizes[number]
+                head, _ = _head(steps[done:k], n)
+                if not head.is_nothing:
+                    number = self._affine(number, *_behind(head, _matrix(np.eye(n)), [Fraction(0)] * n))
+                number, done = self._clip(step, number), k + 1
+        return number
+
+    def follow(self, chain: Sequence[Step], number: int) -> int:
+        """The steps of a chain that begins with vector `number`; the number of its result."""
+        k = 0
+        while k < len(chain):
+            run = next((j for j in range(k, len(chain)) if not isinstance(chain[j], Affine | Diagonal)), len(chain))
+            if run > k:
+                number, k = self._affine(number, *_layer(None, chain[k:run], self.sizes[number])), run
+                continue
+            step = chain[k]
+            match step:
+                case Tanh():
+                    number = self._then(networks.Map((number,), "tanh"))
+                case Activate():
+                    number = self._then(networks.Map((number,), step.function))
+                case Clip():
+                    number = self._clip(step, number)
+                case Branches():
+                    ends = tuple(self.follow(branch, number) for branch in step.of)
+                    number = self._then((networks.Sum if step.kind == "sum" else networks.Concat)(ends))
+                case _:
+                    raise InputError("a normaliser must read the observation itself.")
+            k += 1
+        return number
+
+    def _affine(self, number: int, weight: Array, bias: Array) -> int:
+        return self._then(networks.Affine((number,), weight, bias))
+
+    def _clip(self, step: Clip, number: int) -> int:
+        """A clip, also of one side: max(h, lo) is relu(h - lo) + lo."""
+        width = self.sizes[number]
+        lo, hi = spread(step.lo, width), spread(step.hi, width)
+        if None not in lo and None not in hi:
+            ends = (_numbers([v for v in end if v is not None]) for end in (lo, hi))
+            return self._then(networks.Clip((number,), *ends))
+        for end, sign in ((lo, 1), (hi, -1)):
+            if all(v is None for v in end):
+                continue
+            if None in end:
+                raise InputError("a clip between layers must have a bound for every component, or for none.")
+            at = _numbers([v for v in end if v is not None])
+            eye = sign * np.eye(width)
+            if sign < 0 or np.any(at):
+                number = self._affine(number, eye, -sign * at)
+            number = self._then(networks.Map((number,), "relu"))
+            if sign < 0 or np.any(at):
+                number = self._affine(number, eye, at)
+        return number
+
+    def _then(self, step: networks.Step) -> int:
+        self.steps.append(step)
+        self.sizes.append(step.size([self.sizes[i] for i in step.of]))
+        return len(self.steps)
 
 
-def _one_activation(steps: Sequence[Step]) -> tuple[list[Step], str]:
-    """The steps with `Tanh` for the one function between their layers, and that function's name; relu may be a clip.
-
-    Raises
-    ------
-    InputError : there are several functions, or one of them has no layer after it and is neither tanh nor a clip.
-    """
-    ends = [k for k, step in enumerate(steps) if isinstance(step, Affine)]
-    first, last = (ends[0], ends[-1]) if ends else (0, 0)
-    inner = [_as_relu(step) if first < k < last else step for k, step in enumerate(steps)]
-    found = dict.fromkeys(_function(step) for step in inner[first:last] if isinstance(step, Tanh | Activate))
-    if len(found) > 1:
-        raise InputError(f"a policy must have one activation between its layers; the file has {' and '.join(found)}.")
-    beyond = [step.function for k, step in enumerate(inner) if isinstance(step, Activate) and not first < k < last]
-    if beyond:
-        raise InputError(f"{beyond[0]} must stand between two layers; behind the last one only tanh and a clip may.")
-    return [Tanh() if isinstance(step, Activate) else step for step in inner], next(iter(found), "tanh")
-
-
-def _as_relu(step: Step) -> Step:
-    """relu where a clip is that."""
-    is_relu = isinstance(step, Clip) and all(v == 0 for v in step.lo) and all(v is None for v in step.hi)
-    return Activate("relu") if is_relu else step
-
-
-def _function(step: Tanh | Activate) -> str:
-    return "tanh" if isinstance(step, Tanh) else step.function
+def _apart(step: Step) -> tuple[Step, ...]:
+    """A normaliser's clip as a step of its own."""
+    if not isinstance(step, Normalise) or step.limit is None:
+        return (step,)
+    return (Normalise(step.mean, step.square), Clip((-step.limit,), (step.limit,)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +225,7 @@ def _head(steps: Sequence[Step], n: int) -> tuple[_Head, list[Bounds]]:
                 limits = zip(spread(step.lo, n), spread(step.hi, n), strict=True)
                 bounds = [_preimage(head, i, limit, bounds[i]) for i, limit in enumerate(limits)]
             case _:
-                raise InputError("a policy must begin with a layer; the file has a tanh before the first one.")
+                raise InputError("a normaliser must read the observation itself.")
     return head, bounds
 
 
@@ -208,24 +273,8 @@ def _root_towards(square: Fraction, up: bool) -> Fraction:
     return Fraction(math.isqrt(scaled) + up, square.denominator << _ROOT_BITS)
 
 
-def _segments(steps: Sequence[Step]) -> list[list[Step]]:
-    """The steps between one function and the next."""
-    segments: list[list[Step]] = [[]]
-    for step in steps:
-        if isinstance(step, Tanh):
-            segments.append([])
-        else:
-            segments[-1].append(step)
-    return segments
-
-
 def _layer(head: _Head | None, segment: Sequence[Step], width: int) -> tuple[Array, Array]:
-    """One layer from all steps of a segment, and from `head` before them."""
-    for step in segment:
-        if isinstance(step, Clip):
-            raise InputError(f"between layers there must be an activation; the file has a clip there. {WITH_TANH}")
-        if isinstance(step, Normalise):
-            raise InputError("a normaliser must read the observation itself.")
+    """One layer from all affine steps of a segment, and from `head` before them."""
     if len(segment) == 1 and isinstance(segment[0], Affine) and (head is None or head.is_nothing):
         _require_width(segment[0].weight, width)
         return segment[0].weight, segment[0].bias
@@ -261,7 +310,9 @@ def _product(segment: Sequence[Step], width: int) -> tuple[flint.fmpq_mat, list[
                 entries = [_rational(scales[i]) * weight[i, j] for i in rows for j in range(weight.ncols())]
                 weight = flint.fmpq_mat(weight.nrows(), weight.ncols(), entries)
     if weight is None:
-        raise InputError(_IN_A_ROW)
+        weight = flint.fmpq_mat(width, width, [0] * width**2)
+        for i, s in enumerate(scale):
+            weight[i, i] = _rational(s)
     return weight, bias
 
 

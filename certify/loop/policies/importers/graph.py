@@ -1,19 +1,29 @@
-"""The operations that a graph of ONNX or TorchScript may contain, as exact steps on one chain of values.
+"""The operations that a graph of ONNX or TorchScript may contain, as exact steps on chains of values.
 
-A chain begins with the observation, and each operation extends a chain with constants; two chains never meet. Any other
-operation is rejected by its name.
+A chain begins with the observation, and each operation extends a chain with constants, or joins chains: sums, as of
+skip connections, and values one behind the other. Any other operation is rejected by its name.
 """
 
 from __future__ import annotations
 
 from fractions import Fraction
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from certify.errors import InputError
 from certify.loop.files.arrays import Numbers
-from certify.loop.policies.importers.steps import Activate, Affine, Clip, Diagonal, Step, Tanh, activated, exactly
+from certify.loop.policies.importers.steps import (
+    Activate,
+    Affine,
+    Branches,
+    Clip,
+    Diagonal,
+    Step,
+    Tanh,
+    activated,
+    exactly,
+)
 
 Chain = tuple[Step, ...]
 _EXACT_INTEGERS = 2**53
@@ -86,9 +96,17 @@ def negated(chain: Chain) -> Chain:
     return (*chain, Diagonal((Fraction(-1),), (Fraction(0),)))
 
 
-def mapped(chain: Chain, function: str) -> Chain:
-    """`phi(h)`, by the activation's name."""
-    return (*chain, activated(function))
+def mapped(chain: Chain, function: str, *numbers: float) -> Chain:
+    """`phi(h)`, by the activation's name and its numbers."""
+    return (*chain, *activated(function, *(Fraction(v) for v in numbers)))
+
+
+def joined(kind: Literal["sum", "concat"], *chains: Chain) -> Chain:
+    """The sum of several chains, or one behind the other; they part where their steps are no longer the same."""
+    same = 0
+    while all(len(chain) > same and chain[same] is chains[0][same] for chain in chains):
+        same += 1
+    return (*chains[0][:same], Branches(kind, tuple(chain[same:] for chain in chains)))
 
 
 def product(one: Chain, other: Chain) -> Chain | None:

@@ -19,12 +19,20 @@ import numpy as np
 
 from certify.errors import InputError
 from certify.loop.files.archives import MAX_BYTES
+from certify.loop.networks import Affine, Network
 from certify.loop.policies.exact import require_centred
 from certify.loop.policies.file import Policy
 from certify.loop.policies.importers.comparing import Difference, compare_reading
 from certify.loop.policies.importers.folding import Bounds, Folded, fold
 from certify.loop.policies.importers.normalisers import load_normaliser
-from certify.loop.policies.importers.observing import index_of, over_states, require_equilibrium, sample, shift
+from certify.loop.policies.importers.observing import (
+    Observed,
+    observed,
+    over_states,
+    require_equilibrium,
+    sample,
+    shift,
+)
 from certify.loop.policies.importers.options import ImportOptions
 from certify.loop.policies.importers.reading import Evaluate, Reading
 from certify.loop.policies.importers.recognising import Content, kind_of, read_kind
@@ -137,13 +145,13 @@ def import_bytes(
         reading = replace(reading, evaluate=evaluate, program="the module itself, run")
     _require_answers(kind, reading, options, plant)
     states = options.states if options.states is not None else tuple(s.name for s in plant.states)
-    index = index_of(states, plant)
+    reads = observed(states, plant, options)
     if (reading.n, reading.m) != (len(states), plant.m):
         raise InputError(
             f"the policy must read the {len(states)} states {', '.join(states)} and command the {plant.m} inputs of "
             f"{plant.name}; it reads {reading.n} and commands {reading.m}. Name what it reads with --states."
         )
-    x_eq = [plant.exact_x_eq()[i] for i in index]
+    x_eq = [plant.exact_x_eq()[i] for i in reads.index or ()]
     moved = shift(x_eq, options)
     normaliser = _normaliser(reading, options, len(states))
     before = (*moved, *normaliser)
@@ -151,7 +159,9 @@ def import_bytes(
     after = _action(options, plant.m)
     steps = (*before, *reading.steps, *after)
     folded = fold(steps, len(states))
-    network, valid = _network(folded, index, plant.n, reading, options)
+    if reads.index is None and reads.may_leave(folded.inactive):
+        folded = fold(steps, len(states), keep_clips=True)
+    network, valid = _network(folded, reads, reading, options)
     u_eq = plant.exact_u_eq()
     if network.centre != "none":
         require_centred(network, u_eq)
@@ -160,7 +170,7 @@ def import_bytes(
     x = sample(plant, valid)
     bare = network if reading.beta is not None else replace(network, centre="none")
     values = bare(x, u_eq)
-    difference = compare_reading(reading, before, after, x[:, index], values)
+    difference = compare_reading(reading, before, after, reads(x), values, reads.is_inexact)
     known = {"file": name, "sha256": hashlib.sha256(raw).hexdigest(), "kind": kind}
     known |= {"policy": reading.words, "states": ", ".join(states)}
     record = known | _record(reading, options, plant, difference)
@@ -256,20 +266,32 @@ def _action(options: ImportOptions, m: int) -> tuple[Step, ...]:
 
 
 def _network(
-    folded: Folded, index: list[int], n: int, reading: Reading, options: ImportOptions
+    folded: Folded, reads: Observed, reading: Reading, options: ImportOptions
 ) -> tuple[PolicyNetwork, Array | None]:
     """The network over the plant's states, and the states where no observation is clipped, (n, 2), rounded inwards."""
-    first = over_states(folded.weights[0], index, n)
+    n = reads.plant.n
     centre: Centre = "preactivation" if reading.beta is not None else options.centre or "none"
-    weights, clip = (first, *folded.weights[1:]), folded.clip
-    network = PolicyNetwork.of_layers(
-        *(weights, folded.biases, folded.scale, folded.offset, folded.squash, centre, clip),
-        activation=folded.activation,
+    network = PolicyNetwork(
+        _over_states(folded.network, reads), folded.scale, folded.offset, folded.squash, centre, folded.clip
     )
     valid = np.tile([-math.inf, math.inf], (n, 1))
-    for k, bounds in zip(index, folded.inactive, strict=True):
+    for k, bounds in zip(reads.index or (), folded.inactive, strict=False):
         valid[k] = _inwards(bounds)
     return network, None if np.all(np.isinf(valid)) else valid
+
+
+def _over_states(network: Network, reads: Observed) -> Network:
+    """A network of observations as one of the plant's states."""
+    n = reads.plant.n
+    if reads.index is None:
+        return network.behind(n, reads.step)
+    first, *others = network.steps
+    if isinstance(first, Affine) and not any(0 in step.of for step in others):
+        return Network(n, (Affine((0,), over_states(first.weight, reads.index, n), first.bias), *others))
+    if reads.index == tuple(range(n)):
+        return network
+    chosen = over_states(np.eye(len(reads.index)), reads.index, n)
+    return network.behind(n, Affine((0,), chosen, np.zeros(len(chosen))))
 
 
 def _inwards(bounds: Bounds) -> tuple[float, float]:

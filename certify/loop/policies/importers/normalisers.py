@@ -28,7 +28,7 @@ def load_normaliser(path: Path, epsilon: Fraction | None) -> Normaliser:
 
     Raises
     ------
-    InputError : the file is none of the two, or holds no statistics of one array of observations.
+    InputError : the file is none of the two, or holds no statistics of arrays of observations.
     """
     try:
         raw = path.read_bytes()
@@ -54,20 +54,38 @@ def _vec_normalize(root: Any, what: str) -> Normaliser:
         raise InputError(f"norm_obs in {what} must be true or false; found {brief(normalises)}.")
     if not normalises:
         return Diagonal((Fraction(1),), (Fraction(0),))
-    statistics = state.get("obs_rms")
+    moments = [_moments(each, of) for each, of in _statistics(state, what)]
+    mean, var = (tuple(v for each in moments for v in exactly(each[k])) for k in (0, 1))
+    epsilon = _one(state.get("epsilon"), "epsilon")
+    limit = None if state.get("clip_obs") == math.inf else _one(state.get("clip_obs"), "clip_obs")
+    return Normalise(mean, tuple(v + epsilon for v in var), limit)
+
+
+def _statistics(state: dict[Any, Any], what: str) -> list[tuple[Any, str]]:
+    """The statistics of the observation, or of each array of it in the order of their names."""
+    found = state.get("obs_rms")
+    if not isinstance(found, dict):
+        return [(found, f"obs_rms in {what}")]
+    names, normalised = list(found), state.get("norm_obs_keys")
+    if not names or not all(isinstance(name, str) for name in names):
+        raise InputError(f"obs_rms in {what} must have statistics by the names of observations; it has none.")
+    if normalised is not None and (not isinstance(normalised, list) or set(map(str, normalised)) != set(names)):
+        raise InputError(f"{what} must normalise each array of its observation; norm_obs_keys leaves some as they are.")
+    return [(found[name], f"obs_rms of {name} in {what}") for name in sorted(names)]
+
+
+def _moments(statistics: Any, what: str) -> tuple[Numbers, Numbers]:
     if not isinstance(statistics, Call) or not isinstance(statistics.function, Name):
-        raise InputError(f"{what} must hold obs_rms of one array of observations; found {brief(statistics)}.")
+        raise InputError(f"a normaliser must hold obs_rms of arrays of observations; {what} is {brief(statistics)}.")
     if statistics.function.name != "RunningMeanStd":
-        raise InputError(f"obs_rms in {what} must be a RunningMeanStd; found {statistics.function}.")
-    inner = _state(statistics, f"obs_rms in {what}")
+        raise InputError(f"{what} must be a RunningMeanStd; found {statistics.function}.")
+    inner = _state(statistics, what)
     mean, var = array_of(inner.get("mean"), "obs_rms.mean"), array_of(inner.get("var"), "obs_rms.var")
     if mean.ndim != 1 or mean.shape != var.shape:
         raise InputError(
-            f"the mean and variance in {what} must be two vectors of one size; found {mean.shape}, {var.shape}."
+            f"the mean and variance of {what} must be two vectors of one size; found {mean.shape}, {var.shape}."
         )
-    epsilon = _one(state.get("epsilon"), "epsilon")
-    limit = None if state.get("clip_obs") == math.inf else _one(state.get("clip_obs"), "clip_obs")
-    return Normalise(exactly(mean), tuple(v + epsilon for v in exactly(var)), limit)
+    return mean, var
 
 
 def normaliser_root(tensors: Mapping[str, Numbers]) -> str | None:

@@ -1,4 +1,4 @@
-"""The inputs that a network of another program expects: which states, in which order, measured from which point.
+"""The inputs that a network of another program expects: states or expressions of them, measured from which point.
 
 A policy and a Lyapunov network in one file read the same inputs. This module also samples the states of the domain at
 which a network is compared with its framework.
@@ -6,40 +6,93 @@ which a network is compared with its framework.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
+import flint
 import numpy as np
 
 from certify.errors import InputError
+from certify.loop.expressions import Expression, evaluate, substitute
+from certify.loop.networks import Observe
+from certify.loop.networks.floats import evaluated
+from certify.loop.plants.equations import parse_expression
 from certify.loop.policies.importers.comparing import SAMPLES
+from certify.loop.policies.importers.folding import Bounds
 from certify.loop.policies.importers.options import ImportOptions
 from certify.loop.policies.importers.reading import Reading
 from certify.loop.policies.importers.steps import Diagonal, Step
 from certify.loop.policies.network import Array
+from certify.loop.rigorous import BallAlgebra, ball
 
 if TYPE_CHECKING:
     from certify.loop.plants import System
 
 
-def index_of(states: tuple[str, ...], plant: System) -> list[int]:
-    """The plant's state for each number that the network reads.
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """What a network reads: states of the plant by their numbers, `index`, or `expressions` of them."""
+
+    plant: System
+    index: tuple[int, ...] | None
+    expressions: tuple[Expression, ...]
+
+    @property
+    def step(self) -> Observe:
+        """The step that makes the observations of the states."""
+        return Observe((0,), self.plant.states, self.expressions)
+
+    def __call__(self, x: Array) -> Array:
+        """The observations at states x (k, n), (k, reads)."""
+        if self.index is not None:
+            return np.asarray(x[:, list(self.index)])
+        return np.asarray(evaluated(self.expressions, self.plant.states, x))
+
+    @property
+    def is_inexact(self) -> bool:
+        """True if an observation of a number of single precision need not be one."""
+        return self.index is None
+
+    def may_leave(self, bounds: Sequence[Bounds]) -> bool:
+        """True if an observation may leave its bounds somewhere, whatever the states."""
+        anywhere = dict.fromkeys(self.plant.states, flint.arb(0, math.inf))
+        for expression, (lo, hi) in zip(self.expressions, bounds, strict=True):
+            value = evaluate(expression, anywhere, BallAlgebra())
+            if (lo is not None and not value > ball(lo)) or (hi is not None and not value < ball(hi)):
+                return True
+        return False
+
+
+def observed(states: tuple[str, ...], plant: System, options: ImportOptions) -> Observed:
+    """The observations that `--states` names.
 
     Raises
     ------
-    InputError : the plant has no state of that name.
+    InputError : one is no state of the plant and no expression of its states.
     """
-    known = [s.name for s in plant.states]
-    for name in states:
-        if name not in known:
+    known = {s.name: s for s in plant.states}
+    if all(name in known for name in states):
+        if len(set(states)) != len(states):
+            raise InputError(f"--states must name each state once; found {','.join(states)}.")
+        return Observed(plant, tuple(list(known).index(name) for name in states), tuple(known[n] for n in states))
+    expressions = []
+    for text in states:
+        if text.isidentifier() and text not in known:
             raise InputError(
-                f"the network must read states of {plant.name}, {', '.join(known)}; --states names {name!r}. "
-                "An observation that is a function of states, such as the cosine of an angle, is not proved: only "
-                "networks that read the states themselves are. Train the policy again on the states, through a wrapper "
-                "of the environment that returns them: for the observations (cos_theta, sin_theta, theta_dot) "
-                "gymnasium.wrappers.TransformObservation with (arctan2(sin_theta, cos_theta), theta_dot)."
+                f"the network must read states of {plant.name}, {', '.join(known)}, or expressions of them, such as "
+                f"cos({plant.states[0]}); --states names {text!r}."
             )
-    return [known.index(name) for name in states]
+        try:
+            expressions.append(parse_expression(text, known, f"state of {plant.name}"))
+        except InputError as error:
+            raise InputError(f"--states must name states of {plant.name}, or expressions of them: {error}") from error
+    x_eq = dict(zip(plant.states, plant.exact_x_eq(), strict=True))
+    if options.observes == "absolute" and any(x_eq.values()):
+        expressions = [substitute(e, {s: s + q for s, q in x_eq.items()}) for e in expressions]
+    return Observed(plant, None, tuple(expressions))
 
 
 def shift(x_eq: list[Fraction], options: ImportOptions) -> tuple[Step, ...]:
@@ -64,10 +117,10 @@ def require_equilibrium(reading: Reading, x_eq: list[Fraction]) -> None:
         )
 
 
-def over_states(weight: Array, index: list[int], n: int) -> Array:
+def over_states(weight: Array, index: Sequence[int], n: int) -> Array:
     """The first layer's weight over all n states of the plant, (out, n); 0 where the network does not read a state."""
     whole = np.zeros((len(weight), n))
-    whole[:, index] = weight
+    whole[:, list(index)] = weight
     return whole
 
 

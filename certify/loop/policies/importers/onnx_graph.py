@@ -22,12 +22,15 @@ from certify.loop.policies.importers.options import WITH_TANH, WITHOUT_NORMALISA
 from certify.loop.policies.importers.reading import Observations, Reading, Values
 from certify.loop.policies.importers.steps import Affine
 
-_ACTIVATIONS = ("Tanh", "Elu", "Sigmoid", "Gelu", "Softplus", "Mish", "Softsign")
+_ACTIVATIONS = ("Tanh", "Elu", "Sigmoid", "Gelu", "Softplus", "Mish", "Softsign", "LeakyRelu", "Selu", "Celu")
 _OPERATIONS = {
     "Gemm", "MatMul", "Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", *_ACTIVATIONS,
-    "Identity", "Cast", "Flatten", "Reshape", "Constant",
+    "Identity", "Cast", "Flatten", "Reshape", "Constant", "Concat",
 }  # fmt: skip
-_KNOWN = f"Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu, {', '.join(_ACTIVATIONS)}, Identity, Flatten and Constant"
+_KNOWN = (
+    f"Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu, {', '.join(_ACTIVATIONS)}, Concat, Identity, Flatten and "
+    "Constant"
+)
 _NORMALISATIONS = {
     "LayerNormalization",
     "BatchNormalization",
@@ -35,6 +38,7 @@ _NORMALISATIONS = {
     "GroupNormalization",
     "ReduceMean",
 }
+_SELU = {"gamma": float(np.float32(1.05070102214813)), "alpha": float(np.float32(1.67326319217681))}  # of the standard
 _STANDARD = ("", "ai.onnx")
 _FLAGS = {
     "Gemm": {"alpha", "beta", "transA", "transB"},
@@ -43,6 +47,10 @@ _FLAGS = {
     "Flatten": {"axis"},
     "Reshape": {"allowzero"},
     "Elu": {"alpha"},
+    "LeakyRelu": {"alpha"},
+    "Celu": {"alpha"},
+    "Selu": {"alpha", "gamma"},
+    "Concat": {"axis"},
     "Gelu": {"approximate"},
 }
 _ELEMENTWISE = {"Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", *_ACTIVATIONS, "Exp", "Log", "Identity", "Cast"}
@@ -251,9 +259,12 @@ def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain
     found = [k for k, value in enumerate(given) if isinstance(value, tuple)]
     if len(found) == 2 and kind == "Mul" and (gated := graph.product(*given)) is not None:
         return gated
+    if len(found) == len(given) > 1 and kind in ("Add", "Sub", "Concat"):
+        return _joined(kind, given, flags, at)
     if len(found) != 1:
         raise InputError(
-            f"{at} must join one value that depends on the observation with constants; it has {len(found)}."
+            f"{at} must join one value that depends on the observation with constants; it has {len(found)}. Add, Sub "
+            "and Concat may join several."
         )
     chain: Chain
     place, chain, others = found[0], given[found[0]], [v for v in given if not isinstance(v, tuple)]
@@ -309,10 +320,27 @@ def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain
     raise InputError(f"{at} is not read: the operations are {_KNOWN}, with the observation in the usual place.")
 
 
+def _joined(kind: str, chains: list[Chain], flags: dict[str, Any], at: str) -> Chain:
+    """Values that depend on the observation, joined: sums, differences, and one behind the other in a row."""
+    if kind == "Concat":
+        if "axis" not in flags or flags["axis"].i not in (1, -1):
+            raise InputError(f"{at} must put the numbers of a row one behind the other, along axis 1.")
+        return graph.joined("concat", *chains)
+    one, other = chains
+    return graph.joined("sum", one, graph.negated(other) if kind == "Sub" else other)
+
+
+_ALPHAS = {"LeakyRelu": 0.01, "Elu": 1.0, "Celu": 1.0}  # where nothing is said
+
+
 def _activated(chain: Chain, kind: str, flags: dict[str, Any], at: str) -> Chain:
-    """An activation of the chain, but no Elu with another alpha than 1, nor the Gelu that is an approximation."""
-    if "alpha" in flags and flags["alpha"].f != 1:
-        raise InputError(f"{at} must have alpha 1; found {flags['alpha'].f}.")
+    """An activation of the chain, but not the Gelu that is an approximation."""
+    if kind in _ALPHAS:
+        alpha = float(flags["alpha"].f) if "alpha" in flags else _ALPHAS[kind]
+        name = "leaky_relu" if kind == "LeakyRelu" else kind.lower()
+        return graph.mapped(chain, name, *([] if alpha == 1 and kind == "Elu" else [alpha]))
+    if kind == "Selu":
+        return graph.mapped(chain, "selu", *(float(flags[k].f) if k in flags else v for k, v in _SELU.items()))
     if "approximate" in flags and flags["approximate"].s != b"none":
         raise InputError(f"{at} must be the exact one, without `approximate`.")
     return graph.mapped(chain, kind.lower())

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from certify.errors import InputError
-from certify.loop.activations import ACTIVATIONS
-from certify.loop.policies.importers.steps import Clip
+from certify.loop.policies.importers.steps import IMPORTED, Clip
 from certify.loop.policies.network import Centre
 
 Kind = Literal["auto", "state-dict", "torchscript", "onnx", "sb3", "safetensors", "two-stage"]
 Output = Literal["identity", "tanh", "relu-tanh"]
 Observes = Literal["absolute", "deviation"]
-KNOWN_ACTIVATIONS = f"{', '.join(list(ACTIVATIONS)[:-1])} and {list(ACTIVATIONS)[-1]}"
+KNOWN_ACTIVATIONS = f"{', '.join(IMPORTED[:-1])} and {IMPORTED[-1]}"
 """The activations that are proved, in words."""
 WITH_TANH = (
     f"The activations that are proved are {KNOWN_ACTIVATIONS}. Train the policy again with one of them between its "
@@ -42,9 +41,10 @@ class ImportOptions:
     kind : the kind of file, or `auto`.
     prefix : in a state_dict, the keys of the policy's layers up to their numbers, such as `actor.pi_net.fcs`.
     activation : between the layers of a state_dict, by its name: tanh, relu, elu (alpha 1), sigmoid, silu, gelu (the
-        exact one), softplus (beta 1), mish or softsign.
+        exact one), softplus (beta 1), mish, softsign, leaky_relu (slope 0.01), selu, celu (alpha 1), hardtanh, relu6,
+        hardsigmoid or logsigmoid.
     squash : what follows the last layer of a state_dict: `identity`, `tanh`, or `relu-tanh` for relu(tanh(.)).
-    states : the plant's states in the order in which the network reads them.
+    states : what the network reads, in its order: states of the plant, or expressions of them such as `cos(theta)`.
     normaliser : a file with the observations' normaliser, or `none`.
     epsilon : the number that rsl_rl's normaliser adds to the standard deviation; 1/100 by default.
     action_scale, action_offset : `u = scale * action + offset` in the plant's units, exact, one number or m.
@@ -83,12 +83,10 @@ class ImportOptions:
         ):
             if value is not None and value not in known:
                 raise InputError(f"{option} must be one of {', '.join(known)}; found {value!r}.")
-        if self.activation is not None and self.activation not in ACTIVATIONS:
+        if self.activation is not None and self.activation not in IMPORTED:
             raise InputError(
-                f"--activation must be one of {', '.join(ACTIVATIONS)}; found {self.activation!r}. {WITH_TANH}"
+                f"--activation must be one of {', '.join(IMPORTED)}; found {self.activation!r}. {WITH_TANH}"
             )
-        if self.states is not None and len(set(self.states)) != len(self.states):
-            raise InputError(f"--states must name each state once; found {','.join(self.states)}.")
         if self.action_scale is not None and 0 in self.action_scale:
             raise InputError("--action-scale must not be 0.")
         if self.epsilon is not None and self.epsilon < 0:

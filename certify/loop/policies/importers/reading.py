@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from certify.errors import InputError
 from certify.loop.activations import ACTIVATIONS
 from certify.loop.policies.importers.options import Output
-from certify.loop.policies.importers.steps import Affine, Diagonal, Normalise, Step, activated
+from certify.loop.policies.importers.steps import Affine, Branches, Diagonal, Normalise, Step, activated
 from certify.loop.policies.network import Array
 
 Observations = NDArray[np.floating[Any]]
@@ -61,23 +61,58 @@ class Reading:
     beside: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not any(isinstance(step, Affine) for step in self.steps):
+        if _reads(self.steps) is None:
             raise InputError("a policy must have a layer; the file has none.")
 
     @property
     def n(self) -> int:
         """Number of observations that the first layer reads."""
-        return next(int(step.weight.shape[1]) for step in self.steps if isinstance(step, Affine))
+        return _reads(self.steps) or 0
 
     @property
     def m(self) -> int:
         """Number of actions."""
-        return next(int(step.weight.shape[0]) for step in reversed(self.steps) if isinstance(step, Affine))
+        return _gives(self.steps, self.n)
+
+
+def _reads(steps: Sequence[Step]) -> int | None:
+    """The number of entries that a chain's first layer reads; None if it has no layer."""
+    for step in steps:
+        if isinstance(step, Affine):
+            return int(step.weight.shape[1])
+        if isinstance(step, Branches):
+            known = [found for chain in step.of if (found := _reads(chain)) is not None]
+            if known:
+                return known[0]
+    return None
+
+
+def _gives(steps: Sequence[Step], width: int) -> int:
+    """The number of entries that a chain makes of so many."""
+    for step in steps:
+        if isinstance(step, Affine):
+            width = int(step.weight.shape[0])
+        if isinstance(step, Branches):
+            ends = [_gives(chain, width) for chain in step.of]
+            width = sum(ends) if step.kind == "concat" else ends[0]
+    return width
+
+
+_FORMULAS: Mapping[str, Callable[[Values], Values]] = {
+    "leaky_relu": lambda v: np.where(v > 0, v, 0.01 * v),
+    "selu": lambda v: 1.0507009873554805 * np.where(v > 0, v, 1.6732632423543772 * np.expm1(np.minimum(v, 0))),
+    "celu": lambda v: np.where(v > 0, v, np.expm1(np.minimum(v, 0))),
+    "hardtanh": lambda v: np.clip(v, -1, 1),
+    "relu6": lambda v: np.clip(v, 0, 6),
+    "hardsigmoid": lambda v: np.clip(v + 3, 0, 6) / 6,
+    "logsigmoid": lambda v: -np.logaddexp(0, -v),
+}
+"""The activations that are made of others, as they are written elsewhere."""
 
 
 def perceptron(layers: Sequence[Affine], squash: Output = "identity", activation: str = "tanh") -> Evaluate:
     """The layers with an activation between them, and `squash` behind them, in numpy."""
-    phi = ACTIVATIONS[activation]
+    phi = _FORMULAS[activation] if activation in _FORMULAS else ACTIVATIONS[activation]
     ends: dict[Output, Callable[[Values], Values]] = {
         "identity": lambda y: y,
         "tanh": np.tanh,
@@ -96,7 +131,8 @@ def perceptron(layers: Sequence[Affine], squash: Output = "identity", activation
 
 def between(layers: Sequence[Affine], activation: str = "tanh") -> tuple[Step, ...]:
     """The layers as steps, with an activation between them."""
-    return tuple(step for layer in layers for step in (layer, activated(activation)))[:-1]
+    function = activated(activation)
+    return tuple(step for k, layer in enumerate(layers) for step in ((*function, layer) if k else (layer,)))
 
 
 def widths(layers: Sequence[Affine]) -> str:

@@ -9,6 +9,7 @@ from typing import Literal
 from certify.errors import InputError
 from certify.loop.files.archives import Archive
 from certify.loop.files.arrays import Numbers
+from certify.loop.files.legacy import BEGINNING
 from certify.loop.files.torchfile import TorchFile
 from certify.loop.policies.file import is_text
 from certify.loop.policies.importers.onnx_graph import read_onnx
@@ -25,9 +26,9 @@ _OWN, _LYAPUNOV = "certify-policy/", "certify-lyapunov/"
 
 def content_of(raw: bytes, name: str) -> Content | None:
     """Recognise a file's kind by its bytes and, for ONNX, by its name; None if no reader takes it."""
-    if raw.startswith(b"PK"):
-        archive = Archive(raw, name)
-        if "policy.pth" in archive and "data" in archive:
+    if raw.startswith((b"PK", BEGINNING)):
+        archive = Archive(raw, name) if raw.startswith(b"PK") else None
+        if archive is not None and "policy.pth" in archive and "data" in archive:
             return "sb3"
         file = TorchFile(raw, name, archive)
         if is_torchscript(file):
@@ -58,8 +59,7 @@ def kind_of(raw: bytes, name: str, options: ImportOptions) -> Content:
         wanted = "it must be a file of torch.save, TorchScript, stable-baselines3, ONNX or safetensors"
         if raw[:1] in (b"\x80", b"("):
             raise InputError(
-                f"{wanted}; it is a bare pickle, or torch's format of before version 1.6. If you trust it, load it and "
-                "write it again with torch.save."
+                f"{wanted}; it is a bare pickle. If you trust it, load it and write it again with torch.save."
             )
         raise InputError(f"{wanted}; it is none of these{', but text' if is_text(raw) else ''}.")
     if kind == "policy":

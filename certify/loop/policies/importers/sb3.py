@@ -1,9 +1,11 @@
-"""The zip files of stable-baselines3: PPO, A2C, SAC, TD3 and DDPG with an activation of the table between the layers.
+"""The zip files of stable-baselines3 and sb3-contrib: PPO, A2C, TRPO, SAC, TQC, TD3, DDPG and ARS.
 
 The numbers come from `policy.pth`, their meaning from `data`: JSON with other objects as pickles in base64, which are
-read as data. PPO and A2C *clip* their actions to the bounds of the action space; SAC, TD3 and DDPG squash them by tanh
-and scale them to the bounds, and have ReLU by default. The file does not say whether observations went through
-VecNormalize.
+read as data. The classes of the policies say the rest: PPO, A2C and TRPO *clip* their actions to the bounds of the
+action space; SAC, TQC, TD3 and DDPG squash them by tanh and scale them to the bounds, and have ReLU by default. With
+state-dependent exploration SAC and TQC clip the mean before its tanh (`clip_mean`), and PPO and A2C may squash theirs
+(`squash_output`). Several arrays of observations are joined in the order of their names. The file does not say whether
+observations went through VecNormalize.
 """
 
 from __future__ import annotations
@@ -12,8 +14,11 @@ import base64
 import binascii
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any
 
+import flint
 import numpy as np
 
 from certify.errors import InputError
@@ -23,20 +28,78 @@ from certify.loop.files.arrays import Numbers, array_of
 from certify.loop.files.pickles import Call, Name, brief, read_pickle
 from certify.loop.policies.importers.options import WITH_TANH
 from certify.loop.policies.importers.reading import Observations, Reading, Values, between, perceptron, widths
-from certify.loop.policies.importers.steps import Affine, Clip, Diagonal, Tanh, exactly, linear
+from certify.loop.policies.importers.steps import Affine, Clip, Diagonal, Step, Tanh, exactly, linear
 from certify.loop.policies.importers.tensors import load_tensors
 from certify.loop.policies.importers.unread import braced, unread
 
-_ON_POLICY = Name("stable_baselines3.common.policies", "ActorCriticPolicy")
-_SAC = Name("stable_baselines3.sac.policies", "SACPolicy")
-_TD3 = Name("stable_baselines3.td3.policies", "TD3Policy")
-_TANH = Name("torch.nn.modules.activation", "Tanh")
+
+@dataclass(frozen=True, slots=True)
+class _Class:
+    """A class of policies.
+
+    Parameters
+    ----------
+    words : the methods that train it.
+    activation : between its layers by default.
+    hidden : prefixes of the keys of its sequences of layers, in their order.
+    last : key of the layer behind them, if that lies on its own.
+    others : beginnings of the keys of its tensors for training alone.
+    squashed : True if its actions are squashed and scaled by default, False if they are clipped.
+    joined : True if its observation is a dictionary of arrays.
+    """
+
+    words: str
+    activation: str
+    hidden: tuple[str, ...]
+    last: str
+    others: tuple[str, ...]
+    squashed: bool
+    joined: bool = False
+
+
+_SDE = "sde_features_extractor."
+_BOTH = ("mlp_extractor.shared_net", "mlp_extractor.policy_net")  # versions before 2 have layers that both share
+_ACTOR = ("actor.log_std", f"actor.{_SDE}", "critic", "critic_target")
+_SPREAD = ("mlp_extractor.value_net", "value_net.", "log_std", _SDE)
+
+
+def _classes(joined: bool, a: str, s: str, t: str) -> dict[Name, _Class]:
+    """The classes for one array of observations, or for several, by where they are defined."""
+    return {
+        Name("stable_baselines3.common.policies", a): _Class(
+            "PPO, A2C or TRPO", "tanh", _BOTH, "action_net", _SPREAD, squashed=False, joined=joined
+        ),
+        Name("stable_baselines3.sac.policies", s): _Class(
+            "SAC", "relu", ("actor.latent_pi",), "actor.mu", _ACTOR, squashed=True, joined=joined
+        ),
+        Name("sb3_contrib.tqc.policies", s.replace("SAC", "TQC")): _Class(
+            "TQC", "relu", ("actor.latent_pi",), "actor.mu", _ACTOR, squashed=True, joined=joined
+        ),
+        Name("stable_baselines3.td3.policies", t): _Class(
+            "TD3 or DDPG", "relu", ("actor.mu",), "", ("actor_target", "critic", "critic_target"), True, joined
+        ),
+    }
+
+
+_CLASSES = {
+    **_classes(False, "ActorCriticPolicy", "SACPolicy", "TD3Policy"),
+    **_classes(True, "MultiInputActorCriticPolicy", "MultiInputPolicy", "MultiInputPolicy"),
+    Name("sb3_contrib.ars.policies", "ARSPolicy"): _Class("ARS", "relu", ("action_net",), "", (), squashed=True),
+    Name("sb3_contrib.ars.policies", "ARSLinearPolicy"): _Class(
+        "linear ARS", "relu", ("action_net",), "", (), squashed=False
+    ),
+}
 _MODULES = {row.name: Name("torch.nn.modules.activation", row.module) for row in ACTIVATIONS.values()}
-_FLATTEN = Name("stable_baselines3.common.torch_layers", "FlattenExtractor")
+_LAYERS = "stable_baselines3.common.torch_layers"
+_FLATTEN, _COMBINED = Name(_LAYERS, "FlattenExtractor"), Name(_LAYERS, "CombinedExtractor")
 _HARMLESS = {  # they change how a policy was trained, or are seen in its tensors
     "net_arch", "ortho_init", "log_std_init", "full_std", "use_expln", "optimizer_class", "optimizer_kwargs",
-    "n_critics", "share_features_extractor", "clip_mean", "normalize_images", "features_extractor_kwargs",
+    "n_critics", "n_quantiles", "share_features_extractor", "normalize_images", "features_extractor_kwargs",
+    "sde_net_arch", "with_bias", "device",
 }  # fmt: skip
+_READ = {"activation_fn", "use_sde", "squash_output", "clip_mean", "features_extractor_class"}
+_CLIP_MEAN = 2.0  # where nothing is said
+_BITS = 320
 _BELOW = ("features_extractor", "pi_features_extractor")
 
 
@@ -59,51 +122,71 @@ def read_sb3(archive: Archive, what: str, ignored: tuple[str, ...] | None = None
     if not isinstance(data, dict):
         raise InputError(f"data in {what} must be a JSON object; found {brief(data)}.")
     policy, given = _value(data, "policy_class"), _value(data, "policy_kwargs")
-    if policy not in (_ON_POLICY, _SAC, _TD3):
+    if not isinstance(policy, Name) or policy not in _CLASSES:
         raise InputError(
-            f"the policy of {what} must be MlpPolicy of PPO, A2C, SAC, TD3 or DDPG; it is {brief(policy)}. "
-            "Export it to ONNX and import that."
+            f"the policy of {what} must be MlpPolicy or MultiInputPolicy of PPO, A2C, TRPO, SAC, TQC, TD3, DDPG or "
+            f"ARS; it is {brief(policy)}. Export it to ONNX and import that."
         )
-    activation = _activation(policy, {} if given is None else given, what)
-    n, bounds = _spaces(data, what)
+    kind, given = _CLASSES[policy], {} if given is None else given
+    activation = _activation(kind, given, what)
+    squashed, bound = _end(kind, given, data.get("use_sde"), what)
+    n, joined, bounds = _spaces(data, kind, what)
     tensors = load_tensors(archive.read("policy.pth"), f"policy.pth in {what}")
     if any(name.startswith(_BELOW) for name in tensors):
         raise InputError(f"{what} must have no features extractor of its own; its tensors have one.")
-    layers, left = _layers(tensors, policy, what, ignored)
+    layers, left = _layers(tensors, kind, bound is not None, what, ignored)
     if layers[0].weight.shape[1] != n or len(layers[-1].bias) != bounds.shape[1]:
         raise InputError(f"the spaces of {what} must match its layers; they have {n} and {bounds.shape[1]} numbers.")
-    steps = list(between(layers, activation))
     low, high = bounds
-    described = widths(layers)
-    net = perceptron(layers, "identity" if policy == _ON_POLICY else "tanh", activation)
-    if policy == _ON_POLICY:
-        lows = [None if np.isneginf(v) else exactly(v)[0] for v in low]
-        highs = [None if np.isposinf(v) else exactly(v)[0] for v in high]
-        if any(v is not None for v in (*lows, *highs)):
-            steps.append(Clip(tuple(lows), tuple(highs)))
-        words = f"stable-baselines3 PPO or A2C {described}, actions clipped"
-    else:
-        if not np.all(np.isfinite(bounds)):
-            raise InputError(f"the action space of {what} must be bounded: the policy scales a tanh to its bounds.")
-        pairs = list(zip(exactly(low), exactly(high), strict=True))
-        scale, offset = tuple((hi - lo) / 2 for lo, hi in pairs), tuple((hi + lo) / 2 for lo, hi in pairs)
-        steps += [Tanh(), Diagonal(scale, offset)]
-        words = f"stable-baselines3 {'SAC' if policy == _SAC else 'TD3 or DDPG'} {described}, actions squashed by tanh"
+    net = perceptron(layers, "identity", activation)
 
     def evaluate(x: Observations, double: bool) -> Values:
         y = net(x, double)
-        kind = np.result_type(y, low)
-        lower, upper = low.astype(kind), high.astype(kind)
-        clipped: Values = np.clip(y, lower, upper)
-        unscaled: Values = lower + 0.5 * (y + 1) * (upper - lower)
-        return clipped if policy == _ON_POLICY else unscaled
+        number = np.result_type(y, low)
+        lower, upper = low.astype(number), high.astype(number)
+        if not squashed:
+            clipped: Values = np.clip(y, lower, upper)
+            return clipped
+        y = np.tanh(y if bound is None else np.clip(y, -bound, bound))
+        scaled: Values = lower + 0.5 * (y + 1) * (upper - lower)
+        return scaled
 
     finite = bool(np.all(np.isfinite(bounds)))
-    action = tuple(zip(exactly(low), exactly(high), strict=True)) if finite else None
-    left |= _elsewhere(archive)
-    who = "what its policy_kwargs say" if given and "activation_fn" in given else "the default of its kind"
-    assumed = f"{activation} between the layers is {who}, the rest is how stable-baselines3 documents its policies"
-    return Reading(words=words, steps=tuple(steps), evaluate=evaluate, action=action, assumed=assumed, unread=left)
+    who = "what its policy_kwargs say" if "activation_fn" in given else "the default of its kind"
+    said = "squashed by tanh" if squashed else "clipped"
+    within = "" if bound is None else f", their means clipped to {bound:g} before it"
+    return Reading(
+        words=f"stable-baselines3 {kind.words} {widths(layers)}{joined}, actions {said}{within}",
+        steps=(*between(layers, activation), *_to_the_bounds(low, high, squashed, bound, what)),
+        evaluate=evaluate,
+        action=tuple(zip(exactly(low), exactly(high), strict=True)) if finite else None,
+        assumed=f"{activation} between the layers is {who}, the rest is how stable-baselines3 documents its policies",
+        unread=left | _elsewhere(archive),
+    )
+
+
+def _to_the_bounds(low: Numbers, high: Numbers, squashed: bool, bound: float | None, what: str) -> list[Step]:
+    """The steps behind the last layer."""
+    if not squashed:
+        lows = [None if np.isneginf(v) else exactly(v)[0] for v in low]
+        highs = [None if np.isposinf(v) else exactly(v)[0] for v in high]
+        return [Clip(tuple(lows), tuple(highs))] if any(v is not None for v in (*lows, *highs)) else []
+    if not np.all(np.isfinite((low, high))):
+        raise InputError(f"the action space of {what} must be bounded: the policy scales a tanh to its bounds.")
+    pairs = list(zip(exactly(low), exactly(high), strict=True))
+    scale, offset = tuple((hi - lo) / 2 for lo, hi in pairs), tuple((hi + lo) / 2 for lo, hi in pairs)
+    if bound is None:
+        return [Tanh(), Diagonal(scale, offset)]
+    # tanh rises: of what is clipped to +-c it is what is clipped to +-tanh(c) behind it.
+    most = _tanh(Fraction(bound))
+    return [Tanh(), Clip((-most,), (most,)), Diagonal(scale, offset)]
+
+
+def _tanh(c: Fraction) -> Fraction:
+    """tanh(c) to 300 bits: it is irrational, and each number that is folded from it is rounded to 53."""
+    with flint.ctx.workprec(_BITS):
+        mantissa, exponent = flint.arb(flint.fmpq(c.numerator, c.denominator)).tanh().mid().man_exp()
+    return Fraction(int(mantissa)) * Fraction(2) ** int(exponent)
 
 
 def _elsewhere(archive: Archive) -> dict[str, str]:
@@ -133,71 +216,111 @@ def _value(data: Mapping[str, Any], key: str) -> Any:
     return read_pickle(raw, f"{key} in data")
 
 
-def _activation(policy: Name, given: Any, what: str) -> str:
+def _activation(kind: _Class, given: Any, what: str) -> str:
     """The activation between layers, and refusals of what else changes the policy."""
     if not isinstance(given, dict):
         raise InputError(f"policy_kwargs of {what} must be a dictionary; found {brief(given)}.")
-    activation = given.get("activation_fn", _TANH if policy == _ON_POLICY else Name("torch.nn", "ReLU"))
+    activation = given.get("activation_fn", _MODULES[kind.activation])
     rows = [row for row, name in _MODULES.items() if activation in (name, Name("torch.nn", name.name))]
     if not rows:
         found = activation.name if isinstance(activation, Name) else brief(activation)
         raise InputError(f"the activation of {what} is not proved; it is {found}. {WITH_TANH}")
-    if given.get("use_sde") not in (None, False) and policy == _SAC:
-        raise InputError(
-            f"{what} has state-dependent exploration, which bounds its mean by another function (use_sde)."
-        )
-    if given.get("squash_output") not in (None, False):
-        raise InputError(f"{what} has squash_output; a policy with it is not read. Export it to ONNX.")
-    if given.get("features_extractor_class", _FLATTEN) != _FLATTEN:
+    extractor = _COMBINED if kind.joined else _FLATTEN
+    if given.get("features_extractor_class", extractor) != extractor:
         raise InputError(f"{what} has a features extractor of its own; export the policy to ONNX and import that.")
-    known = _HARMLESS | {"activation_fn", "use_sde", "squash_output", "features_extractor_class"}
-    unknown = sorted(str(key) for key in given if key not in known)
+    unknown = sorted(str(key) for key in given if key not in _HARMLESS | _READ)
     if unknown:
         raise InputError(f"policy_kwargs of {what} must be those of MlpPolicy; unknown are {', '.join(unknown)}.")
     return rows[0]
 
 
-def _spaces(data: Mapping[str, Any], what: str) -> tuple[int, Numbers]:
-    """The number of observations, and low and high of the actions, (2, m)."""
-    observation, action = (
-        _box(_value(data, f"{name}_space"), f"{name}_space of {what}") for name in ("observation", "action")
-    )
-    if observation["low"].ndim != 1 or action["low"].ndim != 1 or action["low"].shape != action["high"].shape:
-        raise InputError(f"the spaces of {what} must be boxes of one axis; found {observation['low'].shape}.")
-    return len(observation["low"]), np.stack([action["low"], action["high"]])
+def _end(kind: _Class, given: Mapping[str, Any], exploration: Any, what: str) -> tuple[bool, float | None]:
+    """Whether the action is squashed, and what its mean is clipped to before that, if it is.
+
+    Parameters
+    ----------
+    exploration : the method's own `use_sde`; what is said to the policy of SAC and TQC counts more.
+    """
+    sde, squash = given.get("use_sde", exploration), given.get("squash_output")
+    if not isinstance(sde, bool | None) or not isinstance(squash, bool | None):
+        raise InputError(f"use_sde and squash_output of {what} must be true or false; found {brief(sde)}.")
+    squash = kind.squashed if squash is None else squash
+    # Without that exploration PPO refuses it; some versions of ARS squash their networks in both cases.
+    possible = kind.words == "linear ARS" or (kind.last == "action_net" and sde is True)
+    if squash != kind.squashed and not possible:
+        raise InputError(f"{what} has squash_output={squash}, which is not read there. Export it to ONNX.")
+    if kind.last != "actor.mu" or not sde:
+        return squash, None
+    bound = given.get("clip_mean", _CLIP_MEAN)
+    if not isinstance(bound, float | int) or isinstance(bound, bool) or not np.isfinite(float(bound)):
+        raise InputError(f"clip_mean of {what} must be a number; found {brief(bound)}.")
+    return squash, float(bound) if bound > 0 else None
 
 
-def _box(space: Any, what: str) -> dict[str, Numbers]:
-    if not isinstance(space, Call) or not isinstance(space.function, Name) or space.function.name != "Box":
-        raise InputError(f"{what} must be a box; found {brief(space)}.")
-    state = space.states[0] if len(space.states) == 1 and isinstance(space.states[0], dict) else {}
-    found = {name: array_of(state.get(name), f"{name} of {what}") for name in ("low", "high")}
-    if any(a.dtype.kind != "f" or a.dtype.itemsize < 4 for a in found.values()):
-        raise InputError(f"{what} must be of single or double precision; found {found['low'].dtype}.")
+def _spaces(data: Mapping[str, Any], kind: _Class, what: str) -> tuple[int, str, Numbers]:
+    """The number of observations, their names where they are joined, and low and high of the actions, (2, m)."""
+    space = _value(data, "observation_space")
+    boxes = _parts(space, what) if kind.joined else {"": space}
+    sizes = {name: _box(box, f"observation_space {name}".rstrip() + f" of {what}") for name, box in boxes.items()}
+    action = _box(_value(data, "action_space"), f"action_space of {what}")
+    shapes = [low.shape for low, _ in sizes.values()]
+    if any(len(shape) != 1 for shape in shapes) or action[0].ndim != 1 or action[0].shape != action[1].shape:
+        raise InputError(f"the spaces of {what} must be boxes of one axis; found {shapes[0]}.")
+    named = ", ".join(f"{name} ({low.size})" for name, (low, _) in sizes.items())
+    return sum(shape[0] for shape in shapes), f" of {named}" if kind.joined else "", np.stack(action)
+
+
+def _parts(space: Any, what: str) -> dict[str, Any]:
+    """The spaces of a dictionary by their names; of another order versions of torch make different ones."""
+    found = None
+    if isinstance(space, Call) and isinstance(space.function, Name) and space.function.name == "Dict":
+        state = space.states[0] if len(space.states) == 1 and isinstance(space.states[0], dict) else {}
+        found = state.get("spaces")
+    if not isinstance(found, dict) or not found or not all(isinstance(name, str) for name in found):
+        raise InputError(f"observation_space of {what} must be a dictionary of boxes; found {brief(space)}.")
+    if list(found) != sorted(found):
+        raise InputError(f"the observations of {what} must be in the order of their names; found {', '.join(found)}.")
     return found
 
 
+def _box(space: Any, what: str) -> tuple[Numbers, Numbers]:
+    """The bounds of a box, low and high."""
+    if not isinstance(space, Call) or not isinstance(space.function, Name) or space.function.name != "Box":
+        raise InputError(f"{what} must be a box; found {brief(space)}.")
+    state = space.states[0] if len(space.states) == 1 and isinstance(space.states[0], dict) else {}
+    low, high = (array_of(state.get(name), f"{name} of {what}") for name in ("low", "high"))
+    if any(a.dtype.kind != "f" or a.dtype.itemsize < 4 for a in (low, high)):
+        raise InputError(f"{what} must be of single or double precision; found {low.dtype}.")
+    return low, high
+
+
 def _layers(
-    tensors: Mapping[str, Numbers], policy: Name, what: str, ignored: tuple[str, ...] | None
+    tensors: Mapping[str, Numbers], kind: _Class, within: bool, what: str, ignored: tuple[str, ...] | None
 ) -> tuple[list[Affine], dict[str, str]]:
-    """The policy's layers, and why each other tensor of `policy.pth` is left out."""
-    if policy == _ON_POLICY:
-        if any(name.startswith("mlp_extractor.shared_net") for name in tensors):
-            raise InputError(f"{what} has layers that policy and value share; export the policy to ONNX.")
-        hidden, last = "mlp_extractor.policy_net", "action_net"
-        others = ("mlp_extractor.value_net", "value_net.", "log_std")
-    elif policy == _SAC:
-        hidden, last, others = "actor.latent_pi", "actor.mu", ("actor.log_std", "critic", "critic_target")
-    else:
-        hidden, last, others = "actor.mu", "", ("actor_target", "critic", "critic_target")
-    count = sum(name.startswith(f"{hidden}.") and name.endswith(".weight") for name in tensors)
-    names = [f"{hidden}.{2 * k}" for k in range(count)] + ([last] if last else [])
+    """The policy's layers, and why each other tensor of `policy.pth` is left out.
+
+    Parameters
+    ----------
+    within : True if the last layer's values are clipped, so that it lies in a sequence with the clip.
+    """
+    names = []
+    for hidden in kind.hidden:
+        count = sum(name.startswith(f"{hidden}.") and name.endswith(".weight") for name in tensors)
+        names += [f"{hidden}.{2 * k}" for k in range(count)]
+    if kind.last:
+        names.append(f"{kind.last}.0" if within else kind.last)
+    if not kind.others:  # ARS: a linear policy may lie on its own, and a layer may have no bias
+        names = names if "action_net.weight" not in tensors else ["action_net"]
     wanted = {f"{name}.{part}" for name in names for part in ("weight", "bias")}
+    if not kind.others:
+        wanted -= {f"{name}.bias" for name in names if f"{name}.bias" not in tensors}
     if wanted - set(tensors) or not names:
         raise InputError(
             f"the tensors of {what} must be those of MlpPolicy; missing {sorted(wanted - set(tensors))}, "
             f"found {braced(tensors) or 'none'}."
         )
-    layers = [linear(tensors[f"{name}.weight"], tensors[f"{name}.bias"]) for name in names]
-    known = {name: "the value, or the spread of actions, of training" for name in tensors if name.startswith(others)}
-    return layers, unread(tensors, wanted, hidden, len(layers[-1].bias), ignored, known)
+    layers = [linear(tensors[f"{name}.weight"], tensors.get(f"{name}.bias")) for name in names]
+    known = {
+        name: "the value, or the spread of actions, of training" for name in tensors if name.startswith(kind.others)
+    }
+    return layers, unread(tensors, wanted, kind.hidden[-1], len(layers[-1].bias), ignored, known)

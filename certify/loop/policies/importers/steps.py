@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 
 from certify.errors import InputError
+from certify.loop.activations import ACTIVATIONS
 from certify.loop.policies.network import Array
 
 T = TypeVar("T")
@@ -105,12 +106,68 @@ class Clip:
                 raise InputError(f"a clip must have lo < hi; found {float(lo)} and {float(hi)}.")
 
 
-Step = Affine | Diagonal | Normalise | Tanh | Activate | Clip
+@dataclass(frozen=True, slots=True)
+class Branches:
+    """Chains of steps that all begin with the same vector, and what joins their results: a sum, or one behind the
+    other. A chain without steps is that vector, as in a skip connection."""
+
+    kind: Literal["sum", "concat"]
+    of: tuple[tuple[Step, ...], ...]
 
 
-def activated(function: str) -> Tanh | Activate:
-    """The step of an activation, by its name."""
-    return Tanh() if function == "tanh" else Activate(function)
+Step = Affine | Diagonal | Normalise | Tanh | Activate | Clip | Branches
+_SELU = Fraction(1.0507009873554804934193349852946), Fraction(1.6732632423543772848170429916717)
+
+
+def activated(function: str, *numbers: Fraction) -> tuple[Step, ...]:
+    """The steps of an activation, by its name and the numbers that torch gives it.
+
+    Functions that are not in the table of activations are sums and scalings of those that are.
+
+    Raises
+    ------
+    InputError : there is no such function.
+    """
+    one, none = Fraction(1), Fraction(0)
+    match function, numbers:
+        case "tanh", ():
+            return (Tanh(),)
+        case _, () if function in ACTIVATIONS:
+            return (Activate(function),)
+        case "leaky_relu", _:
+            slope = numbers[0] if numbers else Fraction(0.01)
+            return (_sum((_scaled(slope),), (Activate("relu"), _scaled(1 - slope))),)
+        case "elu", (alpha,):
+            return (_sum((Activate("elu"), _scaled(alpha)), (Activate("relu"), _scaled(1 - alpha))),)
+        case "selu", _:
+            scale, alpha = numbers if len(numbers) == 2 else _SELU
+            return (_sum((Activate("elu"), _scaled(scale * alpha)), (Activate("relu"), _scaled(scale * (1 - alpha)))),)
+        case "celu", _:
+            alpha = numbers[0] if numbers else one
+            return (_scaled(1 / alpha), Activate("elu"), _scaled(alpha))
+        case "hardtanh", ():
+            return (Clip((-one,), (one,)),)
+        case "relu6", ():
+            return (Clip((none,), (6 * one,)),)
+        case "hardsigmoid", ():
+            return (Diagonal((one,), (3 * one,)), Clip((none,), (6 * one,)), _scaled(one / 6))
+        case "logsigmoid", ():
+            return (_scaled(-one), Activate("softplus"), _scaled(-one))
+    raise InputError(f"the activation must be one of {', '.join(IMPORTED)}; found {function}.")
+
+
+COMPOSED = ("leaky_relu", "selu", "celu", "hardtanh", "relu6", "hardsigmoid", "logsigmoid")
+"""Activations that are made of others."""
+IMPORTED = (*ACTIVATIONS, *COMPOSED)
+"""The names of all activations that are read."""
+
+
+def _scaled(by: Fraction) -> Diagonal:
+    return Diagonal((by,), (Fraction(0),))
+
+
+def _sum(*chains: tuple[Step, ...]) -> Branches:
+    return Branches("sum", chains)
 
 
 def spread(values: tuple[T, ...], width: int) -> tuple[T, ...]:

@@ -28,11 +28,12 @@ _MAX_OPERATIONS = 1000
 _MAX_DEPTH = 40
 _MAX_TEXT = 2**20
 _KNOWN = (
-    "linear, addmm, matmul, add, sub, rsub, mul, div, neg, clamp, hardtanh, relu, tanh, elu, sigmoid, silu, gelu, "
-    "softplus and mish"
+    "linear, addmm, matmul, add, sub, rsub, mul, div, neg, cat, clamp, hardtanh, relu, tanh, elu, sigmoid, silu, gelu, "
+    "softplus, mish, leaky_relu, selu, celu, relu6, hardsigmoid and log_sigmoid"
 )
 _ACTIVATIONS: dict[str, tuple[float, ...]] = {  # with what a program may write behind the value
-    **{"tanh": (), "sigmoid": (), "silu": (), "gelu": (), "mish": (), "elu": (1.0, 1.0, 1.0), "softplus": (1.0, 20.0)}
+    **{"tanh": (), "sigmoid": (), "silu": (), "gelu": (), "mish": (), "elu": (1.0, 1.0, 1.0), "softplus": (1.0, 20.0)},
+    **dict.fromkeys(("selu", "relu6", "hardsigmoid", "log_sigmoid"), ()),
 }
 _NORMALISATIONS = ("layer_norm", "batch_norm", "group_norm", "instance_norm", "rms_norm")
 _RESERVED = ("torch", "CONSTANTS", "getattr")
@@ -41,10 +42,29 @@ _DEFAULTS: dict[str, tuple[Any, ...]] = {"hardtanh": (-1.0, 1.0), "clamp": (None
 
 @dataclass(frozen=True, slots=True)
 class _Value:
-    """A value that depends on the observation: the exact steps to it, and torch's operations with their constants."""
+    """A value that depends on the observation: the exact steps to it, and torch's operation that made it, with its
+    arguments, values and constants."""
 
     chain: Chain = ()
-    operations: tuple[tuple[str, tuple[Any, ...]], ...] = ()
+    name: str = ""
+    given: tuple[Any, ...] = ()
+
+    @property
+    def before(self) -> list[_Value]:
+        """The values that it is made of."""
+        return [v for v in self.given if isinstance(v, _Value)]
+
+    @property
+    def made(self) -> list[_Value]:
+        """All values from the observation to it, in an order in which they can be computed."""
+        found, waiting = dict[int, _Value](), [self]
+        while waiting:
+            missing = [v for v in waiting[-1].before if id(v) not in found]
+            waiting += missing
+            if not missing:
+                value = waiting.pop()
+                found[id(value)] = value
+        return [v for v in found.values() if v.name]
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,20 +95,23 @@ def read_torchscript(file: TorchFile) -> Reading:
         value = _forward(program, file.pickle("data.pkl"), _Value(), 0)
     except RecursionError as error:
         raise InputError(f"the code of {file.what} nests too deep to be read.") from error
-    operations = value.operations
-    own = any(a.dtype == np.float64 and a.ndim for _, given in operations for a in given if _is_array(a))
+    made = value.made
+    own = any(a.dtype == np.float64 and a.ndim for v in made for a in v.given if _is_array(a))
 
     torch = _torch(file.what)
 
     def evaluate(x: Observations, double: bool) -> Values:
         with torch.no_grad():
-            y = torch.tensor(x, dtype=torch.float64 if double else torch.float32)
-            for name, given in operations:
-                y = _run(name, y, given, double)
-            values: Values = y.numpy()
+            known = dict[int, Any]()
+            start = torch.tensor(x, dtype=torch.float64 if double else torch.float32)
+            for v in made:
+                known[id(v)] = _run(
+                    v.name, [known.get(id(g), start) if isinstance(g, _Value) else g for g in v.given], double
+                )
+            values: Values = known[id(value)].numpy() if made else start.numpy()
         return values
 
-    words = f"TorchScript of {', '.join(name for name, _ in operations)[:200]}"
+    words = f"TorchScript of {', '.join(v.name for v in made)[:200]}"
     ran = "the operations of the file's code, one by one in torch (the code is read as text, and not run)"
     return Reading(words=words, steps=value.chain, evaluate=evaluate, double=own, program=ran)
 
@@ -129,7 +152,8 @@ def _classes(file: TorchFile) -> dict[Name, ast.ClassDef]:
     return found
 
 
-def _forward(program: _Program, module: Any, given: _Value, depth: int) -> _Value:
+def _forward(program: _Program, module: Any, given: _Value, depth: int, method: str = "forward") -> _Value:
+    """A call of a module; a trace has a method for each of its calls, forward, forward1, forward2."""
     what = program.file.what
     if depth > _MAX_DEPTH:
         raise InputError(f"the modules of {what} must nest at most {_MAX_DEPTH} deep.")
@@ -137,9 +161,9 @@ def _forward(program: _Program, module: Any, given: _Value, depth: int) -> _Valu
         raise InputError(f"{what} must hold modules; found {brief(module)}.")
     definition = program.classes.get(module.function)
     methods = [] if definition is None else [n for n in definition.body if isinstance(n, ast.FunctionDef)]
-    forward = [node for node in methods if node.name == "forward"]
+    forward = [node for node in methods if node.name == method]
     if len(forward) != 1 or len(forward[0].args.args) != 2 or forward[0].decorator_list:
-        raise InputError(f"{module.function} in {what} must have one forward of one observation.")
+        raise InputError(f"{module.function} in {what} must have one {method} of one observation.")
     names = [argument.arg for argument in forward[0].args.args]
     if len(set(names)) != 2 or any(name in _RESERVED for name in names):
         raise InputError(f"forward of {module.function} in {what} must not rename {', '.join(_RESERVED)}.")
@@ -171,6 +195,8 @@ def _evaluate(program: _Program, node: ast.expr, values: dict[str, Any], depth: 
             return value
         case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() | float() as value)):
             return -value
+        case ast.List(elts=parts):
+            return [_evaluate(program, part, values, depth) for part in parts]
         case ast.Attribute(value=ast.Name(id="CONSTANTS"), attr=attr) if attr[:1] == "c" and attr[1:].isdecimal():
             index = int(attr[1:])
             if index >= len(program.constants):
@@ -185,13 +211,17 @@ def _evaluate(program: _Program, node: ast.expr, values: dict[str, Any], depth: 
                 raise InputError(f"torch.{name} in {program.file.what} is not read. {WITHOUT_NORMALISATION}")
             arguments = [_evaluate(program, argument, values, depth) for argument in node.args]
             return _operation(program, name, arguments, node)
-        case ast.Call(func=ast.Attribute(value=inner, attr="forward"), args=[argument], keywords=[]):
+        case ast.Call(func=ast.Attribute(value=inner, attr=method), args=[argument], keywords=[]) if _is_call(method):
             module = _evaluate(program, inner, values, depth)
             given = _evaluate(program, argument, values, depth)
             if not isinstance(given, _Value):
                 raise InputError(f"a module of {program.file.what} must be given what depends on the observation.")
-            return _forward(program, module, given, depth + 1)
+            return _forward(program, module, given, depth + 1, method)
     raise InputError(f"{program.file.what} has an expression that is not read: {_text(node)}. Known are {_KNOWN}.")
+
+
+def _is_call(method: str) -> bool:
+    return method == "forward" or (method.startswith("forward") and method[7:].isdecimal())
 
 
 def _attribute(program: _Program, module: Any, name: str) -> Any:
@@ -238,13 +268,26 @@ def _operation(program: _Program, name: str, given: list[Any], node: ast.Call) -
             raise InputError(f"{at} has {word.arg}, which is not read.")
     if name in ("t", "numpy_T") and len(given) == 1 and _is_array(given[0]) and given[0].ndim == 2:
         return given[0].T
+    if name == "cat" and len(given) == 2 and given[1] in (1, -1) and _are_values(given[0]):
+        return _Value(graph.joined("concat", *(v.chain for v in given[0])), name, tuple(given[0]))
+    if name in ("add", "sub") and len(given) == 2 and _are_values(given):
+        one, other = (v.chain for v in given)
+        chain = graph.joined("sum", one, graph.negated(other) if name == "sub" else other)
+        return _Value(chain, name, tuple(given))
     places = [k for k, value in enumerate(given) if isinstance(value, _Value)]
-    if len(places) != 1 or any(isinstance(value, Call | bool) for value in given):
-        raise InputError(f"{at} must join one value that depends on the observation with constants.")
-    value, others = given[places[0]], tuple(v for v in given if not isinstance(v, _Value))
-    chain = _step(name, places[0], len(given), value.chain, others, at)
-    label = "rsub" if name == "sub" and places[0] == 1 else name
-    return _Value(chain, (*value.operations, (label, others)))
+    if len(places) != 1 or any(isinstance(value, Call | bool | list) for value in given):
+        raise InputError(
+            f"{at} must join one value that depends on the observation with constants; add, sub and cat may join "
+            "several."
+        )
+    others = tuple(v for v in given if not isinstance(v, _Value))
+    chain = _step(name, places[0], len(given), given[places[0]].chain, others, at)
+    return _Value(chain, name, tuple(given))
+
+
+def _are_values(given: Any) -> bool:
+    """True if all of these depend on the observation."""
+    return isinstance(given, list) and len(given) > 1 and all(isinstance(v, _Value) for v in given)
 
 
 def _step(name: str, place: int, count: int, chain: Chain, given: tuple[Any, ...], at: str) -> Chain:
@@ -267,8 +310,12 @@ def _step(name: str, place: int, count: int, chain: Chain, given: tuple[Any, ...
             return graph.scaled(chain, given[0], at, divide=True)
         case "neg", 0, 1:
             return graph.negated(chain)
+        case "leaky_relu" | "celu", 0, 1 | 2:
+            return graph.mapped(chain, name, *given)
+        case "elu", 0, 2 | 3 | 4 if given[1:] == (1.0, 1.0)[: len(given) - 1] and given[0] != 1:
+            return graph.mapped(chain, name, given[0])
         case _, 0, _ if name in _ACTIVATIONS and given == _ACTIVATIONS[name][: len(given)]:
-            return graph.mapped(chain, name)
+            return graph.mapped(chain, name.replace("log_s", "logs"))
         case "relu", 0, 1:
             return graph.clipped(chain, 0.0, None, at)
         case ("clamp", 0, 1 | 2 | 3) | ("hardtanh", 0, 1 | 2 | 3):
@@ -278,33 +325,37 @@ def _step(name: str, place: int, count: int, chain: Chain, given: tuple[Any, ...
     raise InputError(f"{at}{said} is not read: the operations are {_KNOWN}. {WITH_TANH}")
 
 
-def _run(name: str, y: Any, given: tuple[Any, ...], double: bool) -> Any:
+def _run(name: str, given: list[Any], double: bool) -> Any:
     """torch's own operation, with its constants as they are or in double precision."""
     import torch
 
     kind = np.float64 if double else None
-    constants = [torch.from_numpy(np.array(v, dtype=kind)) if _is_array(v) else v for v in given]
+    arguments = [torch.from_numpy(np.array(v, dtype=kind)) if _is_array(v) else v for v in given]
     functions: dict[str, Callable[..., Any]] = {
         "linear": torch.nn.functional.linear,
-        "addmm": lambda h, bias, weight: torch.addmm(bias, h, weight),
+        "addmm": torch.addmm,
         "matmul": torch.matmul,
         "mm": torch.mm,
         "add": torch.add,
         "sub": torch.sub,
-        "rsub": lambda h, constant: constant - h,
+        "rsub": torch.rsub,
+        "cat": lambda *values: torch.cat(values, 1),
         "mul": torch.mul,
         "div": torch.div,
         "neg": torch.neg,
         "tanh": torch.tanh,
         "sigmoid": torch.sigmoid,
         **{name: getattr(torch.nn.functional, name) for name in ("silu", "gelu", "mish")},
-        "elu": lambda h, *_: torch.nn.functional.elu(h),
+        "elu": lambda h, alpha=1.0, *_: torch.nn.functional.elu(h, alpha),
+        **{name: getattr(torch.nn.functional, name) for name in ("leaky_relu", "selu", "celu", "hardsigmoid")},
+        "relu6": torch.nn.functional.relu6,
+        "log_sigmoid": torch.nn.functional.logsigmoid,
         "softplus": lambda h, *_: torch.nn.functional.softplus(h),
         "relu": torch.relu,
         "clamp": torch.clamp,
         "hardtanh": torch.nn.functional.hardtanh,
     }
-    return functions[name](y, *constants)
+    return functions[name](*arguments)
 
 
 def _is_array(value: Any) -> bool:
