@@ -235,7 +235,7 @@ def _activation(kind: _Class, given: Any, what: str) -> str:
 
 
 def _end(kind: _Class, given: Mapping[str, Any], exploration: Any, what: str) -> tuple[bool, float | None]:
-    """Whether the action is squashed, and what its mean is clipped to before that, if it is.
+    """True if the action is squashed, and the bound of its mean before that, where it is clipped.
 
     Parameters
     ----------
