@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-
 from tests.checker.test_networks import FUNCTIONS, hash_of
 from tests.support.balls import enlarge, with_ball
 from tests.support.beyond import uniform
@@ -73,11 +72,9 @@ def policy(form: str, name: str, W: Any, b: Any, v: Any, K: Any) -> Steps:
         case "concat":
             return [affine(0, W, b), mapped(1, name), joined("concat", 0, 2), affine(3, np.append(K / 2, v / 2))]
     names = ["x", "y"][: W.shape[1]]
-    seen = [["sin", "x"], ["*", names[-1], ["cos", "x"]], ["-", ["sqrt", ["+", "1", names[0]]], "1"]]
-    if len(names) == 1:
-        mixed = np.hstack([W / 2, W / 4, W / 2])
-    else:
-        mixed = np.column_stack([W[:, 0] / 2, W[:, 1], W[:, 0]])
+    root = ["-", ["sqrt", ["+", "1", ["*", str(len(names)), "x"]]], "1"]  # of slope 1/2, or 1
+    seen = [["sin", "x"], ["*", names[-1], ["cos", "x"]], root]
+    mixed = np.column_stack([W[:, 0] / 2, W[:, 0] / 4 if len(names) == 1 else W[:, 1], W[:, 0] / 2])
     observe = {"kind": "observe", "of": [0], "names": names, "expressions": seen}
     return [observe, affine(1, mixed, b), mapped(2, name), affine(3, v)]
 
@@ -128,7 +125,7 @@ def planar(name: str, form: str) -> Document:
     return with_policy(data, policy(form, name, W, b, v, K))
 
 
-# ------------------------------------------------------------------------------------------------- kinds of certificates
+# ------------------------------------------------------------------------------------------------ kinds of certificates
 
 
 def claim(name: str, form: str, kind: str) -> Document:
