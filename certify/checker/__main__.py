@@ -39,7 +39,7 @@ def main(arguments: list[str]) -> int:
     except Unreadable as error:
         status, answer = 2, {"error": str(error), "text": []}
     except Exception as error:
-        status, answer = 70, {"error": f"internal error: {type(error).__name__}: {error}", "text": []}
+        status, answer = 70, {"error": f"internal error of the checker: {type(error).__name__}: {error}", "text": []}
     lines = [json.dumps(answer)] if options.json else answer["text"]
     try:
         sys.stdout.write("".join(f"{line}\n" for line in lines))

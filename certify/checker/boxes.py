@@ -56,7 +56,7 @@ class Boxes(ABC):
     @property
     def width(self) -> int:
         """The most entries of a vector of the networks."""
-        return max(max(network.reads, *(step.size for step in network.steps)) for network in self.networks)
+        return max(network.widest for network in self.networks)
 
     @property
     def networks(self) -> list[Network]:

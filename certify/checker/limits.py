@@ -24,10 +24,10 @@ def is_bearable(case: Case) -> Failures:
     sizes = Sizes(case.c)
     count, work, most = sizes.numbers(), sizes.work(), MOST_IN_PATIENCE if case.patient else MOST_WORK
     if count > MOST_NUMBERS:
-        yield "numbers", f"the file asks for {in_short(count)} at once; {in_short(MOST_NUMBERS)} are allowed"
+        yield "numbers", f"the file asks for {in_short(count)} at once; the checker allows {in_short(MOST_NUMBERS)}"
     if work > most:
         more = f"; with --patient {in_short(MOST_IN_PATIENCE)}" if most < work <= MOST_IN_PATIENCE else ""
-        yield "operations", f"the file asks for {in_short(work)}; {in_short(most)} are allowed{more}"
+        yield "operations", f"the file asks for {in_short(work)}; the checker allows {in_short(most)}{more}"
     return 1
 
 
@@ -46,7 +46,7 @@ class Net:
         self.steps = [shape for network in policy for shape in network.shapes]
         self.steps += [(r, c, before + network.reads) for network in called for r, c, before in network.shapes]
         self.units = sum(step.units for step in steps) + sum(arguments)
-        self.widest = max((*(step.size for step in steps), *arguments), default=0)
+        self.widest = max((network.widest for network in networks), default=0)
         self.kept = -(-sum(network.kept for network in networks) // max(self.widest, 1))
         self.reads = sum(len(step.of) for step in steps)
         self.dear = sum(step.size for step in steps if isinstance(step, Map) and step.function not in ("tanh", "relu"))

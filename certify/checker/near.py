@@ -421,7 +421,7 @@ def gram(X: Near) -> Square:
 
 def near_one(x: Any) -> tuple[Any, int]:
     """(y, e): x is y 2^e, and nothing in y exceeds 1; exact but for underflow, at most 2^-1075 a number."""
-    most = max(np.max(np.abs(x.value), initial=0.0), np.max(x.error.top, initial=0.0))
+    most = np.maximum(np.max(np.abs(x.value), initial=0.0), np.max(x.error.top, initial=0.0))
     by = int(np.frexp(most)[1])
     return type(x)(np.ldexp(x.value, -by), Above(np.ldexp(x.error.top, -by)) + np.size(x.value) * LEAST), by
 
@@ -520,7 +520,7 @@ def _table(values: Iterable[arb]) -> Array:
     """The binary64 numbers nearest to these values."""
     pairs = [near_ball(x) for x in values]
     # At 128 bits the midpoint rounds to within u |value| (1 + 2^-50) of the ball.
-    if any(x.error.top > U * abs(x.value) * (1 + 2.0**-20) + 4 * LEAST for x in pairs):
+    if not all(x.error.top <= U * abs(x.value) * (1 + 2.0**-20) + 4 * LEAST for x in pairs):
         raise ArithmeticError("a table entry is not accurate to one rounding")
     return np.array([x.value for x in pairs])
 
@@ -653,11 +653,13 @@ class Polynomials:
     def _make(self, formula: Callable[[arb_series], arb_series]) -> None:
         points = [arb(k) * _STEP for k in range(-_FAR_POINTS, _FAR_POINTS + 1)]
         cells = [_coefficients(formula, arb(g, _STEP / 2)) for g in points]
-        largest = [max(near_ball(abs(cell[j])).ends[1] for cell in cells) for j in range(_DEGREE + 1)]
-        self.sup = [Above(max(v, _FAR_ERROR, (1 + _FAR_ERROR) * (j == 1))) for j, v in enumerate(largest)]
-        each = [_coefficients(formula, g)[:_DEGREE] for g in points]
+        each = np.array([[near_ball(abs(cell[j])).ends[1] for cell in cells] for j in range(_DEGREE + 1)])
+        largest = np.maximum(np.max(each, axis=1), _FAR_ERROR)  # NaN stays, which Python's max may lose
+        largest[1] = np.maximum(largest[1], 1 + _FAR_ERROR)
+        self.sup = [Above(v) for v in largest]
+        entries = [_coefficients(formula, g)[:_DEGREE] for g in points]
         self.tables = [
-            np.array([[_entry(comb(i, j) * at[i]) for at in each] for i in range(j, _DEGREE)]) for j in range(5)
+            np.array([[_entry(comb(i, j) * at[i]) for at in entries] for i in range(j, _DEGREE)]) for j in range(5)
         ]
         powers = 2.0 ** (-6 * np.arange(_DEGREE))
         self.sizes = [(size(t[1:]) * powers[: len(t) - 1, None]).sum().top for t in self.tables]
@@ -688,7 +690,7 @@ class Polynomials:
 def _entry(x: arb) -> float:
     """The binary64 number nearest to a value, within u of it and 2^-90."""
     found = near_ball(x)
-    if found.error.top > U * abs(found.value) * (1 + 2.0**-20) + 2.0**-90:
+    if not found.error.top <= U * abs(found.value) * (1 + 2.0**-20) + 2.0**-90:
         raise ArithmeticError("a table entry is not accurate enough")
     return float(found.value)
 

@@ -151,7 +151,7 @@ class OnBoxes(Algebra[Enclosed]):
 
     def is_read_once(self, k: int) -> bool:
         """True if the errors that step k adds reach the value through the step in hand alone, and are fresh."""
-        return isinstance(self.steps[k], Affine) and self.network.readers[k] <= 1
+        return isinstance(self.steps[k], Affine) and len(self.network.readers.get(k, ())) <= 1
 
     def sum(self, step: Sum, vectors: Sequence[Enclosed]) -> Enclosed:
         h, (first, *others) = vectors[0].h, vectors

@@ -10,7 +10,6 @@ import hashlib
 import json
 import struct
 from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -109,6 +108,11 @@ class Network:
         """The number of entries of its value."""
         return self.steps[-1].size
 
+    @cached_property
+    def widest(self) -> int:
+        """The most entries of a vector, the argument among them."""
+        return max(self.reads, *(step.size for step in self.steps))
+
     @property
     def widths(self) -> list[int]:
         """The sizes of the argument and of each affine step's vector."""
@@ -153,9 +157,13 @@ class Network:
         )
 
     @cached_property
-    def readers(self) -> Counter[int]:
-        """The number of times that steps read each vector."""
-        return Counter(i for step in self.steps for i in step.of)
+    def readers(self) -> dict[int, list[int]]:
+        """The steps that read a vector, by its number: in order, from 1, one that reads it twice stands there twice."""
+        found: dict[int, list[int]] = {}
+        for k, step in enumerate(self.steps, 1):
+            for i in step.of:
+                found.setdefault(i, []).append(k)
+        return found
 
     def words(self) -> str:
         """The steps but for their numbers, where they are not those of a chain; FORMAT.md has the hash."""
@@ -289,12 +297,10 @@ class Algebra(ABC, Generic[V]):
     def run(self, network: Network, argument: V) -> V:
         """The network's value. A vector is kept no longer than steps read it."""
         vectors: dict[int, Any] = {0: argument}
-        left = network.readers.copy()
         for k, step in enumerate(network.steps, 1):
             vectors[k] = self.make(step, [vectors[i] for i in step.of])
-            left.subtract(step.of)
             for i in set(step.of):
-                if not left[i]:
+                if network.readers[i][-1] == k:
                     del vectors[i]
         return vectors[len(network.steps)]  # type: ignore[no-any-return]
 

@@ -100,7 +100,7 @@ class Function:
 
     def __init__(self, tape: Tape) -> None:
         self.tape, networks = tape, [call.network for call in tape.calls.values()]
-        self.values = max(2 * tape.size, *(v for net in networks for v in (net.reads, *(s.size for s in net.steps))), 0)
+        self.values = max(2 * tape.size, *(network.widest for network in networks), 0)
         self.shapes = [shape for net in networks for shape in net.shapes]
         prepare(*networks)
 

@@ -219,7 +219,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         verdict = judge(raw, MAX_IN_PATIENCE if options.patient else options.operations)
     except Exception as error:  # whatever it is, it must not look like a verdict
-        return failed(f"internal error: {type(error).__name__}: {error}", INTERNAL)
+        return failed(f"internal error of the reference: {type(error).__name__}: {error}", INTERNAL)
     seconds = time.perf_counter() - start
     if options.json:
         say(json.dumps(as_json(verdict, seconds)))

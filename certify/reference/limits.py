@@ -27,9 +27,9 @@ def limits(c: Certificate, most: int | None = None) -> None:
     """Neither too many numbers at once, nor more operations than these (None: than this program takes)."""
     count, work = numbers(c), operations(c)
     most = MAX_OPERATIONS if most is None else most
-    require(count <= MAX_NUMBERS, "limits", "numbers", f"{count} numbers at once; {MAX_NUMBERS} are allowed")
+    require(count <= MAX_NUMBERS, "limits", "numbers", f"{count} numbers at once; the reference allows {MAX_NUMBERS}")
     more = f"; with --patient {MAX_IN_PATIENCE}" if most < work <= MAX_IN_PATIENCE else ""
-    require(work <= most, "limits", "operations", f"{work} operations; {most} are allowed{more}")
+    require(work <= most, "limits", "operations", f"{work} operations; the reference allows {most}{more}")
 
 
 # ----------------------------------------------------------------------------------------------------------- the sizes
@@ -39,9 +39,9 @@ def limits(c: Certificate, most: int | None = None) -> None:
 class Nets:
     """Some networks: rows and columns of their steps with the units of the network before each.
 
-    `units` are those of all of them, `widest` is the most entries that a step makes, `read` counts the vectors that
-    steps read, `waiting` the entries of those that a step reads which is not the next, by `widest`, `dear` the entries
-    of functions that take long.
+    `units` are those of all of them, `widest` is the most entries of a vector, `read` counts the vectors that steps
+    read, `waiting` the entries of those that a step reads which is not the next, by `widest`, `dear` the entries of
+    functions that take long.
     """
 
     shapes: tuple[tuple[int, int, int], ...]
@@ -87,7 +87,7 @@ def nets(called: Sequence[Network], *policy: Network) -> Nets:
     shapes += [(p, q, g + network.reads) for network in called for p, q, g in shapes_of(network)]
     steps = [(k, step) for network in networks for k, step in enumerate(network.steps)]
     units = sum(units_of(step) for _, step in steps) + sum(arguments)
-    widest = max((*arguments, *(step.size for _, step in steps)), default=0)
+    widest = max((size for network in networks for size in network.sizes), default=0)
     waiting = -(-sum(map(entries_waiting, networks)) // max(widest, 1))
     read = sum(len(step.of) for _, step in steps)
     dear = sum(step.size for _, step in steps if isinstance(step, Map) and step.function not in ("tanh", "relu"))

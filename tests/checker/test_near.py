@@ -278,3 +278,13 @@ def test_functions_of_numbers_near_others_hold(name: str, count: int) -> None:
             v = arb(float(c[i])) + arb(float(generator.choice([-1.0, 0.0, 1.0]))) * arb(float(error[i]))
             assert abs(getattr(v, name)() - arb(float(y.value[i]))) <= arb(float(y.error.top[i])), c[i]
     assert said > 0.6 * count
+
+
+def test_a_table_keeps_what_is_not_known() -> None:
+    """Where Arb has no number, a bound over all numbers has none, and an entry of a table is refused."""
+    bent = near.Polynomials(lambda v: (v * v + arb(2) ** -40).sqrt())  # around 0 Arb's square may be negative
+    assert all(np.isnan(bound.top) for bound in bent.sup)
+    with pytest.raises(ArithmeticError, match="not accurate"):
+        near.Polynomials(lambda v: v.log())
+    with pytest.raises(ArithmeticError, match="not accurate"):
+        near._table([arb(1), arb("nan")])

@@ -212,7 +212,7 @@ def test_a_process_that_does_not_answer_is_an_internal_error(
     if alone is not None and int(alone[1].removeprefix("leaf ")) < batch * SIZE:
         assert (status, answered["rule"], answered["at"], answered["detail"]) == (1, *alone)
     else:
-        assert status == 70 and "internal error" in answered["error"] and "result" not in answered
+        assert status == 70 and "internal error of the checker" in answered["error"] and "result" not in answered
     assert _children() <= before
 
 
@@ -262,7 +262,7 @@ def test_answers_that_cannot_be_are_an_internal_error(
     monkeypatch.setattr(processes, "_send", lambda answers, *ends: honestly(LIES[what](answers), *ends))
     for data in (divided(), honest("outer, a network")):
         assert main([str(write(data, tmp_path)), "--json", "--jobs", "3"]) == 70
-        assert "internal error" in json.loads(capsys.readouterr().out)["error"]
+        assert "internal error of the checker" in json.loads(capsys.readouterr().out)["error"]
 
 
 def test_the_same_answers_of_all_processes_are_an_internal_error(

@@ -134,7 +134,7 @@ def test_an_internal_error_is_no_verdict(monkeypatch: pytest.MonkeyPatch, tmp_pa
     path = str(write(honest("scalar"), tmp_path))
     assert command.main([path]) == 70 and command.main([path, "--json"]) == 70
     out, err = capfd.readouterr()
-    assert list(json.loads(out)) == ["error"] and "internal error: ZeroDivisionError" in err
+    assert list(json.loads(out)) == ["error"] and "internal error of the reference: ZeroDivisionError" in err
 
 
 def scalar_with(old: str, new: str) -> bytes:
