@@ -276,6 +276,8 @@ class _OnBall(Algebra[_Part]):
         G, _, E = self._reached(v)
         size = sizes(G, v.Q, v.K, E)
         _, slope, second, third, fourth = step.phi.around(v.at.y, size.radius)
+        if not step.phi.is_smooth:  # at its corner itself the checker has no tangent
+            fourth = np.where(np.abs(v.at.y) <= _AT_CORNER, np.nan, fourth)
         squares = self.form.square(G)
         H, cubic = beyond_tangent(G, squares, v.Q, v.K, second, third)
         rest = remainder(squares, size, E, np.abs(second), np.abs(third), fourth)
