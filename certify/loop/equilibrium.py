@@ -55,14 +55,17 @@ class Rest:
 
 
 def find_rest(loop: ClosedLoop) -> Rest | None:
-    """Enclose the equilibrium that Newton's method reaches from the origin, or else from the end of a trajectory that
-    starts there; None if none can be shown."""
+    """Enclose the equilibrium that Newton's method reaches from the origin, or from the end of a trajectory that starts
+    there: a stable one if either is; None if none can be shown."""
+    first = None
     for begin in (_origin, _end):
         x0 = begin(loop)
         start = None if x0 is None else _newton(loop, x0)
-        if start is not None:
-            return _enclosed(loop, start)
-    return None
+        found = None if start is None else _enclosed(loop, start)
+        if found is not None and found.stable:
+            return found
+        first = found if first is None else first
+    return first
 
 
 def seen_from(loop: ClosedLoop, rest: Rest) -> ClosedLoop:

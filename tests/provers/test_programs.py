@@ -130,7 +130,9 @@ def _point(value: float) -> Any:
 def test_rationals_know_what_steps_make_of_0() -> None:
     assert raw_at_origin(policy("skip", "identity", "output")) == (None,)  # elu of a negative bias
     clipped = raw_at_origin(policy("residual", "identity", "output"))[0]
-    assert clipped is not None and float(clipped) == pytest.approx(policy("residual", "identity", "output").net(np.zeros(2))[0] * 6)
+    assert clipped is not None and float(clipped) == pytest.approx(
+        policy("residual", "identity", "output").net(np.zeros(2))[0] * 6
+    )
     late = raw_at_origin(policy("late", "identity", "output"))
     assert late == (None,)  # sqrt(1.01)
 

@@ -55,7 +55,12 @@ def residual() -> Network:
 def branches() -> Network:
     """Two branches of other functions, one behind the other, and a state beside them."""
     steps = (
-        *(Affine((0,), np.eye(2) / 2, np.array([0.4, -0.3])), Map((1,), "sigmoid"), Map((1,), "softsign"), Concat((2, 3, 0))),
+        *(
+            Affine((0,), np.eye(2) / 2, np.array([0.4, -0.3])),
+            Map((1,), "sigmoid"),
+            Map((1,), "softsign"),
+            Concat((2, 3, 0)),
+        ),
         Affine((4,), np.hstack([np.array([[0.1, -0.1, 0.2, -0.3]]), -K]), np.zeros(1)),
     )
     return Network(2, steps)

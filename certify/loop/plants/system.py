@@ -86,6 +86,8 @@ class System:
     time : `continuous`, or `discrete`: then the equations are those of x+, the state one step later.
     sample : the shortest and longest sampling period of a continuous plant; None if the input follows the
         state at once.
+    observations : expressions of the states' values and the parameters, which a policy for this plant reads if nothing
+        else is said; empty for the states.
 
     Raises
     ------
@@ -110,6 +112,7 @@ class System:
     ranges: Mapping[str, Interval] = field(default_factory=dict)
     time: Time = "continuous"
     sample: Interval | None = None
+    observations: tuple[Expression, ...] = ()
 
     def __post_init__(self) -> None:
         for key in ("parameters", "ranges", "units"):
@@ -118,7 +121,7 @@ class System:
             if not isinstance(symbol, Symbol):
                 raise InputError(f"a name in {self.name} must be one of certify.symbols; found {symbol!r}.")
         object.__setattr__(self, "x_eq", tuple(self.x_eq) or (Number(0),) * self.n)
-        for key in ("dynamics", "u_eq", "x_eq"):
+        for key in ("dynamics", "u_eq", "x_eq", "observations"):
             try:
                 object.__setattr__(self, key, tuple(map(as_expression, getattr(self, key))))
                 for equation in getattr(self, key):
@@ -226,6 +229,12 @@ class System:
         values = self.exact_x_eq()
         return {s.name: q for s, q in zip(self.states, values, strict=True)} if any(values) else {}
 
+    def exact_observations(self) -> tuple[Expression, ...]:
+        """The observations as expressions of the states, deviations from the operating point."""
+        numbers: dict[Symbol, Expression] = {Symbol(name): Number(q) for name, q in self.parameters.items()}
+        numbers |= {s: s + q for s, q in zip(self.states, self.exact_x_eq(), strict=True) if q}
+        return tuple(_substituted(self, e, numbers) for e in self.observations)
+
     def function(self, module: Module = "numpy") -> Callable[[Any, Any], Any]:
         """Floating-point nominal f: arrays x (..., n) and u (..., m) to xdot (..., n); `module` numpy or torch.
 
@@ -239,7 +248,7 @@ class System:
         return function_of(self, self.uncertain_dynamics(), [s for s, _ in self.uncertain], module)
 
 
-def _substituted(system: System, expression: Expression, numbers: Mapping[Symbol, Number]) -> Expression:
+def _substituted(system: System, expression: Expression, numbers: Mapping[Symbol, Expression]) -> Expression:
     """Substitute the numbers; reject the expression if it then divides by 0, or the like."""
     result = substitute(expression, numbers)
     try:

@@ -6,7 +6,7 @@ them to deviations from x_eq. Every error names the line, the entry and the expe
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -31,6 +31,7 @@ _KEYS = (
     "units",
     "training",
     "time",
+    "observations",
 )
 
 
@@ -80,6 +81,7 @@ def build_system(file: PlantFile) -> System:
             x_eq=tuple(x_eq),
             disturbances=tuple(symbol[w] for w in acting),
             ranges={w: interval for w, interval in acting.items() if interval is not None},
+            observations=tuple(_observations(file, {s: symbol[s] for s in (*states, *parameters)})),
         )
     except InputError as error:
         if str(file.path) in str(error):
@@ -135,6 +137,14 @@ def _shorthand(file: PlantFile, symbol: Mapping[str, Symbol]) -> dict[str, Expre
             raise file.refuse("must be a new name, and no state, input, parameter or function.", "where", name)
         found[name] = _equation(file, "where", name, {**symbol, **found}, "name of the plant or of a line above")
     return found
+
+
+def _observations(file: PlantFile, symbol: Mapping[str, Expression]) -> Iterator[Expression]:
+    """The table `observations`: what a policy reads, in its order, over the states' values."""
+    for name in file.table("observations"):
+        if not name.isidentifier():
+            raise file.refuse("must be a name.", "observations", name)
+        yield _equation(file, "observations", name, symbol, "state or parameter")
 
 
 def _time(file: PlantFile) -> Time:

@@ -26,6 +26,7 @@ def validate(system: System) -> None:
     _check_intervals(system)
     _check_parameters(system)
     _check_equations(system)
+    _check_observations(system)
     system.exact_x_eq()
     _check_ranges(system)
     _check_sample(system)
@@ -44,6 +45,14 @@ def _check_counts(system: System) -> None:
             raise InputError(f"`{label}` of {system.name} must have {wanted} entries; found {found}.")
     if n == 0 or m == 0:
         raise InputError(f"{system.name} must have at least one state and one input.")
+
+
+def _check_observations(system: System) -> None:
+    known = {*system.states, *map(Symbol, system.parameters)}
+    for e in system.observations:
+        odd = sorted(s.name for s in symbols_of(e) - known)
+        if odd:
+            raise InputError(f"observations of {system.name} must be of states and parameters; {e} has {odd[0]}.")
 
 
 def _check_names(system: System) -> None:

@@ -139,28 +139,28 @@ def import_bytes(
     InputError : as `import_policy`, without the name.
     """
     kind = kind_of(raw, name, options)
-    n = plant.n if options.states is None else len(options.states)
+    reads = observed(options.states, plant, options)
+    n = reads.count
     reading = read_kind(kind, raw, name, options, n, plant.m, folder, beside)
     if evaluate is not None:
         reading = replace(reading, evaluate=evaluate, program="the module itself, run")
     _require_answers(kind, reading, options, plant)
-    states = options.states if options.states is not None else tuple(s.name for s in plant.states)
-    reads = observed(states, plant, options)
-    if (reading.n, reading.m) != (len(states), plant.m):
+    if (reading.n, reading.m) != (n, plant.m):
         raise InputError(
-            f"the policy must read the {len(states)} states {', '.join(states)} and command the {plant.m} inputs of "
-            f"{plant.name}; it reads {reading.n} and commands {reading.m}. Name what it reads with --states."
+            f"the policy must read the {n} {'states' if reads.index else 'observations'} {reads.words} and command the "
+            f"{plant.m} inputs of {plant.name}; it reads {reading.n} and commands {reading.m}. Name what it reads with "
+            "--states."
         )
     x_eq = [plant.exact_x_eq()[i] for i in reads.index or ()]
     moved = shift(x_eq, options)
-    normaliser = _normaliser(reading, options, len(states))
+    normaliser = _normaliser(reading, options, n)
     before = (*moved, *normaliser)
-    require_equilibrium(reading, x_eq if moved else [Fraction(0)] * len(states))
+    require_equilibrium(reading, x_eq if moved else [Fraction(0)] * n)
     after = _action(options, plant.m)
     steps = (*before, *reading.steps, *after)
-    folded = fold(steps, len(states))
+    folded = fold(steps, n)
     if reads.index is None and reads.may_leave(folded.inactive):
-        folded = fold(steps, len(states), keep_clips=True)
+        folded = fold(steps, n, keep_clips=True)
     network, valid = _network(folded, reads, reading, options)
     u_eq = plant.exact_u_eq()
     if network.centre != "none":
@@ -172,7 +172,7 @@ def import_bytes(
     values = bare(x, u_eq)
     difference = compare_reading(reading, before, after, reads(x), values, reads.is_inexact)
     known = {"file": name, "sha256": hashlib.sha256(raw).hexdigest(), "kind": kind}
-    known |= {"policy": reading.words, "states": ", ".join(states)}
+    known |= {"policy": reading.words, "states": reads.words}
     record = known | _record(reading, options, plant, difference)
     return Imported(
         policy=Policy(network, plant.name, _parameters(plant), {"imported": record}, reading.beta, valid),
@@ -209,7 +209,7 @@ def _require_answers(kind: Content, reading: Reading, options: ImportOptions, pl
     wanted = []
     order = ",".join(s.name for s in plant.states)
     layers_only = kind in ("state-dict", "safetensors")
-    if options.states is None and plant.n > 1:
+    if options.states is None and plant.n > 1 and not plant.observations:
         wanted.append(f"--states {order} (what the network reads, in its order)")
     if options.activation is None and layers_only:
         wanted.append("--activation tanh, relu or another (between the layers)")
@@ -219,7 +219,7 @@ def _require_answers(kind: Content, reading: Reading, options: ImportOptions, pl
         wanted.append("--normaliser FILE or none (what was done to observations)")
     if options.action_scale is None and reading.action != plant.input_bounds:
         wanted.append("--action-scale (u = scale * action + offset in the plant's units: 1 if they are the same)")
-    if options.observes is None and any(plant.exact_x_eq()):
+    if options.observes is None and any(plant.exact_x_eq()) and (options.states or not plant.observations):
         wanted.append(f"--observes absolute or deviation (the operating point of {plant.name} is not 0)")
     if wanted:
         raise InputError(f"the file does not fully define the policy; these options are required: {'; '.join(wanted)}.")

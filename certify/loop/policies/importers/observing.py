@@ -52,6 +52,16 @@ class Observed:
         return np.asarray(evaluated(self.expressions, self.plant.states, x))
 
     @property
+    def count(self) -> int:
+        """The number of observations."""
+        return len(self.expressions)
+
+    @property
+    def words(self) -> str:
+        """For people."""
+        return ", ".join(map(str, self.expressions))
+
+    @property
     def is_inexact(self) -> bool:
         """True if an observation of a number of single precision need not be one."""
         return self.index is None
@@ -66,14 +76,17 @@ class Observed:
         return False
 
 
-def observed(states: tuple[str, ...], plant: System, options: ImportOptions) -> Observed:
-    """The observations that `--states` names.
+def observed(states: tuple[str, ...] | None, plant: System, options: ImportOptions) -> Observed:
+    """The observations that `--states` names; if it names none, those of the plant, or else its states.
 
     Raises
     ------
     InputError : one is no state of the plant and no expression of its states.
     """
     known = {s.name: s for s in plant.states}
+    if states is None and plant.observations:
+        return Observed(plant, None, plant.exact_observations())
+    states = tuple(known) if states is None else states
     if all(name in known for name in states):
         if len(set(states)) != len(states):
             raise InputError(f"--states must name each state once; found {','.join(states)}.")
