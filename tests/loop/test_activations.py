@@ -33,7 +33,7 @@ POINTS = np.concatenate([np.linspace(-12, 12, 97), [-700.0, -90.0, -41.0, 41.0, 
 
 
 def network(name: str, **changes: Any) -> PolicyNetwork:
-    return replace(pendulum_network((6, 5)), activation=name, **changes)
+    return pendulum_network((6, 5)).with_layers(activation=name, **changes)
 
 
 def derivatives(row: Activation, v: float) -> list[float]:
@@ -141,7 +141,7 @@ def test_pi_at_0_of_a_relu_policy_is_a_rational() -> None:
 @pytest.mark.parametrize("name", ACTIVATIONS)
 @pytest.mark.parametrize("widths", [(6,), (6, 5)])
 def test_the_hash_is_the_checkers(name: str, widths: tuple[int, ...]) -> None:
-    ours = replace(pendulum_network(widths), activation=name)
+    ours = pendulum_network(widths).with_layers(activation=name)
     steps: list[Any] = []
     for W, b in zip(ours.weights, ours.biases, strict=True):
         if steps:

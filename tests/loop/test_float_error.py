@@ -356,7 +356,7 @@ def test_tiny_numbers_may_be_lost(weight: float, state: float, large: float, flu
     ],
 )
 def test_what_may_overflow_is_refused(edit: dict[str, Any], message: str) -> None:
-    network = dataclasses.replace(chained(1, squash="identity"), **edit)
+    network = chained(1, squash="identity").with_layers(**edit)
     with pytest.raises(InputError, match=message):
         float_error(network, plant(1, 1, "4"))
 
@@ -394,8 +394,7 @@ def test_the_model_itself_is_nearly_attained(seed: int) -> None:
     At a point, so that nothing is lost to ranges; terms of one sign first, so that partial sums are as large as may be.
     """
     network = random_network((2, 10, 8, 1), seed, squash="tanh", centre="none")
-    network = dataclasses.replace(
-        network,
+    network = network.with_layers(
         weights=tuple(w.astype(f32).astype(float) for w in network.weights),
         biases=tuple(b.astype(f32).astype(float) for b in network.biases),
         scale=network.scale.astype(f32).astype(float),
@@ -498,7 +497,7 @@ def test_other_activations_stay_within_the_bound(name: str) -> None:
     """In torch's binary32, at states of the domain and across the corners of units."""
     import torch
 
-    plant, network = get_system("pendulum"), dataclasses.replace(pendulum_network((12, 8), "output"), activation=name)
+    plant, network = get_system("pendulum"), pendulum_network((12, 8), "output").with_layers(activation=name)
     network = network.with_layers(weights=(*network.weights[:-1], network.weights[-1] / 8))
     found = float_error(network, plant, FloatOptions(boxes=8))
     half = np.array([float(hi) for _, hi in plant.domain])

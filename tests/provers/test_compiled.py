@@ -187,7 +187,7 @@ def test_what_is_not_finite_is_never_proved_and_spoils_no_other_box(way: Way, ba
 def test_a_network_whose_sums_overflow_is_never_bounded(way: Way) -> None:
     network = cartpole_case().loop.network
     first, _, last = network.weights
-    huge = type(network)(
+    huge = type(network).of_layers(
         (first, np.full((24, 24), 1e308), last), network.biases, network.scale, network.offset, "identity", "none"
     )
     lo, hi = boxes(4, 40, 0.1)

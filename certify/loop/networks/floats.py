@@ -143,7 +143,7 @@ class Gradients(_Values):
         return arriving[0]
 
     def _before(self, step: Any, own: Array, local: list[Array]) -> list[Array]:
-        """What arrives at each vector that a step reads."""
+        """The derivatives by each vector that a step reads, so far as they pass through it."""
         match step:
             case Affine():
                 return [own @ step.weight]

@@ -129,7 +129,7 @@ def _found(network: PolicyNetwork, value: Fraction | None, about: float, wanted:
 
 
 def _inside(network: PolicyNetwork) -> str:
-    """What is in the network that rationals may not know."""
+    """The parts of the network that rationals may not know."""
     return (
         " or ".join([*network.network.functions, *(["an observation"] if network.network.operations else [])]) or "tanh"
     )

@@ -31,7 +31,7 @@ FORMAT = "certify-policy/1"
 SECOND = "certify-policy/2"
 # The same with another `activation`.
 THIRD = "certify-policy/3"
-# The same with `reads` and `steps` in the place of `activation`, `weights` and `biases`.
+# The same with `reads` and `steps` instead of `activation`, `weights` and `biases`.
 FOURTH = "certify-policy/4"
 _LAYERS = {"activation", "weights", "biases"}
 _KEYS = {"format", "output", "centre", "system"}

@@ -35,7 +35,7 @@ class Enclosed(NamedTuple):
 
     @property
     def spread(self) -> Array:
-        """What the coefficients of the box coordinates add, (w, B)."""
+        """The sum of the coefficients of the box coordinates, in magnitude, (w, B)."""
         return np.asarray(np.abs(self.h[:, 1:]).sum(1))
 
     @property

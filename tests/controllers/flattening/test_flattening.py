@@ -169,7 +169,7 @@ def test_exact_centring_by_zero_biases_is_kept():
 
 
 def test_a_policy_without_centring_keeps_its_value_at_the_origin():
-    teacher = replace(curved("none"), biases=(*curved().biases[:-1], np.array([-0.125])))
+    teacher = curved("none").with_layers(biases=(*curved().biases[:-1], np.array([-0.125])))
     found = flatten(Policy(teacher, "pendulum", training=_record()), replace(QUICK, max_cost_change=1.0))
     zero, u_eq = np.zeros((1, 2)), PENDULUM.exact_u_eq()
     np.testing.assert_allclose(found.policy.network(zero, u_eq), teacher(zero, u_eq), atol=1e-5)
@@ -178,8 +178,8 @@ def test_a_policy_without_centring_keeps_its_value_at_the_origin():
 def _chattering(centre="preactivation", bias=0.5) -> PolicyNetwork:
     """A policy with sixty times the gain: with actions held over 0.02 s its loop never comes to rest."""
     steep = curved(centre, bias=bias)
-    return replace(
-        steep, weights=(*steep.weights[:-1], 60 * steep.weights[-1]), biases=(*steep.biases[:-1], np.zeros(1))
+    return steep.with_layers(
+        weights=(*steep.weights[:-1], 60 * steep.weights[-1]), biases=(*steep.biases[:-1], np.zeros(1))
     )
 
 

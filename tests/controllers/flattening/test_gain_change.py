@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
 
@@ -63,14 +62,14 @@ def test_it_is_the_old_policy_at_the_smallest_state_that_asks_for_the_same():
 
 def test_its_own_jacobian_leaves_what_it_does_along_its_inputs():
     """With m = n nothing is projected away: the policy itself, up to the rounding of its first layer."""
-    old = replace(network(), weights=(network().weights[0][:, :2], *network().weights[1:]))
+    old = network().with_layers(weights=(network().weights[0][:, :2], *network().weights[1:]))
     new = regained(old, U_EQ, old.jacobian_at_origin(U_EQ), BOX[:2])
     np.testing.assert_allclose(new.weights[0], old.weights[0], atol=1e-5)
 
 
 def test_zero_biases_stay_exact_centring():
     zeros = tuple(np.zeros(len(b)) for b in network().biases)
-    old = replace(network("none"), biases=zeros, offset=np.zeros(2))
+    old = network("none").with_layers(biases=zeros, offset=np.zeros(2))
     origin = (Fraction(0), Fraction(0))
     require_centred(old, origin)
     require_centred(regained(old, origin, J, BOX), origin)
@@ -88,6 +87,6 @@ def test_inputs_that_depend_on_each_other_are_refused():
 
 
 def test_more_inputs_than_states_are_refused():
-    old = replace(network(), weights=(network().weights[0][:, :1], *network().weights[1:]))
+    old = network().with_layers(weights=(network().weights[0][:, :1], *network().weights[1:]))
     with pytest.raises(InputError, match="rank 1"):
         regained(old, U_EQ, J[:, :1], BOX[:1])
