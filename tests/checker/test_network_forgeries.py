@@ -9,7 +9,8 @@ import pytest
 
 from tests.checker.test_networks import checked
 from tests.support.network_forgeries import ALL, GROUPS, forgeries
-from tests.support.network_loops import honest, raw
+from tests.support.network_loops import ACTIVATIONS, honest, raw
+from tests.support.planted import planted
 from tests.support.reference import judge_bytes
 
 Program = Callable[[bytes], str | None]
@@ -62,3 +63,33 @@ def test_forgeries_are_many_and_differ() -> None:
     }
     rules |= {"inputs", "flow", "tree", "ring", "tube", "contraction", "faces", "outer"}
     assert {rule for rule, *_ in found} == rules
+
+
+# ----------------------------------------------------------------------------------------------------------- violations
+
+PLANTED = 200  # of each function
+
+
+@pytest.mark.parametrize(
+    ("name", "seeds"),
+    [(name, range(3)) for name in ACTIVATIONS]
+    + [pytest.param(name, range(3, PLANTED), marks=pytest.mark.slow) for name in ACTIVATIONS],
+)
+def test_planted_violations_are_refused(name: str, seeds: range) -> None:
+    """Vdot is positive at a state that Arb names, by a ten thousandth of what it was or by more."""
+    for seed in seeds:
+        made = planted(name, seed)
+        assert made.rise > 0
+        file = raw(made.certificate)
+        for program in (checked, judge_bytes):
+            assert program(file) in ("local", "inputs", "ring"), seed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_bumps_of_half_the_height_are_often_proved(name: str) -> None:
+    """So that what is refused above is refused for its height."""
+    each = [planted(name, seed, 0.5) for seed in range(40)]
+    assert all(made.rise < 0 for made in each)
+    assert sum(checked(raw(made.certificate)) is None for made in each) >= 10
+    assert sum(judge_bytes(raw(made.certificate)) is None for made in each) >= 10
