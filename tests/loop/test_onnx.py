@@ -153,9 +153,6 @@ def function(made: Any) -> Any:
 
 TWO = (("Gemm", "*", "W1", "B1"), ("Tanh", "*"))
 REFUSED = {
-    "leaky relu": (model(chain(MLP[0], ("LeakyRelu", "*"), MLP[2])), "LeakyRelu .*is not read"),
-    "elu": (model(chain(MLP[0], ("Elu", "*", {"alpha": 2.0}), MLP[2])), "Elu .*must have alpha 1"),
-    "sigmoid": (model(chain(*MLP, ("Sigmoid", "*"))), "sigmoid must stand between two layers"),
     "another file": (other_file(model(chain(*MLP))), "must lie in the file itself"),
     "two inputs": (two_inputs(model(chain(*MLP))), "one input"),
     "a shape that lies": (shape_that_lies(model(chain(*MLP))), "damaged"),
@@ -163,7 +160,7 @@ REFUSED = {
     "a function that redefines tanh": (function(model(chain(*MLP))), "standard operators"),
     "no set of operators": (no_operator_set(model(chain(*MLP))), "evaluator of the onnx package"),
     "a tensor twice": (twice(model(chain(*MLP))), "once"),
-    "a branch": (model([*chain(*TWO)[:1], node("Tanh", "h0", out="v"), node("Add", "h0", "v", out="u")]), "join one"),
+    "a product": (model([*chain(*TWO)[:1], node("Tanh", "h0", out="v"), node("Mul", "h0", "v", out="u")]), "join one"),
     "integers": (model(chain(*MLP), {**CONSTANTS, "W1": np.ones((2, 6), np.int64)}), "floating-point"),
     "nan": (model(chain(*MLP), {**CONSTANTS, "B1": B1 * np.nan}), "finite"),
     "a zero": (model(chain(("Div", "*", "zero"), *MLP)), "divides by 0"),
@@ -299,7 +296,7 @@ SHAPED = {
     "an unknown shape": (shaped("Expand", "s", shape=[1, 6]), "as wide as it is"),
     "a normalisation": (shaped("LayerNormalization", "B1"), "LayerNorm, and every other .* train the policy again"),
     "a mean": (shaped("ReduceMean"), "a part of LayerNorm"),
-    "a selu": (shaped("Selu"), r"The activations that are proved are .*activation_fn=torch\.nn\.Tanh"),
+    "a prelu": (shaped("ThresholdedRelu"), r"The activations that are proved are .*activation_fn=torch\.nn\.Tanh"),
 }
 
 

@@ -345,3 +345,12 @@ def test_a_range_moves_the_fixed_point_of_a_map(tmp_path: Path) -> None:
         for _ in range(2000):
             x = np.stack([f(v, loop.policy(v[None])[0]) for v in x])
         assert np.ptp(x, axis=0).max() < 1e-9 and x[0] @ V @ x[0] <= result.levels.floor
+
+
+def test_a_stable_equilibrium_is_preferred() -> None:
+    """x' = (x + 3/10)(1 - x): Newton's method goes from 0 to -3/10, the trajectory to 1."""
+    x, u = symbols("x u")
+    system = System("two", (x,), (u,), {}, ((x + Fraction(3, 10)) * (1 - x) + u,), (Number(0),), box(2), box(9))
+    none = PolicyNetwork.of_layers((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    rest = find_rest(ClosedLoop(system, none))
+    assert rest is not None and rest.stable and float(rest.x[0]) == pytest.approx(1)

@@ -330,7 +330,7 @@ def _joined(kind: str, chains: list[Chain], flags: dict[str, Any], at: str) -> C
     return graph.joined("sum", one, graph.negated(other) if kind == "Sub" else other)
 
 
-_ALPHAS = {"LeakyRelu": 0.01, "Elu": 1.0, "Celu": 1.0}  # where nothing is said
+_ALPHAS = {"LeakyRelu": float(np.float32(0.01)), "Elu": 1.0, "Celu": 1.0}  # where nothing is said
 
 
 def _activated(chain: Chain, kind: str, flags: dict[str, Any], at: str) -> Chain:

@@ -1,0 +1,196 @@
+"""Policies of other programs that are more than layers: observations, branches, activations made of others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from certify.errors import InputError
+from certify.loop.networks import Clip, Concat, Observe, Sum
+from certify.loop.plants import System, get_system, load_system
+from certify.loop.policies import load_policy, save_policy
+from certify.loop.policies.importers import ImportOptions, import_state_dict
+from certify.loop.policies.importers.memory import import_module
+from certify.loop.policies.importers.steps import COMPOSED, IMPORTED, Normalise, activated
+from certify.loop.rigorous import evaluate_policy
+
+torch = pytest.importorskip("torch")
+nn: Any = torch.nn
+PLANT = get_system("pendulum")
+SAID = ImportOptions(states=("theta", "theta_dot"), normaliser="none", action_scale=(Fraction(1),))
+STATES = np.random.default_rng(0).normal(size=(50, 2)) * [2, 6]
+
+
+class Residual(nn.Module):  # type: ignore[misc]
+    """A hidden skip connection, and the gain beside the network."""
+
+    def __init__(self, function: Any, kind: str = "skip") -> None:
+        super().__init__()
+        torch.manual_seed(3)
+        self.a, self.b, self.c = nn.Linear(2, 6), nn.Linear(6, 6), nn.Linear(12 if kind == "cat" else 6, 1)
+        self.gain, self.function, self.kind = nn.Linear(2, 1, bias=False), function, kind
+
+    def forward(self, x: Any) -> Any:
+        h = self.function(self.a(x))
+        g = self.function(self.b(h))
+        if self.kind == "cat":
+            return torch.tanh(self.c(torch.cat([h, g], 1)) - self.gain(x)) * 6
+        return torch.tanh(self.c(h + g) + self.gain(x)) * 6
+
+
+FUNCTIONS = {
+    "ReLU": nn.ReLU(),
+    "LeakyReLU": nn.LeakyReLU(0.2),
+    "SELU": nn.SELU(),
+    "CELU": nn.CELU(2.0),
+    "ELU": nn.ELU(0.5),
+    "Hardtanh": nn.Hardtanh(-0.5, 0.7),
+    "ReLU6": nn.ReLU6(),
+    "Hardsigmoid": nn.Hardsigmoid(),
+    "LogSigmoid": nn.LogSigmoid(),
+    "GELU": nn.GELU(),
+    "Tanh": nn.Tanh(),
+}
+
+
+@pytest.mark.parametrize("kind", ["skip", "cat"])
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_modules_with_branches(name: str, kind: str, tmp_path: Path) -> None:
+    """In floats, in Arb and from a file again they are the module."""
+    module = Residual(FUNCTIONS[name], kind).double()
+    found = import_module(module, PLANT, SAID).policy
+    with torch.no_grad():
+        wanted = module(torch.tensor(STATES)).numpy()
+    u_eq = PLANT.exact_u_eq()
+    assert np.allclose(found.network(STATES, u_eq), wanted, atol=1e-13)
+    from certify.loop.closed_loop import ClosedLoop
+
+    loop = ClosedLoop(PLANT, found.network)
+    for x, u in zip(STATES[:5], wanted[:5], strict=True):
+        assert abs(float(evaluate_policy(loop, x)[0].mid()) - u[0]) < 1e-13
+    kinds = {type(step) for step in found.network.network.steps}
+    assert Sum in kinds and (kind == "skip" or Concat in kinds)
+    save_policy(tmp_path / "p.pt", found)
+    again = load_policy(tmp_path / "p.pt").network
+    assert again.sha256() == found.network.sha256()
+    assert np.array_equal(again(STATES, u_eq), found.network(STATES, u_eq))
+
+
+@pytest.mark.parametrize("name", IMPORTED)
+def test_state_dicts_of_every_activation(name: str) -> None:
+    generator = np.random.default_rng(1)
+    tensors = {
+        "0.weight": generator.normal(size=(5, 2)), "0.bias": generator.normal(size=5),
+        "2.weight": generator.normal(size=(5, 5)), "2.bias": generator.normal(size=5),
+        "4.weight": generator.normal(size=(1, 5)), "4.bias": generator.normal(size=1),
+    }  # fmt: skip
+    found = import_state_dict(tensors, PLANT, replace(SAID, activation=name, squash="identity"))
+    known = {"relu6": "relu6", "leaky_relu": "leaky_relu", "logsigmoid": "logsigmoid"}
+    phi = getattr(nn.functional, known.get(name, name))
+    h = torch.tensor(STATES)
+    for k in (0, 2, 4):
+        h = nn.functional.linear(phi(h) if k else h, *(torch.tensor(tensors[f"{k}.{p}"]) for p in ("weight", "bias")))
+    assert np.allclose(found.policy.network(STATES, (Fraction(0),)), h.numpy(), atol=1e-12)
+
+
+def test_every_activation_that_is_named_has_steps() -> None:
+    assert all(activated(name) for name in IMPORTED) and set(COMPOSED) < set(IMPORTED)
+    with pytest.raises(InputError, match="activation must be one of"):
+        activated("prelu")
+
+
+# --------------------------------------------------------------------------------------------------------- observations
+
+
+def observing(**changes: Any) -> ImportOptions:
+    states = ("cos(theta)", "sin(theta)", "theta_dot/8")
+    return replace(SAID, states=states, activation="tanh", squash="tanh", action_scale=(Fraction(6),), **changes)
+
+
+def three() -> dict[str, np.ndarray]:
+    generator = np.random.default_rng(2)
+    return {
+        "0.weight": generator.normal(size=(5, 3)), "0.bias": generator.normal(size=5),
+        "2.weight": generator.normal(size=(1, 5)), "2.bias": generator.normal(size=1),
+    }  # fmt: skip
+
+
+def by_hand(tensors: dict[str, np.ndarray], o: np.ndarray) -> np.ndarray:
+    h = np.tanh(o @ tensors["0.weight"].T + tensors["0.bias"])
+    return np.asarray(6 * np.tanh(h @ tensors["2.weight"].T + tensors["2.bias"]))
+
+
+def observations() -> np.ndarray:
+    theta, speed = STATES.T
+    return np.stack([np.cos(theta), np.sin(theta), speed / 8], axis=1)
+
+
+def test_expressions_of_the_states() -> None:
+    found = import_state_dict(three(), PLANT, observing()).policy
+    assert np.allclose(found.network(STATES, (Fraction(0),)), by_hand(three(), observations()), atol=1e-13)
+    first = found.network.network.steps[0]
+    assert isinstance(first, Observe) and found.network.n == 2 and found.valid is None
+    assert found.network.words == "3-5-1 tanh of cos(theta), sin(theta), theta_dot/8"
+
+
+@pytest.mark.parametrize("limit", [10.0, 0.5])
+def test_a_normaliser_of_observations_keeps_its_clip_where_it_may_act(
+    limit: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """|cos| and |sin| are within 1, the speed is not bounded by its form."""
+    mean, square = np.array([0.1, -0.2, 0.05]), np.array([0.5, 0.4, 0.3])
+    rational = (tuple(map(Fraction, part.tolist())) for part in (mean, square))
+    normaliser = Normalise(*rational, Fraction(limit))
+    monkeypatch.setattr("certify.loop.policies.importers.importing.load_normaliser", lambda *_: normaliser)
+    (tmp_path / "n.pkl").touch()
+    for speed, kept in (("theta_dot/8", True), ("tanh(theta_dot)", limit < 1)):
+        states = ("cos(theta)", "sin(theta)", speed)
+        options = replace(observing(normaliser=tmp_path / "n.pkl"), states=states)
+        found = import_state_dict(three(), PLANT, options).policy
+        o = observations()
+        o[:, 2] = STATES[:, 1] / 8 if speed == "theta_dot/8" else np.tanh(STATES[:, 1])
+        clipped = np.clip((o - mean) / np.sqrt(square), -limit, limit)
+        assert np.allclose(found.network(STATES, (Fraction(0),)), by_hand(three(), clipped), atol=1e-12)
+        assert any(isinstance(step, Clip) for step in found.network.network.steps) is kept and found.valid is None
+
+
+def test_a_plant_says_what_is_observed(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "examples/plants/gymnasium/pendulum.toml").read_text()
+    plant = load_system(_written(tmp_path, text))
+    tensors = three()
+    found = import_state_dict(tensors, plant, replace(observing(), states=None)).policy
+    theta, speed = STATES.T
+    o = np.stack([np.cos(theta), np.sin(theta), speed], axis=1)
+    assert np.allclose(found.network(STATES, (Fraction(0),)), by_hand(tensors, o), atol=1e-13)
+    with pytest.raises(InputError, match=r"observations.*theta_dott"):
+        load_system(_written(tmp_path, text.replace('speed = "theta_dot"', 'speed = "theta_dott"')))
+
+
+def _written(folder: Path, text: str) -> Path:
+    path = folder / "plant.toml"
+    path.write_text(text)
+    return path
+
+
+def test_observations_are_of_values_or_of_deviations() -> None:
+    x, y, u = PLANT.states[0], PLANT.states[1], PLANT.inputs[0]
+    plant = System(
+        "away", (x, y), (u,), {}, (y, u - 1), (Fraction(1),), ((-2, 2), (-2, 2)), ((-9, 9),), x_eq=(Fraction(1, 2), 0)
+    )
+    for observes, at in (("absolute", 0.5), ("deviation", 0.0)):
+        found = import_state_dict(three(), plant, observing(observes=observes)).policy
+        theta, speed = STATES.T
+        o = np.stack([np.cos(theta + at), np.sin(theta + at), speed / 8], axis=1)
+        assert np.allclose(found.network(STATES, (Fraction(1),)), by_hand(three(), o), atol=1e-13)
+
+
+@pytest.mark.parametrize("parts", ["theta,cos(theta), max(theta,1)", " theta , cos( theta ),max(theta, 1)"])
+def test_commas_in_brackets_part_nothing(parts: str) -> None:
+    from certify.cli.importing import _parts
+
+    assert [part.replace(" ", "") for part in _parts(parts)] == ["theta", "cos(theta)", "max(theta,1)"]
