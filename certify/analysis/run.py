@@ -27,6 +27,7 @@ from certify.certificates.verdict import Stop
 from certify.effort import WHOLE, Effort
 from certify.errors import InputError, SoundnessError
 from certify.loop.closed_loop import ClosedLoop
+from certify.loop.composition import composed
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
 
@@ -82,6 +83,7 @@ def certify_roa(
     from certify.provers.execution.threads import one_thread
 
     options = options or RoaOptions()
+    system, network = composed(system, network)
     begin = setting_of(ClosedLoop(system, network), options)
     aside = earlier_aside(out, tell or (lambda _: None), keep=options.resume)
     with one_thread(), sole_writer(out), aside, _runner_for(options) as runner:

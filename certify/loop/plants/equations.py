@@ -10,7 +10,7 @@ from __future__ import annotations
 import ast
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
 
 from certify.errors import InputError
@@ -23,7 +23,10 @@ _OPERATORS = "+ - * /, integer powers with **"
 
 
 def parse_expression(
-    text: str | int | Fraction, names: Mapping[str, Expression], known: str = "state, input or parameter"
+    text: str | int | Fraction,
+    names: Mapping[str, Expression],
+    known: str = "state, input or parameter",
+    networks: Mapping[str, Network] | None = None,
 ) -> Expression:
     """An expression from text such as `(g/l)*sin(theta) - b/(m*l**2)*theta_dot`.
 
@@ -31,6 +34,7 @@ def parse_expression(
     ----------
     names : allowed names, with their symbols or the expressions that they stand for.
     known : a description of these names, for messages.
+    networks : functions that may be called, as in `observer[1](x, y)`: of an entry's number and of arguments.
 
     Raises
     ------
@@ -46,7 +50,7 @@ def parse_expression(
         tree = ast.parse(source, mode="eval")
         if any(isinstance(node, ast.BitXor) for node in ast.walk(tree)):
             raise InputError(f"equation {source!r}: `^` is no power here; write ** as in x**2.")
-        found = _Reader(source, names, known).read(tree.body)
+        found = _Reader(source, names, known, networks or {}).read(tree.body)
     except (SyntaxError, RecursionError, ValueError, MemoryError) as error:
         if isinstance(error, InputError):
             raise
@@ -100,9 +104,14 @@ def decimal(text: str) -> Fraction:
         raise InputError(f"number {text!r} must be a finite decimal such as 0.15 or 1e-3.") from error
 
 
+Network = Callable[[int | None, tuple[Expression, ...]], Expression]
+
+
 class _Reader:
-    def __init__(self, source: str, names: Mapping[str, Expression], known: str) -> None:
-        self.source, self.names, self.known = source, names, known
+    def __init__(
+        self, source: str, names: Mapping[str, Expression], known: str, networks: Mapping[str, Network]
+    ) -> None:
+        self.source, self.names, self.known, self.networks = source, names, known, networks
 
     def read(self, node: ast.expr) -> Expression:
         if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
@@ -138,6 +147,8 @@ class _Reader:
 
     def _call(self, node: ast.Call) -> Expression:
         name = self._text(node.func)
+        if (called := self._network(node)) is not None:
+            return called
         if not isinstance(node.func, ast.Name) or name not in NAMED:
             given = [*node.args, *(keyword.value for keyword in node.keywords)]
             instead = instead_of_call(name, [self._text(a) for a in given], NAMED)
@@ -151,6 +162,21 @@ class _Reader:
             takes = {1: "one argument", 2: "two arguments or more", 3: "three arguments, a value and two ends"}[least]
             raise self._refuse(f"{name} takes {takes}; found {self._text(node)!r}")
         return function(name, *map(self.read, node.args))
+
+    def _network(self, node: ast.Call) -> Expression | None:
+        """A call of a network; None for other calls."""
+        of, entry = node.func, None
+        match of:
+            case ast.Subscript(value=inner, slice=ast.Constant(value=int() as number)):
+                of, entry = inner, number
+        if not isinstance(of, ast.Name) or of.id not in self.networks:
+            return None
+        if node.keywords or not node.args:
+            raise self._refuse(f"{self._text(node)!r} must have arguments, without names")
+        try:
+            return self.networks[of.id](entry, tuple(map(self.read, node.args)))
+        except InputError as error:
+            raise error if str(error).endswith(".") else self._refuse(str(error)) from error
 
     def _operation(self, node: ast.BinOp) -> Expression:
         left, right = self.read(node.left), self.read(node.right)

@@ -30,6 +30,7 @@ from certify.loop.expressions import (
     value_if_rational,
 )
 from certify.loop.expressions.numerical import Module
+from certify.loop.plants.calls import Call
 from certify.loop.plants.floating_point import function_of
 from certify.loop.plants.validation import validate
 
@@ -88,6 +89,8 @@ class System:
         state at once.
     observations : expressions of the states' values and the parameters, which a policy for this plant reads if nothing
         else is said; empty for the states.
+    calls : networks that the dynamics call, whose results stand there as symbols; see `certify.loop.composition`.
+    rest_of_calls : exact values of results at the operating point, by their symbols' names, where they are given.
 
     Raises
     ------
@@ -113,9 +116,11 @@ class System:
     time: Time = "continuous"
     sample: Interval | None = None
     observations: tuple[Expression, ...] = ()
+    calls: tuple[Call, ...] = ()
+    rest_of_calls: Mapping[str, Fraction] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for key in ("parameters", "ranges", "units"):
+        for key in ("parameters", "ranges", "units", "rest_of_calls"):
             object.__setattr__(self, key, MappingProxyType(dict(getattr(self, key))))
         for symbol in (*self.states, *self.inputs, *self.disturbances):
             if not isinstance(symbol, Symbol):

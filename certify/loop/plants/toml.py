@@ -7,12 +7,23 @@ them to deviations from x_eq. Every error names the line, the entry and the expe
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, cast, get_args
 
 from certify.errors import InputError
-from certify.loop.expressions import NAMED, Expression, Number, Symbol, substitute, symbols, value_if_rational
+from certify.loop.expressions import (
+    NAMED,
+    Expression,
+    Number,
+    Symbol,
+    substitute,
+    symbols,
+    symbols_of,
+    value_if_rational,
+)
+from certify.loop.plants.calls import Call, Named
 from certify.loop.plants.deviations import in_deviations
 from certify.loop.plants.equations import nearest, parse_expression
 from certify.loop.plants.operating_point import require_equilibrium
@@ -32,6 +43,7 @@ _KEYS = (
     "training",
     "time",
     "observations",
+    "networks",
 )
 
 
@@ -59,9 +71,12 @@ def build_system(file: PlantFile) -> System:
         symbol = dict(zip(everything, symbols(everything), strict=True))
         constants = {p: symbol[p] for p in parameters}
         x_eq = [_equation(file, "x_eq", s, constants, "parameter", 0) for s in states]
-        shorthand = _shorthand(file, symbol)
+        networks = _networks(file, everything)
+        shorthand = _shorthand(file, symbol, networks)
         known = "state, input, parameter or disturbance" + (", and not defined in [where] above" if shorthand else "")
-        dynamics = [_equation(file, "dynamics", s, symbol | shorthand, known) for s in states]
+        dynamics = [_equation(file, "dynamics", s, symbol | shorthand, known, networks=networks) for s in states]
+        calls = [call for network in networks.values() for call in network.made()]
+        at = [symbol[s] for s in states], x_eq
         u_eq = [_equation(file, "u_eq", s, constants, "parameter") for s in inputs]
         for s, e in zip(inputs, u_eq, strict=True):
             _at_rest(file, "u_eq", s, e, parameters)
@@ -81,6 +96,8 @@ def build_system(file: PlantFile) -> System:
             x_eq=tuple(x_eq),
             disturbances=tuple(symbol[w] for w in acting),
             ranges={w: interval for w, interval in acting.items() if interval is not None},
+            calls=tuple(replace(call, arguments=in_deviations(call.arguments, *at)) for call in _in_order(calls)),
+            rest_of_calls={name: q for network in networks.values() for name, q in network.at_rest().items()},
             observations=tuple(_observations(file, {s: symbol[s] for s in (*states, *parameters)})),
         )
     except InputError as error:
@@ -129,13 +146,34 @@ def _check_names(
         file.require_known(table, names, what)
 
 
-def _shorthand(file: PlantFile, symbol: Mapping[str, Symbol]) -> dict[str, Expression]:
+def _networks(file: PlantFile, everything: list[str]) -> dict[str, Named]:
+    """The table `networks`: functions that equations may call."""
+    for name in file.table("networks"):
+        if name in everything or name in NAMED or not name.isidentifier():
+            raise file.refuse("must be a new name, and no state, input, parameter or function.", "networks", name)
+    return {name: Named(file, name, everything) for name in file.table("networks")}
+
+
+def _in_order(calls: list[Call]) -> list[Call]:
+    """The calls, each behind those whose results it reads."""
+    found, known = list[Call](), set[Symbol]()
+    results = {symbol for call in calls for _, symbol in call.results}
+    while len(found) < len(calls):
+        for call in calls:
+            if call not in found and symbols_of(*call.arguments) & results <= known:
+                found.append(call)
+                known |= {symbol for _, symbol in call.results}
+    return found
+
+
+def _shorthand(file: PlantFile, symbol: Mapping[str, Symbol], networks: Mapping[str, Named]) -> dict[str, Expression]:
     """The table `where`: names for expressions that equations share, each over the plant's names and those above."""
     found: dict[str, Expression] = {}
     for name in file.table("where"):
         if name in symbol or name in NAMED or not name.isidentifier():
             raise file.refuse("must be a new name, and no state, input, parameter or function.", "where", name)
-        found[name] = _equation(file, "where", name, {**symbol, **found}, "name of the plant or of a line above")
+        names, known = {**symbol, **found}, "name of the plant or of a line above"
+        found[name] = _equation(file, "where", name, names, known, networks=networks)
     return found
 
 
@@ -157,7 +195,13 @@ def _time(file: PlantFile) -> Time:
 
 
 def _equation(
-    file: PlantFile, table: str, name: str, symbol: Mapping[str, Expression], known: str, default: int | None = None
+    file: PlantFile,
+    table: str,
+    name: str,
+    symbol: Mapping[str, Expression],
+    known: str,
+    default: int | None = None,
+    networks: Mapping[str, Named] | None = None,
 ) -> Expression:
     entries = file.table(table)
     if name not in entries:
@@ -168,7 +212,7 @@ def _equation(
     if isinstance(value, bool) or not isinstance(value, str | int | Fraction):
         raise file.refuse(f"must be an equation as text, or a number; found {value!r}.", table, name)
     try:
-        return parse_expression(value, symbol, known)
+        return parse_expression(value, symbol, known, networks)
     except InputError as error:
         raise file.refuse(str(error), table, name) from error
 

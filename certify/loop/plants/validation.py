@@ -95,7 +95,13 @@ def _check_parameters(system: System) -> None:
 def _check_equations(system: System) -> None:
     """Reject a symbol that the plant does not have."""
     parameters = {Symbol(p) for p in system.parameters}
-    everything = {*system.states, *system.inputs, *parameters, *system.disturbances}
+    results, known = set[Symbol](), {*system.states, *system.inputs, *parameters}
+    for call in system.calls:
+        odd = symbols_of(*call.arguments) - known - results
+        if odd:
+            raise InputError(f"arguments of {call.name} must be of states, inputs and parameters; found {odd.pop()}.")
+        results |= {symbol for _, symbol in call.results}
+    everything = {*system.states, *system.inputs, *parameters, *system.disturbances, *results}
     for allowed, equations in ((everything, system.dynamics), (parameters, (*system.u_eq, *system.x_eq))):
         for node in nodes(*equations):
             if isinstance(node, Symbol) and node not in allowed:

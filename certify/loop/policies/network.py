@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.loop.networks import Network, frozen, layered, like, sha256_of, tangent_at, tanh, values
+from certify.loop.networks import Affine, Clip, Map, Network, frozen, layered, like, sha256_of, tangent_at, tanh, values
 from certify.loop.policies.arithmetic import Arithmetic
 
 Squash = Literal["tanh", "identity"]
@@ -243,6 +243,18 @@ class PolicyNetwork:
         shift, offset = self.centring(u_eq, self.net(np.zeros(self.n)).tolist(), _ARRAYS)
         network = self.network.shifted(np.array(shift)) if any(shift) else self.network
         return replace(self, network=network, offset=np.array(offset), centre="none")
+
+    def program(self, u_eq: Sequence[Fraction]) -> Network:
+        """pi as one network, with squash, scale, offset and clip as steps; the numbers of a centring are rounded."""
+        plain, eye = self.folded(u_eq), np.eye(self.m)
+        steps = list(plain.network.steps)
+        if plain.squash == "tanh":
+            steps.append(Map((len(steps),), "tanh"))
+        if np.any(plain.scale != 1) or np.any(plain.offset):
+            steps.append(Affine((len(steps),), plain.scale * eye, plain.offset))
+        if plain.clip is not None:
+            steps.append(Clip((len(steps),), *plain.clip))
+        return Network(self.n, tuple(steps))
 
     def jacobian_at_origin(self, u_eq: Sequence[Fraction]) -> Array:
         """`d pi / d x` at 0 in float64, shape (m, n).
