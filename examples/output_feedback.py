@@ -20,9 +20,9 @@ REACH = torch.tensor([3.2, 20.0, 3.2, 6.0]).double()  # of what the network read
 
 
 def rate(x: torch.Tensor) -> torch.Tensor:
-    """The rate in rad/s^2 of the speed's estimate that a Luenberger observer has, with m, l, b, g of the plant."""
-    m, l, b, g, (theta, speed, measured, u) = 0.15, 0.5, 0.1, 9.81, x.T
-    return g / l * torch.sin(theta) - b / (m * l**2) * speed + u / (m * l**2) + 400 * (measured - theta)
+    """The rate in rad/s^2 of the speed's estimate that a Luenberger observer has, by the plant's equations."""
+    m, r, b, g, (theta, speed, measured, u) = 0.15, 0.5, 0.1, 9.81, x.T
+    return g / r * torch.sin(theta) - b / (m * r**2) * speed + u / (m * r**2) + 400 * (measured - theta)
 
 
 def trained() -> torch.nn.Sequential:

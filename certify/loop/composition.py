@@ -14,7 +14,7 @@ import numpy as np
 
 from certify.errors import InputError
 from certify.loop.expressions import Expression, Number, Symbol, substitute
-from certify.loop.networks import Affine, Concat, Network, Observe, Step, values
+from certify.loop.networks import Affine, Clip, Concat, Map, Network, Observe, Step, values
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork, bounded_by_form
 
@@ -59,11 +59,24 @@ def composed(system: System, policy: PolicyNetwork) -> tuple[System, PolicyNetwo
     return inner, PolicyNetwork(network, ones, zeros, "identity", "none" if none else "output", clip)
 
 
+def program_of(policy: PolicyNetwork, u_eq: Sequence[Fraction] = ()) -> Network:
+    """pi as one network, with squash, scale, offset and clip as steps; the numbers of a centring are rounded."""
+    plain, eye = policy.folded(u_eq), np.eye(policy.m)
+    steps = list(plain.network.steps)
+    if plain.squash == "tanh":
+        steps.append(Map((len(steps),), "tanh"))
+    if np.any(plain.scale != 1) or np.any(plain.offset):
+        steps.append(Affine((len(steps),), plain.scale * eye, plain.offset))
+    if plain.clip is not None:
+        steps.append(Clip((len(steps),), *plain.clip))
+    return Network(policy.n, tuple(steps))
+
+
 class _Built:
     """The steps of the policy and of the calls after it; `parts` are the vectors of states, inputs and results."""
 
     def __init__(self, system: System, policy: PolicyNetwork) -> None:
-        program = policy.program(system.exact_u_eq())
+        program = program_of(policy, system.exact_u_eq())
         self.n, self.steps = system.n, list[Step](program.steps)
         self.symbols: list[Symbol] = [*system.states, *system.inputs]
         self.parts, self.results = [0, len(self.steps)], list[Symbol]()

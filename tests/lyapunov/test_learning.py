@@ -166,7 +166,7 @@ def test_a_run_along_a_face_pays_for_it_and_one_that_meets_it_is_lost() -> None:
 
 def test_whoever_asks_for_an_input_out_of_bounds_is_lost() -> None:
     loop = disc()
-    network = dataclasses.replace(silent(2), weights=(np.array([[0.0, -4.0]]),))
+    network = silent(2).with_layers(weights=(np.array([[0.0, -4.0]]),))
     found = LearningFlow(ClosedLoop(loop.system, network), UNIT, 0.01).run(
         np.array([[0.0, 0.2], [0.0, 0.3]]), np.ones(2)
     )

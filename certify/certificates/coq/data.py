@@ -207,8 +207,8 @@ def _network(policy: Mapping[str, Any], stated: Mapping[str, Any], n: int, m: in
 
 def _layers(network: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """The affine steps of a network that has tanh between them, each of the vector just before."""
-    kinds = [(step["kind"], step["of"], step.get("function", "tanh")) for step in network["steps"]]
-    expected = [(("affine", "map")[k % 2], [k], "tanh") for k in range(len(kinds))]
+    kinds = [(step["kind"], step["of"], step.get("function")) for step in network["steps"]]
+    expected = [(("affine", "map")[k % 2], [k], (None, "tanh")[k % 2]) for k in range(len(kinds))]
     if kinds != expected or len(kinds) % 2 == 0:
         raise CertificateFormatError(
             f"the network {network['name']} must be of affine steps with tanh between them, each of the vector just "

@@ -123,15 +123,18 @@ def read(file: PlantFile, name: str, reads: int) -> Network:
 
 
 def _own(path: Path) -> Network:
+    from certify.loop.composition import program_of
     from certify.loop.policies import load_policy
 
     policy = load_policy(path).network
     if policy.centre != "none":
         raise InputError(f"{path} must be without a centring; found {policy.centre!r}.")
-    return policy.program(())
+    return program_of(policy)
 
 
 def _imported(raw: bytes, path: Path, reads: int, said: dict[str, Any]) -> Network:
+    from certify.loop.composition import program_of
+    from certify.loop.networks import values
     from certify.loop.policies import PolicyNetwork
     from certify.loop.policies.importers import ImportOptions
     from certify.loop.policies.importers.comparing import compare_reading
@@ -145,9 +148,8 @@ def _imported(raw: bytes, path: Path, reads: int, said: dict[str, Any]) -> Netwo
     if reading.n != reads:
         raise InputError(f"{path} reads {reading.n} numbers; it is called with {reads}.")
     folded = fold(reading.steps, reads, keep_clips=True)
-    network = PolicyNetwork(folded.network, folded.scale, folded.offset, folded.squash, "none", folded.clip).program(())
-    from certify.loop.networks import values
-
+    plain = PolicyNetwork(folded.network, folded.scale, folded.offset, folded.squash, "none", folded.clip)
+    network = program_of(plain)
     x = np.random.default_rng(0).normal(size=(_SAMPLES, reads)).astype(np.float32).astype(np.float64)
     compare_reading(reading, (), (), x, values(network, x))
     return network

@@ -30,17 +30,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.loop.networks import Affine, Clip, Map, Network, frozen, layered, like, sha256_of, tangent_at, tanh, values
+from certify.loop.networks import Affine, Clip, Map, Network, frozen, like, sha256_of, tangent_at, tanh, values
 from certify.loop.policies.arithmetic import Arithmetic
+from certify.loop.policies.programmed import WHOSE, Programmed, chain
 
 Squash = Literal["tanh", "identity"]
 Centre = Literal["output", "preactivation", "none"]
 Array = NDArray[np.float64]
-_WHOSE = "the policy"  # in messages
 
 
 @dataclass(frozen=True, slots=True)
-class PolicyNetwork:
+class PolicyNetwork(Programmed):
     """A network of the states with its squash, centring, scale, offset and clip.
 
     `of_layers` makes one of weights and biases.
@@ -59,7 +59,6 @@ class PolicyNetwork:
         centred is not 0.
     """
 
-    network: Network
     scale: Array
     offset: Array
     squash: Squash = "tanh"
@@ -94,11 +93,11 @@ class PolicyNetwork:
         InputError : shapes do not chain, a number is not finite, or as `PolicyNetwork`.
         """
         at = np.asarray(origin, dtype=np.float64)
-        return cls(_layers(weights, biases, activation), scale, offset, squash, centre, clip, at)
+        return cls(chain(weights, biases, activation), scale, offset, squash, centre, clip, at)
 
     def __post_init__(self) -> None:
         for name in ("scale", "offset"):
-            object.__setattr__(self, name, frozen(getattr(self, name), name, _WHOSE))
+            object.__setattr__(self, name, frozen(getattr(self, name), name, WHOSE))
         if self.squash not in get_args(Squash):
             raise InputError(f"`squash` must be one of {get_args(Squash)}; found {self.squash!r}.")
         if self.centre not in get_args(Centre):
@@ -114,7 +113,7 @@ class PolicyNetwork:
         if self.clip is not None:
             object.__setattr__(self, "clip", _limits(self.clip, self.m))
         origin = self.origin if np.any(self.origin) else np.zeros(self.n)  # of whatever n was before `replace`
-        object.__setattr__(self, "origin", frozen(origin, "origin", _WHOSE))
+        object.__setattr__(self, "origin", frozen(origin, "origin", WHOSE))
         if self.origin.shape != (self.n,):
             raise InputError(f"`origin` must have shape ({self.n},); found {self.origin.shape}.")
         if self.is_moved and self.centre != "none":
@@ -124,30 +123,6 @@ class PolicyNetwork:
     def is_moved(self) -> bool:
         """True if the network reads another state than 0 at x = 0."""
         return bool(np.any(self.origin != 0))
-
-    @property
-    def n(self) -> int:
-        """Number of states that the network reads."""
-        return self.network.reads
-
-    @property
-    def m(self) -> int:
-        """Number of inputs that the network commands."""
-        return self.network.gives
-
-    @property
-    def layers(self) -> tuple[int, ...]:
-        """Widths from what the first layer reads to the input, such as (2, 16, 16, 1)."""
-        return self.network.widths
-
-    @property
-    def words(self) -> str:
-        """Widths and functions, such as `2-16-16-1 tanh`, for people."""
-        network, text = self.network, "-".join(map(str, self.layers))
-        text += "".join(f" {name}" for name in network.functions)
-        if network.observation is not None:
-            text += f" of {', '.join(map(str, network.observation.expressions))}"
-        return text if network.is_observed_chain else f"{text}, {len(network.steps)} steps"
 
     def ratios(self, u_eq: Sequence[Fraction]) -> tuple[Fraction, ...]:
         """`(u_eq - offset) / scale`, exactly, (m,): the value of tanh at the origin with preactivation centring.
@@ -244,18 +219,6 @@ class PolicyNetwork:
         network = self.network.shifted(np.array(shift)) if any(shift) else self.network
         return replace(self, network=network, offset=np.array(offset), centre="none")
 
-    def program(self, u_eq: Sequence[Fraction]) -> Network:
-        """pi as one network, with squash, scale, offset and clip as steps; the numbers of a centring are rounded."""
-        plain, eye = self.folded(u_eq), np.eye(self.m)
-        steps = list(plain.network.steps)
-        if plain.squash == "tanh":
-            steps.append(Map((len(steps),), "tanh"))
-        if np.any(plain.scale != 1) or np.any(plain.offset):
-            steps.append(Affine((len(steps),), plain.scale * eye, plain.offset))
-        if plain.clip is not None:
-            steps.append(Clip((len(steps),), *plain.clip))
-        return Network(self.n, tuple(steps))
-
     def jacobian_at_origin(self, u_eq: Sequence[Fraction]) -> Array:
         """`d pi / d x` at 0 in float64, shape (m, n).
 
@@ -268,58 +231,11 @@ class PolicyNetwork:
         self.require_unclipped(u_eq if self.centre != "none" else (self.scale * squashed + self.offset).tolist())
         return np.asarray(self.scale[:, None] * ((self.squash_slope(squashed) * np.ones(self.m))[:, None] * at.J))
 
-    def require_layers(self, what: str) -> None:
-        """Reject a network that is not layers of the states with one function between them.
-
-        Raises
-        ------
-        InputError : it has other steps, which `what` does not read yet.
-        """
-        if not self.network.is_chain:
-            kinds = ", ".join(dict.fromkeys(step.kind for step in self.network.steps))
-            raise InputError(
-                f"{what} needs a policy of layers that read the states, with one function between them; found the "
-                f"steps {kinds}. `certify roa` proves such a policy."
-            )
-
-    @property
-    def activation(self) -> str:
-        """The function between the layers of a chain, tanh where there is one layer."""
-        return next(iter(self.network.functions), "tanh")
-
-    @property
-    def weights(self) -> tuple[Array, ...]:
-        """The matrices of the layers."""
-        return tuple(step.weight for step in self.network.affine)
-
-    @property
-    def biases(self) -> tuple[Array, ...]:
-        """The biases of the layers."""
-        return tuple(step.bias for step in self.network.affine)
-
-    def with_layers(
-        self,
-        weights: Sequence[Any] | None = None,
-        biases: Sequence[Any] | None = None,
-        activation: str | None = None,
-        **others: Any,
-    ) -> PolicyNetwork:
-        """The same policy with other numbers in its layers, or another function between them; `others` are further
-        fields."""
-        self.require_layers("to replace its layers one")
-        given = (weights or self.weights, biases or self.biases, activation or self.activation)
-        return replace(self, network=_layers(*given), **others)
-
     def sha256(self) -> str:
         """Hash of the canonical bytes as FORMAT.md has them; the origin is not part of them."""
         arrays = [a for step in self.network.steps for a in step.arrays]
         head, rest = f"certify-policy/1\0{self.squash}\0{self.centre}\0", (self.scale, self.offset, *(self.clip or ()))
         return sha256_of(head.encode(), (*arrays, *rest), self.network.words())
-
-
-def _layers(weights: Sequence[Any], biases: Sequence[Any], function: str) -> Network:
-    steps = layered(weights, biases, function, _WHOSE)
-    return Network(int(np.shape(weights[0])[1]), steps)
 
 
 class _Arrays:
@@ -344,7 +260,7 @@ _ARRAYS = _Arrays()
 def _limits(clip: Any, m: int) -> tuple[Array, Array]:
     if not isinstance(clip, tuple | list) or len(clip) != 2:
         raise InputError(f"`clip` must be a pair (lo, hi) of arrays of shape ({m},), or None; found {clip!r}.")
-    lo, hi = (frozen(end, "clip", _WHOSE) for end in clip)
+    lo, hi = (frozen(end, "clip", WHOSE) for end in clip)
     if lo.shape != (m,) or hi.shape != (m,):
         raise InputError(f"`clip` must be two arrays of shape ({m},); found {lo.shape} and {hi.shape}.")
     if not np.all(lo < hi):
