@@ -41,7 +41,7 @@ def ends_with_its_certificate(printed: str, folder: Path) -> Path:
 
 def test_each_is_one_screen_and_named_in_the_page() -> None:
     page = (EXAMPLES / "README.md").read_text("utf-8")
-    assert [path.stem for path in SCRIPTS] == ["candidates", "own_policy", "pendulum", "van_der_pol"]
+    assert [path.stem for path in SCRIPTS] == ["candidates", "output_feedback", "own_policy", "pendulum", "van_der_pol"]
     for path in SCRIPTS:
         text = path.read_text("utf-8")
         assert len(text.splitlines()) <= 60
@@ -111,3 +111,16 @@ def test_as_a_command_it_takes_a_folder(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["found"] and (
         tmp_path / "found" / "certificate.json"
     ).is_file()
+
+
+@pytest.mark.slow
+def test_output_feedback_with_an_observer_that_is_trained_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From rest the angle alone may be 2.1 rad, and the estimates as far off; both checkers take the file."""
+    result: RoaResult = script("output_feedback").main(tmp_path)
+    assert result.verdict is Verdict.PROVED and result.claim == "asymptotic"
+    assert result.volume is not None and result.volume > 10_000
+    assert result.contains([[2.1, 0, 0, 0], [0, 0, 2.1, 0]]).all()
+    assert [s.name for s in result.system.inputs] == ["u", "observer_0"]
+    assert ends_with_its_certificate(capsys.readouterr().out, tmp_path).exists()

@@ -32,9 +32,10 @@ def plant(
 
     The exit status is 2 if the operating point is no equilibrium.
     """
+    from certify.loop.composition import with_results_as_inputs
     from certify.loop.plants import chosen_system, controllability, linearise, require_equilibrium
 
-    found = changes.of(chosen_system(system))
+    found = with_results_as_inputs(changes.of(chosen_system(system)))
     A, B = linearise(found)
     eigenvalues, reach = _eigenvalues(A), controllability(A, B)
     if as_json:

@@ -44,6 +44,11 @@ class ClosedLoop:
                 f"the policy must read {system.n} states and command {system.m} inputs of {system.name}; "
                 f"it reads {network.n} and commands {network.m}."
             )
+        if system.calls:
+            raise InputError(
+                f"the equations of {system.name} call {', '.join(call.name for call in system.calls)}; certify roa and "
+                "certify_roa take such a plant, this does not yet."
+            )
         u_eq = system.exact_u_eq()
         object.__setattr__(self, "u_eq", u_eq)
         object.__setattr__(self, "folded", network.folded(u_eq))

@@ -43,19 +43,10 @@ def composed(system: System, policy: PolicyNetwork) -> tuple[System, PolicyNetwo
         built.add(call.network, _exact(system, call.arguments), call.results)
     network = built.network()
     at_rest = values(network, np.zeros(system.n))[system.m :]
-    names = [symbol.name for symbol in built.results]
-    u_eq = [Number(system.rest_of_calls.get(k, Fraction(float(v)))) for k, v in zip(names, at_rest, strict=True)]
-    bounds = (Fraction(-_FREE), Fraction(_FREE))
-    inner = replace(
-        system,
-        inputs=(*system.inputs, *built.results),
-        u_eq=(*system.u_eq, *u_eq),
-        input_bounds=(*system.input_bounds, *[bounds] * len(names)),
-        calls=(),
-        rest_of_calls={},
-    )
+    each = zip(built.results, at_rest.tolist(), strict=True)
+    inner = _opened(system, built.results, [system.rest_of_calls.get(s.name, Fraction(v)) for s, v in each])
     ones, zeros, none = np.ones(network.gives), np.zeros(network.gives), policy.centre == "none"
-    clip = _clip(system, policy, len(names))
+    clip = _clip(system, policy, len(built.results))
     return inner, PolicyNetwork(network, ones, zeros, "identity", "none" if none else "output", clip)
 
 
@@ -70,6 +61,25 @@ def program_of(policy: PolicyNetwork, u_eq: Sequence[Fraction] = ()) -> Network:
     if plain.clip is not None:
         steps.append(Clip((len(steps),), *plain.clip))
     return Network(policy.n, tuple(steps))
+
+
+def with_results_as_inputs(system: System) -> System:
+    """The plant in which the results of its calls are inputs, 0 at the operating point if its file says nothing else:
+    for looking at it alone."""
+    results = [symbol for call in system.calls for _, symbol in call.results]
+    return _opened(system, results, [system.rest_of_calls.get(s.name, Fraction(0)) for s in results])
+
+
+def _opened(system: System, results: Sequence[Symbol], at_rest: Sequence[Fraction]) -> System:
+    bounds = (Fraction(-_FREE), Fraction(_FREE))
+    return replace(
+        system,
+        inputs=(*system.inputs, *results),
+        u_eq=(*system.u_eq, *map(Number, at_rest)),
+        input_bounds=(*system.input_bounds, *[bounds] * len(results)),
+        calls=(),
+        rest_of_calls={},
+    )
 
 
 class _Built:

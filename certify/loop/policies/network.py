@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.loop.networks import Affine, Clip, Map, Network, frozen, like, sha256_of, tangent_at, tanh, values
+from certify.loop.networks import frozen, like, sha256_of, tangent_at, tanh, values
 from certify.loop.policies.arithmetic import Arithmetic
 from certify.loop.policies.programmed import WHOSE, Programmed, chain
 
