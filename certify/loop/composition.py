@@ -14,10 +14,16 @@ import numpy as np
 
 from certify.errors import InputError
 from certify.loop.expressions import Expression, Number, Symbol, substitute
-from certify.loop.networks import Affine, Clip, Concat, Map, Network, Observe, Step, values
+from certify.loop.networks import Affine, Concat, Network, Observe, Step, values
 from certify.loop.plants import System
-from certify.loop.policies import PolicyNetwork, bounded_by_form
+from certify.loop.plants.calls import Call, NetworkFile
+from certify.loop.policies import PolicyNetwork, bounded_by_form, load_policy, program_of
+from certify.loop.policies.importers import ImportOptions, content_of, read_bytes
+from certify.loop.policies.importers.comparing import compare_reading
+from certify.loop.policies.importers.folding import fold
+from certify.loop.policies.importers.recognising import kind_of, read_kind
 
+_SAMPLES = 1000  # arguments at which a network is compared with its file's own program
 _FREE = 2.0**100  # the bounds of a result, beyond anything that is proved
 
 
@@ -40,7 +46,8 @@ def composed(system: System, policy: PolicyNetwork) -> tuple[System, PolicyNetwo
         )
     built = _Built(system, policy)
     for call in system.calls:
-        built.add(call.network, _exact(system, call.arguments), call.results)
+        network = network_of(call)
+        built.add(network, _exact(system, call.arguments), [(_entry(call, network, k), s) for k, s in call.results])
     network = built.network()
     at_rest = values(network, np.zeros(system.n))[system.m :]
     each = zip(built.results, at_rest.tolist(), strict=True)
@@ -50,17 +57,52 @@ def composed(system: System, policy: PolicyNetwork) -> tuple[System, PolicyNetwo
     return inner, PolicyNetwork(network, ones, zeros, "identity", "none" if none else "output", clip)
 
 
-def program_of(policy: PolicyNetwork, u_eq: Sequence[Fraction] = ()) -> Network:
-    """pi as one network, with squash, scale, offset and clip as steps; the numbers of a centring are rounded."""
-    plain, eye = policy.folded(u_eq), np.eye(policy.m)
-    steps = list(plain.network.steps)
-    if plain.squash == "tanh":
-        steps.append(Map((len(steps),), "tanh"))
-    if np.any(plain.scale != 1) or np.any(plain.offset):
-        steps.append(Affine((len(steps),), plain.scale * eye, plain.offset))
-    if plain.clip is not None:
-        steps.append(Clip((len(steps),), *plain.clip))
-    return Network(policy.n, tuple(steps))
+def network_of(call: Call) -> Network:
+    """The network that is called: itself, or read from a policy file of this program or another program's file.
+
+    Raises
+    ------
+    InputError : the file cannot be read, or the network reads another number of arguments.
+    """
+    reads, network = len(call.arguments), call.network
+    if isinstance(network, NetworkFile):
+        try:
+            network = _read(network, reads)
+        except InputError as error:
+            raise InputError(f"the network {call.name}: {error}") from error
+    if network.reads != reads:
+        raise InputError(f"the network {call.name} reads {network.reads} numbers; found {reads} arguments.")
+    return network
+
+
+def _entry(call: Call, network: Network, entry: int | None) -> int:
+    """The number of an entry of the value."""
+    if entry is None and network.gives != 1:
+        raise InputError(
+            f"the network {call.name} gives {network.gives} numbers; write which, as in {call.name}[0](...)."
+        )
+    if not 0 <= (entry or 0) < network.gives:
+        raise InputError(f"the network {call.name} gives {network.gives} numbers, from 0 on; there is no {entry}.")
+    return entry or 0
+
+
+def _read(file: NetworkFile, reads: int) -> Network:
+    raw = read_bytes(file.path)
+    if content_of(raw, file.path.name) == "policy":
+        policy = load_policy(file.path).network
+        if policy.centre != "none":
+            raise InputError(f"{file.path} must be without a centring; found {policy.centre!r}.")
+        return program_of(policy)
+    options = ImportOptions(**{"normaliser": "none", "squash": "identity", **file.options})
+    kind = kind_of(raw, file.path.name, options)
+    reading = read_kind(kind, raw, file.path.name, options, reads, file.gives, file.path.parent, None)
+    if reading.n != reads:
+        raise InputError(f"{file.path} reads {reading.n} numbers; found {reads} arguments.")
+    folded = fold(reading.steps, reads, keep_clips=True)
+    network = program_of(PolicyNetwork(folded.network, folded.scale, folded.offset, folded.squash, "none", folded.clip))
+    x = np.random.default_rng(0).normal(size=(_SAMPLES, reads)).astype(np.float32).astype(np.float64)
+    compare_reading(reading, (), (), x, values(network, x))
+    return network
 
 
 def with_results_as_inputs(system: System) -> System:
@@ -123,7 +165,7 @@ def _exact(system: System, arguments: Sequence[Expression]) -> list[Expression]:
 
 
 def _clip(system: System, policy: PolicyNetwork, more: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """What limits the inputs: the policy's clip, or the bounds that it keeps by its form; results are free."""
+    """The limits of the inputs: the policy's clip, or the bounds that it keeps by its form; results are free."""
     if policy.clip is None and not bounded_by_form(policy, system.input_bounds):
         return None
     ends = policy.clip or tuple(np.array([float(pair[k]) for pair in system.input_bounds]) for k in (0, 1))

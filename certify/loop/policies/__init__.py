@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from certify.loop.policies.exact import bounded_by_form, require_centred
 from certify.loop.policies.file import Policy, load_policy, save_policy
-from certify.loop.policies.network import Centre, PolicyNetwork
+from certify.loop.policies.network import Centre, PolicyNetwork, program_of
 
 __all__ = [
     "Centre",
@@ -12,6 +12,7 @@ __all__ = [
     "PolicyNetwork",
     "bounded_by_form",
     "load_policy",
+    "program_of",
     "require_centred",
     "save_policy",
 ]

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.loop.networks import frozen, like, sha256_of, tangent_at, tanh, values
+from certify.loop.networks import Affine, Clip, Map, Network, frozen, like, sha256_of, tangent_at, tanh, values
 from certify.loop.policies.arithmetic import Arithmetic
 from certify.loop.policies.programmed import WHOSE, Programmed, chain
 
@@ -236,6 +236,19 @@ class PolicyNetwork(Programmed):
         arrays = [a for step in self.network.steps for a in step.arrays]
         head, rest = f"certify-policy/1\0{self.squash}\0{self.centre}\0", (self.scale, self.offset, *(self.clip or ()))
         return sha256_of(head.encode(), (*arrays, *rest), self.network.words())
+
+
+def program_of(policy: PolicyNetwork, u_eq: Sequence[Fraction] = ()) -> Network:
+    """pi as one network, with squash, scale, offset and clip as steps; the numbers of a centring are rounded."""
+    plain, eye = policy.folded(u_eq), np.eye(policy.m)
+    steps = list(plain.network.steps)
+    if plain.squash == "tanh":
+        steps.append(Map((len(steps),), "tanh"))
+    if np.any(plain.scale != 1) or np.any(plain.offset):
+        steps.append(Affine((len(steps),), plain.scale * eye, plain.offset))
+    if plain.clip is not None:
+        steps.append(Clip((len(steps),), *plain.clip))
+    return Network(policy.n, tuple(steps))
 
 
 class _Arrays:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """What a network reads: states of the plant by their numbers, `index`, or `expressions` of them."""
+    """The observations of a network: states of the plant by their numbers, `index`, or `expressions` of them."""
 
     plant: System
     index: tuple[int, ...] | None

@@ -270,29 +270,14 @@ def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain
     place, chain, others = found[0], given[found[0]], [v for v in given if not isinstance(v, tuple)]
     match kind, place, len(given):
         case "Gemm", 0, 2 | 3:
-            if "transA" in flags and flags["transA"].i:
-                raise InputError(f"{at} must not transpose the observation (transA).")
-            alpha, beta = (float(flags[k].f) if k in flags else 1.0 for k in ("alpha", "beta"))
-            weight = graph.real(given[1], at)
-            if weight.ndim != 2:
-                raise InputError(f"the weight of {at} must be a matrix; its shape is {weight.shape}.")
-            weight = weight if "transB" in flags and flags["transB"].i else weight.T
-            if alpha == 1 and beta == 1:
-                return graph.affine(chain, weight, given[2] if len(given) == 3 else None, at)
-            chain = graph.affine(chain, weight, None, at)
-            chain = chain if alpha == 1 else graph.scaled(chain, alpha, at)
-            if len(given) == 3 and given[2] is not None:
-                chain = graph.moved(chain, tuple(v * graph.row(beta, at)[0] for v in graph.row(given[2], at)))
-            return chain
+            return _gemm(chain, given, flags, at)
         case "MatMul", 0, 2:
             weight = graph.real(given[1], at)
             if weight.ndim != 2:
                 raise InputError(f"the weight of {at} must be a matrix; its shape is {weight.shape}.")
             return graph.affine(chain, weight.T, None, at)
-        case "Add", _, 2:
-            return graph.shifted(chain, others[0], at)
-        case "Sub", 0, 2:
-            return graph.shifted(chain, others[0], at, sign=-1)
+        case ("Add", _, 2) | ("Sub", 0, 2):
+            return graph.shifted(chain, others[0], at, sign=-1 if kind == "Sub" else 1)
         case "Sub", 1, 2:
             return graph.shifted(graph.negated(chain), others[0], at)
         case "Mul", _, 2:
@@ -303,10 +288,10 @@ def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain
             return graph.negated(chain)
         case _, 0, 1 if kind in _ACTIVATIONS:
             return _activated(chain, kind, flags, at)
-        case "Identity", 0, 1:
-            return chain
         case "Cast", 0, 1:
             _require_real(flags, at)
+            return chain
+        case "Identity", 0, 1:
             return chain
         case "Flatten", 0, 1 if flags["axis"].i in (1, -1) if "axis" in flags else True:
             return chain
@@ -318,6 +303,24 @@ def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain
             bounds = [*given[1:], None, None]
             return graph.clipped(chain, bounds[0], bounds[1], at)
     raise InputError(f"{at} is not read: the operations are {_KNOWN}, with the observation in the usual place.")
+
+
+def _gemm(chain: Chain, given: list[Any], flags: dict[str, Any], at: str) -> Chain:
+    """`alpha W h + beta b`."""
+    if "transA" in flags and flags["transA"].i:
+        raise InputError(f"{at} must not transpose the observation (transA).")
+    alpha, beta = (float(flags[k].f) if k in flags else 1.0 for k in ("alpha", "beta"))
+    weight = graph.real(given[1], at)
+    if weight.ndim != 2:
+        raise InputError(f"the weight of {at} must be a matrix; its shape is {weight.shape}.")
+    weight = weight if "transB" in flags and flags["transB"].i else weight.T
+    if alpha == 1 and beta == 1:
+        return graph.affine(chain, weight, given[2] if len(given) == 3 else None, at)
+    chain = graph.affine(chain, weight, None, at)
+    chain = chain if alpha == 1 else graph.scaled(chain, alpha, at)
+    if len(given) == 3 and given[2] is not None:
+        chain = graph.moved(chain, tuple(v * graph.row(beta, at)[0] for v in graph.row(given[2], at)))
+    return chain
 
 
 def _joined(kind: str, chains: list[Chain], flags: dict[str, Any], at: str) -> Chain:
