@@ -256,6 +256,11 @@ def shortest(value: float) -> str:
     return _typeset(repr(value).removesuffix(".0"))
 
 
+def is_free(lo: Fraction | float, hi: Fraction | float) -> bool:
+    """True if bounds are so far apart that they are none, as those of a network's result that equations use."""
+    return bool(hi - lo >= 2**100)
+
+
 def below(value: float | Fraction, digits: int = 6) -> str:
     """A number rounded down to so many digits: the decimal that is shown is not above the exact value.
 

@@ -196,3 +196,9 @@ def test_bends_are_those_that_flattening_lowers() -> None:
         pendulum_network((16, 16, 16), centre="none"),
     ):
         assert _bend(network, box) == pytest.approx(departure_of(network, box.tolist()), rel=1e-9)
+
+
+def test_bounds_that_bound_nothing_are_not_shown() -> None:
+    from certify.report.words import is_free
+
+    assert is_free(Fraction(-(2**100)), Fraction(2**100)) and not is_free(Fraction(-(10**6)), Fraction(10**6))

@@ -28,6 +28,7 @@ from certify.report.words import (
     above,
     below,
     inner_level,
+    is_free,
     kept_apart,
     network_name,
     pretty_unit,
@@ -51,6 +52,7 @@ def claim_of(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict
     bounds = [
         f"{below(lo)} ≤ {symbol(s.name)} ≤ {above(hi)} {units[s.name]}".rstrip()
         for s, (lo, hi) in zip(system.inputs, system.input_bounds, strict=True)
+        if not is_free(lo, hi)
     ]
     parts = _parts(certificate, _notes(certificate, answer, bounds))
     inner, outer = inner_level(certificate.kind, inner_of(certificate)), below(certificate.roa)

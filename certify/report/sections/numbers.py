@@ -35,6 +35,7 @@ from certify.report.words import (
     distinguished,
     estimated,
     held_at,
+    is_free,
     network_name,
     number,
     seconds,
@@ -149,9 +150,8 @@ def _geometry(certificate: Certificate) -> Rows:
 def _evidence(certificate: Certificate, accepted: Mapping[str, Any] | None, sha256: str, size: int | None) -> Rows:
     """The claim's basis: the policy, the file, and the checker's counts if it `accepted`."""
     network, beyond, slabs = certificate.network, certificate.claim.outer, slabs_of(certificate)
-    layers = "-".join(map(str, network.layers))
     rows = [
-        ("policy", f"{layers} {network.activation}, squash {network.squash}, centre {network.centre}"),
+        ("policy", f"{network.words}, squash {network.squash}, centre {network.centre}"),
         *(() if network.clip is None else (("clipped to", _clip(certificate)),)),
         *((("its layers read", read_in_words(certificate)),) if network.is_moved else ()),
         ("policy sha256", network.sha256()),
@@ -255,7 +255,8 @@ def _clip(certificate: Certificate) -> str:
     """Each input's limits, in its unit."""
     inputs, clip = certificate.system.inputs, certificate.network.clip or ()
     each = zip(inputs, *clip, strict=True)
-    return ", ".join(f"{s.name} in [{number(float(lo), 10)}, {number(float(hi), 10)}]" for s, lo, hi in each)
+    acting = ((s.name, float(lo), float(hi)) for s, lo, hi in each if not is_free(lo, hi))
+    return ", ".join(f"{name} in [{number(lo, 10)}, {number(hi, 10)}]" for name, lo, hi in acting)
 
 
 def _eigenvalues(certificate: Certificate) -> str:

@@ -12,7 +12,7 @@ from certify.loop.expressions import Expression, Number, Symbol, nodes
 from certify.loop.plants import input_errors
 from certify.report.mathml import identifier, is_long, multiplied_out, typeset
 from certify.report.sections.shared import centre_in_words, read_in_words
-from certify.report.words import above, at_rest, below, held_at, number, pretty_unit, symbol, varying_in
+from certify.report.words import above, at_rest, below, held_at, is_free, number, pretty_unit, symbol, varying_in
 
 
 def plant_of(certificate: Certificate) -> dict[str, Any]:
@@ -22,6 +22,8 @@ def plant_of(certificate: Certificate) -> dict[str, Any]:
 
     def interval(name: str, bounds: tuple[Fraction, Fraction]) -> str:
         lo, hi = bounds
+        if is_free(lo, hi):
+            return f"{symbol(name)} of any size"
         return f"{symbol(name)} ∈ [{below(lo)}, {above(hi)}] {pretty_unit(units.get(name, ''))}".rstrip()
 
     equilibrium = zip(system.inputs, system.exact_u_eq(), strict=True)
