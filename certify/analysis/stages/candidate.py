@@ -39,6 +39,7 @@ from certify.provers.falsify import Witness
 
 _HEAT = 0.04  # share of the effort for a candidate's first heat
 _SEARCH = 0.6  # share of the effort that is left for a search that cannot be interrupted
+_AROUND_FIRST = 0.3  # the same in many states, for the first of several, of which the later ones are to be the larger
 _GRACE, _LEAST = 1.0 * UNIT, 0.05  # operations, or of the whole, for a local level where nothing is proved yet
 _FOR_PROOF = 0.4  # share of the whole in which no further candidate is optimised
 _WORTH = 1.05  # growth of a volume that another candidate must promise
@@ -190,7 +191,7 @@ class _Choice:
         for that, then others until one proves something; then the largest sampled one, if there is effort left."""
         race, first = self.race, self._made(partial(peak, self.loop), FOR_PEAK)
         for one in ([] if first is None else [first]) + by_reach(trials):
-            self._enter_alone(one)
+            self._enter_alone(one, _AROUND_FIRST)
             if race.best.proved:
                 break
         if race.best.proved and self._is_left_for_more():
@@ -203,18 +204,18 @@ class _Choice:
         of a loop that rests exactly, and the largest candidates come first as they do there."""
         race, large = self.race, self._made(partial(optimised, self.loop))
         if large is not None:
-            self._enter_alone(large)
+            self._enter_alone(large, _AROUND_FIRST)
         if large is not None and race.best.proved > _NEAR * large.volume:
             self._improve()
         little = large is None or race.best.proved < _SMALL * large.volume
         if little and self._is_left_for_more():
             certain = self._made(partial(robust, self.loop), share_of_robust(self.loop))
             if certain is not None:
-                self._enter_alone(certain)
+                self._enter_alone(certain, _AROUND_FIRST)
         for one in by_reach(trials):
             if race.contenders and race.best.proved:
                 break
-            self._enter_alone(one)
+            self._enter_alone(one, _AROUND_FIRST)
 
     def _improve(self) -> None:
         """The optimised candidate again, from where it is, as long as its proofs reach as far as its samples do.
@@ -251,9 +252,9 @@ class _Choice:
     def _granted(self, share: float = OPTIMISING) -> Effort:
         return _granted(self.effort, self.tools.whole, share)
 
-    def _enter_alone(self, trial: Trial) -> None:
-        """Enter a trial with a heat of the effort that is left if a search cannot be interrupted."""
-        self.race.enter([trial], self.race.heat if self.state.interruptible else _SEARCH * self.effort.left)
+    def _enter_alone(self, trial: Trial, share: float = _SEARCH) -> None:
+        """Enter a trial with a heat of this share of the effort that is left."""
+        self.race.enter([trial], share * self.effort.left)
 
     def _is_left_for_more(self) -> bool:
         return self.effort.left > _FOR_PROOF * self.tools.whole
