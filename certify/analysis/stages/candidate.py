@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from certify.analysis.asked import ellipsoid_in
+from certify.analysis.candidates.converging import is_nearby
 from certify.analysis.candidates.robust import NoCandidateError
 from certify.analysis.candidates.trials import (
     FOR_PEAK,
     OPTIMISING,
     SAMPLING,
     Trial,
+    blend,
     blends,
     by_reach,
     corrected,
@@ -46,6 +48,8 @@ _WORTH = 1.05  # growth of a volume that another candidate must promise
 _SMALL = 0.1  # share of the volume within a candidate's reach: if less is proved, another one is worth its effort
 _NEAR = 1e-3  # the same: where less is proved, its own correction is not
 _MISLED = 0.9  # share of its reach: a violation below it is one that the samples missed
+_REACHED = 0.9  # share of its target: a level above it leaves nothing to a candidate that is easier to prove
+_APART = 1 / 16  # shares of a blend that are no farther apart are not told apart
 
 Make = Callable[[RoaOptions, Effort], Trial | None]
 
@@ -142,6 +146,7 @@ class _Choice:
     effort: Effort
     race: Race
     cut_short: bool = False  # the effort ended the making of the last candidate
+    nearby: bool = False  # all converge to one equilibrium in the set that is proved first
 
     @property
     def loop(self) -> ClosedLoop:
@@ -188,16 +193,53 @@ class _Choice:
 
     def _around_a_level(self, trials: list[Trial]) -> None:
         """A practical claim in many states, where no tree of boxes can carry what a ball does not: the candidate made
-        for that, then others until one proves something; then the largest sampled one, if there is effort left."""
+        for that, then others until one proves something; then the largest sampled one, and what lies between the two,
+        if there is effort left."""
         race, first = self.race, self._made(partial(peak, self.loop), FOR_PEAK)
         for one in ([] if first is None else [first]) + by_reach(trials):
             self._enter_alone(one, _AROUND_FIRST)
             if race.best.proved:
                 break
         if race.best.proved and self._is_left_for_more():
-            large = self._made(partial(optimised, self.loop))
-            if large is not None:
-                self._enter_alone(large)
+            sure, large = race.best, self._made(partial(optimised, self.loop))
+            if large is None:
+                return
+            self.nearby = self.state.converging and self._is_nearby(sure)
+            if not self._reaches(large):
+                self._between(large, sure.trial)
+
+    def _between(self, large: Trial, sure: Trial) -> None:
+        """Blends of a large candidate and of one with which a set is proved, by bisection: nearer to the large one
+        where a proof reaches as far as its candidate, nearer to the other where it does not."""
+        low, high = 0.0, 1.0
+        while high - low > _APART and not self.effort.over:
+            share = (low + high) / 2
+            one = blend(self.loop, large, sure, share, self.state.options)
+            if one.volume > _WORTH * self.race.best.proved and not self._reaches(one):
+                low = share
+            else:
+                high = share
+
+    def _reaches(self, trial: Trial) -> bool:
+        """True if nothing easier to prove could gain more: about all within the trial's reach is proved, or that is
+        not worth a heat. A larger set of which the claim is weaker counts for nothing."""
+        entered = self._enter_alone(trial)
+        if entered is None:
+            return True
+        if entered is self.race.best and self.nearby and not self._is_nearby(entered):
+            self.race.contenders.remove(entered)
+            self.tools.remarks.append(
+                f"with {trial.name} a set of volume {entered.proved:.6g} is proved as well, but not that all converge "
+                "to one equilibrium in it: the claim `practical` would have it"
+            )
+            return False
+        return (entered.attempt.level or 0.0) >= _REACHED * trial.task.target
+
+    def _is_nearby(self, contender: Contender) -> bool:
+        """True if all converge to one equilibrium in its set."""
+        with self.tools.timing("candidate"):
+            proof, path = contender.attempt.proof(), self.tools.out / "certificate.json"
+            return is_nearby(contender.trial.task.problem, proof, path)
 
     def _around_its_rest(self, trials: list[Trial]) -> None:
         """A practical claim in many states of a loop that rests where V is 0: a ball carries there as much as it does
@@ -252,9 +294,11 @@ class _Choice:
     def _granted(self, share: float = OPTIMISING) -> Effort:
         return _granted(self.effort, self.tools.whole, share)
 
-    def _enter_alone(self, trial: Trial, share: float = _SEARCH) -> None:
-        """Enter a trial with a heat of this share of the effort that is left."""
+    def _enter_alone(self, trial: Trial, share: float = _SEARCH) -> Contender | None:
+        """Enter a trial with a heat of this share of the effort that is left; None if its reach is not worth one."""
+        before = len(self.race.contenders)
         self.race.enter([trial], share * self.effort.left)
+        return self.race.contenders[-1] if len(self.race.contenders) > before else None
 
     def _is_left_for_more(self) -> bool:
         return self.effort.left > _FOR_PROOF * self.tools.whole
