@@ -146,7 +146,6 @@ class _Choice:
     effort: Effort
     race: Race
     cut_short: bool = False  # the effort ended the making of the last candidate
-    nearby: bool = False  # all converge to one equilibrium in the set that is proved first
 
     @property
     def loop(self) -> ClosedLoop:
@@ -201,32 +200,39 @@ class _Choice:
             if race.best.proved:
                 break
         if race.best.proved and self._is_left_for_more():
-            sure, large = race.best, self._made(partial(optimised, self.loop))
-            if large is None:
-                return
-            self.nearby = self.state.converging and self._is_nearby(sure)
-            if not self._reaches(large):
-                self._between(large, sure.trial)
+            sure, large = race.best.trial, self._made(partial(optimised, self.loop))
+            if large is not None and not self._reaches(large):
+                self._between(large, sure)
 
     def _between(self, large: Trial, sure: Trial) -> None:
-        """Blends of a large candidate and of one with which a set is proved, by bisection: nearer to the large one
-        where a proof reaches as far as its candidate, nearer to the other where it does not."""
-        low, high = 0.0, 1.0
-        while high - low > _APART and not self.effort.over:
-            share = (low + high) / 2
-            one = blend(self.loop, large, sure, share, self.state.options)
-            if one.volume > _WORTH * self.race.best.proved and not self._reaches(one):
+        """Blends of a large candidate and of one with which a set is proved: a search for the share of the latter with
+        which most is proved, as if there were one maximum. A larger set of which less is claimed counts for nothing."""
+        race, low, high = self.race, 0.0, 1.0
+        best, nearby = float(race.best.trial is not large), self.state.converging and self._is_nearby(race.best)
+        while high - low > _APART and self.effort.left > _LEAST * self.tools.whole:
+            within = min(max(best, low), high)
+            share = (low + within) / 2 if within - low >= high - within else (within + high) / 2
+            one, before = blend(self.loop, large, sure, share, self.state.options), race.best
+            if one.volume <= _WORTH * before.proved:  # nor are those with more of the smaller one worth a heat
+                high = share
+                continue
+            reaches = self._reaches(one, nearby)
+            if race.best is not before:
+                low, high = (max(low, best), high) if best < share else (low, min(best, high))
+                best, high = share, share if reaches else high
+            elif share < best:
                 low = share
             else:
                 high = share
 
-    def _reaches(self, trial: Trial) -> bool:
+    def _reaches(self, trial: Trial, nearby: bool = False) -> bool:
         """True if nothing easier to prove could gain more: about all within the trial's reach is proved, or that is
-        not worth a heat. A larger set of which the claim is weaker counts for nothing."""
+        not worth a heat. With `nearby` it is left out again where it is not shown that all converge to one equilibrium.
+        """
         entered = self._enter_alone(trial)
         if entered is None:
             return True
-        if entered is self.race.best and self.nearby and not self._is_nearby(entered):
+        if nearby and entered is self.race.best and not self._is_nearby(entered):
             self.race.contenders.remove(entered)
             self.tools.remarks.append(
                 f"with {trial.name} a set of volume {entered.proved:.6g} is proved as well, but not that all converge "
