@@ -1,4 +1,4 @@
-"""Whether a practical claim's proof carries the stronger one too: that all trajectories converge to one equilibrium."""
+"""The stronger claim that a practical one's proof may carry: that all trajectories converge to one equilibrium."""
 
 from __future__ import annotations
 
