@@ -110,6 +110,25 @@ def chain(n: int, poles: list[float]) -> tuple[System, PolicyNetwork]:
     return system, network
 
 
+def springs(push: str) -> tuple[System, TanhNetwork]:
+    """Two softening springs that hold each other, little damped; the policy adds to one, which a force disturbs."""
+    p, v, q, w, u, force = symbols("p v q w u force")
+    system = System(
+        name="springs",
+        states=(p, v, q, w),
+        inputs=(u,),
+        parameters={},
+        dynamics=(v, -p + p**3 / 4 - v / 2 + u + force + q / 2, w, -q + q**3 / 4 - w / 2 + p / 2),
+        u_eq=(Number(0),),
+        domain=box(2, 2, 2, 2),
+        input_bounds=box(1),
+        disturbances=(force,),
+        ranges={"force": (-Fraction(push), Fraction(push))},
+    )
+    gain = np.array([[-0.3, -0.2, 0.0, 0.0]])
+    return system, TanhNetwork((gain,), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+
+
 def saturated_lqr(
     K: np.ndarray,
     scale: float,

@@ -227,9 +227,15 @@ def blends(loop: ClosedLoop, large: Trial, provable: Trial, options: RoaOptions,
     for share in _BLENDS:
         if effort.over:
             return
-        P = (1 - share) * large.unit + share * provable.unit
-        name = f"{large.name} with {share:.0%} of {provable.name}"
-        yield trial(loop, (P + P.T) / 2, name, options, effort)
+        yield blend(loop, large, provable, share, options, effort)
+
+
+def blend(
+    loop: ClosedLoop, large: Trial, provable: Trial, share: float, options: RoaOptions, effort: Effort = UNLIMITED
+) -> Trial:
+    """The candidate that has this share of the one that is easier to prove."""
+    P = (1 - share) * large.unit + share * provable.unit
+    return trial(loop, (P + P.T) / 2, f"{large.name} with {share:.0%} of {provable.name}", options, effort)
 
 
 def by_reach(trials: Sequence[Trial]) -> list[Trial]:

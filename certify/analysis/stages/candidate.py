@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from certify.analysis.asked import ellipsoid_in
+from certify.analysis.candidates.converging import is_nearby
 from certify.analysis.candidates.robust import NoCandidateError
 from certify.analysis.candidates.trials import (
     FOR_PEAK,
     OPTIMISING,
     SAMPLING,
     Trial,
+    blend,
     blends,
     by_reach,
     corrected,
@@ -39,12 +41,15 @@ from certify.provers.falsify import Witness
 
 _HEAT = 0.04  # share of the effort for a candidate's first heat
 _SEARCH = 0.6  # share of the effort that is left for a search that cannot be interrupted
+_AROUND_FIRST = 0.3  # the same in many states, for the first of several, of which the later ones are to be the larger
 _GRACE, _LEAST = 1.0 * UNIT, 0.05  # operations, or of the whole, for a local level where nothing is proved yet
 _FOR_PROOF = 0.4  # share of the whole in which no further candidate is optimised
 _WORTH = 1.05  # growth of a volume that another candidate must promise
 _SMALL = 0.1  # share of the volume within a candidate's reach: if less is proved, another one is worth its effort
 _NEAR = 1e-3  # the same: where less is proved, its own correction is not
 _MISLED = 0.9  # share of its reach: a violation below it is one that the samples missed
+_REACHED = 0.9  # share of its target: a level above it leaves nothing to a candidate that is easier to prove
+_APART = 1 / 16  # shares of a blend that are no farther apart are not told apart
 
 Make = Callable[[RoaOptions, Effort], Trial | None]
 
@@ -187,34 +192,78 @@ class _Choice:
 
     def _around_a_level(self, trials: list[Trial]) -> None:
         """A practical claim in many states, where no tree of boxes can carry what a ball does not: the candidate made
-        for that, then others until one proves something; then the largest sampled one, if there is effort left."""
+        for that, then others until one proves something; then the largest sampled one, and what lies between the two,
+        if there is effort left."""
         race, first = self.race, self._made(partial(peak, self.loop), FOR_PEAK)
         for one in ([] if first is None else [first]) + by_reach(trials):
-            self._enter_alone(one)
+            self._enter_alone(one, _AROUND_FIRST)
             if race.best.proved:
                 break
         if race.best.proved and self._is_left_for_more():
-            large = self._made(partial(optimised, self.loop))
-            if large is not None:
-                self._enter_alone(large)
+            sure, large = race.best.trial, self._made(partial(optimised, self.loop))
+            if large is not None and not self._reaches(large):
+                self._between(large, sure)
+
+    def _between(self, large: Trial, sure: Trial) -> None:
+        """Blends of a large candidate and of one with which a set is proved: a search for the share of the latter with
+        which most is proved, as if there were one maximum. A larger set of which less is claimed counts for nothing."""
+        race, low, high = self.race, 0.0, 1.0
+        best, nearby = float(race.best.trial is not large), self.state.converging and self._is_nearby(race.best)
+        while high - low > _APART and self.effort.left > _LEAST * self.tools.whole:
+            within = min(max(best, low), high)
+            share = (low + within) / 2 if within - low >= high - within else (within + high) / 2
+            one, before = blend(self.loop, large, sure, share, self.state.options), race.best
+            if one.volume <= _WORTH * before.proved:  # nor are those with more of the smaller one worth a heat
+                high = share
+                continue
+            reaches = self._reaches(one, nearby)
+            if race.best is not before:
+                low, high = (max(low, best), high) if best < share else (low, min(best, high))
+                best, high = share, share if reaches else high
+            elif share < best:
+                low = share
+            else:
+                high = share
+
+    def _reaches(self, trial: Trial, nearby: bool = False) -> bool:
+        """True if nothing easier to prove could gain more: about all within the trial's reach is proved, or that is
+        not worth a heat. With `nearby` it is left out again where it is not shown that all converge to one equilibrium.
+        """
+        entered = self._enter_alone(trial)
+        if entered is None:
+            return True
+        if nearby and entered is self.race.best and not self._is_nearby(entered):
+            self.race.contenders.remove(entered)
+            self.tools.remarks.append(
+                f"with {trial.name} a set of volume {entered.proved:.6g} is proved as well, but not that all converge "
+                "to one equilibrium in it: the claim `practical` would have it"
+            )
+            return False
+        return (entered.attempt.level or 0.0) >= _REACHED * trial.task.target
+
+    def _is_nearby(self, contender: Contender) -> bool:
+        """True if all converge to one equilibrium in its set."""
+        with self.tools.timing("candidate"):
+            proof, path = contender.attempt.proof(), self.tools.out / "certificate.json"
+            return is_nearby(contender.trial.task.problem, proof, path)
 
     def _around_its_rest(self, trials: list[Trial]) -> None:
         """A practical claim in many states of a loop that rests where V is 0: a ball carries there as much as it does
         of a loop that rests exactly, and the largest candidates come first as they do there."""
         race, large = self.race, self._made(partial(optimised, self.loop))
         if large is not None:
-            self._enter_alone(large)
+            self._enter_alone(large, _AROUND_FIRST)
         if large is not None and race.best.proved > _NEAR * large.volume:
             self._improve()
         little = large is None or race.best.proved < _SMALL * large.volume
         if little and self._is_left_for_more():
             certain = self._made(partial(robust, self.loop), share_of_robust(self.loop))
             if certain is not None:
-                self._enter_alone(certain)
+                self._enter_alone(certain, _AROUND_FIRST)
         for one in by_reach(trials):
             if race.contenders and race.best.proved:
                 break
-            self._enter_alone(one)
+            self._enter_alone(one, _AROUND_FIRST)
 
     def _improve(self) -> None:
         """The optimised candidate again, from where it is, as long as its proofs reach as far as its samples do.
@@ -251,9 +300,11 @@ class _Choice:
     def _granted(self, share: float = OPTIMISING) -> Effort:
         return _granted(self.effort, self.tools.whole, share)
 
-    def _enter_alone(self, trial: Trial) -> None:
-        """Enter a trial with a heat of the effort that is left if a search cannot be interrupted."""
-        self.race.enter([trial], self.race.heat if self.state.interruptible else _SEARCH * self.effort.left)
+    def _enter_alone(self, trial: Trial, share: float = _SEARCH) -> Contender | None:
+        """Enter a trial with a heat of this share of the effort that is left; None if its reach is not worth one."""
+        before = len(self.race.contenders)
+        self.race.enter([trial], share * self.effort.left)
+        return self.race.contenders[-1] if len(self.race.contenders) > before else None
 
     def _is_left_for_more(self) -> bool:
         return self.effort.left > _FOR_PROOF * self.tools.whole

@@ -46,15 +46,16 @@ class BoundsEngine(Engine):
         return Once(lambda budget, report: self._practical(task, budget, report))
 
     def _practical(self, task: Task, budget: Budget, report: Report | None) -> Proof:
-        """The better of two: a ring from a ball around a level, and one that leaves alone have to carry."""
+        """The better of two: a ring from a ball around a level, and in few states one carried by leaves alone."""
         start = time.perf_counter()
-        whole = budget.effort.left
-        first = self._from_ball(task, replace(budget, effort=budget.effort.share(_FOR_BALL)), report)
+        whole, alone = budget.effort.left, self.T.shape[0] > FEW
+        for_ball = budget.effort.share(1.0 if alone else _FOR_BALL)
+        first = self._from_ball(task, replace(budget, effort=for_ball), report)
         if task.exactly and first is not None and first.claim is not None and first.claim.roa < task.target:
             first = None
         if first is not None and _is_ample(first, task.target):
             return first
-        if self.T.shape[0] > FEW:
+        if alone:
             return first or Proof(None, None, Stop.LOCAL, "no ball shows V to fall around any level; try another P")
         if first is not None and budget.effort.left < _FOR_BALL * whole:
             return first
