@@ -160,7 +160,7 @@ REFUSED = {
     "a function that redefines tanh": (function(model(chain(*MLP))), "standard operators"),
     "no set of operators": (no_operator_set(model(chain(*MLP))), "evaluator of the onnx package"),
     "a tensor twice": (twice(model(chain(*MLP))), "once"),
-    "a product": (model([*chain(*TWO)[:1], node("Tanh", "h0", out="v"), node("Mul", "h0", "v", out="u")]), "join one"),
+    "a quotient": (model([*chain(*TWO)[:1], node("Tanh", "h0", out="v"), node("Div", "h0", "v", out="u")]), "join one"),
     "integers": (model(chain(*MLP), {**CONSTANTS, "W1": np.ones((2, 6), np.int64)}), "floating-point"),
     "nan": (model(chain(*MLP), {**CONSTANTS, "B1": B1 * np.nan}), "finite"),
     "a zero": (model(chain(("Div", "*", "zero"), *MLP)), "divides by 0"),
@@ -294,7 +294,7 @@ SHAPED = {
     "integers": (shaped("Cast", to=TensorProto.INT64), "must be a cast to float32 or float64"),
     "half precision": (shaped("Cast", to=TensorProto.FLOAT16), "must be a cast to float32 or float64"),
     "an unknown shape": (shaped("Expand", "s", shape=[1, 6]), "as wide as it is"),
-    "a normalisation": (shaped("LayerNormalization", "B1"), "LayerNorm, and every other .* train the policy again"),
+    "a normalisation": (shaped("GroupNormalization", "B1", "B1"), "train the policy again"),
     "a mean": (shaped("ReduceMean"), "a part of LayerNorm"),
     "a prelu": (shaped("ThresholdedRelu"), r"The activations that are proved are .*activation_fn=torch\.nn\.Tanh"),
 }

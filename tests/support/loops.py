@@ -110,7 +110,7 @@ def chain(n: int, poles: list[float]) -> tuple[System, PolicyNetwork]:
     return system, network
 
 
-def springs(push: str) -> tuple[System, TanhNetwork]:
+def springs(push: str) -> tuple[System, PolicyNetwork]:
     """Two softening springs that hold each other, little damped; the policy adds to one, which a force disturbs."""
     p, v, q, w, u, force = symbols("p v q w u force")
     system = System(
@@ -126,7 +126,7 @@ def springs(push: str) -> tuple[System, TanhNetwork]:
         ranges={"force": (-Fraction(push), Fraction(push))},
     )
     gain = np.array([[-0.3, -0.2, 0.0, 0.0]])
-    return system, TanhNetwork((gain,), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    return system, PolicyNetwork.of_layers((gain,), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
 
 
 def saturated_lqr(
