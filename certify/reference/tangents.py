@@ -23,7 +23,7 @@ from .expressions import Call
 from .function import net_at_0
 from .functions import Beyond, beyond_tangent, expansion, unsure
 from .model import Model
-from .networks import Affine, Clip, Concat, Map, Observe, Sum
+from .networks import Affine, Clip, Concat, Map, Observe, Product, Sum, paired
 from .refusal import Refused
 from .symmetric import half, whole
 
@@ -232,6 +232,34 @@ class OnBall:
 
         each = [doubts for v in vectors for doubts in v.doubts()]
         return self.made(make, *([*part] for part in zip(*each, strict=True)))
+
+    def product(self, step: Product, v: Vector, w: Vector) -> Vector:
+        """v w = v(0) w(0) + v(0) (w - w(0)) + w(0) (v - v(0)) and a unit, the product of what is in brackets."""
+        pairs = list(paired(self.models(v), self.models(w)))
+
+        def make() -> Tangent:
+            values = list(paired(v.tangent.at_0, w.tangent.at_0))
+            (G, L), (H, M) = self.aligned(v.tangent), self.aligned(w.tangent)
+            rows = zip(*(paired(A.tolist(), B.tolist()) for A, B in ((G, H), (L, M))), strict=True)
+            mixed_G, mixed_L = list[list[arb]](), list[list[arb]]()
+            for (p, q), ((g, h), (k, m)) in zip(values, rows, strict=True):
+                mixed_G.append([q * x + p * y for x, y in zip(g, h, strict=True)])
+                mixed_L.append([q * x + p * y for x, y in zip(k, m, strict=True)])
+            count = len(values)
+            flat = ([x for row in mixed for x in row] for mixed in (mixed_G, mixed_L))
+            return Tangent(
+                [p * q for p, q in values],
+                *(arb_mat(count, A.ncols(), x) for A, x in zip((G, L), flat, strict=True)),
+                True,
+            )
+
+        off = [x.size * y.off + y.size * x.off for x, y in pairs]
+        slack = [x.size * y.slack + x.off * y.slope + y.size * x.slack + y.off * x.slope for x, y in pairs]
+        result = self.made(make, off, slack)
+        for x, y in pairs:
+            both = replace(x, v=ZERO) * replace(y, v=ZERO)
+            self.stack.append(Beyond(both.Q, both.K, both.whole, both.lip))
+        return result
 
     def aligned(self, y: Tangent) -> tuple[arb_mat, arb_mat]:
         """G and L with a column for each root and each unit so far."""

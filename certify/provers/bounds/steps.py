@@ -186,7 +186,6 @@ class StepsOnBoxes(Algebra[Enclosed]):
                 return []
         return [weight] * len(made.of) if made.slope is None else [weight * made.slope[:, None]]
 
-
     def _gathered(self, weight: Array, number: int) -> Array:
         """The weights of a vector in a product's entries; of a single entry that of all of them together."""
         alone = len(self.made[number].added) == 1 < len(weight)
