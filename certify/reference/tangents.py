@@ -240,18 +240,7 @@ class OnBall:
         def make() -> Tangent:
             values = list(paired(v.tangent.at_0, w.tangent.at_0))
             (G, L), (H, M) = self.aligned(v.tangent), self.aligned(w.tangent)
-            rows = zip(*(paired(A.tolist(), B.tolist()) for A, B in ((G, H), (L, M))), strict=True)
-            mixed_G, mixed_L = list[list[arb]](), list[list[arb]]()
-            for (p, q), ((g, h), (k, m)) in zip(values, rows, strict=True):
-                mixed_G.append([q * x + p * y for x, y in zip(g, h, strict=True)])
-                mixed_L.append([q * x + p * y for x, y in zip(k, m, strict=True)])
-            count = len(values)
-            flat = ([x for row in mixed for x in row] for mixed in (mixed_G, mixed_L))
-            return Tangent(
-                [p * q for p, q in values],
-                *(arb_mat(count, A.ncols(), x) for A, x in zip((G, L), flat, strict=True)),
-                True,
-            )
+            return Tangent([p * q for p, q in values], crossed(values, G, H), crossed(values, L, M), True)
 
         off = [x.size * y.off + y.size * x.off for x, y in pairs]
         slack = [x.size * y.slack + x.off * y.slope + y.size * x.slack + y.off * x.slope for x, y in pairs]
@@ -390,6 +379,14 @@ def turn_of(v: Model) -> arb:
 
 def sum_of(pairs: Sequence[tuple[arb, arb]]) -> tuple[arb, arb]:
     return sum((a for a, _ in pairs), ZERO), sum((b for _, b in pairs), ZERO)
+
+
+def crossed(values: Sequence[tuple[arb, arb]], A: arb_mat, B: arb_mat) -> arb_mat:
+    """For each pair (p, q) a row q a + p b, a and b of A and B, of which one may have a single row for all."""
+    result = list[arb]()
+    for (p, q), (a, b) in zip(values, paired(A.tolist(), B.tolist()), strict=True):
+        result += [q * x + p * y for x, y in zip(a, b, strict=True)]
+    return arb_mat(len(values), A.ncols(), result)
 
 
 def through(step: Affine, part: list[arb] | None) -> list[arb] | None:

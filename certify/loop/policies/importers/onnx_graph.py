@@ -25,14 +25,13 @@ from certify.loop.policies.importers.steps import Affine
 _ACTIVATIONS = ("Tanh", "Elu", "Sigmoid", "Gelu", "Softplus", "Mish", "Softsign", "LeakyRelu", "Selu", "Celu")
 _OPERATIONS = {
     "Gemm", "MatMul", "Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", *_ACTIVATIONS,
-    "Identity", "Cast", "Flatten", "Reshape", "Constant", "Concat",
+    "Identity", "Cast", "Flatten", "Reshape", "Constant", "Concat", "HardSwish", "LayerNormalization",
 }  # fmt: skip
 _KNOWN = (
-    f"Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu, {', '.join(_ACTIVATIONS)}, Concat, Identity, Flatten and "
-    "Constant"
+    f"Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu, {', '.join(_ACTIVATIONS)}, HardSwish, "
+    "LayerNormalization, Concat, Identity, Flatten and Constant"
 )
 _NORMALISATIONS = {
-    "LayerNormalization",
     "BatchNormalization",
     "InstanceNormalization",
     "GroupNormalization",
@@ -52,8 +51,23 @@ _FLAGS = {
     "Selu": {"alpha", "gamma"},
     "Concat": {"axis"},
     "Gelu": {"approximate"},
+    "LayerNormalization": {"axis", "epsilon", "stash_type"},
 }
-_ELEMENTWISE = {"Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", *_ACTIVATIONS, "Exp", "Log", "Identity", "Cast"}
+_ELEMENTWISE = {
+    "Add",
+    "Sub",
+    "Mul",
+    "Div",
+    "Neg",
+    "Clip",
+    "Relu",
+    *_ACTIVATIONS,
+    "Exp",
+    "Log",
+    "Identity",
+    "Cast",
+    "HardSwish",
+}
 
 
 def read_onnx(raw: bytes, what: str, wanted: str | None = None, folder: Path | None = None) -> Reading:
@@ -257,14 +271,14 @@ def _walk(graph_: Any, name: str, output: str, what: str) -> Chain:
 
 def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain:
     found = [k for k, value in enumerate(given) if isinstance(value, tuple)]
-    if len(found) == 2 and kind == "Mul" and (gated := graph.product(*given)) is not None:
-        return gated
+    if len(found) == len(given) == 2 and kind == "Mul":
+        return graph.product(*given)
     if len(found) == len(given) > 1 and kind in ("Add", "Sub", "Concat"):
         return _joined(kind, given, flags, at)
     if len(found) != 1:
         raise InputError(
-            f"{at} must join one value that depends on the observation with constants; it has {len(found)}. Add, Sub "
-            "and Concat may join several."
+            f"{at} must join one value that depends on the observation with constants; it has {len(found)}. Add, Sub, "
+            "Mul and Concat may join several."
         )
     chain: Chain
     place, chain, others = found[0], given[found[0]], [v for v in given if not isinstance(v, tuple)]
@@ -303,6 +317,12 @@ def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain
             return graph.negated(chain)
         case _, 0, 1 if kind in _ACTIVATIONS:
             return _activated(chain, kind, flags, at)
+        case "HardSwish", 0, 1:
+            return graph.mapped(chain, "hardswish")
+        case "LayerNormalization", 0, 2 | 3 if flags["axis"].i in (1, -1) if "axis" in flags else True:
+            epsilon = float(flags["epsilon"].f) if "epsilon" in flags else float(np.float32(1e-5))
+            gain = graph.real(given[1], at)
+            return graph.layer_normalised(chain, gain.size, epsilon, gain, (*given, None)[2], at)
         case "Identity", 0, 1:
             return chain
         case "Cast", 0, 1:
