@@ -290,8 +290,8 @@ def _operation(program: _Program, name: str, given: list[Any], node: ast.Call) -
 
 
 def _normalised(given: list[Any], at: str) -> Chain:
-    """layer_norm(value, [width], gain, bias, epsilon), over the entries of a row."""
-    match given:
+    """layer_norm(value, [width], gain, bias, epsilon), over the entries of a row; the last ones may be left out."""
+    match [*given, *(None, None, 1e-5)[max(len(given) - 2, 0) :]]:
         case [_Value() as value, [int(width)], gain, bias, float(epsilon), *rest] if (
             width > 0 and len(rest) <= 1 and all(v is None or _is_array(v) for v in (gain, bias))
         ):
