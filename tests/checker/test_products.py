@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from flint import arb, ctx
 
+from certify.checker import ball
 from certify.checker.expression import parse
+from certify.checker.jets import Units
 from certify.checker.near import Above, Form, lines_around_product
 from certify.checker.network import OnBoxes, enclose
 from certify.checker.networks import Affine, Concat, Map, Network, Observe, Product, Step, Sum
 from certify.reference.affine import OnBoxes as Theirs
 from certify.reference.affine import moved_together
+from certify.reference.model import Model
+from certify.reference.tangents import OnBall as Tangents
 from tests.checker.test_attack_networks import Truths
+from tests.checker.test_networks import a_jet
 from tests.reference.test_networks import read
 
 Array = Any
@@ -196,3 +202,66 @@ def test_an_error_passes_a_product_with_the_other_factor() -> None:
     algebra = Theirs(1)
     value = read(net).run(algebra, algebra.given([[arb(1)], [arb(1)]], [[arb(0.5)], [arb(0.5)]]))
     assert all(not error > 1e-12 for ((_, _, error),) in algebra.forms(value, [0, 1]))
+
+
+def chosen(*rows: list[float]) -> list[Step]:
+    """For each row an affine step of the argument."""
+    return [Affine((0,), 1, np.array([row]), np.zeros(1)) for row in rows]
+
+
+def test_old_errors_of_products_are_as_long_as_they_are_said_to_be() -> None:
+    """A number of [-1/2, 1/2] more in a vector of one entry arrives in all entries at once."""
+    c = np.array([3.0, -4.0, 12.0])
+    constant = Affine((0,), 3, np.zeros((3, 1)), c)
+    for of in ((0, 1), (1, 0)):
+        net = Network("net", 1, (constant, Product(of, 3)))
+        boxes = OnBoxes(net, Form(np.ones((1, 1, 1)), Above(np.full((1, 1), 0.5))))
+        assert boxes.last.ball.top[0] == pytest.approx(6.5) and boxes.last.ball.top[0] >= 6.5
+        algebra = Theirs(1)
+        value = read(net).run(algebra, algebra.given([[arb(1)]], [[arb(0.5)]]))
+        assert not value.length[0] < 6.5 and value.length[0] < 6.6
+    pair = Network("net", 3, (Affine((0,), 3, np.eye(3), c), Product((0, 1), 3)))
+    boxes = OnBoxes(pair, Form(np.ones((1, 3, 1)), Above(np.full((3, 1), 0.5))))
+    most = np.linalg.norm(0.5 * (np.abs(c + 1) + 1))
+    assert most <= boxes.last.ball.top[0] < most * 1.001
+    algebra = Theirs(1)
+    value = read(pair).run(algebra, algebra.given([[arb(1)]] * 3, [[arb(0.5)]] * 3))
+    assert not value.length[0] < most * (1 - 1e-15) and value.length[0] < most * 1.001
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_product_on_a_ball_is_that_of_models(seed: int) -> None:
+    """Two entries of an argument, with terms of each order and a Lipschitz constant, by a step and by an expression."""
+    rng = np.random.default_rng(seed)
+    units = Units(np.zeros((2, 2, 0)), np.zeros((0, 0)))
+    v, w = (jet * jet + jet.function("sin") for jet, _ in (a_jet(rng, 2, 0.3, units) for _ in range(2)))
+    given = [replace(x, lip=x.lip + 0.1) for x in (v, w)]
+    net = Network("net", 2, (*chosen([1.0, 0.0], [0.0, 1.0]), Product((1, 2), 1)))
+    found, expected = ball.OnBall(2).value(net, given), given[0] * given[1]
+    whole = found.remainder[..., 0] + np.tensordot(found.units.U, np.abs(found.B.value[:, 0]), 1)
+    assert np.allclose(found.Q.value[..., 0], expected.Q.value, rtol=1e-12, atol=1e-15)
+    assert np.allclose(found.K.value[:, 0], expected.K.value, rtol=1e-12, atol=1e-15)
+    assert np.allclose(whole, expected.whole.majorant, rtol=1e-9, atol=1e-13)
+    assert found.lipschitz.top[0] == pytest.approx(float(expected.lipschitz.top), rel=1e-9)
+    assert found.c.value[0] == pytest.approx(float(expected.c.value), rel=1e-14)
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("unsure", [0.0, 0.1])
+def test_so_it_is_in_the_reference(seed: int, unsure: float) -> None:
+    """Where values and gradients are not known exactly, too: an expression may say no less than a step does."""
+    rng = np.random.default_rng(seed)
+    given = list[Model]()
+    for _ in range(2):
+        v = Model.affine(arb(float(rng.normal())), [arb(float(t)) for t in rng.normal(size=2) * 0.3], lip=arb(0))
+        v = v * v + v.function("sin")
+        given.append(replace(v, lip=v.lip and v.lip + 0.1, off=arb(unsure), slack=arb(unsure / 2)))
+    net = read(Network("net", 2, (*chosen([1.0, 0.0], [0.0, 1.0]), Product((1, 2), 1))))
+    algebra = Tangents(given)
+    (found,), _ = algebra.results(net.run(algebra, algebra.first), [0])
+    expected = given[0] * given[1]
+    for part in ("v", "off", "slack", "lip"):
+        assert abs(getattr(found, part) - getattr(expected, part)) < 1e-12
+    for part in ("a", "Q", "K", "whole"):
+        each = zip(getattr(found, part).entries(), getattr(expected, part).entries(), strict=True)
+        assert all(abs(x - y) < 1e-12 for x, y in each)
