@@ -297,7 +297,7 @@ SHAPED = {
     "integers": (shaped("Cast", to=TensorProto.INT64), "must be a cast to float32 or float64"),
     "half precision": (shaped("Cast", to=TensorProto.FLOAT16), "must be a cast to float32 or float64"),
     "an unknown shape": (shaped("Expand", "s", shape=[1, 6]), "as wide as it is"),
-    "a normalisation": (shaped("LayerNormalization", "B1"), "LayerNorm, and every other .* train the policy again"),
+    "a normalisation": (shaped("BatchNormalization", "B1", "B1", "B1", "B1"), "train the policy again without it"),
     "a mean": (shaped("ReduceMean"), "a part of LayerNorm"),
     "a selu": (shaped("Selu"), r"The activations that are proved are .*activation_fn=torch\.nn\.Tanh"),
 }

@@ -25,10 +25,10 @@ from certify.loop.policies.importers.steps import Affine
 _ACTIVATIONS = ("Tanh", "Elu", "Sigmoid", "Gelu", "Softplus", "Mish", "Softsign", "LeakyRelu", "Selu", "Celu")
 _OPERATIONS = {
     "Gemm", "MatMul", "Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", *_ACTIVATIONS,
-    "Identity", "Cast", "Flatten", "Reshape", "Constant", "Concat", "HardSwish", "LayerNormalization",
+    "Identity", "Cast", "Flatten", "Reshape", "Constant", "Concat", "LayerNormalization",
 }  # fmt: skip
 _KNOWN = (
-    f"Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu, {', '.join(_ACTIVATIONS)}, HardSwish, "
+    f"Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu, {', '.join(_ACTIVATIONS)}, "
     "LayerNormalization, Concat, Identity, Flatten and Constant"
 )
 _NORMALISATIONS = {
@@ -66,7 +66,6 @@ _ELEMENTWISE = {
     "Log",
     "Identity",
     "Cast",
-    "HardSwish",
 }
 
 
@@ -317,8 +316,6 @@ def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain
             return graph.negated(chain)
         case _, 0, 1 if kind in _ACTIVATIONS:
             return _activated(chain, kind, flags, at)
-        case "HardSwish", 0, 1:
-            return graph.mapped(chain, "hardswish")
         case "LayerNormalization", 0, 2 | 3 if flags["axis"].i in (1, -1) if "axis" in flags else True:
             epsilon = float(flags["epsilon"].f) if "epsilon" in flags else float(np.float32(1e-5))
             gain = graph.real(given[1], at)
