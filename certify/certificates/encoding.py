@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from certify.errors import CertificateFormatError
 from certify.loop.activations import ACTIVATIONS
 from certify.loop.expressions import Symbol, from_tree, to_tree
-from certify.loop.networks import Affine, Clip, Concat, Map, Network, Observe, Step, Sum
+from certify.loop.networks import Affine, Clip, Concat, Map, Network, Observe, Product, Step, Sum
 
 Array = NDArray[np.float64]
 
@@ -79,6 +79,8 @@ def _read_step(part: Mapping[str, Any], name: str, widths: Sequence[int]) -> Ste
             return Sum(of)
         case "concat":
             return Concat(of)
+        case "product":
+            return Product(of)
         case "observe":
             names = {s: Symbol(s) for s in part["names"]}
             return Observe(of, tuple(names.values()), tuple(from_tree(t, names) for t in part["expressions"]))

@@ -20,7 +20,7 @@ from .functions import FUNCTIONS
 from .jets import Jet, Units, between, constant, uncertain
 from .near import ZERO, Above, Array, Cubic, Near, Square, Vector, all_near, mixed, near, size, stacked, triples, within
 from .network import norm2
-from .networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Sum
+from .networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Product, Sum
 
 _MOST_JETS = 2**26  # numbers in the matrices and tensors of all jets
 _MOST_NUMBERS = 2**25  # in those of a layer and the paths to it
@@ -320,6 +320,25 @@ class OnBall(Algebra[Rows]):
         y = np.concatenate([v.y.value for v in vectors])
         of_y = np.concatenate([v.y.error.top + 0 * v.y.value for v in vectors])
         return Rows(Near(y, Above(of_y)), Vector(np.concatenate([X.value for X in parts]), error.root))
+
+    def product(self, step: Product, v: Rows, w: Rows) -> Rows:
+        """What both are beyond their values at d = 0 has a product that is the units': of their jets without these."""
+        units = self.R.shape[2]
+        x, y = (self.repeated(part, step.size, units) for part in (v, w))
+        first, second = self.jets(x), self.jets(y)
+        none = Near(np.zeros(step.size))
+        made = replace(first, c=none) * replace(second, c=none, units=first.units)
+        X = y.X.times(x.y) + x.X.times(y.y)
+        of_units = self.with_units(made.Q.value, made.K.value, made.remainder, made.lipschitz)
+        return Rows(x.y * y.y, X, of_units)
+
+    def repeated(self, v: Rows, width: int, units: int) -> Rows:
+        """A vector of so many entries, all of them the same if it has a single one, with columns for all units."""
+        X = self.columns(v, units)
+        if len(X.value) == width:
+            return Rows(v.y, X)
+        ones = np.ones((width, 1))
+        return Rows(v.y.through(ones), X.mapped(ones, size(ones).norm((0, 1))))
 
     def observe(self, step: Observe, v: Rows) -> Rows:
         u = self.jets(v)

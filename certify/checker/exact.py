@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from .document import Policy
 from .expression import MAX_BITS, Call, evaluate
 from .functions import FUNCTIONS, Undecided
-from .networks import Affine, Algebra, Clip, Concat, Map, Observe, Sum
+from .networks import Affine, Algebra, Clip, Concat, Map, Observe, Product, Sum
 
 MAX_INVERSE_BITS = 2**14  # of a number in a matrix all of whose inverse is wanted, times the matrix's size
 MAX_MATRIX_BITS = 2**16  # of a number in a matrix, times the matrix's size: beyond, a decision takes minutes
@@ -136,6 +136,9 @@ class Exactly(Algebra[list[Exact]]):
 
     def concat(self, step: Concat, vectors: Sequence[list[Exact]]) -> list[Exact]:
         return [x for v in vectors for x in v]
+
+    def product(self, step: Product, v: list[Exact], w: list[Exact]) -> list[Exact]:
+        return [v[i % len(v)] * w[i % len(w)] for i in range(step.size)]
 
     def observe(self, step: Observe, v: list[Exact]) -> list[Exact]:
         return evaluate(step.tape, Exact, v)

@@ -284,6 +284,13 @@ class Form(Near):
         """The forms as numbers, whatever the symbols are."""
         return Near(self.value[0], size(self.value[1:]).sum() + self.error)
 
+    @property
+    def unmoved(self) -> Form:
+        """The coefficients of the symbols alone, and 0 for that of 1."""
+        value = self.value.copy()
+        value[0] = 0.0
+        return Form(value)
+
     def raised(self, b: Near) -> Form:
         """The sum with numbers, at the first coefficient."""
         value = self.value.copy()
@@ -788,6 +795,32 @@ def clip_of(v: Near, least: Array, most: Array) -> tuple[Array, Array, Above]:
     upper, lower = np.max(highs, axis=0), np.min(lows, axis=0)
     m = 0.5 * (upper + lower)
     return s, m, (Near(upper) - Near(m)).size.most((Near(lower) - Near(m)).size)
+
+
+def lines_around_product(V: Form, of_V: Above, W: Form, of_W: Above, same: bool) -> tuple[Array, Above]:
+    """(m, gap) with |(V + v)(W + w) - m| <= gap for all |v| <= of_V, |w| <= of_W, V and W being exact forms whose first
+    coefficient is 0; `same` says that V + v and W + w are the same number.
+
+    For any p > 0 it is p/4 ((X + Y/p)^2 - (X - Y/p)^2), X = V + v, Y = W + w, and so between -p/4 s^2 and p/4 t^2,
+    s and t being the sums of the magnitudes of the coefficients of V -+ W/p and of of_V + of_W/p. It is also at most
+    |X||Y|. p = sup|Y|/sup|X|, where that is a positive number, makes the former the better ones. A square is not
+    negative.
+    """
+    x, y = V.size + of_V, W.size + of_W
+    most = x * y
+    if same:
+        least = Above(0 * most.v)
+    else:
+        with np.errstate(all="ignore"):
+            p = (y.top + 0 * x.top) / x.top
+        p = np.where((p > 2.0**-500) & (p < 2.0**500), p, 1.0)
+        scaled, errors = W.over(p), of_V + of_W.over(p)
+        least, top = (((V + part).size + errors) for part in (-scaled, scaled))
+        least, top = ((s * s * (p * 0.25)).least(most) for s in (least, top))
+        most = top
+    upper, lower = most.top, -least.top
+    m = 0.5 * (upper + lower)
+    return m, (Near(upper) - Near(m)).size.most((Near(lower) - Near(m)).size)
 
 
 def spectral_norm(W: Array) -> Above:

@@ -25,13 +25,14 @@ from .near import (
     Uniform,
     all_near,
     clip_of,
+    lines_around_product,
     near_atanh,
     norm,
     size,
     spectral_norm,
     stacked,
 )
-from .networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Step, Sum
+from .networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Product, Step, Sum
 from .taylor import Taylor, affine, constants
 
 TANH = Map((0,), 0, "tanh")  # the policy's squash
@@ -97,6 +98,7 @@ class OnBoxes(Algebra[Enclosed]):
         """x (k + 1, reads, B) is the argument."""
         self.network, self.added = network, [x.error]
         self.slopes: list[Array | None] = [None]  # of the lines that a step takes for its function
+        self.factors: dict[int, tuple[Array, Array]] = {}  # of a product, with which errors of its vectors pass
         self.steps: list[Step | None] = [None]
         start = Enclosed(Form(x.value), x.error, ZERO, ZERO, 0)
         self.last = self.run(network, start)
@@ -172,6 +174,18 @@ class OnBoxes(Algebra[Enclosed]):
             squares = squares + v.ball * v.ball
         return Enclosed(h, fresh, old, squares.root, len(self.steps) - 1)
 
+    def product(self, step: Product, v: Enclosed, w: Enclosed) -> Enclosed:
+        """With v = c + V and w = e + W it is c e + c W + e V + V W: errors of v and w pass times e and c, exact
+        numbers, and V W is between bounds."""
+        c, e = v.h.value[0], w.h.value[0]
+        moved, other = v.h.unmoved, w.h.unmoved
+        shift, gap = lines_around_product(moved, v.error, other, w.error, v.step == w.step)
+        h = (w.plain * Near(c) + moved * Near(e)).raised(Near(shift))
+        passed, added = v.error * size(e) + w.error * size(c), gap + h.error
+        self.added[-1], self.factors[len(self.steps) - 1] = added, (e, c)
+        ball = (_length(v, e) + _length(w, c)).least(passed.norm())
+        return Enclosed(Form(h.value), added, passed, ball, len(self.steps) - 1)
+
     def observe(self, step: Observe, v: Enclosed) -> Enclosed:
         x = models(v.h, v.error)
         y = evaluate(step.tape, constants(x[0]), x)
@@ -206,6 +220,11 @@ class OnBoxes(Algebra[Enclosed]):
                 return [(of[0], weight.times(self.slopes[k][:, None]))]  # type: ignore[index]
             case Sum():
                 return [(i, weight) for i in of]
+            case Product():
+                return [
+                    (i, _gathered(weight.times(factor[:, None]), self.width(i)))
+                    for i, factor in zip(of, self.factors[k], strict=True)
+                ]
             case Concat():
                 ends = np.cumsum([0, *(self.width(i) for i in of)])
                 return [
@@ -218,6 +237,18 @@ class OnBoxes(Algebra[Enclosed]):
         """The number of entries of vector k."""
         step = self.steps[k]
         return self.network.reads if step is None else step.size
+
+
+def _length(v: Enclosed, factor: Array) -> Above:
+    """Upper bound of the 2-norm of the errors of v times factors, of an error for all of them if v has one entry."""
+    steep = norm(factor) if v.h.value.shape[1] == 1 else size(factor).max()
+    return steep * (v.ball + v.fresh.norm())
+
+
+def _gathered(weight: Uniform, width: int) -> Uniform:
+    """The weights of a vector of this width that is multiplied; of a single entry, those of all products together."""
+    count = len(weight.value)
+    return weight.through(np.ones((1, count))) if width == 1 < count else weight
 
 
 def enclose(network: Network, x: Form, entries: Sequence[int]) -> Form:

@@ -87,6 +87,10 @@ class Concat(Step):
     """Vectors one behind the other."""
 
 
+class Product(Step):
+    """The product of two vectors, entry by entry; one of a single entry multiplies every entry of the other."""
+
+
 @dataclass(frozen=True, eq=False)
 class Observe(Step):
     """Expressions of the entries, by their names."""
@@ -218,6 +222,7 @@ KEYS = {
     "clip": "lo hi",
     "sum": "",
     "concat": "",
+    "product": "",
     "observe": "names expressions",
 }
 
@@ -228,7 +233,7 @@ def _step(value: Value, sizes: Sequence[int]) -> Step:
     value.must(known, f"an object of kind {' or '.join(KEYS)}")
     kind = value.raw["kind"]
     _, of, *others = value.keys(f"kind of {KEYS[kind]}")
-    least, most = (2, MAX_STEPS) if kind in ("sum", "concat") else (1, 1)
+    least, most = {"sum": (2, MAX_STEPS), "concat": (2, MAX_STEPS), "product": (2, 2)}.get(kind, (1, 1))
     read = of.listed(lambda i: i.integer(0, len(sizes) - 1), least, most)
     width = sizes[read[0]]
     match kind:
@@ -247,6 +252,10 @@ def _step(value: Value, sizes: Sequence[int]) -> Step:
             size = sum(sizes[i] for i in read)
             of.must(size <= MAX_WIDTH, f"vectors of at most {MAX_WIDTH} entries in all")
             return Concat(read, size)
+        case "product":
+            size = max(sizes[i] for i in read)
+            of.must(all(sizes[i] in (1, size) for i in read), "vectors of equal length, or one of a single entry")
+            return Product(read, size)
         case _:
             return _observe(read, width, *others)
 
@@ -291,6 +300,10 @@ class Algebra(ABC, Generic[V]):
         """Vectors one behind the other."""
 
     @abstractmethod
+    def product(self, step: Product, v: V, w: V) -> V:
+        """The product of two vectors, of which one may have a single entry."""
+
+    @abstractmethod
     def observe(self, step: Observe, v: V) -> V:
         """Expressions of the entries."""
 
@@ -317,6 +330,8 @@ class Algebra(ABC, Generic[V]):
                 return self.sum(step, vectors)
             case Concat():
                 return self.concat(step, vectors)
+            case Product():
+                return self.product(step, *vectors)
             case Observe():
                 return self.observe(step, vectors[0])
         raise TypeError(f"no kind of step: {type(step).__name__}")

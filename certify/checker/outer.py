@@ -24,7 +24,7 @@ from .expression import Call, Tape, evaluate
 from .functions import FUNCTIONS
 from .near import Above, Array, Form, Near, near
 from .network import enclose_on_boxes, entries, models, prepare
-from .networks import Affine, Algebra, Clip, Concat, Map, Observe, Sum
+from .networks import Affine, Algebra, Clip, Concat, Map, Observe, Product, Sum
 from .processes import Batch, in_order
 from .taylor import Taylor, constant, constants, upper_bound
 
@@ -84,6 +84,9 @@ class InRows(Algebra[Dual]):
 
     def concat(self, step: Concat, vectors: Sequence[Dual]) -> Dual:
         return _stacked([row for v in vectors for row in _rows(v)])
+
+    def product(self, step: Product, v: Dual, w: Dual) -> Dual:
+        return _repeated(v, step.size) * _repeated(w, step.size)
 
     def observe(self, step: Observe, v: Dual) -> Dual:
         made: list[Dual] = evaluate(step.tape, _numbers(v.value), _rows(v))
@@ -282,6 +285,11 @@ def _stacked(duals: Sequence[Dual]) -> Dual:
 def _in_rows(models: Sequence[Taylor]) -> Taylor:
     c, p = np.stack([v.c for v in models]), np.stack([v.p for v in models], 1)
     return Taylor(c, p, Above(np.stack([v.r.top + np.zeros_like(v.c) for v in models])))
+
+
+def _repeated(v: Dual, size: int) -> Dual:
+    """So many rows, all of them the same if v has a single one."""
+    return v if len(v.value.c) == size else _stacked(_rows(v) * size)
 
 
 def _rows(v: Dual) -> list[Dual]:

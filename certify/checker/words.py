@@ -7,7 +7,7 @@ from fractions import Fraction
 from typing import Any
 
 from .document import Array, Certificate, Partition, Policy
-from .networks import Map, Network, Observe, Step, Sum, hashed
+from .networks import Map, Network, Observe, Product, Step, Sum, hashed
 
 CLAIMS = {
     "asymptotic": "the origin is asymptotically stable, and every trajectory of the closed loop that starts in "
@@ -142,6 +142,8 @@ def _step(step: Step) -> str:
             return f"{step.function}({of[0]})"
         case Sum():
             return " + ".join(of)
+        case Product():
+            return " * ".join(of)
         case Observe():
             made = ", ".join(expression(tree) for tree in step.tape.trees)
             return f"({made}) of ({', '.join(step.names)}) = {of[0]}"

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Algebra, Expression, Symbol, differentiate, evaluate, solution_series
-from certify.loop.networks import Affine, Clip, Concat, Map, Network, Observe, Sum
+from certify.loop.networks import Affine, Clip, Concat, Map, Network, Observe, Product, Sum, repeated
 from certify.loop.networks import Algebra as Networks
 from certify.loop.policies import PolicyNetwork
 
@@ -350,6 +350,9 @@ class _Points(Networks[Balls]):
     def concat(self, step: Concat, *vectors: Balls) -> Balls:
         return [b for v in vectors for b in v]
 
+    def product(self, step: Product, v: Balls, w: Balls) -> Balls:
+        return [a * b for a, b in zip(*repeated(v, w), strict=True)]
+
     def observe(self, step: Observe, v: Balls) -> Balls:
         return _expressions(step.expressions, step.symbols, v)
 
@@ -378,6 +381,10 @@ class _Slopes(Networks[Tangent]):
         return _POINTS.concat(step, *(y for y, _ in vectors)), flint.arb_mat(
             [row for _, J in vectors for row in J.tolist()]
         )
+
+    def product(self, step: Product, v: Tangent, w: Tangent) -> Tangent:
+        (y, z), (J, K) = repeated(v[0], w[0]), repeated(v[1].tolist(), w[1].tolist())
+        return _POINTS.product(step, v[0], w[0]), _scaled(y, flint.arb_mat(K)) + _scaled(z, flint.arb_mat(J))
 
     def observe(self, step: Observe, v: Tangent) -> Tangent:
         k, slopes = len(step.symbols), _expressions(step.slopes, step.symbols, v[0])

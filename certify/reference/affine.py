@@ -15,7 +15,7 @@ from flint import arb, arb_mat
 from .balls import ONE, ZERO, norm, total
 from .expressions import Call
 from .lines import Line, clipped
-from .networks import Affine, Clip, Concat, Map, Network, Observe, Sum
+from .networks import Affine, Clip, Concat, Map, Network, Observe, Product, Sum, paired
 from .refusal import Refused
 from .table import FUNCTIONS
 from .taylor import Taylor, constant
@@ -61,6 +61,12 @@ class Forms:
         if self.fresh is None:
             return old
         return [v + norm(fresh) for v, fresh in zip(old, by_leaf(self.fresh), strict=True)]
+
+
+def lengthened(v: Forms, factors: Rows, count: int) -> list[arb]:
+    """On each of `count` leaves a bound of the 2-norm of factors times the errors of v; a single entry has all factors."""
+    each = zip(v.lengths(count), by_leaf(factors), strict=True)
+    return [x * (norm(by) if len(v.rows) == 1 else max_of([abs(f) for f in by])) for x, by in each]
 
 
 class OnBoxes:
@@ -169,6 +175,38 @@ class OnBoxes:
             start += len(v.rows)
         return self.vector(result, *ways)
 
+    def product(self, step: Product, v: Forms, w: Forms) -> Forms:
+        """(c + X)(e + Y) = c e + c Y + e X + X Y on each leaf: the errors of X and Y count e and c times."""
+        rows, gaps, stride = Rows(), Rows(), self.stride(v)
+        nothing = [ZERO] * self.count
+        wrong = paired(*(u.error or [nothing] * len(u.rows) for u in (v, w)))
+        for (row, other), doubts in zip(paired(v.rows, w.rows), wrong, strict=True):
+            entries, apart = list[arb](), list[arb]()
+            for b, (of_X, of_Y) in enumerate(zip(*doubts, strict=True)):
+                c, *X = row[b * stride : (b + 1) * stride]
+                e, *Y = other[b * stride : (b + 1) * stride]
+                least, most = moved_together(X, of_X, Y, of_Y, v is w)
+                entries.append(c * e + (most - least) / 2)
+                entries += [e * x + c * y for x, y in zip(X, Y, strict=True)]
+                apart.append((most + least) / 2)
+            rows.append(entries)
+            gaps.append(apart)
+        times_v, times_w = ([row[::stride] for row in u.rows] for u in (w, v))
+        parts = [passed(u.error, by, step.size) for u, by in ((v, times_v), (w, times_w))]
+        old = both(*parts)
+        result = Forms(rows, gaps, old, gaps)
+
+        def measured() -> list[arb]:
+            sums = zip(
+                lengthened(v, times_v, self.count), lengthened(w, times_w, self.count), by_leaf(old or []), strict=True
+            )
+            return [lesser(x + y, norm(after)) for x, y, after in sums]
+
+        result.measured = measured
+        return self.vector(
+            result, *((u, returning(by, len(u.rows), step.size)) for u, by in ((v, times_v), (w, times_w)))
+        )
+
     def stacked(self, parts: Sequence[Rows | None], vectors: Sequence[Forms]) -> Rows | None:
         if all(part is None for part in parts):
             return None
@@ -245,6 +283,42 @@ def called(call: Call, given: Sequence[Taylor], symbols: int, first: int) -> lis
         slopes[k] += error
         result.append(Taylor(mid, arb_mat(1, symbols, slopes)))
     return result
+
+
+def moved_together(X: list[arb], of_X: arb, Y: list[arb], of_Y: arb, same: bool) -> tuple[arb, arb]:
+    """(l, u) with -l <= x y <= u where x and y are within errors of forms without a constant; or the same number.
+
+    x y is p/4 times the difference of the squares of x + y/p and x - y/p; and never beyond the sizes' product.
+    """
+    x, y = total(map(abs, X)) + of_X, total(map(abs, Y)) + of_Y
+    if same:
+        return ZERO, x * x
+    p = (y / x).mid() if x > 0 and y > 0 else ZERO
+    if not (p.is_finite() and p > 0):
+        return x * y, x * y
+    errors = of_X + of_Y / p
+    down = total(abs(a - b / p) for a, b in zip(X, Y, strict=True)) + errors
+    up = total(abs(a + b / p) for a, b in zip(X, Y, strict=True)) + errors
+    return lesser(p * down * down / 4, x * y), lesser(p * up * up / 4, x * y)
+
+
+def passed(errors: Rows | None, factors: Rows, size: int) -> Rows | None:
+    """Errors times the magnitudes of factors, for so many entries."""
+    if errors is None:
+        return None
+    each = list(paired(errors, factors))
+    found = [[e * abs(f) for e, f in zip(*pair, strict=True)] for pair in each]
+    return found * (size // len(found))
+
+
+def returning(factors: Rows, count: int, size: int) -> Callable[[Rows], Rows]:
+    """The way back to a vector of so many entries that has these factors; one alone is reached from all entries."""
+
+    def back(ways: Rows) -> Rows:
+        found = scaled(ways, factors * (size // len(factors)))
+        return found if count == size else [[total(column) for column in zip(*found, strict=True)]]
+
+    return back
 
 
 def model_of(form: list[arb], error: arb) -> Taylor:

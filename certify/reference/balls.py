@@ -53,7 +53,8 @@ def spectral_norm(W: arb_mat) -> arb:
     G = W if W.nrows() >= W.ncols() else W.transpose()
     for _ in range(6):
         G = G.transpose() * G
-    return norm(G.entries()).root(64)
+    whole = norm(G.entries())
+    return whole if whole.is_zero() else whole.root(64)  # of 0 that is no number
 
 
 @cache

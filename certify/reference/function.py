@@ -17,7 +17,7 @@ from . import affine
 from .balls import SPREAD, ZERO
 from .document import Certificate, Function
 from .expressions import Call
-from .networks import Affine, Clip, Concat, Map, Network, Observe, Sum
+from .networks import Affine, Clip, Concat, Map, Network, Observe, Product, Sum, paired
 from .refusal import Refused
 from .series import Coefficient, Term, along
 from .taylor import Taylor, constant
@@ -26,7 +26,7 @@ Vector = list[Taylor]
 
 
 class InRows:
-    """Networks of models. `seen` has what `map` and `observe` steps have read, in their order."""
+    """Networks of models. `seen` has what `map`, `product` and `observe` steps have read, in their order."""
 
     def __init__(self) -> None:
         self.seen = list[Vector]()
@@ -49,6 +49,10 @@ class InRows:
 
     def concat(self, step: Concat, *vectors: Vector) -> Vector:
         return [x for v in vectors for x in v]
+
+    def product(self, step: Product, v: Vector, w: Vector) -> Vector:
+        self.seen += [v, w]
+        return [x * y for x, y in paired(v, w)]
 
     def observe(self, step: Observe, v: Vector) -> Vector:
         self.seen.append(v)
@@ -75,6 +79,12 @@ class Rates:
 
     def concat(self, step: Concat, *vectors: Vector) -> Vector:
         return [x for v in vectors for x in v]
+
+    def product(self, step: Product, v: Vector, w: Vector) -> Vector:
+        """(x y)' = x y' + y x'."""
+        x, y = next(self.seen), next(self.seen)
+        one, other = ([a * rate for a, rate in paired(*pair)] for pair in ((x, w), (y, v)))
+        return summed([one, other])
 
     def observe(self, step: Observe, v: Vector) -> Vector:
         values, rates = (dict(zip(step.names, each, strict=True)) for each in (next(self.seen), v))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from .document import Certificate
 from .evidence import Covering, Tree
 from .expressions import Equations
-from .networks import Affine, Clip, Map, Network, Observe, Step
+from .networks import Affine, Clip, Map, Network, Observe, Product, Step
 from .rational import bits
 from .refusal import require
 
@@ -101,7 +101,7 @@ def entries_waiting(network: Network) -> int:
 
 
 def units_of(step: Step) -> int:
-    return step.size if isinstance(step, Map | Clip | Observe) else 0
+    return step.size if isinstance(step, Map | Clip | Product | Observe) else 0
 
 
 def shapes_of(network: Network) -> Iterator[tuple[int, int, int]]:

@@ -14,7 +14,7 @@ from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from flint import arb, arb_mat
 
@@ -25,6 +25,7 @@ from .refusal import require
 from .table import FUNCTIONS
 
 MAX_NETWORKS, MAX_STEPS, MAX_WIDTH = 64, 256, 2**14
+T = TypeVar("T")
 MAPS = tuple(name for name in FUNCTIONS if name not in ("1/", "abs"))  # these two are for expressions
 
 
@@ -111,6 +112,11 @@ class Concat(Step):
 
 
 @dataclass(frozen=True)
+class Product(Step):
+    kind = "product"
+
+
+@dataclass(frozen=True)
 class Observe(Step):
     names: tuple[str, ...]
     expressions: Equations
@@ -129,6 +135,7 @@ class Algebra(Protocol):
     def clip(self, step: Clip, v: Any, /) -> Any: ...
     def sum(self, step: Sum, *vectors: Any) -> Any: ...
     def concat(self, step: Concat, *vectors: Any) -> Any: ...
+    def product(self, step: Product, v: Any, w: Any, /) -> Any: ...
     def observe(self, step: Observe, v: Any, /) -> Any: ...
 
 
@@ -180,6 +187,12 @@ class Network:
 
     def described(self) -> bytes:
         return b"" if self.is_plain else "".join(step.words() for step in self.steps).encode()
+
+
+def paired(v: Sequence[T], w: Sequence[T]) -> Iterator[tuple[T, T]]:
+    """The entries that a product multiplies: one alone is taken with each of the other vector."""
+    count = max(len(v), len(w))
+    return zip(list(v) * (count // len(v)), list(w) * (count // len(w)), strict=True)
 
 
 def packed(axes: Sequence[int], values: array[float]) -> bytes:
@@ -236,8 +249,8 @@ def read_step(value: Any, at: str, sizes: Sequence[int]) -> Step:
     of, many = entries(step["of"], f"{at}.of"), kind in ("sum", "concat")
     before = all(is_integer(i) and 0 <= i < len(sizes) for i in of)
     require(before, "format", f"{at}.of", "the numbers of vectors before it were expected")
-    fits = len(of) >= 2 if many else len(of) == 1
-    require(fits, "format", f"{at}.of", "two or more vectors were expected" if many else "one vector was expected")
+    fits = len(of) >= 2 if many else len(of) == (2 if kind == "product" else 1)
+    require(fits, "format", f"{at}.of", "two or more vectors were expected" if many else "another number of vectors")
     made: Step = read(step, at, tuple(of), [sizes[i] for i in of])
     return made
 
@@ -272,6 +285,12 @@ def read_concat(step: Mapping[str, Any], at: str, of: tuple[int, ...], sizes: Se
     return Concat(of, sum(sizes))
 
 
+def read_product(step: Mapping[str, Any], at: str, of: tuple[int, ...], sizes: Sequence[int]) -> Product:
+    fits = sizes[0] == sizes[1] or 1 in sizes
+    require(fits, "format", f"{at}.of", "vectors of equal length or a single entry were expected")
+    return Product(of, max(sizes))
+
+
 def read_observe(step: Mapping[str, Any], at: str, of: tuple[int, ...], sizes: Sequence[int]) -> Observe:
     few = sizes[0] <= MAX_NAMES
     require(few, "format", f"{at}.of", f"at most {MAX_NAMES} entries can have names")
@@ -290,5 +309,6 @@ READERS: dict[str, tuple[tuple[str, ...], Any]] = {
     "clip": (("lo", "hi"), read_clip),
     "sum": ((), read_sum),
     "concat": ((), read_concat),
+    "product": ((), read_product),
     "observe": (("names", "expressions"), read_observe),
 }

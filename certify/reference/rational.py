@@ -15,7 +15,7 @@ from .document import Certificate
 from .evidence import Tree
 from .expressions import MAX_BITS, Call
 from .fields import exact
-from .networks import Affine, Clip, Concat, Map, Observe, Sum
+from .networks import Affine, Clip, Concat, Map, Observe, Product, Sum, paired
 from .refusal import Refused, require
 from .table import FUNCTIONS
 
@@ -166,6 +166,9 @@ class Exactly:
 
     def concat(self, step: Concat, *vectors: list[Exact]) -> list[Exact]:
         return [x for v in vectors for x in v]
+
+    def product(self, step: Product, v: list[Exact], w: list[Exact]) -> list[Exact]:
+        return [x * y for x, y in paired(v, w)]
 
     def observe(self, step: Observe, v: list[Exact]) -> list[Exact]:
         return step.expressions.evaluate(dict(zip(step.names, v, strict=True)), Exact)

@@ -23,7 +23,7 @@ from .expressions import Call
 from .function import net_at_0
 from .functions import Beyond, beyond_tangent, expansion, unsure
 from .model import Model
-from .networks import Affine, Clip, Concat, Map, Observe, Sum
+from .networks import Affine, Clip, Concat, Map, Observe, Product, Sum, paired
 from .refusal import Refused
 from .symmetric import half, whole
 
@@ -233,6 +233,23 @@ class OnBall:
         each = [doubts for v in vectors for doubts in v.doubts()]
         return self.made(make, *([*part] for part in zip(*each, strict=True)))
 
+    def product(self, step: Product, v: Vector, w: Vector) -> Vector:
+        """v w = v(0) w(0) + v(0) (w - w(0)) + w(0) (v - v(0)) and a unit, the product of what is in brackets."""
+        pairs = list(paired(self.models(v), self.models(w)))
+
+        def make() -> Tangent:
+            values = list(paired(v.tangent.at_0, w.tangent.at_0))
+            (G, L), (H, M) = self.aligned(v.tangent), self.aligned(w.tangent)
+            return Tangent([p * q for p, q in values], crossed(values, G, H), crossed(values, L, M), True)
+
+        off = [x.size * y.off + y.size * x.off for x, y in pairs]
+        slack = [x.size * y.slack + x.off * y.slope + y.size * x.slack + y.off * x.slope for x, y in pairs]
+        result = self.made(make, off, slack)
+        for x, y in pairs:
+            both = replace(x, v=ZERO) * replace(y, v=ZERO)
+            self.stack.append(Beyond(both.Q, both.K, both.whole, both.lip))
+        return result
+
     def aligned(self, y: Tangent) -> tuple[arb_mat, arb_mat]:
         """G and L with a column for each root and each unit so far."""
         rows, L = len(y.at_0), y.ways
@@ -362,6 +379,14 @@ def turn_of(v: Model) -> arb:
 
 def sum_of(pairs: Sequence[tuple[arb, arb]]) -> tuple[arb, arb]:
     return sum((a for a, _ in pairs), ZERO), sum((b for _, b in pairs), ZERO)
+
+
+def crossed(values: Sequence[tuple[arb, arb]], A: arb_mat, B: arb_mat) -> arb_mat:
+    """For each pair (p, q) a row q a + p b, a and b of A and B, of which one may have a single row for all."""
+    result = list[arb]()
+    for (p, q), (a, b) in zip(values, paired(A.tolist(), B.tolist()), strict=True):
+        result += [q * x + p * y for x, y in zip(a, b, strict=True)]
+    return arb_mat(len(values), A.ncols(), result)
 
 
 def through(step: Affine, part: list[arb] | None) -> list[arb] | None:

@@ -21,7 +21,7 @@ from certify.checker.expression import Call, Tape, evaluate, parse
 from certify.checker.jets import Units
 from certify.checker.near import Above, Form, triples
 from certify.checker.network import enclose
-from certify.checker.networks import Affine, Algebra, Clip, Concat, Map, Observe, Sum
+from certify.checker.networks import Affine, Algebra, Clip, Concat, Map, Observe, Product, Sum
 from certify.checker.ring import Ring
 from certify.checker.taylor import Taylor, constants
 from certify.checker.taylor import affine as form_of
@@ -30,7 +30,7 @@ from tests.support.certificates import Document, encode
 from tests.support.earlier import newer
 
 Array = Any
-SEEDS = range(60)
+SEEDS = range(100)
 TWO_CALLS = [
     [
         "+",
@@ -99,6 +99,9 @@ class Truths(Algebra[list[arb]]):
 
     def concat(self, step: Concat, vectors: Sequence[list[arb]]) -> list[arb]:
         return [x for v in vectors for x in v]
+
+    def product(self, step: Product, v: list[arb], w: list[arb]) -> list[arb]:
+        return [v[i % len(v)] * w[i % len(w)] for i in range(step.size)]
 
     def observe(self, step: Observe, v: list[arb]) -> list[arb]:
         return true_values(step.tape, v)

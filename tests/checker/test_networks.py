@@ -22,7 +22,7 @@ from certify.checker.expression import Tape, evaluate, parse
 from certify.checker.functions import Undecided
 from certify.checker.jets import Jet, Units, constant
 from certify.checker.near import Above, Form, Near, Vector
-from certify.checker.networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Step, Sum
+from certify.checker.networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Product, Step, Sum
 from certify.checker.outer import Dual, InRows
 from certify.checker.taylor import Taylor, constants
 from certify.checker.taylor import affine as form_of
@@ -31,7 +31,8 @@ from tests.support.earlier import newer
 from tests.support.reference import judge_bytes
 
 Array = Any
-SEEDS = range(60)
+SEEDS = range(100)
+WITH_PRODUCTS = 60  # from this seed on networks have products, too
 FUNCTIONS: dict[str, Callable[[Array], Array]] = {
     "tanh": np.tanh,
     "sin": np.sin,
@@ -82,6 +83,9 @@ class Numbers(Algebra[Array]):
     def concat(self, step: Concat, vectors: Any) -> Array:
         return np.concatenate(vectors)
 
+    def product(self, step: Product, v: Array, w: Array) -> Array:
+        return v * w
+
     def observe(self, step: Observe, v: Array) -> Array:
         return np.array([Plain.of(step.tape, list(v))[i] for i in range(len(step.tape.outputs))])
 
@@ -119,6 +123,7 @@ def a_network(seed: int, reads: int, gives: int, kinds: str = "affine map clip s
     functions = [name for name in FUNCTIONS if name not in ("sqrt", "abs")]
     trees = [*TREES, *CORNERS] if seed % 3 == 0 and "clip" in kinds else TREES
     sizes, steps = [reads], list[Step]()
+    kinds += " product product" * (seed >= WITH_PRODUCTS)
 
     def add(step: Step) -> None:
         steps.append(step)
@@ -142,6 +147,10 @@ def a_network(seed: int, reads: int, gives: int, kinds: str = "affine map clip s
             case "concat":
                 two = (int(rng.integers(0, len(sizes))), i)
                 add(Concat(two, sum(sizes[j] for j in two)))
+            case "product":
+                fits = [j for j, size in enumerate(sizes) if size == sizes[i] or 1 in (size, sizes[i])]
+                pair = tuple(int(j) for j in rng.permutation([rng.choice(fits), i]))
+                add(Product(pair, max(sizes[j] for j in pair)))
             case "observe":
                 names = tuple("abcdefghijklmnop"[: sizes[i]])
                 chosen = [trees[int(k)] for k in rng.integers(0, len(trees), 3)]
@@ -455,6 +464,13 @@ MALFORMED: dict[str, Callable[[Document], None]] = {
     "a clip of one number": more({"kind": "clip", "of": [2], "lo": encode([1.0]), "hi": encode([1.0])}),
     "a clip of two": more({"kind": "clip", "of": [2], "lo": encode([-1.0] * 2), "hi": encode([1.0] * 2)}),
     "an infinite clip": more({"kind": "clip", "of": [2], "lo": encode([-np.inf]), "hi": encode([1.0])}),
+    "a product of one": more({"kind": "product", "of": [2]}),
+    "a product of three": more({"kind": "product", "of": [2, 2, 2]}),
+    "a product of unequal ones": more(
+        {"kind": "concat", "of": [1, 1]}, {"kind": "concat", "of": [1, 1, 2]}, {"kind": "product", "of": [3, 4]}
+    ),
+    "a product with itself to come": more({"kind": "product", "of": [2, 3]}),
+    "a product with numbers": more({"kind": "product", "of": [2, 2], "weight": encode([1.0])}),
     "two names for one": more({"kind": "observe", "of": [2], "names": ["a", "b"], "expressions": ["a"]}),
     "no name": more({"kind": "observe", "of": [2], "names": [], "expressions": ["1"]}),
     "one name twice": more(
@@ -536,13 +552,23 @@ def called_in_part(data: Document) -> None:
     data["plant"]["dynamics"] = [["+", ["/", "x", "2"], half, ["*", "1/2", "u"]]]
 
 
+def multiplied(data: Document) -> None:
+    """tanh(x) times a vector of one entry, which is 1, and then entry by entry."""
+    one = {"kind": "affine", "of": [0], "shape": [1, 1], "weight": encode([0.0]), "bias": encode([1.0])}
+    more(one, {"kind": "concat", "of": [2, 2]}, {"kind": "product", "of": [4, 3]}, {"kind": "product", "of": [3, 5]})(
+        data
+    )
+    last = data["networks"][0]["steps"][-1]
+    last |= {"shape": [1, 2], "weight": encode([-1.0, -1.0])}
+
+
 def saturated(data: Document) -> None:
     data["plant"]["dynamics"] = [
         ["+", ["/", "x", "2"], ["clip", "u", "-5/2", "5/2"], ["*", "0", ["abs", ["+", "u", "3"]]]]
     ]
 
 
-REWRITTEN = [split_in_two, skipping, observed, clipped_far_out, called, called_in_part, saturated]
+REWRITTEN = [split_in_two, skipping, observed, clipped_far_out, multiplied, called, called_in_part, saturated]
 
 
 @pytest.mark.parametrize("program", [checked, judge_bytes], ids=["checker", "reference"])
@@ -597,3 +623,13 @@ def test_steps_in_another_order_have_another_hash(program: Callable[[bytes], str
     data["policy"]["sha256"] = with_first
     own[2] = {"kind": "sum", "of": [1, 2]}
     assert hash_of(data) != with_first and program(json.dumps(data).encode()) == "hash"
+
+
+@pytest.mark.parametrize("program", [checked, judge_bytes], ids=["checker", "reference"])
+def test_a_product_with_another_vector_has_another_hash(program: Callable[[bytes], str | None]) -> None:
+    data = a_document()
+    multiplied(data)
+    data["policy"]["sha256"] = hash_of(data)
+    for of in ([5, 3], [3, 3], [5, 5], [4, 5]):
+        data["networks"][0]["steps"][5]["of"] = of
+        assert program(json.dumps(data).encode()) in ("hash", "format")

@@ -294,7 +294,7 @@ SHAPED = {
     "integers": (shaped("Cast", to=TensorProto.INT64), "must be a cast to float32 or float64"),
     "half precision": (shaped("Cast", to=TensorProto.FLOAT16), "must be a cast to float32 or float64"),
     "an unknown shape": (shaped("Expand", "s", shape=[1, 6]), "as wide as it is"),
-    "a normalisation": (shaped("GroupNormalization", "B1", "B1"), "train the policy again"),
+    "a normalisation": (shaped("BatchNormalization", "B1", "B1", "B1", "B1"), "train the policy again without it"),
     "a mean": (shaped("ReduceMean"), "a part of LayerNorm"),
     "a prelu": (shaped("ThresholdedRelu"), r"The activations that are proved are .*activation_fn=torch\.nn\.Tanh"),
 }

@@ -4,7 +4,20 @@ from __future__ import annotations
 
 from certify.loop.networks.floats import Gradients, Tangent, tangent_at, values
 from certify.loop.networks.layers import frozen, frozen_layers, like, sha256_of, tanh, through, widths
-from certify.loop.networks.steps import Affine, Algebra, Clip, Concat, Map, Network, Observe, Step, Sum, layered
+from certify.loop.networks.steps import (
+    Affine,
+    Algebra,
+    Clip,
+    Concat,
+    Map,
+    Network,
+    Observe,
+    Product,
+    Step,
+    Sum,
+    layered,
+    repeated,
+)
 
 __all__ = [
     "Affine",
@@ -15,6 +28,7 @@ __all__ = [
     "Map",
     "Network",
     "Observe",
+    "Product",
     "Step",
     "Sum",
     "Tangent",
@@ -22,6 +36,7 @@ __all__ = [
     "frozen_layers",
     "layered",
     "like",
+    "repeated",
     "sha256_of",
     "tangent_at",
     "tanh",

@@ -10,7 +10,7 @@ import numpy as np
 
 from certify.loop.expressions import Expression, Symbol, numerical
 from certify.loop.networks.layers import like
-from certify.loop.networks.steps import Affine, Algebra, Array, Clip, Concat, Map, Network, Observe, Sum
+from certify.loop.networks.steps import Affine, Algebra, Array, Clip, Concat, Map, Network, Observe, Product, Sum
 
 
 class _Values(Algebra[Any]):
@@ -31,6 +31,9 @@ class _Values(Algebra[Any]):
 
     def concat(self, step: Concat, *vectors: Any) -> Any:
         return joined(vectors)
+
+    def product(self, step: Product, v: Any, w: Any) -> Any:
+        return v * w
 
     def observe(self, step: Observe, v: Any) -> Any:
         return evaluated(step.expressions, step.symbols, v)
@@ -102,6 +105,9 @@ class _Tangents(Algebra[Tangent]):
     def concat(self, step: Concat, *vectors: Tangent) -> Tangent:
         return Tangent(np.concatenate([v.y for v in vectors]), np.concatenate([v.J for v in vectors]))
 
+    def product(self, step: Product, v: Tangent, w: Tangent) -> Tangent:
+        return Tangent(v.y * w.y, v.y[:, None] * w.J + w.y[:, None] * v.J)
+
     def observe(self, step: Observe, v: Tangent) -> Tangent:
         return Tangent(evaluated(step.expressions, step.symbols, v.y), jacobian(step, v.y) @ v.J)
 
@@ -116,7 +122,7 @@ class Gradients(_Values):
 
     def __init__(self, network: Network, x: Array) -> None:
         self.network = network
-        self._slopes: list[Array] = []  # of each step, where it is no matrix of numbers
+        self._slopes: list[Any] = []  # of each step, where it is no matrix of numbers
         self.value: Array = self.run(network, x)
 
     def map(self, step: Map, v: Array) -> Array:
@@ -127,6 +133,10 @@ class Gradients(_Values):
     def clip(self, step: Clip, v: Array) -> Array:
         self._slopes.append(np.where((v > step.lo) & (v < step.hi), 1.0, 0.0))
         return np.asarray(super().clip(step, v))
+
+    def product(self, step: Product, v: Array, w: Array) -> Array:
+        self._slopes.append((v, w))
+        return np.asarray(super().product(step, v, w))
 
     def observe(self, step: Observe, v: Array) -> Array:
         self._slopes.append(jacobian(step, v))
@@ -142,7 +152,7 @@ class Gradients(_Values):
                 arriving[i] = arriving[i] + part if i in arriving else part
         return arriving[0]
 
-    def _before(self, step: Any, own: Array, local: list[Array]) -> list[Array]:
+    def _before(self, step: Any, own: Array, local: list[Any]) -> list[Array]:
         """The derivatives by each vector that a step reads, so far as they pass through it."""
         match step:
             case Affine():
@@ -152,6 +162,14 @@ class Gradients(_Values):
             case Concat():
                 ends = np.cumsum([self.network.sizes[i] for i in step.of])[:-1]
                 return np.split(own, ends, axis=-1)
+            case Product():
+                v, w = local.pop()
+                return [_gathered(own * w, v), _gathered(own * v, w)]
             case Observe():
                 return [np.einsum("bw,bwk->bk", own, local.pop())]
         return [own * local.pop()]
+
+
+def _gathered(part: Array, v: Array) -> Array:
+    """What arrives at v of its product; at a single entry from all of them."""
+    return part if part.shape == v.shape else np.asarray(part.sum(axis=-1, keepdims=True))

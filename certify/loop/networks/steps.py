@@ -23,6 +23,7 @@ from certify.loop.expressions import Expression, Symbol, differentiate, nodes, s
 from certify.loop.networks.layers import frozen, frozen_layers
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 V = TypeVar("V")
 MOST_NAMES = 64  # that an observation reads or makes
 
@@ -123,6 +124,20 @@ class Concat(Step):
         if len(widths) < 2:
             raise InputError("vectors one behind the other must be two or more.")
         return sum(widths)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Product(Step):
+    """The product of two vectors, entry by entry; one of a single entry multiplies every entry of the other."""
+
+    kind = "product"
+
+    def size(self, widths: Sequence[int]) -> int:
+        if len(widths) != 2 or (widths[0] != widths[1] and 1 not in widths):
+            raise InputError(
+                f"a product must have two vectors of equal length, or one of one entry; found lengths {list(widths)}."
+            )
+        return max(widths)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -307,6 +322,11 @@ def _in_words(step: Step) -> str:
     return text
 
 
+def repeated(v: list[T], w: list[T]) -> tuple[list[T], list[T]]:
+    """What a product reads as lists of equal length, a single entry as often as the other has entries."""
+    return v * len(w) if len(v) == 1 else v, w * len(v) if len(w) == 1 else w
+
+
 class Algebra(ABC, Generic[V]):
     """The meaning of each kind of step for vectors V."""
 
@@ -331,6 +351,10 @@ class Algebra(ABC, Generic[V]):
         """Vectors one behind the other."""
 
     @abstractmethod
+    def product(self, step: Product, v: V, w: V) -> V:
+        """The product of two vectors, of which one may have a single entry."""
+
+    @abstractmethod
     def observe(self, step: Observe, v: V) -> V:
         """Expressions of the entries."""
 
@@ -352,8 +376,10 @@ __all__ = [
     "Map",
     "Network",
     "Observe",
+    "Product",
     "Step",
     "Sum",
     "frozen",
     "layered",
+    "repeated",
 ]

@@ -11,7 +11,7 @@ import numpy as np
 from certify.errors import InputError
 from certify.loop.activations import ACTIVATIONS
 from certify.loop.expressions import Expression, Symbol, value_if_rational
-from certify.loop.networks import Affine, Algebra, Clip, Concat, Map, Observe, Sum
+from certify.loop.networks import Affine, Algebra, Clip, Concat, Map, Observe, Product, Sum, repeated
 from certify.loop.policies.network import PolicyNetwork
 
 Exact = list[Fraction | None]
@@ -71,10 +71,23 @@ class _Rationals(Algebra[Exact]):
     def concat(self, step: Concat, *vectors: Exact) -> Exact:
         return [q for v in vectors for q in v]
 
+    def product(self, step: Product, v: Exact, w: Exact) -> Exact:
+        return [_product(p, q) for p, q in zip(*repeated(v, w), strict=True)]
+
     def observe(self, step: Observe, v: Exact) -> Exact:
         known = {s: q for s, q in zip(step.symbols, v, strict=True) if q is not None}
         unknown = [s for s in step.symbols if s not in known]
         return [_expression(e, known, unknown) for e in step.expressions]
+
+
+def _product(p: Fraction | None, q: Fraction | None) -> Fraction | None:
+    """Exact 0 removes what is unknown."""
+    if p == 0 or q == 0:
+        return Fraction(0)
+    if p is None or q is None:
+        return None
+    value = p * q
+    return None if max(value.numerator.bit_length(), value.denominator.bit_length()) > _MOST_BITS else value
 
 
 def _expression(e: Expression, known: Mapping[Symbol, Fraction], unknown: Sequence[Symbol]) -> Fraction | None:

@@ -23,7 +23,7 @@ from certify.loop.activations import ACTIVATIONS
 from certify.loop.expressions import Symbol, from_tree, to_tree
 from certify.loop.files.arrays import Numbers
 from certify.loop.files.plain import array_in, layers_in, origin_in, read_plain, require_keys, tensors, write_plain
-from certify.loop.networks import Affine, Clip, Concat, Map, Network, Observe, Step, Sum, layered
+from certify.loop.networks import Affine, Clip, Concat, Map, Network, Observe, Product, Step, Sum, layered
 from certify.loop.policies.network import Array, Centre, PolicyNetwork, Squash
 
 FORMAT = "certify-policy/1"
@@ -298,7 +298,7 @@ def _read_steps(data: Mapping[str, Any]) -> Network:
 
 def _read_step(step: Any, name: str) -> Step:
     kind = step.get("kind") if isinstance(step, dict) else None
-    kinds: dict[Any, type[Step]] = {of.kind: of for of in (Affine, Map, Clip, Sum, Concat, Observe)}
+    kinds: dict[Any, type[Step]] = {of.kind: of for of in (Affine, Map, Clip, Sum, Concat, Product, Observe)}
     if not isinstance(kind, str) or kind not in kinds:
         raise InputError(f"`{name}.kind` must be one of {', '.join(kinds)}; found {kind!r}.")
     arrays = _ARRAYS.get(kind, ())
@@ -306,7 +306,7 @@ def _read_step(step: Any, name: str) -> Step:
     of = step["of"]
     if not isinstance(of, list) or not all(type(i) is int for i in of):
         raise InputError(f"`{name}.of` must be a list of numbers of vectors; found {of!r:.60}.")
-    if len(of) != 1 and kind not in ("sum", "concat"):
+    if len(of) != 1 and kind not in ("sum", "concat", "product"):
         raise InputError(f"`{name}.of` must be one vector; found {of!r:.60}.")
     if kind == "map" and step["function"] not in ACTIVATIONS:
         raise InputError(f"`{name}.function` must be one of {', '.join(ACTIVATIONS)}; found {step['function']!r:.60}.")

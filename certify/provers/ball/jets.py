@@ -144,6 +144,20 @@ def remainder(squares: Array, size: Sizes, E: Array, second: Array, third: Array
     return np.asarray((2 * second * slope)[:, x] * flat + spread[:, x] * wide + m[:, x] * squares)
 
 
+def product_beyond(
+    a: Array, Q: Array, K: Array, E: Array, of_a: Array, of_Q: Array, of_K: Array, of_E: Array
+) -> tuple[Array, Array, Array]:
+    """H, K and R of the products of rows of what values add to those at the middle; a single row stands for all."""
+    rows = max(len(a), len(of_a))
+    a, Q, K, E, of_a, of_Q, of_K, of_E = (
+        np.broadcast_to(part, (rows, part.shape[1])) for part in (a, Q, K, E, of_a, of_Q, of_K, of_E)
+    )
+    b, x, p, q = basis(a.shape[1]), np.newaxis, sizes(a, Q, K, E), sizes(of_a, of_Q, of_K, of_E)
+    left = p.slope * q.twist + p.twist * q.slope + (p.bend + p.twist) * (q.bend + q.twist)
+    R = p.radius[:, x] * of_E + (q.slope + q.bend + q.twist)[:, x] * E + left[:, x] * b.eye
+    return b.between(a, of_a), b.times(a, of_Q) + b.times(of_a, Q), R
+
+
 def is_extreme(c: float) -> bool:
     """True if the powers of a middle c, that inverses and roots have derivatives of, may leave binary64."""
     return not 2.0**-200 < abs(c) < 2.0**200

@@ -24,10 +24,10 @@ from certify.errors import InputError
 from certify.loop.activations import CERTAIN
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import evaluate, nodes
-from certify.loop.networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Sum
+from certify.loop.networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Product, Sum
 from certify.loop.networks.floats import evaluated, jacobian
 from certify.loop.policies import bounded_by_form
-from certify.provers.ball.jets import Jet, Jets, basis, beyond_tangent, remainder, sizes
+from certify.provers.ball.jets import Jet, Jets, basis, beyond_tangent, product_beyond, remainder, sizes
 from certify.provers.ball.ranged import RangedJet
 
 Array = NDArray[np.float64]
@@ -301,6 +301,19 @@ class _OnBall(Algebra[_Part]):
         Q, K = (np.concatenate([getattr(v, part) for v in vectors]) for part in ("Q", "K"))
         return _Part(next(self._vectors), Q, K)
 
+    def product(self, step: Product, v: _Part, w: _Part) -> _Part:
+        """The product of what both add to their values at the middle is that of a unit."""
+        first, second = (self._beyond(part) for part in (v, w))
+        H, cubic, rest = product_beyond(*first, *second)
+        self.R = np.concatenate([self.R, rest])
+        y, z = v.at.y[:, None], w.at.y[:, None]
+        return _Part(next(self._vectors), y * w.Q + z * v.Q + H, y * w.K + z * v.K + cubic)
+
+    def _beyond(self, v: _Part) -> tuple[Array, Array, Array, Array]:
+        """The rows of all that a vector adds to its value at the middle."""
+        G, _, E = self._reached(v)
+        return G, v.Q, v.K, E
+
     def observe(self, step: Observe, v: _Part) -> _Part:
         """Jets of the expressions, whose terms beyond their tangents become those of units."""
         G, _, E = self._reached(v)
@@ -355,6 +368,11 @@ class _Along(Algebra[_Vector]):
         y, wrong = (np.concatenate([getattr(v, part) for v in vectors]) for part in ("y", "wrong"))
         return self._made(y, np.concatenate([v.among(most) for v in vectors]), wrong)
 
+    def product(self, step: Product, v: _Vector, w: _Vector) -> _Vector:
+        y, X = v.y * w.y, v.y[:, None] * self._all(w) + w.y[:, None] * self._all(v)
+        wrong = np.abs(v.y) * w.wrong + np.abs(w.y) * v.wrong + _ROUNDED * np.abs(y)
+        return self._made(y, X, wrong, own=True)
+
     def observe(self, step: Observe, v: _Vector) -> _Vector:
         D, y = jacobian(step, v.y), evaluated(step.expressions, step.symbols, v.y)
         X = np.zeros((len(y), self._units))
@@ -382,7 +400,7 @@ def shapes(network: Network) -> list[tuple[int, int, int]]:
             found.append((rows, step.weight.shape[1], before))
         elif not (isinstance(step, Map) and step.of == (k,) and k and isinstance(network.steps[k - 1], Affine)):
             found.append((rows, len(step.of), before))
-        before += rows if isinstance(step, Map | Clip | Observe) else 0
+        before += rows if isinstance(step, Map | Clip | Product | Observe) else 0
     return found
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from certify.loop.expressions import Expression, evaluate
-from certify.loop.networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Step, Sum
+from certify.loop.networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Product, Step, Sum
 from certify.provers.bounds.arrays import Array
 from certify.provers.bounds.lines import clip_lines, lines_of
 from certify.provers.bounds.taylor import EPS, TINY, Models, Taylor
@@ -47,13 +47,14 @@ class Enclosed(NamedTuple):
 
 @dataclass(slots=True)
 class _Made:
-    """A vector: the step that made it, which read vectors `of`, the errors (w, B) that it added, and the slopes of its
-    lines, if it is made by lines."""
+    """A vector: the step that made it, which read vectors `of`, the errors (w, B) that it added, and the slopes with
+    which it has those of the vectors that it read, if it is made by lines, or a product."""
 
     step: Step | None
     of: tuple[int, ...]
     added: Array
     slope: Array | None = None
+    others: Array | None = None  # of a product's second vector
 
 
 class StepsOnBoxes(Algebra[Enclosed]):
@@ -124,6 +125,24 @@ class StepsOnBoxes(Algebra[Enclosed]):
         ball = np.sqrt(sum(v.ball * v.ball for v in vectors)) * _GROWN + TINY
         return self._then(step, tuple(v.number for v in vectors), h, fresh, old, ball, np.zeros_like(fresh))
 
+    def product(self, step: Product, v: Enclosed, w: Enclosed) -> Enclosed:
+        """c_v c_w + c_w V + c_v W + V W, where V = g_v.d + e_v and W are how far v and w are from their middles."""
+        a, b = v.h[:, 0], w.h[:, 0]
+        h = b[:, None] * v.h + a[:, None] * w.h
+        h[:, 0] = a * b
+        least, most = second_order(v, w)
+        shift, gap = 0.5 * (most - least), 0.5 * (most + least)
+        h[:, 0] += shift
+        size = np.abs(a) * (np.abs(b) + w.spread) + np.abs(b) * v.spread
+        own = gap * _GROWN + 4 * EPS * (size + shift) + TINY
+        old = (np.abs(b) * (v.fresh + v.old) + np.abs(a) * (w.fresh + w.old)) * _GROWN + TINY
+        bent = gap / (v.spread + w.spread + TINY)
+        self.share += (bent[:, None] * (np.abs(v.h[:, 1:]) + np.abs(w.h[:, 1:]))).sum(0)
+        ball = np.minimum(_length(v, b) + _length(w, a), np.sqrt((old * old).sum(0))) * _GROWN + TINY
+        made = self._then(step, (v.number, w.number), h, own, old, ball, own)
+        self.made[-1].slope, self.made[-1].others = b, a
+        return made
+
     def observe(self, step: Observe, v: Enclosed) -> Enclosed:
         h, own, bent = observed(step, v.h, v.fresh + v.old)
         self.share += bent.sum(0)
@@ -157,9 +176,47 @@ class StepsOnBoxes(Algebra[Enclosed]):
             case Concat():
                 ends = np.cumsum([len(self.made[i].added) for i in made.of])[:-1]
                 return np.split(weight, ends)
+            case Product():
+                return [
+                    self._gathered(weight * slope[:, None], i)
+                    for i, slope in zip(made.of, (made.slope, made.others), strict=True)
+                    if slope is not None
+                ]
             case Observe():
                 return []
         return [weight] * len(made.of) if made.slope is None else [weight * made.slope[:, None]]
+
+    def _gathered(self, weight: Array, number: int) -> Array:
+        """The weights of a vector in a product's entries; of a single entry that of all of them together."""
+        alone = len(self.made[number].added) == 1 < len(weight)
+        return np.asarray(weight.sum(0, keepdims=True)) if alone else weight
+
+
+def second_order(v: Enclosed, w: Enclosed) -> tuple[Array, Array]:
+    """(l, u), both (w, B), with -l <= V W <= u for a product's two vectors, V and W being how far they are from their
+    middles.
+
+    4 V W = p ((V + W/p)^2 - (V - W/p)^2) for any p > 0, here that at which V and W/p are of equal size. |V W| is at
+    most the product of both, which takes the place of what is not finite. A vector times itself is a square.
+    """
+    of_v, of_w = v.fresh + v.old, w.fresh + w.old
+    reach_v, reach_w = v.spread + of_v, w.spread + of_w
+    most = reach_v * reach_w * _GROWN + TINY
+    if v.number == w.number:
+        return np.zeros_like(most), most
+    p = reach_w / reach_v
+    p = np.where(np.isfinite(p) & (p > 0), p, 1.0)
+    g, other, errors = v.h[:, 1:], w.h[:, 1:] / p[:, None], of_v + of_w / p
+    plus, minus = (np.abs(g + sign * other).sum(1) + errors for sign in (1.0, -1.0))
+    least, top = (np.fmin(0.25 * p * r * r * _GROWN + TINY, most) for r in (minus, plus))
+    return least, top
+
+
+def _length(v: Enclosed, slope: Array) -> Array:
+    """Bounds the 2-norm of slopes times the errors of v."""
+    whole = v.ball + np.sqrt((v.fresh * v.fresh).sum(0))
+    alone = len(v.fresh) == 1
+    return np.asarray((np.sqrt((slope * slope).sum(0)) if alone else np.abs(slope).max(0)) * whole)
 
 
 def observed(step: Observe, h: Array, error: Array) -> tuple[Array, Array, Array]:

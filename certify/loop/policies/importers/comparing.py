@@ -18,7 +18,17 @@ import numpy as np
 from certify.errors import InputError
 from certify.loop.activations import ACTIVATIONS
 from certify.loop.policies.importers.reading import Reading
-from certify.loop.policies.importers.steps import Activate, Affine, Branches, Clip, Diagonal, Normalise, Step, Tanh
+from certify.loop.policies.importers.steps import (
+    Activate,
+    Affine,
+    Branches,
+    Clip,
+    Diagonal,
+    InverseRoot,
+    Normalise,
+    Step,
+    Tanh,
+)
 from certify.loop.policies.network import Array
 
 SAMPLES = 10_000
@@ -176,10 +186,18 @@ def _run(steps: Sequence[Step], x: Array, error: Array, unit: float) -> tuple[Ar
                 h = value
             case Clip():
                 h = np.clip(h, _ends(step.lo, -np.inf), _ends(step.hi, np.inf))
+            case InverseRoot():
+                least = np.where(h > e, h - e, np.nan)  # where rounding may leave nothing, no bound is known
+                h, e = 1 / np.sqrt(h), e / (2 * least**1.5) + 8 * unit / np.sqrt(least)
             case Branches():
                 ends = [_run(chain, h, e, unit) for chain in step.of]
                 if step.kind == "concat":
                     h, e = (np.concatenate(parts, axis=1) for parts in zip(*ends, strict=True))
+                    continue
+                if step.kind == "product":
+                    (v, of_v), (w, of_w) = ends
+                    h = v * w
+                    e = np.abs(v) * of_w + np.abs(w) * of_v + of_v * of_w + 2 * unit * np.abs(h)
                     continue
                 sizes = sum(np.abs(v) + w for v, w in ends)
                 h, e = (np.sum(parts, axis=0) for parts in zip(*ends, strict=True))

@@ -22,6 +22,7 @@ import numpy as np
 
 from certify.errors import InputError
 from certify.loop import networks
+from certify.loop.expressions import Symbol, sqrt
 from certify.loop.networks import Network
 from certify.loop.policies.importers.steps import (
     Activate,
@@ -29,6 +30,7 @@ from certify.loop.policies.importers.steps import (
     Branches,
     Clip,
     Diagonal,
+    InverseRoot,
     Normalise,
     Step,
     Tanh,
@@ -40,6 +42,8 @@ Bounds = tuple[Fraction | None, Fraction | None]
 _BITS = (128, 512, 2048, 8192)
 _ROOT_BITS = 128
 _NO_BOUNDS: Bounds = (None, None)
+_JOINED = {"sum": networks.Sum, "concat": networks.Concat, "product": networks.Product}
+_V = Symbol("v")
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +146,9 @@ class _Program:
                     number = self._clip(step, number)
                 case Branches():
                     ends = tuple(self.follow(branch, number) for branch in step.of)
-                    number = self._then((networks.Sum if step.kind == "sum" else networks.Concat)(ends))
+                    number = self._then(_JOINED[step.kind](ends))
+                case InverseRoot():
+                    number = self._then(networks.Observe((number,), (_V,), (1 / sqrt(_V),)))
                 case _:
                     raise InputError("a normaliser must read the observation itself.")
             k += 1

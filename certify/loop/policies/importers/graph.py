@@ -1,7 +1,7 @@
 """The operations that a graph of ONNX or TorchScript may contain, as exact steps on chains of values.
 
 A chain begins with the observation, and each operation extends a chain with constants, or joins chains: sums, as of
-skip connections, and values one behind the other. Any other operation is rejected by its name.
+skip connections, products, as of gates, and values one behind the other. Any other operation is rejected by its name.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from certify.loop.policies.importers.steps import (
     activated,
     exactly,
 )
+from certify.loop.policies.importers.steps import layer_normalised as layer_normalised_steps
 
 Chain = tuple[Step, ...]
 _EXACT_INTEGERS = 2**53
@@ -101,23 +102,35 @@ def mapped(chain: Chain, function: str, *numbers: float) -> Chain:
     return (*chain, *activated(function, *(Fraction(v) for v in numbers)))
 
 
-def joined(kind: Literal["sum", "concat"], *chains: Chain) -> Chain:
-    """The sum of several chains, or one behind the other; they part where their steps are no longer the same."""
+def layer_normalised(chain: Chain, width: int, epsilon: float, gain: Any | None, bias: Any | None, what: str) -> Chain:
+    """Layer normalisation over all `width` numbers of a row, then its gain and bias.
+
+    Raises
+    ------
+    InputError : epsilon is not positive, or gain or bias have another shape.
+    """
+    made: Chain = (*chain, *layer_normalised_steps(width, Fraction(epsilon)))
+    made = made if gain is None else scaled(made, gain, what)
+    return made if bias is None else shifted(made, bias, what)
+
+
+def joined(kind: Literal["sum", "concat", "product"], *chains: Chain) -> Chain:
+    """The sum of several chains, the product of two, or one behind the other; they part where their steps differ."""
     same = 0
     while all(len(chain) > same and chain[same] is chains[0][same] for chain in chains):
         same += 1
     return (*chains[0][:same], Branches(kind, tuple(chain[same:] for chain in chains)))
 
 
-def product(one: Chain, other: Chain) -> Chain | None:
-    """`h * sigmoid(h)` and `h * tanh(softplus(h))`, as programs write silu and mish; None for other products."""
+def product(one: Chain, other: Chain) -> Chain:
+    """The product of two values; `h * sigmoid(h)` and `h * tanh(softplus(h))` are silu and mish."""
     short, long = sorted((one, other), key=len)
     same = all(a is b for a, b in zip(short, long, strict=False))
     more = long[len(short) :]
     for name, gate in (("silu", (Activate("sigmoid"),)), ("mish", (Activate("softplus"), Tanh()))):
         if same and more == gate:
             return (*short, Activate(name))
-    return None
+    return joined("product", one, other)
 
 
 def clipped(chain: Chain, lo: Any | None, hi: Any | None, what: str) -> Chain:

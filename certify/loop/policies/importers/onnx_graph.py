@@ -25,14 +25,13 @@ from certify.loop.policies.importers.steps import Affine
 _ACTIVATIONS = ("Tanh", "Elu", "Sigmoid", "Gelu", "Softplus", "Mish", "Softsign", "LeakyRelu", "Selu", "Celu")
 _OPERATIONS = {
     "Gemm", "MatMul", "Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", *_ACTIVATIONS,
-    "Identity", "Cast", "Flatten", "Reshape", "Constant", "Concat",
+    "Identity", "Cast", "Flatten", "Reshape", "Constant", "Concat", "LayerNormalization",
 }  # fmt: skip
 _KNOWN = (
-    f"Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu, {', '.join(_ACTIVATIONS)}, Concat, Identity, Flatten and "
-    "Constant"
+    f"Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu, {', '.join(_ACTIVATIONS)}, "
+    "LayerNormalization, Concat, Identity, Flatten and Constant"
 )
 _NORMALISATIONS = {
-    "LayerNormalization",
     "BatchNormalization",
     "InstanceNormalization",
     "GroupNormalization",
@@ -52,8 +51,22 @@ _FLAGS = {
     "Selu": {"alpha", "gamma"},
     "Concat": {"axis"},
     "Gelu": {"approximate"},
+    "LayerNormalization": {"axis", "epsilon", "stash_type"},
 }
-_ELEMENTWISE = {"Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", *_ACTIVATIONS, "Exp", "Log", "Identity", "Cast"}
+_ELEMENTWISE = {
+    "Add",
+    "Sub",
+    "Mul",
+    "Div",
+    "Neg",
+    "Clip",
+    "Relu",
+    *_ACTIVATIONS,
+    "Exp",
+    "Log",
+    "Identity",
+    "Cast",
+}
 
 
 def read_onnx(raw: bytes, what: str, wanted: str | None = None, folder: Path | None = None) -> Reading:
@@ -257,14 +270,14 @@ def _walk(graph_: Any, name: str, output: str, what: str) -> Chain:
 
 def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain:
     found = [k for k, value in enumerate(given) if isinstance(value, tuple)]
-    if len(found) == 2 and kind == "Mul" and (gated := graph.product(*given)) is not None:
-        return gated
+    if len(found) == len(given) == 2 and kind == "Mul":
+        return graph.product(*given)
     if len(found) == len(given) > 1 and kind in ("Add", "Sub", "Concat"):
         return _joined(kind, given, flags, at)
     if len(found) != 1:
         raise InputError(
-            f"{at} must join one value that depends on the observation with constants; it has {len(found)}. Add, Sub "
-            "and Concat may join several."
+            f"{at} must join one value that depends on the observation with constants; it has {len(found)}. Add, Sub, "
+            "Mul and Concat may join several."
         )
     chain: Chain
     place, chain, others = found[0], given[found[0]], [v for v in given if not isinstance(v, tuple)]
@@ -288,6 +301,8 @@ def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain
             return graph.negated(chain)
         case _, 0, 1 if kind in _ACTIVATIONS:
             return _activated(chain, kind, flags, at)
+        case "HardSwish" | "LayerNormalization", 0, _:
+            return _composed(kind, chain, given, flags, at)
         case "Cast", 0, 1:
             _require_real(flags, at)
             return chain
@@ -321,6 +336,18 @@ def _gemm(chain: Chain, given: list[Any], flags: dict[str, Any], at: str) -> Cha
     if len(given) == 3 and given[2] is not None:
         chain = graph.moved(chain, tuple(v * graph.row(beta, at)[0] for v in graph.row(given[2], at)))
     return chain
+
+
+def _composed(kind: str, chain: Chain, given: list[Any], flags: dict[str, Any], at: str) -> Chain:
+    """Operations that are made of several steps."""
+    if kind == "HardSwish" and len(given) == 1:
+        return graph.mapped(chain, "hardswish")
+    axis = flags["axis"].i if "axis" in flags else -1
+    if kind != "LayerNormalization" or len(given) not in (2, 3) or axis not in (1, -1):
+        raise InputError(f"{at} is not read: it must normalise the numbers of a row, along axis 1.")
+    epsilon = float(flags["epsilon"].f) if "epsilon" in flags else float(np.float32(1e-5))
+    gain = graph.real(given[1], at)
+    return graph.layer_normalised(chain, gain.size, epsilon, gain, (*given, None)[2], at)
 
 
 def _joined(kind: str, chains: list[Chain], flags: dict[str, Any], at: str) -> Chain:

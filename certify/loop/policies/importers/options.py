@@ -26,7 +26,8 @@ WITH_TANH = (
 )
 """The next step where a policy has another activation."""
 WITHOUT_NORMALISATION = (
-    "LayerNorm, and every other normalisation between layers, is not supported: train the policy again without it. "
+    "LayerNorm is read of a module, of TorchScript, and of ONNX as LayerNormalization (from opset 17 on); for another "
+    "normalisation between layers train the policy again without it. "
     "BatchNorm alone is affine in evaluation and can be folded into the layer before it."
 )
 """The next step where a policy has a normalisation between its layers."""

@@ -94,7 +94,7 @@ def _gives(steps: Sequence[Step], width: int) -> int:
             width = int(step.weight.shape[0])
         if isinstance(step, Branches):
             ends = [_gives(chain, width) for chain in step.of]
-            width = sum(ends) if step.kind == "concat" else ends[0]
+            width = sum(ends) if step.kind == "concat" else max(ends)
     return width
 
 
@@ -105,6 +105,7 @@ _FORMULAS: Mapping[str, Callable[[Values], Values]] = {
     "hardtanh": lambda v: np.clip(v, -1, 1),
     "relu6": lambda v: np.clip(v, 0, 6),
     "hardsigmoid": lambda v: np.clip(v + 3, 0, 6) / 6,
+    "hardswish": lambda v: v * (np.clip(v + 3, 0, 6) / 6),
     "logsigmoid": lambda v: -np.logaddexp(0, -v),
 }
 """The activations that are made of others, as they are written elsewhere."""

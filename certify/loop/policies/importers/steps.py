@@ -107,15 +107,20 @@ class Clip:
 
 
 @dataclass(frozen=True, slots=True)
-class Branches:
-    """Chains of steps that all begin with the same vector, and what joins their results: a sum, or one behind the
-    other. A chain without steps is that vector, as in a skip connection."""
+class InverseRoot:
+    """`y = 1/sqrt(h)` of one number that is positive."""
 
-    kind: Literal["sum", "concat"]
+
+@dataclass(frozen=True, slots=True)
+class Branches:
+    """Chains of steps that all begin with the same vector, and what joins their results: a sum, a product of two, or
+    one behind the other. A chain without steps is that vector, as in a skip connection."""
+
+    kind: Literal["sum", "concat", "product"]
     of: tuple[tuple[Step, ...], ...]
 
 
-Step = Affine | Diagonal | Normalise | Tanh | Activate | Clip | Branches
+Step = Affine | Diagonal | Normalise | Tanh | Activate | Clip | InverseRoot | Branches
 _SELU = Fraction(1.0507009873554804934193349852946), Fraction(1.6732632423543772848170429916717)
 
 
@@ -151,15 +156,32 @@ def activated(function: str, *numbers: Fraction) -> tuple[Step, ...]:
             return (Clip((none,), (6 * one,)),)
         case "hardsigmoid", ():
             return (Diagonal((one,), (3 * one,)), Clip((none,), (6 * one,)), _scaled(one / 6))
+        case "hardswish", ():
+            return (Branches("product", ((), activated("hardsigmoid"))),)
         case "logsigmoid", ():
             return (_scaled(-one), Activate("softplus"), _scaled(-one))
     raise InputError(f"the activation must be one of {', '.join(IMPORTED)}; found {function}.")
 
 
-COMPOSED = ("leaky_relu", "selu", "celu", "hardtanh", "relu6", "hardsigmoid", "logsigmoid")
+COMPOSED = ("leaky_relu", "selu", "celu", "hardtanh", "relu6", "hardsigmoid", "hardswish", "logsigmoid")
 """Activations that are made of others."""
 IMPORTED = (*ACTIVATIONS, *COMPOSED)
 """The names of all activations that are read."""
+
+
+def layer_normalised(width: int, epsilon: Fraction) -> tuple[Step, ...]:
+    """`c / sqrt(mean of c^2 + epsilon)` of so many numbers, c being these less their mean.
+
+    Raises
+    ------
+    InputError : epsilon is not positive, so that equal numbers would have no value.
+    """
+    if epsilon <= 0:
+        raise InputError(f"the epsilon of a layer normalisation must be positive; found {float(epsilon)}.")
+    none, share = Fraction(0), Fraction(1, width)
+    centred = Affine(width * np.eye(width) - 1, np.zeros(width)), Diagonal((share,), (none,))
+    mean = Affine(np.ones((1, width)), np.zeros(1)), Diagonal((share,), (epsilon,))
+    return (*centred, Branches("product", ((), (Branches("product", ((), ())), *mean, InverseRoot()))))
 
 
 def _scaled(by: Fraction) -> Diagonal:

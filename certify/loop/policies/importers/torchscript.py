@@ -29,13 +29,13 @@ _MAX_DEPTH = 40
 _MAX_TEXT = 2**20
 _KNOWN = (
     "linear, addmm, matmul, add, sub, rsub, mul, div, neg, cat, clamp, hardtanh, relu, tanh, elu, sigmoid, silu, gelu, "
-    "softplus, mish, leaky_relu, selu, celu, relu6, hardsigmoid and log_sigmoid"
+    "softplus, mish, leaky_relu, selu, celu, relu6, hardsigmoid, hardswish, log_sigmoid and layer_norm"
 )
 _ACTIVATIONS: dict[str, tuple[float, ...]] = {  # with what a program may write behind the value
     **{"tanh": (), "sigmoid": (), "silu": (), "gelu": (), "mish": (), "elu": (1.0, 1.0, 1.0), "softplus": (1.0, 20.0)},
-    **dict.fromkeys(("selu", "relu6", "hardsigmoid", "log_sigmoid"), ()),
+    **dict.fromkeys(("selu", "relu6", "hardsigmoid", "hardswish", "log_sigmoid"), ()),
 }
-_NORMALISATIONS = ("layer_norm", "batch_norm", "group_norm", "instance_norm", "rms_norm")
+_NORMALISATIONS = ("batch_norm", "group_norm", "instance_norm", "rms_norm")
 _RESERVED = ("torch", "CONSTANTS", "getattr")
 _DEFAULTS: dict[str, tuple[Any, ...]] = {"hardtanh": (-1.0, 1.0), "clamp": (None, None)}
 
@@ -274,15 +274,29 @@ def _operation(program: _Program, name: str, given: list[Any], node: ast.Call) -
         one, other = (v.chain for v in given)
         chain = graph.joined("sum", one, graph.negated(other) if name == "sub" else other)
         return _Value(chain, name, tuple(given))
+    if name == "mul" and len(given) == 2 and _are_values(given):
+        return _Value(graph.product(*(v.chain for v in given)), name, tuple(given))
+    if name == "layer_norm":
+        return _Value(_normalised(given, at), name, tuple(given[:5]))
     places = [k for k, value in enumerate(given) if isinstance(value, _Value)]
     if len(places) != 1 or any(isinstance(value, Call | bool | list) for value in given):
         raise InputError(
-            f"{at} must join one value that depends on the observation with constants; add, sub and cat may join "
-            "several."
+            f"{at} must join one value that depends on the observation with constants; add, sub, mul and cat may "
+            "join several."
         )
     others = tuple(v for v in given if not isinstance(v, _Value))
     chain = _step(name, places[0], len(given), given[places[0]].chain, others, at)
     return _Value(chain, name, tuple(given))
+
+
+def _normalised(given: list[Any], at: str) -> Chain:
+    """layer_norm(value, [width], gain, bias, epsilon), over the entries of a row; the last ones may be left out."""
+    match [*given, *(None, None, 1e-5)[max(len(given) - 2, 0) :]]:
+        case [_Value() as value, [int(width)], gain, bias, float(epsilon), *rest] if (
+            width > 0 and len(rest) <= 1 and all(v is None or _is_array(v) for v in (gain, bias))
+        ):
+            return graph.layer_normalised(value.chain, width, epsilon, gain, bias, at)
+    raise InputError(f"{at} is read of a value that depends on the observation, over one axis, with constants.")
 
 
 def _are_values(given: Any) -> bool:
@@ -347,7 +361,8 @@ def _run(name: str, given: list[Any], double: bool) -> Any:
         "sigmoid": torch.sigmoid,
         **{name: getattr(torch.nn.functional, name) for name in ("silu", "gelu", "mish")},
         "elu": lambda h, alpha=1.0, *_: torch.nn.functional.elu(h, alpha),
-        **{name: getattr(torch.nn.functional, name) for name in ("leaky_relu", "selu", "celu", "hardsigmoid")},
+        **{n: getattr(torch.nn.functional, n) for n in ("leaky_relu", "selu", "celu", "hardsigmoid", "hardswish")},
+        "layer_norm": torch.nn.functional.layer_norm,
         "relu6": torch.nn.functional.relu6,
         "log_sigmoid": torch.nn.functional.logsigmoid,
         "softplus": lambda h, *_: torch.nn.functional.softplus(h),
