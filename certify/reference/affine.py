@@ -64,7 +64,7 @@ class Forms:
 
 
 def lengthened(v: Forms, factors: Rows, count: int) -> list[arb]:
-    """On each of `count` leaves a bound of the 2-norm of factors times the errors of v; a single entry has all factors."""
+    """On each of `count` leaves a bound of the 2-norm of factors times the errors of v; one entry has all factors."""
     each = zip(v.lengths(count), by_leaf(factors), strict=True)
     return [x * (norm(by) if len(v.rows) == 1 else max_of([abs(f) for f in by])) for x, by in each]
 
