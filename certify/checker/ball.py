@@ -322,7 +322,7 @@ class OnBall(Algebra[Rows]):
         return Rows(Near(y, Above(of_y)), Vector(np.concatenate([X.value for X in parts]), error.root))
 
     def product(self, step: Product, v: Rows, w: Rows) -> Rows:
-        """What both are beyond their values at d = 0 has a product that is the units': of their jets without these."""
+        """The units are products of both without their values at d = 0, as of jets without constants."""
         units = self.R.shape[2]
         x, y = (self.repeated(part, step.size, units) for part in (v, w))
         first, second = self.jets(x), self.jets(y)

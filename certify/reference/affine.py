@@ -63,12 +63,6 @@ class Forms:
         return [v + norm(fresh) for v, fresh in zip(old, by_leaf(self.fresh), strict=True)]
 
 
-def lengthened(v: Forms, factors: Rows, count: int) -> list[arb]:
-    """On each of `count` leaves a bound of the 2-norm of factors times the errors of v; one entry has all factors."""
-    each = zip(v.lengths(count), by_leaf(factors), strict=True)
-    return [x * (norm(by) if len(v.rows) == 1 else max_of([abs(f) for f in by])) for x, by in each]
-
-
 class OnBoxes:
     """Networks between affine forms on `count` leaves, on each of which `undefined` tells whether something may be."""
 
@@ -177,35 +171,17 @@ class OnBoxes:
 
     def product(self, step: Product, v: Forms, w: Forms) -> Forms:
         """(c + X)(e + Y) = c e + c Y + e X + X Y on each leaf: the errors of X and Y count e and c times."""
-        rows, gaps, stride = Rows(), Rows(), self.stride(v)
-        nothing = [ZERO] * self.count
-        wrong = paired(*(u.error or [nothing] * len(u.rows) for u in (v, w)))
-        for (row, other), doubts in zip(paired(v.rows, w.rows), wrong, strict=True):
-            entries, apart = list[arb](), list[arb]()
-            for b, (of_X, of_Y) in enumerate(zip(*doubts, strict=True)):
-                c, *X = row[b * stride : (b + 1) * stride]
-                e, *Y = other[b * stride : (b + 1) * stride]
-                least, most = moved_together(X, of_X, Y, of_Y, v is w)
-                entries.append(c * e + (most - least) / 2)
-                entries += [e * x + c * y for x, y in zip(X, Y, strict=True)]
-                apart.append((most + least) / 2)
-            rows.append(entries)
-            gaps.append(apart)
-        times_v, times_w = ([row[::stride] for row in u.rows] for u in (w, v))
-        parts = [passed(u.error, by, step.size) for u, by in ((v, times_v), (w, times_w))]
-        old = both(*parts)
+        rows, gaps = multiplied(v, w, self.count, self.stride(v))
+        factors = [(u, [row[:: self.stride(u)] for row in by.rows]) for u, by in ((v, w), (w, v))]
+        old = both(*(passed(u.error, by, step.size) for u, by in factors))
         result = Forms(rows, gaps, old, gaps)
-
-        def measured() -> list[arb]:
-            sums = zip(
-                lengthened(v, times_v, self.count), lengthened(w, times_w, self.count), by_leaf(old or []), strict=True
+        result.measured = lambda: [
+            lesser(total(each), norm(after))
+            for *each, after in zip(
+                *(lengthened(u, by, self.count) for u, by in factors), by_leaf(old or []), strict=True
             )
-            return [lesser(x + y, norm(after)) for x, y, after in sums]
-
-        result.measured = measured
-        return self.vector(
-            result, *((u, returning(by, len(u.rows), step.size)) for u, by in ((v, times_v), (w, times_w)))
-        )
+        ]
+        return self.vector(result, *((u, returning(by, len(u.rows), step.size)) for u, by in factors))
 
     def stacked(self, parts: Sequence[Rows | None], vectors: Sequence[Forms]) -> Rows | None:
         if all(part is None for part in parts):
@@ -283,6 +259,30 @@ def called(call: Call, given: Sequence[Taylor], symbols: int, first: int) -> lis
         slopes[k] += error
         result.append(Taylor(mid, arb_mat(1, symbols, slopes)))
     return result
+
+
+def multiplied(v: Forms, w: Forms, count: int, stride: int) -> tuple[Rows, Rows]:
+    """Forms of products of the entries, and their gaps."""
+    rows, gaps, nothing = Rows(), Rows(), [ZERO] * count
+    wrong = paired(*(u.error or [nothing] * len(u.rows) for u in (v, w)))
+    for (row, other), doubts in zip(paired(v.rows, w.rows), wrong, strict=True):
+        entries, apart = list[arb](), list[arb]()
+        for b, (of_X, of_Y) in enumerate(zip(*doubts, strict=True)):
+            c, *X = row[b * stride : (b + 1) * stride]
+            e, *Y = other[b * stride : (b + 1) * stride]
+            least, most = moved_together(X, of_X, Y, of_Y, v is w)
+            entries.append(c * e + (most - least) / 2)
+            entries += [e * x + c * y for x, y in zip(X, Y, strict=True)]
+            apart.append((most + least) / 2)
+        rows.append(entries)
+        gaps.append(apart)
+    return rows, gaps
+
+
+def lengthened(v: Forms, factors: Rows, count: int) -> list[arb]:
+    """On each leaf a bound of the 2-norm of factors times the errors of v; a single entry has all factors."""
+    each = zip(v.lengths(count), by_leaf(factors), strict=True)
+    return [x * (norm(by) if len(v.rows) == 1 else max_of([abs(f) for f in by])) for x, by in each]
 
 
 def moved_together(X: list[arb], of_X: arb, Y: list[arb], of_Y: arb, same: bool) -> tuple[arb, arb]:

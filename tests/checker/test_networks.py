@@ -562,13 +562,40 @@ def multiplied(data: Document) -> None:
     last |= {"shape": [1, 2], "weight": encode([-1.0, -1.0])}
 
 
+def normalised(data: Document) -> None:
+    """Layer normalisation of (x, -x) with epsilon 1, x/sqrt(x^2 + 1), instead of tanh: 0 at 0 in rationals."""
+    inverse_root = ["/", "1", ["sqrt", "v"]]
+    data["networks"][0]["steps"] = [
+        {"kind": "affine", "of": [0], "shape": [2, 1], "weight": encode([1.0, -1.0]), "bias": encode([0.0, 0.0])},
+        {"kind": "product", "of": [1, 1]},
+        {"kind": "affine", "of": [2], "shape": [1, 2], "weight": encode([0.5, 0.5]), "bias": encode([1.0])},
+        {"kind": "observe", "of": [3], "names": ["v"], "expressions": [inverse_root]},
+        {"kind": "product", "of": [1, 4]},
+        {"kind": "affine", "of": [5], "shape": [1, 2], "weight": encode([-1.0, 1.0]), "bias": encode([0.0])},
+    ]
+    tree = b"\xff"
+    for _ in range(6):
+        tree = b"\0" + tree * 2
+    data["evidence"]["tree"] = base64.b64encode(tree).decode()
+
+
 def saturated(data: Document) -> None:
     data["plant"]["dynamics"] = [
         ["+", ["/", "x", "2"], ["clip", "u", "-5/2", "5/2"], ["*", "0", ["abs", ["+", "u", "3"]]]]
     ]
 
 
-REWRITTEN = [split_in_two, skipping, observed, clipped_far_out, multiplied, called, called_in_part, saturated]
+REWRITTEN = [
+    split_in_two,
+    skipping,
+    observed,
+    clipped_far_out,
+    multiplied,
+    normalised,
+    called,
+    called_in_part,
+    saturated,
+]
 
 
 @pytest.mark.parametrize("program", [checked, judge_bytes], ids=["checker", "reference"])

@@ -171,5 +171,5 @@ class Gradients(_Values):
 
 
 def _gathered(part: Array, v: Array) -> Array:
-    """What arrives at v of its product; at a single entry from all of them."""
+    """The part of a product that arrives at v; at a single entry all of it together."""
     return part if part.shape == v.shape else np.asarray(part.sum(axis=-1, keepdims=True))

@@ -323,7 +323,7 @@ def _in_words(step: Step) -> str:
 
 
 def repeated(v: list[T], w: list[T]) -> tuple[list[T], list[T]]:
-    """What a product reads as lists of equal length, a single entry as often as the other has entries."""
+    """A product's two vectors as lists of equal length, a single entry as often as the other has entries."""
     return v * len(w) if len(v) == 1 else v, w * len(v) if len(w) == 1 else w
 
 
