@@ -22,6 +22,7 @@ from controllers.plants import shipped
 if TYPE_CHECKING:
     from certify.loop.plants import System
 
+Activation = Literal["tanh", "relu", "elu", "sigmoid", "silu", "gelu", "softplus", "mish", "softsign"]
 Centre = Literal["preactivation", "output", "none"]
 Identification = Literal["during", "before", "never"]
 Transitions = Literal["all", "latest"]
@@ -69,6 +70,10 @@ class TrainingOptions:
     critic_scale: Annotated[float, "Unit of the critics' values; about the size of a return."] = 100.0
     warm_up: Annotated[int, "First steps, with uniform random actions and without gradient steps."] = 1000
     actor: Annotated[tuple[int, ...], "Hidden widths of the actor."]
+    activation: Annotated[
+        Activation,
+        "Function between the actor's layers: tanh, relu, elu, sigmoid, silu, gelu, softplus, mish or softsign.",
+    ] = "tanh"
     critic: Annotated[tuple[int, ...], "Hidden widths of the value and Q networks."]
     log_std: Annotated[
         tuple[float, ...], "Lower and upper bound of the log standard deviation; none means that it has no bounds."
@@ -78,7 +83,8 @@ class TrainingOptions:
         float, "Weight of the mean ||J_mu(x) - J_mu(0)|| / ||x|| in the ball in the actor's loss; 0 drops the term."
     ] = 0.0
     rest_weight: Annotated[
-        float, "Weight of the hidden units' norms at the origin, summed over layers, in the actor's loss; 0 drops it."
+        float, "Weight of the hidden tanh units' norms at the origin, summed over layers, in the actor's loss; 0 drops it, "
+        "other units have none."
     ] = 0.0
     proof_weight: Annotated[
         float,
@@ -137,6 +143,7 @@ class TrainingOptions:
         rising = len(self.log_std) == 2 and self.log_std[0] < self.log_std[1]
         self._require("log_std", not self.log_std or rising, "two rising numbers, or none")
         choices_of = {
+            "activation": Activation,
             "centre": Centre,
             "identification": Identification,
             "transitions": Transitions,
@@ -171,9 +178,17 @@ class TrainingOptions:
             self._require("dt", lo <= self.dt <= hi, f"{held}, over which {system.name} holds its inputs")
 
     def record(self) -> dict[str, Any]:
-        """All options as plain values, for the policy file and for checkpoints."""
-        return _plain({option.name: getattr(self, option.name) for option in fields(self)})
+        """The options as plain values, for the policy file and for checkpoints; a file of tanh looks as it always did."""
+        values = _plain({option.name: getattr(self, option.name) for option in fields(self)})
+        return {name: value for name, value in values.items() if (name, value) not in _LEFT_OUT.items()}
 
+    def full_record(self) -> dict[str, Any]:
+        """All options as plain values, to compare with `default_record()` and what a record has beyond it."""
+        return {**default_record(), **self.record()}
+
+
+_LEFT_OUT = {"activation": "tanh"}
+"""Values that a record leaves out: they are the defaults of options that came later."""
 
 _FORMER = {"transitions": "latest"}
 """Values that runs had before an option was there, where they are not its default."""

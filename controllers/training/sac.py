@@ -59,7 +59,8 @@ class SAC:
     ) -> None:
         n, m = len(interface.state_factors), len(interface.scale)
         self.options, self.generator, self.device = options, generator, device
-        self.actor = Actor(interface, options.actor, options.centre, options.log_std).to(device)
+        shape = (options.actor, options.centre, options.log_std, options.activation)
+        self.actor = Actor(interface, *shape).to(device)
         self.value = Critic(n, options.critic, 1, options.critic_scale).to(device)
         self.value_target = Critic(n, options.critic, 1, options.critic_scale).to(device)
         self.value_target.load_state_dict(self.value.state_dict())
