@@ -15,7 +15,7 @@ from controllers.options import Activation, Centre, GainNorm
 from controllers.training.departure import departure
 from controllers.training.device import CPU, exact
 from controllers.training.interface import Interface
-from controllers.training.units import Units, keep_corners_away
+from controllers.training.units import Units, begin_away, keep_away
 
 
 def squashed_log_likelihood(w: Tensor, mean: Tensor, log_std: Tensor, scale: Tensor) -> Tensor:
@@ -62,7 +62,7 @@ class Actor(nn.Module):
         self.mean = nn.Linear(sizes[-1], m, device=CPU)
         self.log_std = nn.Linear(sizes[-1], m, device=CPU)
         self.centre, self.bounds, self.units = centre, tuple(log_std), Units(activation)
-        keep_corners_away(self._layers(), self.units)
+        begin_away(self._layers(), self.units)
         for name, numbers in (
             ("scale", interface.scale),
             ("offset", interface.offset),
@@ -146,6 +146,10 @@ class Actor(nn.Module):
         weights = [layer.weight for layer in layers]
         biases = [layer.bias for layer in layers]
         return departure([weights[0] * self.factors, *weights[1:]], biases, box, self.units)
+
+    def keep_corners_away(self, box: Tensor) -> None:
+        """Move biases so that no unit passes its corner in the box with half-widths (n,), in the states' units."""
+        keep_away(self._layers(), self.units, box * self.factors)
 
     def gain_loss(self, K: Tensor, norm: GainNorm = "frobenius") -> Tensor:
         """`||J_mu(0) + K|| + ||mu(0) - u_eq||`, the first norm as chosen; the sign is that of u = u_eq - K x.

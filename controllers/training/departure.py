@@ -4,7 +4,8 @@ Bounds on Vdot follow each unit's difference from its tangent at the origin alon
 magnitudes. So what a proof sees of a policy is a sum over units, not the policy's shape: two bends that cancel cost
 twice. The sum below is that one, in the smooth form that a gradient needs. A tanh whose values range over +- v differs
 from its tangent by about v^3 / 3, while its weight towards the inputs grows as 1 / v only: the same action from smaller
-ranges is easier to prove. Another smooth unit differs by about v^2, a relu by what lies beyond its corner. The last tanh is left out; it keeps the inputs in their bounds and is not to be trained away.
+ranges is easier to prove. Other smooth units differ by about v^2, a relu by what lies beyond its corner. The last
+tanh is left out; it keeps the inputs in their bounds and is not to be trained away.
 """
 
 from __future__ import annotations

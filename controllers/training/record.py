@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 from decimal import Decimal
 from fractions import Fraction
@@ -12,6 +13,7 @@ import torch
 
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
+from controllers.evaluation.corners import nearest_corner
 from controllers.evaluation.curvature import curvature
 from controllers.identification.gain_learner import Identified
 from controllers.options import TrainingOptions
@@ -41,6 +43,8 @@ def training_record(
     off : ||J_mu(0) + K|| and ||mu(0) - u_eq|| of the actor.
     """
     learned: dict[str, Any] = {}
+    corner = nearest_corner(network, system)
+    bent = {"nearest_corner": corner} if math.isfinite(corner) else {}
     if identified is not None:
         learned = {name: getattr(identified, name).tolist() for name in ("A", "B", "K")} | {"distance": off[0]}
     return {
@@ -48,6 +52,7 @@ def training_record(
         **learned,
         "offset_before_centring": off[1],
         "curvature": curvature(network, system, options.eta),
+        **bent,
         "versions": {
             "python": platform.python_version(),
             "torch": torch.__version__.split("+")[0],

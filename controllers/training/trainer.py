@@ -26,6 +26,7 @@ from certify.certificates import write_atomically
 from certify.errors import InputError, OptionError
 from certify.loop.plants import System
 from certify.loop.policies import Policy
+from controllers.evaluation.corners import nearest_corner
 from controllers.identification.gain_learner import GainLearner, Phase
 from controllers.options import Plant, TrainingOptions
 from controllers.training.annealing import annealed_share, closing_share
@@ -138,7 +139,8 @@ class Trainer:
 
         Raises
         ------
-        InputError : the run is too short to have learned a gain, and was to learn one; or it has diverged.
+        InputError : the run is too short to have learned a gain, and was to learn one; it has diverged; or a unit has
+            its corner at the origin.
         """
         self._require_finite(self.distance()[1])
         if not self.ships:
@@ -148,6 +150,11 @@ class Trainer:
                 f"the run ended after {self.steps_done} steps without a gain; it needs more `steps`{instead}."
             )
         network, found, device = self.sac.actor.network(), self.gain.identified, self.sac.device
+        if not nearest_corner(network, self.system) > 0:
+            raise OptionError(
+                f"a unit of {network.activation} has its corner at the origin, where the policy then has no slope; "
+                "train for more `steps` or with another `seed`."
+            )
         record = training_record(self.options, self.system, network, found, self.distance(), device)
         return Policy(network, self.system.name, parameters_of(self.system), record)
 

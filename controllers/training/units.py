@@ -1,7 +1,8 @@
-"""The units of a network in torch: the values and slopes of an activation, and first biases that keep its corner away.
+"""The units of a network in torch: the values and slopes of an activation, and biases that keep its corner away.
 
 relu has a corner at 0, elu and softsign one in their slope. Where a unit's argument at the origin is 0, the policy has
-no Jacobian there, and nothing is proved; where it is nearly 0, little is. So biases begin at a distance from 0.
+no Jacobian there, and nothing is proved; where it is nearly 0, little is. So biases begin at a distance from 0, and
+training keeps one.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ from torch import Tensor, nn
 from certify.loop.activations import activation
 
 Pair = tuple[Tensor, Tensor]
-_LEAST = 0.5  # share of a layer's largest first bias below which no argument at the origin begins
 
 
 def _tanh(y: Tensor) -> Pair:
@@ -91,8 +91,8 @@ class Units:
 
 
 @torch.no_grad()
-def keep_corners_away(layers: Sequence[nn.Linear], units: Units) -> None:
-    """Move biases of new hidden layers so that no unit's argument at the origin is near the activation's corner.
+def begin_away(layers: Sequence[nn.Linear], units: Units) -> None:
+    """Move the biases of new hidden layers so that no unit's argument at the origin is near the activation's corner.
 
     With b = 1 / sqrt(inputs) of the layer, torch's largest first bias, the argument y becomes `sign(y) (b + |y|) / 2`.
     Layers of smooth units stay as they are.
@@ -102,6 +102,30 @@ def keep_corners_away(layers: Sequence[nn.Linear], units: Units) -> None:
     h = layers[0].weight.new_zeros(layers[0].in_features)
     for layer in layers:
         y = layer(h)
-        away = torch.where(y < 0, -1.0, 1.0) * _LEAST * (layer.in_features**-0.5 + y.abs())
-        layer.bias += away - y
-        h = units(layer(h))
+        h = units(_moved(layer, y, (layer.in_features**-0.5 + y.abs()) / 2))
+
+
+@torch.no_grad()
+def keep_away(layers: Sequence[nn.Linear], units: Units, half_widths: Tensor) -> None:
+    """Move the biases of hidden layers as little as needed so that no unit passes its corner in a box.
+
+    To first order, as `nearest_corner` has it; a unit stays on its side. Layers of smooth units stay as they are.
+
+    Parameters
+    ----------
+    half_widths : (n,), of the box around the origin, in what the first layer reads.
+    """
+    if units.is_smooth:
+        return
+    h, J = torch.zeros_like(half_widths), torch.diag(half_widths)
+    for layer in layers:
+        y, J = layer(h), layer.weight @ J
+        h, slope = units.pair(_moved(layer, y, torch.maximum(y.abs(), J.abs().sum(1))))
+        J = slope[:, None] * J
+
+
+def _moved(layer: nn.Linear, y: Tensor, size: Tensor) -> Tensor:
+    """Arguments of this size on the side where they are, y, by the layer's bias."""
+    away = torch.where(y < 0, -size, size)
+    layer.bias.add_(away - y)
+    return away
