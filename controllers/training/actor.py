@@ -62,7 +62,7 @@ class Actor(nn.Module):
         self.mean = nn.Linear(sizes[-1], m, device=CPU)
         self.log_std = nn.Linear(sizes[-1], m, device=CPU)
         self.centre, self.bounds, self.units = centre, tuple(log_std), Units(activation)
-        begin_away(self._layers(), self.units)
+        begin_away(self._arrays(), self.units)
         for name, numbers in (
             ("scale", interface.scale),
             ("offset", interface.offset),
@@ -149,7 +149,7 @@ class Actor(nn.Module):
 
     def keep_corners_away(self, box: Tensor) -> None:
         """Move biases so that no unit passes its corner in the box with half-widths (n,), in the states' units."""
-        keep_away(self._layers(), self.units, box * self.factors)
+        keep_away(self._arrays(), self.units, box * self.factors)
 
     def gain_loss(self, K: Tensor, norm: GainNorm = "frobenius") -> Tensor:
         """`||J_mu(0) + K|| + ||mu(0) - u_eq||`, the first norm as chosen; the sign is that of u = u_eq - K x.
@@ -187,6 +187,9 @@ class Actor(nn.Module):
 
     def _layers(self) -> list[nn.Linear]:
         return cast(list[nn.Linear], list(self.hidden))
+
+    def _arrays(self) -> list[tuple[Tensor, Tensor]]:
+        return [(layer.weight, layer.bias) for layer in self._layers()]
 
 
 def _largest_singular(matrix: Tensor) -> Tensor:

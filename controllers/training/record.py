@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from certify.errors import OptionError
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
 from controllers.evaluation.corners import nearest_corner
@@ -26,6 +27,20 @@ def parameters_of(system: System) -> dict[str, str]:
         decimal = str(Decimal(value.numerator) / Decimal(value.denominator))
         texts[name] = decimal if Fraction(decimal) == value else str(value)
     return texts
+
+
+def require_slope(network: PolicyNetwork, system: System) -> None:
+    """Refuse a policy that has no Jacobian at the origin.
+
+    Raises
+    ------
+    InputError : a unit's corner lies there.
+    """
+    if not nearest_corner(network, system) > 0:
+        raise OptionError(
+            f"a unit of {network.activation} has its corner at the origin, where the policy then has no slope; train "
+            "for more `steps` or with another `seed`."
+        )
 
 
 def training_record(

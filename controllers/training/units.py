@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from certify.loop.activations import activation
 
 Pair = tuple[Tensor, Tensor]
+Layers = Sequence[tuple[Tensor, Tensor]]  # weights (out, in) and biases (out,)
 
 
 def _tanh(y: Tensor) -> Pair:
@@ -91,7 +92,7 @@ class Units:
 
 
 @torch.no_grad()
-def begin_away(layers: Sequence[nn.Linear], units: Units) -> None:
+def begin_away(layers: Layers, units: Units) -> None:
     """Move the biases of new hidden layers so that no unit's argument at the origin is near the activation's corner.
 
     With b = 1 / sqrt(inputs) of the layer, torch's largest first bias, the argument y becomes `sign(y) (b + |y|) / 2`.
@@ -99,14 +100,14 @@ def begin_away(layers: Sequence[nn.Linear], units: Units) -> None:
     """
     if units.is_smooth:
         return
-    h = layers[0].weight.new_zeros(layers[0].in_features)
-    for layer in layers:
-        y = layer(h)
-        h = units(_moved(layer, y, (layer.in_features**-0.5 + y.abs()) / 2))
+    h = layers[0][0].new_zeros(layers[0][0].shape[1])
+    for weight, bias in layers:
+        y = weight @ h + bias
+        h = units(_moved(bias, y, (weight.shape[1] ** -0.5 + y.abs()) / 2))
 
 
 @torch.no_grad()
-def keep_away(layers: Sequence[nn.Linear], units: Units, half_widths: Tensor) -> None:
+def keep_away(layers: Layers, units: Units, half_widths: Tensor) -> None:
     """Move the biases of hidden layers as little as needed so that no unit passes its corner in a box.
 
     To first order, as `nearest_corner` has it; a unit stays on its side. Layers of smooth units stay as they are.
@@ -118,14 +119,14 @@ def keep_away(layers: Sequence[nn.Linear], units: Units, half_widths: Tensor) ->
     if units.is_smooth:
         return
     h, J = torch.zeros_like(half_widths), torch.diag(half_widths)
-    for layer in layers:
-        y, J = layer(h), layer.weight @ J
-        h, slope = units.pair(_moved(layer, y, torch.maximum(y.abs(), J.abs().sum(1))))
+    for weight, bias in layers:
+        y, J = weight @ h + bias, weight @ J
+        h, slope = units.pair(_moved(bias, y, torch.maximum(y.abs(), J.abs().sum(1))))
         J = slope[:, None] * J
 
 
-def _moved(layer: nn.Linear, y: Tensor, size: Tensor) -> Tensor:
+def _moved(bias: Tensor, y: Tensor, size: Tensor) -> Tensor:
     """Arguments of this size on the side where they are, y, by the layer's bias."""
     away = torch.where(y < 0, -size, size)
-    layer.bias.add_(away - y)
+    bias.add_(away - y)
     return away
