@@ -162,7 +162,7 @@ def rows(
     found = []
     for seed in range(seeds):
         own = replace(options, seed=seed)
-        name, asked = f"{system.name}/{folder.name}/{seed}", {"options": own.record(), "time_limit": limit}
+        name, asked = f"{system.name}/{folder.name}/{seed}", {"options": own.full_record(), "time_limit": limit}
         row = store.find(name, asked)
         if row is None and training:
             place = folder / f"seed-{seed}"

@@ -13,6 +13,7 @@ import typer
 
 from certify.cli.ending import closed_pipe, end_by_sigterm, is_of_closed_pipe
 from controllers.commands.compare import compare
+from controllers.commands.distil import distil
 from controllers.commands.evaluate import evaluate
 from controllers.commands.flatten import flatten
 from controllers.commands.history import history
@@ -28,6 +29,7 @@ app = typer.Typer(
 )
 app.command("train")(train)
 app.command("flatten")(flatten)
+app.command("distil")(distil)
 app.command("evaluate")(evaluate)
 app.command("theory")(theory)
 app.command("train-baseline")(train_baseline)

@@ -22,6 +22,7 @@ from controllers.plants import shipped
 if TYPE_CHECKING:
     from certify.loop.plants import System
 
+Activation = Literal["tanh", "relu", "elu", "sigmoid", "silu", "gelu", "softplus", "mish", "softsign"]
 Centre = Literal["preactivation", "output", "none"]
 Identification = Literal["during", "before", "never"]
 Transitions = Literal["all", "latest"]
@@ -69,6 +70,10 @@ class TrainingOptions:
     critic_scale: Annotated[float, "Unit of the critics' values; about the size of a return."] = 100.0
     warm_up: Annotated[int, "First steps, with uniform random actions and without gradient steps."] = 1000
     actor: Annotated[tuple[int, ...], "Hidden widths of the actor."]
+    activation: Annotated[
+        Activation,
+        "Function between the actor's layers: tanh, relu, elu, sigmoid, silu, gelu, softplus, mish or softsign.",
+    ] = "tanh"
     critic: Annotated[tuple[int, ...], "Hidden widths of the value and Q networks."]
     log_std: Annotated[
         tuple[float, ...], "Lower and upper bound of the log standard deviation; none means that it has no bounds."
@@ -78,7 +83,9 @@ class TrainingOptions:
         float, "Weight of the mean ||J_mu(x) - J_mu(0)|| / ||x|| in the ball in the actor's loss; 0 drops the term."
     ] = 0.0
     rest_weight: Annotated[
-        float, "Weight of the hidden units' norms at the origin, summed over layers, in the actor's loss; 0 drops it."
+        float,
+        "Weight of the hidden units' norms at the origin, summed over layers, in the actor's loss; 0 drops it. Of tanh "
+        "units only.",
     ] = 0.0
     proof_weight: Annotated[
         float,
@@ -87,6 +94,9 @@ class TrainingOptions:
     proof_box: Annotated[
         tuple[float, ...], "Half-widths of that box, one a state; none means the states in which episodes start."
     ] = ()
+    corner_margin: Annotated[
+        float, "Share of the domain, around the origin, in which no unit of relu, elu or softsign passes its corner."
+    ] = 0.1
     # The stabilising part
     identification: Annotated[
         Identification,
@@ -123,7 +133,7 @@ class TrainingOptions:
         for name in ("seed", "penalty", "gain_weight", "curvature_weight", "rest_weight", "proof_weight", "warm_up"):
             self._require(name, getattr(self, name) >= 0, "at least 0")
         self._require("seed", self.seed < 2**63, "below 2^63")
-        for name in ("gamma", "anneal"):
+        for name in ("gamma", "anneal", "corner_margin"):
             self._require(name, 0 <= getattr(self, name) < 1, "in [0, 1)")
         for name in ("tau", "start"):
             self._require(name, 0 < getattr(self, name) <= 1, "in (0, 1]")
@@ -137,6 +147,7 @@ class TrainingOptions:
         rising = len(self.log_std) == 2 and self.log_std[0] < self.log_std[1]
         self._require("log_std", not self.log_std or rising, "two rising numbers, or none")
         choices_of = {
+            "activation": Activation,
             "centre": Centre,
             "identification": Identification,
             "transitions": Transitions,
@@ -171,9 +182,18 @@ class TrainingOptions:
             self._require("dt", lo <= self.dt <= hi, f"{held}, over which {system.name} holds its inputs")
 
     def record(self) -> dict[str, Any]:
-        """All options as plain values, for the policy file and for checkpoints."""
-        return _plain({option.name: getattr(self, option.name) for option in fields(self)})
+        """The options as plain values, for the policy file and for checkpoints; those of a tanh run look as ever."""
+        values = _plain({option.name: getattr(self, option.name) for option in fields(self)})
+        left_out = _LATER if self.activation == "tanh" else {}
+        return {name: value for name, value in values.items() if (name, value) not in left_out.items()}
 
+    def full_record(self) -> dict[str, Any]:
+        """All options as plain values, to compare with `default_record()` and what a record has beyond it."""
+        return {**default_record(), **self.record()}
+
+
+_LATER = {"activation": "tanh", "corner_margin": 0.1}
+"""Defaults of options that came later, which the record of a tanh run leaves out."""
 
 _FORMER = {"transitions": "latest"}
 """Values that runs had before an option was there, where they are not its default."""

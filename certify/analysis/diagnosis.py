@@ -23,6 +23,7 @@ from certify.analysis.results import RoaResult
 from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT, UNLIMITED, WHOLE, Effort
 from certify.errors import InputError
+from certify.loop.activations import activation
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, require_equilibrium
 from certify.loop.policies import Centre, PolicyNetwork
@@ -231,9 +232,8 @@ def _may_go_beyond(result: RoaResult, options: RoaOptions) -> bool:
 def _can_be_flattened(result: RoaResult) -> bool:
     """True if `controllers flatten` takes the policy and judges it by the loop that is certified."""
     network, system = result.network, result.system
-    return (
-        network.network.is_chain and network.network.functions == ("tanh",) and not (system.in_steps or system.ranges)
-    )
+    layers = network.network.is_chain and bool(network.network.functions)
+    return layers and not (system.in_steps or system.ranges)
 
 
 def _share_proved(result: RoaResult) -> float:
@@ -258,11 +258,11 @@ def _bend(network: PolicyNetwork, half_widths: Array) -> float:
     through, times their gain towards the inputs.
     """
     y, J, units = np.zeros(network.n), np.eye(network.n), list[tuple[Array, Array, Array]]()
+    phi = activation(network.activation)
     for W, b in zip(network.weights[:-1], network.biases[:-1], strict=True):
         y, J = W @ y + b, W @ J
-        t, reach = np.tanh(y), np.abs(J) @ half_widths
-        slope = 1 - t**2
-        ends = [np.abs(np.tanh(y + v) - t - slope * v) for v in (reach, -reach)]
+        (t, slope), reach = phi.pair(y), np.abs(J) @ half_widths
+        ends = [np.abs(phi.pair(y + v)[0] - t - slope * v) for v in (reach, -reach)]
         units.append((W, slope, (ends[0] + ends[1]) / 2))
         y, J = t, slope[:, None] * J
     gain, total = network.weights[-1], 0.0

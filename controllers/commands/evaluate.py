@@ -74,6 +74,7 @@ def _table(result: Evaluation, options: EvaluationOptions) -> dict[str, Any]:
         "||J+K||/||K||": f"{100 * result.gain_relative:.3g} %" if learned else None,
         "learned A, B, K": f"off by {A_error}, {B_error} and {K_error}" if learned else None,
         "curvature": None if math.isnan(result.curvature) else f"{result.curvature:.4g}",
+        **({} if math.isinf(result.corner) else {"nearest corner": f"at {result.corner:.3g} of the domain"}),
         **runs,
     } | ({} if covered is None else {"in the proved set": _share(covered)})
 

@@ -205,7 +205,7 @@ def _summary(policy: Policy, out: Path) -> dict[str, Any]:
         "K": training.get("K"),
         "distance": training.get("distance"),
         "curvature": training["curvature"],
-    }
+    } | {name: training[name] for name in ("nearest_corner",) if name in training}
 
 
 train.__signature__ = _signature()  # type: ignore[attr-defined]

@@ -176,7 +176,7 @@ def _require_asked(run: Run, path: Path, system: System, training: TrainingOptio
     """
     policy = load_policy(path)
     require_plant(str(path), policy.system, policy.parameters, system)
-    asked = run_options(run, training, plan).record()
+    asked = run_options(run, training, plan).full_record()
     used = {**default_record(), **policy.training}  # a run had no options that came later
     for name in sorted(asked.keys() - _NO_MATTER - _UNUSED.get(run, frozenset())):
         if used.get(name) != asked[name]:

@@ -68,7 +68,8 @@ def from_checkpoint(checkpoint: bytes, system: System) -> Trained:
     try:
         (name, parameters), options = state["system"], {**default_record(), **state["options"]}
         require_plant("checkpoint", name, parameters, system)
-        actor = Actor(interface, options["actor"], options["centre"], options["log_std"])
+        shape = (options["actor"], options["centre"], options["log_std"], options["activation"])
+        actor = Actor(interface, *shape)
         actor.load_state_dict(state["sac"]["actor"])
         steps, seed = int(state["steps_done"]), int(options["seed"])
     except InputError:

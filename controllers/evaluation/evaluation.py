@@ -20,6 +20,7 @@ from certify.errors import InputError
 from certify.loop.plants import System
 from certify.loop.plants.system import Time
 from certify.loop.policies import Policy
+from controllers.evaluation.corners import nearest_corner
 from controllers.evaluation.curvature import curvature
 from controllers.evaluation.proved_set import Covered, count_covered
 from controllers.evaluation.record import recorded, recorded_step
@@ -41,6 +42,7 @@ class Evaluation:
 
     `K_relative_error` is against the gain of the true plant, for the weights that the record says K was made for.
     `curvature` is that of `curvature()` in the ball in which the plant was identified; NaN without `training.eta`.
+    `corner` is that of `nearest_corner()`, infinite for smooth units.
     `eigenvalues` are those of the closed loop's Jacobian at the origin: of the rate of change, or, where `time` is
     discrete, of a step. `continuous` is None in discrete time. `covered` is None without a certificate.
     """
@@ -58,6 +60,7 @@ class Evaluation:
     continuous: Settling | None
     held: Settling
     covered: Covered | None = None
+    corner: float = math.inf
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; NaN and infinity become None."""
@@ -78,6 +81,7 @@ class Evaluation:
             "policy": {"sha256": self.sha256},
             "gain": {"distance": _finite(self.gain_distance), "relative": _finite(self.gain_relative)},
             "curvature": _finite(self.curvature),
+            "nearest_corner": _finite(self.corner),
             "identification": {
                 "A": _finite(self.A_relative_error),
                 "B": _finite(self.B_relative_error),
@@ -146,6 +150,7 @@ def evaluate(
         continuous=continuous,
         held=held,
         covered=covered,
+        corner=nearest_corner(network, system),
     )
 
 

@@ -24,9 +24,7 @@ def bend(network: PolicyNetwork, box: Sequence[float] | Array, states: int = 100
     """
     half_widths = np.asarray(box, dtype=np.float64)
     x = np.random.default_rng(0).uniform(-half_widths, half_widths, (states, network.n))
-    affine = PolicyNetwork.of_layers(
-        network.weights, network.biases, np.ones(network.m), np.zeros(network.m), "identity", "none"
-    )
+    affine = PolicyNetwork(network.network, np.ones(network.m), np.zeros(network.m), "identity", "none")
     J = affine.jacobian_at_origin(())
     linear = x @ J.T
     rest = affine.net(x) - affine.net(np.zeros(network.n)) - linear

@@ -1,9 +1,12 @@
 """Policies between a policy and its own linearisation: one number says how much of the hidden units' curvature is left.
 
-A unit that ranges over a tenth of what it did, behind weights ten times as large, does the same to first order and a
+A tanh that ranges over a tenth of what it did, behind weights ten times as large, does the same to first order and a
 hundredth of what it did to third. Shrinking every hidden unit's range so, by the first layer, and making up for it in
 the last one leads from a network (factor 1) to its linearisation (factor 0), squash and centring untouched. Training
 would have to find that way through five layers step by step; it is a closed form.
+
+A tanh is straight at 0, so the values at the origin shrink too. Other units keep these values: most are not straight at
+0, and a relu has its corner there, which leaves the range as that shrinks.
 """
 
 from __future__ import annotations
@@ -12,16 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
+from certify.loop.activations import activation
 from certify.loop.policies import PolicyNetwork
 
 Array = NDArray[np.float64]
 
 
 def contracted(network: PolicyNetwork, factor: float) -> PolicyNetwork:
-    """The policy whose hidden units range, and rest at the origin, at `factor` times what they did.
+    """The policy whose hidden units range over `factor` times what they did; tanh units rest there at the origin too.
 
     Values before each tanh at the origin become `factor` times as large, and with them, to first order, what each
-    unit makes of the state; the next layer's weights take back the change of tanh's slope. So net(0) and the Jacobian
+    unit makes of the state; the next layer's weights take back the change of tanh's slope. Values before other units
+    stay at the origin, and so do the slopes. So net(0) and the Jacobian
     at the origin stay, up to the rounding to float32. Layers, squash, centring, scale, offset and clip are the same.
 
     Parameters
@@ -41,7 +46,8 @@ def contracted(network: PolicyNetwork, factor: float) -> PolicyNetwork:
     last = len(network.weights) - 1
     weights, biases = [], []
     h = shrunk = np.zeros(network.n)
-    slopes = np.ones(network.n)  # tanh' of the old unit over that of the new one
+    slopes = np.ones(network.n)  # phi' of the old unit over that of the new one
+    phi, rests = activation(network.activation), factor if network.activation == "tanh" else 1.0
     for k, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
         y = weight @ h + bias
         stretch = (factor if k == 0 else 1.0) / (factor if k == last else 1.0)
@@ -49,18 +55,19 @@ def contracted(network: PolicyNetwork, factor: float) -> PolicyNetwork:
         if k == last:
             biases.append(_last_bias(weights[-1], shrunk, y))
             break
-        biases.append(_single(factor * y - weights[-1] @ shrunk))
-        h, shrunk = np.tanh(y), np.tanh(weights[-1] @ shrunk + biases[-1])
-        old, new = 1 - h**2, 1 - shrunk**2
-        slopes = np.divide(old, new, out=np.zeros(len(old)), where=old > 0)  # a saturated unit passes nothing on
+        biases.append(_single(rests * y - weights[-1] @ shrunk))
+        (h, old), (shrunk, new) = phi.pair(y), phi.pair(weights[-1] @ shrunk + biases[-1])
+        slopes = np.ones(len(old))
+        if rests != 1:
+            slopes = np.divide(old, new, out=np.zeros(len(old)), where=old > 0)  # a saturated unit passes nothing on
     return network.with_layers(weights=tuple(weights), biases=tuple(biases))
 
 
 def with_value_at_origin(network: PolicyNetwork, value: Array) -> PolicyNetwork:
     """The network with the last bias that makes net(0) equal `value` (m,), up to rounding."""
-    h = np.zeros(network.n)
+    h, phi = np.zeros(network.n), activation(network.activation)
     for weight, bias in zip(network.weights[:-1], network.biases[:-1], strict=True):
-        h = np.tanh(weight @ h + bias)
+        h, _ = phi.pair(weight @ h + bias)
     return network.with_layers(biases=(*network.biases[:-1], _last_bias(network.weights[-1], h, value)))
 
 

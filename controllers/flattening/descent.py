@@ -80,7 +80,7 @@ class Descent:
             change = (student(states) - wanted) / size
             fit = change.square().sum(1).mean()
             gain = ((slope[:, None] * student.jacobian()) * box - J).square().sum() / largest
-            bends = departure(student.weights, student.biases, box)
+            bends = departure(student.weights, student.biases, box, student.units)
             return fit + GAIN * gain + task.options.weight * bends, fit, bends
 
         return loss

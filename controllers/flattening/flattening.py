@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from certify.errors import InputError, OptionError
+from certify.errors import OptionError
 from certify.loop.plants import System
 from certify.loop.policies import Policy, PolicyNetwork
 from controllers.evaluation.curvature import curvature
@@ -59,15 +59,12 @@ def flatten(
 
     Raises
     ------
-    InputError : policy, box and plant do not fit each other; the policy has no hidden units, or others than tanh; its
-        closed loop has no finite cost to compare with; there is no LQR gain, or the policy cannot have it, where that
-        is asked for; or no iterate has a lower departure within the bounds.
+    InputError : policy, box and plant do not fit each other; the policy has no hidden units, or other steps than
+        layers; its closed loop has no finite cost to compare with; there is no LQR gain, or the policy cannot have it,
+        where that is asked for; or no iterate has a lower departure within the bounds.
     """
     options, began = options or FlattenOptions(), time.monotonic()
-    if policy.network.activation != "tanh":
-        raise InputError(
-            f"a policy must have tanh between its layers to be flattened; this one has {policy.network.activation}."
-        )
+    policy.network.require_layers("flattening")
     torch.set_num_threads(options.threads)
     task = Task(policy, options, chosen)
     selection = Selection(task, task.visited(task.goal))

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from certify.errors import InputError
 from certify.loop.policies import PolicyNetwork, require_centred
+from controllers.evaluation.corners import nearest_corner
 from controllers.flattening.result import Figures
 from controllers.flattening.task import Task
 from controllers.training.departure import departure_of
@@ -40,6 +41,7 @@ class Selection:
                 f"the policy must have a finite median cost to compare with; half of {task.options.states} runs of "
                 f"{task.system.name} or more diverge. Choose smaller `initial_states`, or train it further."
             )
+        self.corner = min(1.0, nearest_corner(task.old, task.system))  # no unit may have its corner nearer
         self.best: tuple[PolicyNetwork, Figures] | None = None
         self._objective = math.inf
 
@@ -49,6 +51,8 @@ class Selection:
             return False
         objective = self.objective(network)
         if self.best is not None and objective >= self._objective:
+            return False
+        if nearest_corner(network, self.task.system) < self.corner:
             return False
         task, figures = self.task, self.task.figures(network)
         allowed = (1 + task.options.max_cost_change) * self.before.cost

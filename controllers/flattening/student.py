@@ -11,6 +11,7 @@ from torch import Tensor
 
 from certify.loop.policies import PolicyNetwork
 from controllers.training.departure import linearised
+from controllers.training.units import Units
 
 Array = NDArray[np.float64]
 
@@ -27,7 +28,7 @@ class Student(torch.nn.Module):
         self.value, self.scale, self.offset = (
             torch.tensor(a, dtype=torch.float32) for a in (value, folded.scale, folded.offset)
         )
-        self.folded = folded
+        self.folded, self.units = folded, Units(start.activation)
         self.n = start.n
 
     @property
@@ -42,14 +43,15 @@ class Student(torch.nn.Module):
         """Inputs (batch, m) at states (batch, n)."""
         h = torch.cat([x, x.new_zeros(1, self.n)])
         for k, (W, b) in enumerate(zip(self._weights, self._biases, strict=True)):
-            h = torch.addmm(b, torch.tanh(h) if k else h, W.T)
+            h = torch.addmm(b, self.units(h) if k else h, W.T)
         y = self.folded.squashed(h[:-1] - h[-1] + self.value)
         u: Tensor = self.folded.clipped(self.scale * y + self.offset)
         return u
 
     def jacobian(self) -> Tensor:
         """The Jacobian (m, n) of net at the origin, in float64."""
-        return linearised([W.double() for W in self._weights], [b.double() for b in self._biases]).jacobians[-1]
+        weights, biases = ([p.double() for p in of] for of in (self._weights, self._biases))
+        return linearised(weights, biases, self.units).jacobians[-1]
 
     def groups(self, states: Array, rate: float) -> list[dict[str, Any]]:
         """Parameters with their first steps: a share of a layer's weights, and of the values that a bias is added to.
@@ -60,7 +62,7 @@ class Student(torch.nn.Module):
         h = torch.from_numpy(states).float()
         with torch.no_grad():
             for k, (W, b) in enumerate(zip(self._weights, self._biases, strict=True)):
-                h = torch.addmm(b, torch.tanh(h) if k else h, W.T)
+                h = torch.addmm(b, self.units(h) if k else h, W.T)
                 groups.append({"params": [W], "lr": rate * _size(W)})
                 if b.requires_grad:
                     groups.append({"params": [b], "lr": rate * _size(h)})

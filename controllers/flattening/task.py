@@ -56,7 +56,7 @@ class Task:
         self.plant.check(self.system)
         self._require_sizes()
         self.u_eq = self.system.exact_u_eq()
-        self.dt, self.Q, self.R = self._judging_weights()
+        self.dt, self.Q, self.R = judging_weights(policy, self.system, self.plant)
         self.box = np.array(options.box if options.box is not None else self.plant.initial_states)
         self.K = None if options.gain == "kept" else self._lqr_gain()
         self.goal = self.old if self.K is None else regained(self.old, self.u_eq, -self.K, self.box)
@@ -68,12 +68,7 @@ class Task:
 
     def visited(self, network: PolicyNetwork) -> Array:
         """States (N, n) on the way from the box of initial states, over an episode's horizon, inside the domain."""
-        loop = held_loop(self.system, self.dt, mean_action(network, self.system), self.Q, self.R)
-        preset, every = self.plant.preset, 1 if self.system.time == "discrete" else _EVERY
-        runs = loop.run(self.x0, preset.horizon * preset.dt)
-        states = np.concatenate([x for k, (x, _) in enumerate(runs) if k % every == 0])
-        lo, hi = np.array(self.system.domain, dtype=np.float64).T
-        return np.asarray(states[((states >= lo) & (states <= hi)).all(axis=1)])  # NaN, a run that diverged, is not
+        return visited_states(network, self.system, self.plant, (self.dt, self.Q, self.R), self.x0)
 
     def inputs(self, network: PolicyNetwork, states: Array) -> Array:
         """The inputs (N, m) that a policy gives at states (N, n)."""
@@ -143,27 +138,6 @@ class Task:
         Q, R = self.lqr_weights()
         return riccati_gain(*discrete_linearisation(self.system, self.dt), np.diag(Q), np.diag(R))
 
-    def _judging_weights(self) -> tuple[float, Array, Array]:
-        """dt, Q and R of the runs that judge: the policy's record, and the plant's preset where it has none.
-
-        dt is one over which the plant holds its inputs, in discrete time 1.
-        """
-        preset, record = self.plant.preset, self.policy.training
-        wanted = (("dt", ()), ("state_weights", (self.system.n,)), ("input_weights", (self.system.m,)))
-        found = []
-        for name, shape in wanted:
-            try:
-                value = np.array(record.get(name, getattr(preset, name)), dtype=np.float64)
-            except (TypeError, ValueError) as error:
-                raise InputError(f"`training.{name}` of the policy must hold numbers.") from error
-            if value.shape != shape or not np.all(np.isfinite(value)) or np.any(value < 0):
-                raise InputError(f"`training.{name}` must hold finite numbers of shape {shape}, none of them negative.")
-            found.append(value)
-        dt = float(found[0])
-        if not dt > 0:
-            raise InputError(f"`training.dt` of the policy must be positive; found {dt}.")
-        return held_over(self.system, dt), found[1], found[2]
-
     def _require_sizes(self) -> None:
         network, system, box = self.old, self.system, self.options.box
         if (network.n, network.m) != (system.n, system.m):
@@ -185,3 +159,42 @@ class Task:
         except InputError:
             return False
         return True
+
+
+def visited_states(
+    network: PolicyNetwork, system: System, plant: Plant, judging: tuple[float, Array, Array], x0: Array
+) -> Array:
+    """States (N, n) on the way from x0, over an episode's horizon, inside the domain; `judging` is dt, Q and R."""
+    dt, Q, R = judging
+    loop = held_loop(system, dt, mean_action(network, system), Q, R)
+    preset, every = plant.preset, 1 if system.time == "discrete" else _EVERY
+    runs = loop.run(x0, preset.horizon * preset.dt)
+    states = np.concatenate([x for k, (x, _) in enumerate(runs) if k % every == 0])
+    lo, hi = np.array(system.domain, dtype=np.float64).T
+    return np.asarray(states[((states >= lo) & (states <= hi)).all(axis=1)])  # NaN, a run that diverged, is not
+
+
+def judging_weights(policy: Policy, system: System, plant: Plant) -> tuple[float, Array, Array]:
+    """dt, Q and R of the runs that judge: the policy's record, and the plant's preset where it has none.
+
+    dt is one over which the plant holds its inputs, in discrete time 1.
+
+    Raises
+    ------
+    InputError : the record holds something else.
+    """
+    preset, record = plant.preset, policy.training
+    wanted = (("dt", ()), ("state_weights", (system.n,)), ("input_weights", (system.m,)))
+    found = []
+    for name, shape in wanted:
+        try:
+            value = np.array(record.get(name, getattr(preset, name)), dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"`training.{name}` of the policy must hold numbers.") from error
+        if value.shape != shape or not np.all(np.isfinite(value)) or np.any(value < 0):
+            raise InputError(f"`training.{name}` must hold finite numbers of shape {shape}, none of them negative.")
+        found.append(value)
+    dt = float(found[0])
+    if not dt > 0:
+        raise InputError(f"`training.dt` of the policy must be positive; found {dt}.")
+    return held_over(system, dt), found[1], found[2]

@@ -11,10 +11,11 @@ import torch
 from torch import Tensor, nn
 
 from certify.loop.policies import PolicyNetwork
-from controllers.options import Centre, GainNorm
+from controllers.options import Activation, Centre, GainNorm
 from controllers.training.departure import departure
 from controllers.training.device import CPU, exact
 from controllers.training.interface import Interface
+from controllers.training.units import Units, begin_away, keep_away
 
 
 def squashed_log_likelihood(w: Tensor, mean: Tensor, log_std: Tensor, scale: Tensor) -> Tensor:
@@ -29,7 +30,7 @@ def squashed_log_likelihood(w: Tensor, mean: Tensor, log_std: Tensor, scale: Ten
 
 
 class Actor(nn.Module):
-    """Tanh Gaussian policy; the network's mean head alone is the policy that ships.
+    """Gaussian policy behind tanh; the network's mean head alone is the policy that ships.
 
     Parameters
     ----------
@@ -37,6 +38,7 @@ class Actor(nn.Module):
     widths : hidden widths.
     centre : how the mean will be centred, if at all; decides which Jacobian is compared with -K.
     log_std : lower and upper bound of the log standard deviation, or none.
+    activation : the function between the layers.
     """
 
     scale: Tensor
@@ -45,14 +47,22 @@ class Actor(nn.Module):
     factors: Tensor
     rest: Tensor
 
-    def __init__(self, interface: Interface, widths: Sequence[int], centre: Centre, log_std: Sequence[float]) -> None:
+    def __init__(
+        self,
+        interface: Interface,
+        widths: Sequence[int],
+        centre: Centre,
+        log_std: Sequence[float],
+        activation: Activation = "tanh",
+    ) -> None:
         super().__init__()
         n, m = len(interface.state_factors), len(interface.scale)
         sizes = [n, *widths]
         self.hidden = nn.ModuleList(nn.Linear(a, b, device=CPU) for a, b in pairwise(sizes))
         self.mean = nn.Linear(sizes[-1], m, device=CPU)
         self.log_std = nn.Linear(sizes[-1], m, device=CPU)
-        self.centre, self.bounds = centre, tuple(log_std)
+        self.centre, self.bounds, self.units = centre, tuple(log_std), Units(activation)
+        begin_away(self._arrays(), self.units)
         for name, numbers in (
             ("scale", interface.scale),
             ("offset", interface.offset),
@@ -66,7 +76,7 @@ class Actor(nn.Module):
         """Mean and log standard deviation of w, before the squash."""
         h = x * self.factors
         for layer in self.hidden:
-            h = torch.tanh(layer(h))
+            h = self.units(layer(h))
         log_std = self.log_std(h)
         return self.mean(h), log_std.clamp(*self.bounds) if self.bounds else log_std
 
@@ -87,8 +97,8 @@ class Actor(nn.Module):
         h = torch.zeros_like(self.factors)
         jacobian = torch.diag(self.factors)
         for layer in self._layers():
-            h = torch.tanh(layer(h))
-            jacobian = (1 - h * h)[:, None] * (layer.weight @ jacobian)
+            h, slope = self.units.pair(layer(h))
+            jacobian = slope[:, None] * (layer.weight @ jacobian)
         normalised = torch.tanh(self.mean(h))
         last = self.rest if self.centre == "preactivation" else normalised
         jacobian = (self.scale * (1 - last * last))[:, None] * (self.mean.weight @ jacobian)
@@ -99,8 +109,8 @@ class Actor(nn.Module):
         h, rest = x * self.factors, torch.zeros_like(self.factors)
         jacobian = torch.diag(self.factors).expand(len(x), -1, -1)
         for layer in self._layers():
-            h, rest = torch.tanh(layer(h)), torch.tanh(layer(rest))
-            jacobian = (1 - h * h)[..., None] * (layer.weight @ jacobian)
+            (h, slope), rest = self.units.pair(layer(h)), self.units(layer(rest))
+            jacobian = slope[..., None] * (layer.weight @ jacobian)
         w = self.mean(h)
         if self.centre == "preactivation":
             w = w - self.mean(rest) + torch.atanh(self.rest)
@@ -115,13 +125,15 @@ class Actor(nn.Module):
         return quotients.mean()
 
     def rest_loss(self) -> Tensor:
-        """Sum over the hidden layers of ||h(0)||_2, h the layer's tanh units.
+        """Sum over the hidden layers of ||h(0)||_2, h the layer's tanh units; 0 of other units.
 
         Where all of them are 0, so is every second derivative of the mean before its last tanh, unit by unit and not
         only in sum: bounds that add magnitudes find no curvature there either. Units far from 0 are also nearly
         saturated, which slows learning down.
         """
         h = torch.zeros_like(self.factors)
+        if self.units.name != "tanh":  # their second derivatives are not 0 where they are
+            return h.sum()
         norms = []
         for layer in self._layers():
             h = torch.tanh(layer(h))
@@ -132,7 +144,12 @@ class Actor(nn.Module):
         """`departure.departure` of the mean on the box with half-widths (n,), in the states' units."""
         layers = [*self._layers(), self.mean]
         weights = [layer.weight for layer in layers]
-        return departure([weights[0] * self.factors, *weights[1:]], [layer.bias for layer in layers], box)
+        biases = [layer.bias for layer in layers]
+        return departure([weights[0] * self.factors, *weights[1:]], biases, box, self.units)
+
+    def keep_corners_away(self, box: Tensor) -> None:
+        """Move biases so that no unit passes its corner in the box with half-widths (n,), in the states' units."""
+        keep_away(self._arrays(), self.units, box * self.factors)
 
     def gain_loss(self, K: Tensor, norm: GainNorm = "frobenius") -> Tensor:
         """`||J_mu(0) + K|| + ||mu(0) - u_eq||`, the first norm as chosen; the sign is that of u = u_eq - K x.
@@ -154,7 +171,7 @@ class Actor(nn.Module):
         return math.nan if K is None else float(torch.linalg.vector_norm(jacobian + K)), offset
 
     def network(self) -> PolicyNetwork:
-        """The mean action as an exact tanh network with its centring; the states' factors are folded in exactly."""
+        """The mean action as an exact network with its centring; the states' factors are folded in exactly."""
         layers = [*self._layers(), self.mean]
         weights = [exact(layer.weight) for layer in layers]
         weights[0] = weights[0] * exact(self.factors)
@@ -165,10 +182,14 @@ class Actor(nn.Module):
             offset=exact(self.offset),
             squash="tanh",
             centre=self.centre,
+            activation=self.units.name,
         )
 
     def _layers(self) -> list[nn.Linear]:
         return cast(list[nn.Linear], list(self.hidden))
+
+    def _arrays(self) -> list[tuple[Tensor, Tensor]]:
+        return [(layer.weight, layer.bias) for layer in self._layers()]
 
 
 def _largest_singular(matrix: Tensor) -> Tensor:

@@ -47,7 +47,7 @@ def require_same_run(state: dict[str, Any], system: System, options: TrainingOpt
     """
     if state.get("system") != [system.name, parameters_of(system)]:
         raise InputError(f"the checkpoint must be of {system.name}; it is of {state['system']}.")
-    mine = options.record()
+    mine = options.full_record()
     theirs = {**default_record(), **state.get("options", {})}  # a run had no options that came later
     changed = sorted(name for name in mine.keys() | theirs.keys() if mine.get(name) != theirs.get(name))
     if changed:

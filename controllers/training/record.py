@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 from decimal import Decimal
 from fractions import Fraction
@@ -10,8 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from certify.errors import OptionError
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
+from controllers.evaluation.corners import nearest_corner
 from controllers.evaluation.curvature import curvature
 from controllers.identification.gain_learner import Identified
 from controllers.options import TrainingOptions
@@ -24,6 +27,20 @@ def parameters_of(system: System) -> dict[str, str]:
         decimal = str(Decimal(value.numerator) / Decimal(value.denominator))
         texts[name] = decimal if Fraction(decimal) == value else str(value)
     return texts
+
+
+def require_slope(network: PolicyNetwork, system: System) -> None:
+    """Refuse a policy that has no Jacobian at the origin.
+
+    Raises
+    ------
+    InputError : a unit's corner lies there.
+    """
+    if not nearest_corner(network, system) > 0:
+        raise OptionError(
+            f"a unit of {network.activation} has its corner at the origin, where the policy then has no slope; train "
+            "for more `steps` or with another `seed`."
+        )
 
 
 def training_record(
@@ -41,6 +58,8 @@ def training_record(
     off : ||J_mu(0) + K|| and ||mu(0) - u_eq|| of the actor.
     """
     learned: dict[str, Any] = {}
+    corner = nearest_corner(network, system)
+    bent = {"nearest_corner": corner} if math.isfinite(corner) else {}
     if identified is not None:
         learned = {name: getattr(identified, name).tolist() for name in ("A", "B", "K")} | {"distance": off[0]}
     return {
@@ -48,6 +67,7 @@ def training_record(
         **learned,
         "offset_before_centring": off[1],
         "curvature": curvature(network, system, options.eta),
+        **bent,
         "versions": {
             "python": platform.python_version(),
             "torch": torch.__version__.split("+")[0],

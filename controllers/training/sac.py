@@ -59,12 +59,14 @@ class SAC:
     ) -> None:
         n, m = len(interface.state_factors), len(interface.scale)
         self.options, self.generator, self.device = options, generator, device
-        self.actor = Actor(interface, options.actor, options.centre, options.log_std).to(device)
+        shape = (options.actor, options.centre, options.log_std, options.activation)
+        self.actor = Actor(interface, *shape).to(device)
         self.value = Critic(n, options.critic, 1, options.critic_scale).to(device)
         self.value_target = Critic(n, options.critic, 1, options.critic_scale).to(device)
         self.value_target.load_state_dict(self.value.state_dict())
         self.q = Critic(n + m, options.critic, 2, options.critic_scale).to(device)
         self.box = torch.tensor(options.proof_box or options.start * interface.reach, device=device)
+        self._cornerless = torch.tensor(options.corner_margin * interface.reach, device=device).float()
         self._actor_weights = list(self.actor.parameters())
         self._critic_weights = [*self.value.parameters(), *self.q.parameters()]
         self._fresh: list[Tensor] = list(self.value.parameters())
@@ -116,6 +118,7 @@ class SAC:
 
         self.actor_optimiser.param_groups[0]["lr"] = options.learning_rate * actor_step
         _apply(self.actor_optimiser, self._actor_weights, actor_gradients)
+        self.actor.keep_corners_away(self._cornerless)
         _apply(self.critic_optimiser, self._critic_weights, critic_gradients)
         with torch.no_grad():
             torch._foreach_lerp_(self._averaged, self._fresh, options.tau)

@@ -36,7 +36,7 @@ from controllers.training.episode import RunningEpisode
 from controllers.training.interface import Interface
 from controllers.training.log import Episode, Monitored
 from controllers.training.monitoring import monitored
-from controllers.training.record import parameters_of, training_record
+from controllers.training.record import parameters_of, require_slope, training_record
 from controllers.training.replay import Replay
 from controllers.training.sac import SAC
 
@@ -138,7 +138,7 @@ class Trainer:
 
         Raises
         ------
-        InputError : the run is too short to have learned a gain, and was to learn one; or it has diverged.
+        InputError : the run is too short to have learned a gain, or has diverged, or a unit's corner is at the origin.
         """
         self._require_finite(self.distance()[1])
         if not self.ships:
@@ -148,6 +148,7 @@ class Trainer:
                 f"the run ended after {self.steps_done} steps without a gain; it needs more `steps`{instead}."
             )
         network, found, device = self.sac.actor.network(), self.gain.identified, self.sac.device
+        require_slope(network, self.system)
         record = training_record(self.options, self.system, network, found, self.distance(), device)
         return Policy(network, self.system.name, parameters_of(self.system), record)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certify.loop.networks.floats import Gradients, Tangent, tangent_at, values
+from certify.loop.networks.floats import Gradients, Tangent, Tangents, tangent_at, values
 from certify.loop.networks.layers import frozen, frozen_layers, like, sha256_of, tanh, through, widths
 from certify.loop.networks.steps import (
     Affine,
@@ -32,6 +32,7 @@ __all__ = [
     "Step",
     "Sum",
     "Tangent",
+    "Tangents",
     "frozen",
     "frozen_layers",
     "layered",

@@ -87,7 +87,9 @@ class Tangent:
     J: Array
 
 
-class _Tangents(Algebra[Tangent]):
+class Tangents(Algebra[Tangent]):
+    """Values and Jacobians together."""
+
     def affine(self, step: Affine, v: Tangent) -> Tangent:
         return Tangent(step.weight @ v.y + step.bias, step.weight @ v.J)
 
@@ -114,7 +116,7 @@ class _Tangents(Algebra[Tangent]):
 
 def tangent_at(network: Network, x: Array) -> Tangent:
     """The network's value (gives,) and Jacobian (gives, reads) at a state (reads,)."""
-    return _Tangents().run(network, Tangent(x, np.eye(network.reads)))
+    return Tangents().run(network, Tangent(x, np.eye(network.reads)))
 
 
 class Gradients(_Values):

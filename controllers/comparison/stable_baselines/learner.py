@@ -1,7 +1,7 @@
 """SAC and PPO of stable-baselines3 on our plants, as learners that can be followed and resumed to the bit.
 
 They learn on `PlantEnvironment` of the plant's preset: its rewards, dt, horizon and
-starts, with the preset's actor widths and tanh activation. They see the states times `Interface.state_factors`, as our
+starts, with the preset's actor widths and activation. They see the states times `Interface.state_factors`, as our
 learner does, and actions scaled to [-1, 1]; learning rate, gamma, batch, tau, replay buffer and warm-up of its SAC are
 the preset's, the critics have the preset's widths and the actor's activation, and everything else (the temperature that
 SAC tunes, all of PPO's) is its own default. It is an optional extra, imported only where it is used.
@@ -119,7 +119,7 @@ class Sb3Learner:
         return as_trained(self.algorithm, self.model.policy, self.system, self.steps_done, self.options.seed)
 
     def network(self) -> PolicyNetwork:
-        """The mean action as an exact tanh network, not centred: PPO's is clipped, SAC's is squashed by tanh."""
+        """The mean action as an exact network, not centred: PPO's is clipped, SAC's is squashed by tanh."""
         policy, interface = self.model.policy, Interface(self.system)
         if self.algorithm == "ppo":
             layers = [*policy.mlp_extractor.policy_net, policy.action_net]
@@ -137,6 +137,7 @@ class Sb3Learner:
             squash="identity" if self.algorithm == "ppo" else "tanh",
             centre="none",
             clip=(u_lo, u_hi) if self.algorithm == "ppo" else None,
+            activation=self.options.activation,
         )
 
     def keep(self, folder: Path) -> None:
@@ -197,7 +198,7 @@ class Sb3Learner:
         InputError : the bytes are no checkpoint, or one of another run.
         """
         state = read_checkpoint(checkpoint, CHECKPOINT_FORMAT)
-        mine = [self.algorithm, [self.system.name, parameters_of(self.system)], self.options.record()]
+        mine = [self.algorithm, [self.system.name, parameters_of(self.system)], self.options.full_record()]
         began = {**default_record(), **state.get("options", {})}  # a run had no options that came later
         if [state.get("algorithm"), state.get("system"), began] != mine:
             raise InputError(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from certify.errors import InputError
+from certify.loop.activations import activation
 from certify.loop.plants import System
 from controllers.comparison.trained import Trained
 from controllers.options import TrainingOptions
@@ -73,7 +74,7 @@ def new_model(algorithm: Algorithm, options: TrainingOptions, plant: PlantEnviro
         common["batch_size"], common["tau"] = options.batch, options.tau
         common["buffer_size"], common["learning_starts"] = min(options.replay, options.steps), options.warm_up
         make = library.SAC
-    networks = {"net_arch": shape, "activation_fn": nn.Tanh}
+    networks = {"net_arch": shape, "activation_fn": getattr(nn, activation(options.activation).module)}
     # As a vector of one: then the library puts nothing of its own around it that a checkpoint would have to hold.
     vector = stable_baselines("common.vec_env").DummyVecEnv([lambda: scaled_environment(plant)])
     with warnings.catch_warnings():
