@@ -13,7 +13,7 @@ from fractions import Fraction
 import numpy as np
 
 from certify.errors import InputError
-from certify.loop.expressions import Expression, Number, Symbol, substitute
+from certify.loop.expressions import Expression, Number, Symbol, substitute, symbols_of
 from certify.loop.networks import Affine, Concat, Network, Observe, Step, values
 from certify.loop.plants import System
 from certify.loop.plants.calls import Call, NetworkFile
@@ -161,6 +161,10 @@ class _Built:
 
 def _exact(system: System, arguments: Sequence[Expression]) -> list[Expression]:
     numbers = {Symbol(name): Number(q) for name, q in system.parameters.items()}
+    for e in arguments:
+        odd = [s.name for s, _ in system.uncertain if s in symbols_of(e)]
+        if odd:
+            raise InputError(f"an argument of a network must not depend on what is uncertain; {e} does on {odd[0]}.")
     return [substitute(e, numbers) for e in arguments]
 
 

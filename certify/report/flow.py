@@ -114,7 +114,7 @@ class Flow:
 
 def cost_of(network: PolicyNetwork) -> float:
     """Multiplications' worth of one evaluation of a loop with this policy."""
-    return _EQUATIONS + sum(w.size for w in network.weights) + _TANH * sum(b.size for b in network.biases)
+    return _EQUATIONS + network.network.entries + _TANH * network.network.units
 
 
 def time_scales(flow: Flow, samples: int = _RATE_SAMPLES, reach: Array | None = None) -> tuple[float, float]:

@@ -16,7 +16,7 @@ _SMALL_NETWORK = 10_000  # weights
 def threads_for(network: PolicyNetwork) -> Iterator[None]:
     """One thread for a small network: its operations are shorter than the threads' handshakes."""
     threads = torch.get_num_threads()
-    if sum(W.size for W in network.weights) < _SMALL_NETWORK:
+    if network.network.entries < _SMALL_NETWORK:
         torch.set_num_threads(1)
     try:
         yield

@@ -125,6 +125,13 @@ def test_what_is_no_call_is_refused(before: str, after: str, message: str, tmp_p
         composed(plant(tmp_path, PLANT.replace(before, after)), law())
 
 
+def test_what_is_uncertain_is_no_argument(tmp_path: Path) -> None:
+    """Else another loop would be proved: the nominal value would stand there."""
+    uncertain = plant(tmp_path).with_ranges({"k": (Fraction(1), Fraction(3))})
+    with pytest.raises(InputError, match=r"must not depend on what is uncertain.*on k"):
+        composed(uncertain, law())
+
+
 def test_a_network_that_is_centred_is_refused(tmp_path: Path) -> None:
     plant(tmp_path)
     save_policy(tmp_path / "pair.pt", Policy(PolicyNetwork.of_layers(

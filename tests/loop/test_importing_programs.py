@@ -171,6 +171,15 @@ def test_a_plant_says_what_is_observed(tmp_path: Path) -> None:
         load_system(_written(tmp_path, text.replace('speed = "theta_dot"', 'speed = "theta_dott"')))
 
 
+def test_an_observation_does_not_depend_on_what_is_uncertain(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "examples/plants/gymnasium/pendulum.toml").read_text()
+    plant = load_system(_written(tmp_path, text.replace('speed = "theta_dot"', 'speed = "l*theta_dot"')))
+    said = replace(observing(), states=None)
+    assert import_state_dict(three(), plant, said).policy.network.n == 2
+    with pytest.raises(InputError, match="must not depend on what is uncertain"):
+        import_state_dict(three(), plant.with_ranges({"l": (Fraction(1, 2), Fraction(2))}), said)
+
+
 def _written(folder: Path, text: str) -> Path:
     path = folder / "plant.toml"
     path.write_text(text)

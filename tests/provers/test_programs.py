@@ -9,16 +9,23 @@ import numpy as np
 import pytest
 
 from certify import certify_roa
+from certify.certificates.claims import Asymptotic
+from certify.certificates.claims.conditions import conditions
+from certify.certificates.claims.queries import query
 from certify.certificates.reading import read_certificate
 from certify.certificates.verdict import Verdict
 from certify.checker.near import Above, Form
 from certify.checker.network import enclose_on_boxes
+from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
+from certify.loop.float32 import float_error
 from certify.loop.plants import get_system
 from certify.loop.policies import PolicyNetwork
 from certify.loop.policies.exact import raw_at_origin
 from certify.loop.rigorous import evaluate_policy, policy_on
+from certify.lyapunov.function import Quadratic
 from certify.provers.ball.models import paths
+from certify.provers.base import Problem
 from certify.provers.bounds.policy import LayersEnclosure, StepsEnclosure, policy_enclosure
 from tests.provers.test_activations import boxes, folded
 from tests.provers.test_activations import policy as layers
@@ -177,3 +184,18 @@ def test_no_program_is_proved_that_lets_go() -> None:
     steps[3] = replace(steps[3], weight=-steps[3].weight)
     broken = PolicyNetwork(replace(away.network, steps=tuple(steps)), away.scale, away.offset, "tanh", "preactivation")
     assert certify_roa(PLANT, broken).verdict is not Verdict.PROVED
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_what_reads_layers_alone_refuses_other_networks(name: str) -> None:
+    """Else another policy would be judged: dReal's formulas, binary32, and whoever asks for weights."""
+    law = policy(name)
+    for read in ("weights", "biases", "activation"):
+        with pytest.raises(InputError, match="needs a policy of layers"):
+            getattr(law, read)
+    problem = Problem(ClosedLoop(PLANT, law), Quadratic(np.eye(2)))
+    for condition in conditions(Asymptotic(1.0, 0.1), problem):
+        with pytest.raises(InputError):
+            query(condition, problem)
+    with pytest.raises(InputError, match="needs a policy of layers"):
+        float_error(law, PLANT)

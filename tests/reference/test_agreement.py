@@ -22,7 +22,7 @@ import pytest
 from certify.analysis.run import RoaOptions, certify_roa
 from certify.checker.networks import Affine, Clip, Map, Observe, Step
 from certify.loop.plants import System, get_system, load_system
-from certify.loop.policies import TanhNetwork, load_policy
+from certify.loop.policies import PolicyNetwork, load_policy
 from certify.loop.policies.importers import ImportOptions, import_policy
 from tests.checker.test_networks import a_network, checked
 from tests.checker.test_rules import FALSE, HONEST, MUTANTS
@@ -167,14 +167,14 @@ OPTIONS: dict[str, dict[str, Any]] = {
 LARGE = ("bicycle", "cartpole", "furuta", "quadrotor2d", "quadrotor3d")  # these take minutes
 
 
-def example(path: Path) -> tuple[System, TanhNetwork]:
+def example(path: Path) -> tuple[System, PolicyNetwork]:
     """A policy of `examples/` and its plant."""
     policy, plant = load_policy(path), EXAMPLES / "plants" / f"{path.stem}.toml"
     system = load_system(plant) if plant.exists() else get_system(path.stem)
     return system.with_parameters(policy.parameters), policy.network
 
 
-def produced(folder: Path, system: System, network: TanhNetwork, **options: Any) -> Document | None:
+def produced(folder: Path, system: System, network: PolicyNetwork, **options: Any) -> Document | None:
     """The certificate that a short run ends with, if any."""
     result = certify_roa(system, network, Path(mkdtemp(dir=folder)), RoaOptions(effort=0.1, **options))
     return None if result.certificate is None else dict(json.loads(result.certificate.read_text()))

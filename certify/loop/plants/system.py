@@ -27,6 +27,7 @@ from certify.loop.expressions import (
     as_expression,
     constant_of,
     substitute,
+    symbols_of,
     value_if_rational,
 )
 from certify.loop.expressions.numerical import Module
@@ -235,7 +236,15 @@ class System:
         return {s.name: q for s, q in zip(self.states, values, strict=True)} if any(values) else {}
 
     def exact_observations(self) -> tuple[Expression, ...]:
-        """The observations as expressions of the states, deviations from the operating point."""
+        """The observations as expressions of the states, deviations from the operating point.
+
+        Raises
+        ------
+        InputError : one depends on a parameter that is uncertain.
+        """
+        odd = symbols_of(*self.observations) & {s for s, _ in self.uncertain}
+        if odd:
+            raise InputError(f"an observation of {self.name} must not depend on what is uncertain; found {odd.pop()}.")
         numbers: dict[Symbol, Expression] = {Symbol(name): Number(q) for name, q in self.parameters.items()}
         numbers |= {s: s + q for s, q in zip(self.states, self.exact_x_eq(), strict=True) if q}
         return tuple(_substituted(self, e, numbers) for e in self.observations)

@@ -164,7 +164,7 @@ def _format_of(policy: Policy) -> str:
     """The oldest version of the format that holds it."""
     if not policy.network.network.is_chain:
         return FOURTH
-    if policy.network.activation != "tanh":
+    if policy.network.network.functions not in ((), ("tanh",)):
         return THIRD
     return FORMAT if policy.network.clip is None and policy.valid is None else SECOND
 

@@ -62,17 +62,20 @@ class Programmed:
 
     @property
     def activation(self) -> str:
-        """The function between the layers of a chain, tanh where there is one layer."""
+        """The function between the layers, tanh where there is one layer; raises as `require_layers`."""
+        self.require_layers("this")
         return next(iter(self.network.functions), "tanh")
 
     @property
     def weights(self) -> tuple[Array, ...]:
-        """The matrices of the layers."""
+        """The matrices of the layers; raises as `require_layers`."""
+        self.require_layers("this")
         return tuple(step.weight for step in self.network.affine)
 
     @property
     def biases(self) -> tuple[Array, ...]:
-        """The biases of the layers."""
+        """The biases of the layers; raises as `require_layers`."""
+        self.require_layers("this")
         return tuple(step.bias for step in self.network.affine)
 
     def with_layers(

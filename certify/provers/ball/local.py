@@ -195,7 +195,7 @@ class Rule:
     @property
     def operations(self) -> float:
         """Operations of a look at one ball, about, as an `Effort` counts them."""
-        n, units = len(self.T), sum(len(b) for b in self.problem.loop.network.biases)
+        n, units = len(self.T), self.problem.loop.network.network.units
         corners = max(1, len(self.cells)) * 2 ** len(self.problem.loop.system.ranges)
         return float(self.operations_of_models + corners * _WEIGHINGS * (_WEIGHING + 30.0 * units * n**2 + 15.0 * n**5))
 

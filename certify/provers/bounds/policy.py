@@ -93,7 +93,8 @@ class LayersEnclosure(Enclosure):
     def __init__(self, network: PolicyNetwork, centring: Sequence[Array]) -> None:
         super().__init__(network, centring)
         self.n, self.observation, self.origin = network.n, network.network.observation, None
-        weights, biases = ([v.copy() for v in each] for each in (network.weights, network.biases))
+        layers = network.network.affine
+        weights, biases = [step.weight.copy() for step in layers], [step.bias.copy() for step in layers]
         magnitudes, bias_errors = [np.abs(w) for w in weights], [np.zeros_like(b) for b in biases]
         if network.is_moved and self.observation is not None:
             self.origin = network.origin
@@ -104,7 +105,7 @@ class LayersEnclosure(Enclosure):
             bias_errors[0] = (len(at) + 2) * EPS * size + TINY
         rows = [np.linalg.norm(w, axis=1) for w in weights]
         norms = [norm_of(w) for w in weights]
-        self.activation = network.activation
+        self.activation = next(iter(network.network.functions), "tanh")
         bias = biases[-1]
         biases[-1] = bias + self.shift
         made = np.where(self.shift == 0, 0.0, self.shift_error + EPS * (np.abs(bias) + np.abs(self.shift)))

@@ -170,7 +170,7 @@ def _contains(J: Array, P: Array, room: float) -> bool:
 
 def look(known: Paths) -> float:
     """Operations to try one slab, about, as an `Effort` counts them."""
-    n, units = known.loop.system.n, sum(len(b) for b in known.loop.network.biases)
+    n, units = known.loop.system.n, known.loop.network.network.units
     return known.operations + _GROWTHS * (3e5 + 30.0 * units * n**2 + 15.0 * n**5)
 
 
