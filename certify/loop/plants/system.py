@@ -235,20 +235,6 @@ class System:
         values = self.exact_x_eq()
         return {s.name: q for s, q in zip(self.states, values, strict=True)} if any(values) else {}
 
-    def exact_observations(self) -> tuple[Expression, ...]:
-        """The observations as expressions of the states, deviations from the operating point.
-
-        Raises
-        ------
-        InputError : one depends on a parameter that is uncertain.
-        """
-        odd = symbols_of(*self.observations) & {s for s, _ in self.uncertain}
-        if odd:
-            raise InputError(f"an observation of {self.name} must not depend on what is uncertain; found {odd.pop()}.")
-        numbers: dict[Symbol, Expression] = {Symbol(name): Number(q) for name, q in self.parameters.items()}
-        numbers |= {s: s + q for s, q in zip(self.states, self.exact_x_eq(), strict=True) if q}
-        return tuple(_substituted(self, e, numbers) for e in self.observations)
-
     def function(self, module: Module = "numpy") -> Callable[[Any, Any], Any]:
         """Floating-point nominal f: arrays x (..., n) and u (..., m) to xdot (..., n); `module` numpy or torch.
 
@@ -260,6 +246,21 @@ class System:
     def uncertain_function(self, module: Module = "numpy") -> Callable[[Any, Any, Sequence[Any]], Any]:
         """The same with a third argument: values of the uncertain quantities, k numbers in the order of the ranges."""
         return function_of(self, self.uncertain_dynamics(), [s for s, _ in self.uncertain], module)
+
+
+def observations_of(system: System) -> tuple[Expression, ...]:
+    """A plant's observations as expressions of the states, deviations from the operating point.
+
+    Raises
+    ------
+    InputError : one depends on a parameter that is uncertain.
+    """
+    odd = symbols_of(*system.observations) & {s for s, _ in system.uncertain}
+    if odd:
+        raise InputError(f"an observation of {system.name} must not depend on what is uncertain; found {odd.pop()}.")
+    numbers: dict[Symbol, Expression] = {Symbol(name): Number(q) for name, q in system.parameters.items()}
+    numbers |= {s: s + q for s, q in zip(system.states, system.exact_x_eq(), strict=True) if q}
+    return tuple(_substituted(system, e, numbers) for e in system.observations)
 
 
 def _substituted(system: System, expression: Expression, numbers: Mapping[Symbol, Expression]) -> Expression:

@@ -20,6 +20,7 @@ from certify.loop.expressions import Expression, evaluate, substitute
 from certify.loop.networks import Observe
 from certify.loop.networks.floats import evaluated
 from certify.loop.plants.equations import parse_expression
+from certify.loop.plants.system import observations_of
 from certify.loop.policies.importers.comparing import SAMPLES
 from certify.loop.policies.importers.folding import Bounds
 from certify.loop.policies.importers.options import ImportOptions
@@ -85,7 +86,7 @@ def observed(states: tuple[str, ...] | None, plant: System, options: ImportOptio
     """
     known = {s.name: s for s in plant.states}
     if states is None and plant.observations:
-        return Observed(plant, None, plant.exact_observations())
+        return Observed(plant, None, observations_of(plant))
     states = tuple(known) if states is None else states
     if all(name in known for name in states):
         if len(set(states)) != len(states):
