@@ -28,6 +28,9 @@ from onnx.reference import ReferenceEvaluator
 
 from certify import Policy, PolicyNetwork, certify_roa, get_system, save_policy
 from certify.loop.composition import composed
+from certify.loop.expressions import Symbol
+from certify.loop.networks import Affine, Concat, Map, Network, Observe
+from certify.loop.plants.equations import parse_expression
 from certify.loop.policies.network import Array
 
 SAMPLES = 10_000
@@ -146,6 +149,93 @@ def _controller(graph: Graph, most: float) -> PolicyNetwork:
     return PolicyNetwork.of_layers(
         weights, biases, np.ones(2), np.zeros(2), "identity", "output", clip, activation="relu"
     )
+
+
+def output_feedback(graph: Graph, out: Path) -> tuple[Path, PolicyNetwork]:
+    """The plant's file, an observer's beside it and the policy of eight states: plant, and errors of the estimates.
+
+    Four rays from the quadrotor to the ground are measured, of lengths in [0, 5]. Controller and observer read the
+    estimates and the difference between measured and expected lengths.
+    """
+    angles = [str(Decimal(v)) for v in graph.constants["/Constant_19_output_0"].ravel().tolist()]
+    above, longest = graph.number("/Constant_14_output_0"), graph.number("/Constant_20_output_0")
+    most, rest = graph.number("/Constant_39_output_0"), graph.number("/Constant_36_output_0")
+    names = list(OUTPUT_BOX)[:4]
+    estimate = {name: f"({name} - e_{name})" for name in names}
+
+    def ray(angle: str, y: str, theta: str) -> str:
+        return f"clip(({y} + {above})/cos({theta} - ({angle})), 0, {longest})"
+
+    read = [
+        *estimate.values(),
+        *(f"{ray(a, 'y', 'theta')} - {ray(a, estimate['y'], estimate['theta'])}" for a in angles),
+    ]
+    now, expected = ", ".join(read), ", ".join((*read[:4], "0", "0", "0", "0"))
+    parameters = {
+        "dt": graph.number("/Constant_74_output_0"),
+        "k": graph.number("/Constant_57_output_0"),
+        "g": graph.number("/Constant_58_output_0"),
+        "r": graph.number("/Constant_64_output_0"),
+    }
+    where = {
+        "y_then": '"y_dot + dt*(k*cos(theta)*(u1 + u2) - g)"',
+        "theta_then": '"theta_dot + dt*r*(u1 - u2)"',
+        "y_guess": f'"{estimate["y_dot"]} + dt*(k*cos{estimate["theta"]}*(u1 + u2) - g)"',
+        "theta_guess": f'"{estimate["theta_dot"]} + dt*r*(u1 - u2)"',
+    }
+    where |= {f"shift{k}": f'"observer[{k}]({now}) - observer[{k}]({expected})"' for k in range(4)}
+    then = [
+        "y + dt/2*(y_dot + y_then)",
+        "theta + dt/2*(theta_dot + theta_then)",
+        "y_then",
+        "theta_then",
+    ]
+    guess = [
+        f"{estimate['y']} + dt/2*({estimate['y_dot']} + y_guess)",
+        f"{estimate['theta']} + dt/2*({estimate['theta_dot']} + theta_guess)",
+        "y_guess",
+        "theta_guess",
+    ]
+    dynamics = {name: f'"{e}"' for name, e in zip(names, then, strict=True)}
+    dynamics |= {f"e_{names[k]}": f'"{then[k]} - ({guess[k]} + shift{k})"' for k in range(4)}
+    plant = out / "output.toml"
+    plant.write_text(
+        'name = "lsnc_output"\ntime = "discrete"\n'
+        + f'states = {json.dumps(list(OUTPUT_BOX))}\ninputs = ["u1", "u2"]\n\n'
+        + _table("parameters", parameters)
+        + _table("networks", {"observer": '{file = "observer.pt"}'})
+        + _table("where", where)
+        + _table("dynamics", dynamics)
+        + _table("u_eq", {"u1": rest, "u2": rest})
+        + _table("domain", {name: f"[-{v}, {v}]" for name, v in OUTPUT_BOX.items()})
+        + _table("input_bounds", {"u1": f"[0, {most}]", "u2": f"[0, {most}]"}),
+        "utf-8",
+    )
+    (slope,) = {a.f for n in graph.model.graph.node if n.op_type == "LeakyRelu" for a in n.attribute}
+    weights, biases = graph.layers("observer.fc_net")
+    leaky = np.hstack([slope * np.eye(8), (1 - slope) * np.eye(8)])  # of h and its positive part, exactly
+    steps = (
+        Affine((0,), weights[0], biases[0]),
+        Map((1,), "relu"),
+        Concat((1, 2)),
+        Affine((3,), leaky, np.zeros(8)),
+        Affine((4,), weights[1], biases[1]),
+    )
+    observer = PolicyNetwork(Network(8, steps), np.ones(4), np.zeros(4), "identity", "none")
+    save_policy(out / "observer.pt", Policy(observer, "lsnc_observer"))
+
+    states = tuple(Symbol(name) for name in OUTPUT_BOX)
+    named = {str(s): s for s in states}
+    seen = tuple(parse_expression(text, named) for text in read)
+    weights, biases = graph.layers("controller.net")
+    steps = (
+        Observe((0,), states, seen),
+        Affine((1,), weights[0], biases[0]),
+        Map((2,), "relu"),
+        Affine((3,), weights[1], biases[1]),
+    )
+    clip = (np.zeros(2), np.full(2, float(most)))
+    return plant, PolicyNetwork(Network(8, steps), np.ones(2), np.zeros(2), "identity", "output", clip)
 
 
 def compare(graph: Graph, plant: Path, policy: PolicyNetwork, box: dict[str, Any]) -> tuple[float, float]:
