@@ -151,12 +151,17 @@ def _controller(graph: Graph, most: float) -> PolicyNetwork:
     )
 
 
-def output_feedback(graph: Graph, out: Path) -> tuple[Path, PolicyNetwork]:
+def output_feedback(graph: Graph, out: Path, free: tuple[int, ...] = ()) -> tuple[Path, PolicyNetwork]:
     """The plant's file, an observer's beside it and the policy of eight states: plant, and errors of the estimates.
 
     Four rays from the quadrotor to the ground are measured, of lengths in [0, 5]. Controller and observer read the
     estimates and the difference between measured and expected lengths.
+
+    The observer's units counted in `free` are LeakyReLUs between whose values at two points, here with and without a
+    difference of lengths, lies a secant with a slope in [0.01, 1]: the plant has these slopes as parameters `s`, and
+    with them as any function of time it has all trajectories of the loop, and more.
     """
+    weights, biases = graph.layers("observer.fc_net")
     angles = [str(Decimal(v)) for v in graph.constants["/Constant_19_output_0"].ravel().tolist()]
     above, longest = graph.number("/Constant_14_output_0"), graph.number("/Constant_20_output_0")
     most, rest = graph.number("/Constant_39_output_0"), graph.number("/Constant_36_output_0")
@@ -183,7 +188,13 @@ def output_feedback(graph: Graph, out: Path) -> tuple[Path, PolicyNetwork]:
         "y_guess": f'"{estimate["y_dot"]} + dt*(k*cos{estimate["theta"]}*(u1 + u2) - g)"',
         "theta_guess": f'"{estimate["theta_dot"]} + dt*r*(u1 - u2)"',
     }
-    where |= {f"shift{k}": f'"observer[{k}]({now}) - observer[{k}]({expected})"' for k in range(4)}
+    gaps = {
+        i: " + ".join(f"({Decimal(w)})*({d})" for w, d in zip(weights[0][i, 4:], read[4:], strict=True)) for i in free
+    }
+    for k in range(4):
+        secants = "".join(f" + ({Decimal(weights[1][k, i])})*s{i}*({gap})" for i, gap in gaps.items())
+        where[f"shift{k}"] = f'"observer[{k}]({now}) - observer[{k}]({expected}){secants}"'
+    parameters |= {f"s{i}": "1" for i in free}
     then = [
         "y + dt/2*(y_dot + y_then)",
         "theta + dt/2*(theta_dot + theta_then)",
@@ -198,12 +209,13 @@ def output_feedback(graph: Graph, out: Path) -> tuple[Path, PolicyNetwork]:
     ]
     dynamics = {name: f'"{e}"' for name, e in zip(names, then, strict=True)}
     dynamics |= {f"e_{names[k]}": f'"{then[k]} - ({guess[k]} + shift{k})"' for k in range(4)}
-    plant = out / "output.toml"
+    name = "".join(["output", *(f"_{i}" for i in free)])
+    plant = out / f"{name}.toml"
     plant.write_text(
         'name = "lsnc_output"\ntime = "discrete"\n'
         + f'states = {json.dumps(list(OUTPUT_BOX))}\ninputs = ["u1", "u2"]\n\n'
         + _table("parameters", parameters)
-        + _table("networks", {"observer": '{file = "observer.pt"}'})
+        + _table("networks", {"observer": f'{{file = "{name}.pt"}}'})
         + _table("where", where)
         + _table("dynamics", dynamics)
         + _table("u_eq", {"u1": rest, "u2": rest})
@@ -212,17 +224,18 @@ def output_feedback(graph: Graph, out: Path) -> tuple[Path, PolicyNetwork]:
         "utf-8",
     )
     (slope,) = {a.f for n in graph.model.graph.node if n.op_type == "LeakyRelu" for a in n.attribute}
-    weights, biases = graph.layers("observer.fc_net")
-    leaky = np.hstack([slope * np.eye(8), (1 - slope) * np.eye(8)])  # of h and its positive part, exactly
+    kept = [i for i in range(8) if i not in free]
+    eye = np.eye(len(kept))
+    leaky = np.hstack([slope * eye, (1 - slope) * eye])  # of h and its positive part, exactly
     steps = (
-        Affine((0,), weights[0], biases[0]),
+        Affine((0,), weights[0][kept], biases[0][kept]),
         Map((1,), "relu"),
         Concat((1, 2)),
-        Affine((3,), leaky, np.zeros(8)),
-        Affine((4,), weights[1], biases[1]),
+        Affine((3,), leaky, np.zeros(len(kept))),
+        Affine((4,), weights[1][:, kept], biases[1]),
     )
     observer = PolicyNetwork(Network(8, steps), np.ones(4), np.zeros(4), "identity", "none")
-    save_policy(out / "observer.pt", Policy(observer, "lsnc_observer"))
+    save_policy(out / f"{name}.pt", Policy(observer, "lsnc_observer"))
 
     states = tuple(Symbol(name) for name in OUTPUT_BOX)
     named = {str(s): s for s in states}
