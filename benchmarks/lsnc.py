@@ -26,7 +26,8 @@ import onnx
 from onnx import numpy_helper
 from onnx.reference import ReferenceEvaluator
 
-from certify import Policy, PolicyNetwork, certify_roa, get_system, save_policy
+from certify import Policy, PolicyNetwork, RoaResult, certify_roa, get_system, save_policy
+from certify.certificates.checking import run_checker
 from certify.loop.composition import composed
 from certify.loop.expressions import Symbol
 from certify.loop.networks import Affine, Concat, Map, Network, Observe
@@ -34,6 +35,9 @@ from certify.loop.plants.equations import parse_expression
 from certify.loop.policies.network import Array
 
 SAMPLES = 10_000
+FREE, SLOPES = (0, 5, 7), ("0.0099", "1")  # units of the observer, and slopes beyond those of a secant of its LeakyReLU
+SMALL = 3e-10  # about the largest level of which the nearest kink lets a ball be proved
+_COLUMNS = "| loop | V | claim | V <= | from V = | volume | s | second checker |"
 STATE_BOX = {"x": 0.75, "y": 0.75, "theta": 1.57, "x_dot": 4, "y_dot": 4, "theta_dot": 3}
 OUTPUT_BOX = {
     "y": "0.1",
@@ -241,14 +245,14 @@ def output_feedback(graph: Graph, out: Path, free: tuple[int, ...] = ()) -> tupl
     named = {str(s): s for s in states}
     seen = tuple(parse_expression(text, named) for text in read)
     weights, biases = graph.layers("controller.net")
-    steps = (
+    law = (
         Observe((0,), states, seen),
         Affine((1,), weights[0], biases[0]),
         Map((2,), "relu"),
         Affine((3,), weights[1], biases[1]),
     )
     clip = (np.zeros(2), np.full(2, float(most)))
-    return plant, PolicyNetwork(Network(8, steps), np.ones(2), np.zeros(2), "identity", "output", clip)
+    return plant, PolicyNetwork(Network(8, law), np.ones(2), np.zeros(2), "identity", "output", clip)
 
 
 def compare(graph: Graph, plant: Path, policy: PolicyNetwork, box: dict[str, Any]) -> tuple[float, float]:
@@ -259,4 +263,89 @@ def compare(graph: Graph, plant: Path, policy: PolicyNetwork, box: dict[str, Any
     x = x.astype(np.float32).astype(np.float64)
     u = network(x, system.exact_u_eq())
     ours = np.asarray(system.function()(x, u))
-    return tuple(float(np.max(np.abs(ours - graph.evaluate(x, double)[:, 2:]))) for double in (True, False))
+    wide, single = (float(np.max(np.abs(ours - graph.evaluate(x, double)[:, 2:]))) for double in (True, False))
+    return wide, single
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A proof: what it is about, what was asked for, and what came of it."""
+
+    loop: str
+    V: str
+    result: RoaResult
+    seconds: float
+    second: str
+
+    @property
+    def cells(self) -> list[str]:
+        """Of the table."""
+        found = self.result.levels
+        numbers = ["", "", ""]
+        if self.result.verdict == "PROVED" and found.roa is not None and found.floor is not None:
+            numbers = [f"{found.roa:.5g}", f"{found.floor:.2g}", f"{self.result.volume:.4g}"]
+        claim = self.result.claim if numbers[0] else f"{self.result.verdict}: {self.result.reason}"
+        return [self.loop, self.V, claim, *numbers, f"{self.seconds:.1f}", self.second]
+
+
+def proved(loop: str, V: str, plant: Path, policy: PolicyNetwork, out: Path, **asked: Any) -> Row:
+    """Ask for a proof, and the second checker for its answer."""
+    start = time.perf_counter()
+    result = certify_roa(str(plant), policy, out, **asked)
+    seconds, second = time.perf_counter() - start, ""
+    if result.verdict == "PROVED":
+        second = "accepts" if run_checker(out / "certificate.json", "reference")["result"] == "ACCEPTED" else "no"
+    row = Row(loop, V, result, seconds, second)
+    print(" ".join(row.cells), flush=True)
+    return row
+
+
+def state_rows(graph: Graph, out: Path) -> list[Row]:
+    """The loop with six states: with the graph's V in the benchmark's box, up to the benchmark's level and beyond it;
+    and with a V of our own in the box."""
+    plant, policy = state_feedback(graph, out, wide=False)
+    wide, _ = state_feedback(graph, out, wide=True)
+    theirs, P = "the graph's", graph.P()
+    print("state: differences", compare(graph, plant, policy, STATE_BOX))
+    return [
+        proved("state, their box", theirs, plant, policy, out / "state", P=P),
+        proved("state, wider box", theirs, wide, policy, out / "state_level", P=P, level=1.3392),
+        proved("state, wider box", theirs, wide, policy, out / "state_wide", P=P),
+        proved("state, their box", "our own", plant, policy, out / "state_own"),
+    ]
+
+
+def output_rows(graph: Graph, out: Path) -> list[Row]:
+    """The loop with eight states and the graph's V: the loop itself in a small set, and in a larger one with three
+    units of the observer, whose kinks are nearest, as secants."""
+    plant, policy = output_feedback(graph, out)
+    secants, _ = output_feedback(graph, out, FREE)
+    theirs, P = "the graph's", graph.P()
+    print("output: differences", compare(graph, plant, policy, OUTPUT_BOX))
+    slopes = {f"s{i}": SLOPES for i in FREE}
+    asked: dict[str, Any] = {"P": P, "claim": "practical", "ranges": slopes}
+    return [
+        proved("output", theirs, plant, policy, out / "output", P=P, level=SMALL),
+        proved("output, secants", theirs, secants, policy, out / "output_secants", **asked),
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="a copy of shizhouxing/LSNC_VNNCOMP2024")
+    parser.add_argument("--out", type=Path, default=Path("out/lsnc"), help="plants, certificates and the table")
+    parser.add_argument("--loops", default="state,output", help="which of the two")
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for name, of in (("state", state_rows), ("output", output_rows)):
+        if name in given.loops.split(","):
+            rows += of(read(given.folder / "onnx" / f"quadrotor2d_{name}.onnx"), given.out)
+    lines = [_COLUMNS, "|" + "---|" * (_COLUMNS.count("|") - 1), *(f"| {' | '.join(row.cells)} |" for row in rows)]
+    text = "\n".join(lines) + "\n"
+    (given.out / "lsnc.md").write_text(text, "utf-8")
+    print(text, end="")
+
+
+if __name__ == "__main__":
+    main()
