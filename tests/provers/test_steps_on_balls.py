@@ -411,6 +411,14 @@ def test_no_band_where_the_disturbance_is_stronger_than_the_input() -> None:
     assert prove_band(problem, T, 0.25) is None  # |x| ends at 1
 
 
+def test_a_ball_without_a_definite_decay_costs_no_rounds_of_multipliers() -> None:
+    problem, T = linear(U + W, "-1/10")
+    rule = Rule.anywhere(problem, T)
+    assert rule.around(0.25).rounds > 0
+    upwards, T = linear(X / 2 + X + U / 4)
+    assert Rule.anywhere(upwards, T).around(0.25).rounds == 0
+
+
 def test_a_policy_that_is_not_centred_has_a_band_around_where_it_rests() -> None:
     """u = -x + 1/20: V = x^2 falls for |x| > 1/20 alone."""
     problem, T = linear(U)

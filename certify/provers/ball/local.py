@@ -109,8 +109,9 @@ def prove_band(
 
     def floor(level: float) -> float:
         if level not in floors:
-            effort.charge(_ROUNDS * rule.operations)
-            floors[level] = max(rule.around(level).floor, _NOTHING * limit)
+            found = rule.around(level)
+            effort.charge(max(found.rounds * rule.operations, rule.operations_of_models))
+            floors[level] = max(found.floor, _NOTHING * limit)
         return floors[level]
 
     top = _largest(lambda level: floor(level) < level, limit, effort, _NEAR)
@@ -152,14 +153,18 @@ def ball_around(problem: Problem, T: Array, level: float) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class _Around:
-    """The least level around which a ball's inequality holds, infinite if there is none, and by what."""
+    """The least level around which a ball's inequality holds, infinite if there is none, and by what.
+
+    `rounds` is how many rounds of multipliers count as work; without a definite decay none is weighed.
+    """
 
     floor: float
     edge: float
     multipliers: Multipliers
+    rounds: int = _ROUNDS
 
 
-_NOWHERE = _Around(math.inf, 0.0, NOT_SHOWN.multipliers)
+_NOWHERE = _Around(math.inf, 0.0, NOT_SHOWN.multipliers, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,10 +227,10 @@ class Rule:
             for _ in range(_ROUNDS):
                 found = best_at([replace(c, decay=c.decay - edge * V) for c in corners], _AMPLE)
                 if not found.margin > _MARGIN:
-                    return best
+                    return replace(best, rounds=best.rounds if found is NOT_SHOWN else _ROUNDS)
                 around = self._least(corners, V, found.multipliers)
                 if not around.floor < best.floor * (1 - _WORTH):
-                    return min(best, around, key=lambda one: one.floor)
+                    return min(around, best, key=lambda one: one.floor)
                 best, edge = around, around.edge
             return best
 
@@ -241,13 +246,13 @@ class Rule:
             parts.append((values, (vectors.T @ c.linear) ** 2, c.start + _ROUNDING * float(np.trace(c.decay))))
         most, h = min(float(values[0]) for values, _, _ in parts), self.steps.longest
         if not most > 0:
-            return _NOWHERE
+            return replace(_NOWHERE, rounds=_ROUNDS)
         edges = most * np.append(np.geomspace(1e-4, 0.5, _EDGES), 1 - np.geomspace(0.5, 1e-4, _EDGES))
         edges = np.minimum(edges, (1 - _MARGIN) / h) if h else edges
         floors = [(s + np.sum(w / (v - edges[:, None]), axis=1)) / edges for v, w, s in parts]
         worst = np.max(floors, axis=0) * _ABOVE
         at = int(np.argmin(worst))
-        return _Around(float(worst[at]), float(edges[at]), by) if worst[at] < math.inf else _NOWHERE
+        return _Around(float(worst[at]), float(edges[at]), by)
 
     def models(self, J: Array, level: float) -> list[Models]:
         """The models of a step on a ball that holds {V <= level}, in each cell."""
