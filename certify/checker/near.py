@@ -42,7 +42,6 @@ LEAST = 2.0**-1022
 _MORE = 1 + 2.0**-40
 _MOST_ROUNDINGS = 1000
 _STEP = 2.0**-5
-_WIDE = 2.0**-20  # share of a number by which more than roundings are unknown of it
 _TANH_END = 20.0  # 1 - tanh(20) < 2^-56
 _ANGLE_END = 64.0  # beyond, sin and cos are only known to lie in [-1, 1]
 _EXP_END = 64.0  # beyond, nothing is known of exp; below -64 it lies between 0 and 2^-92
@@ -242,9 +241,7 @@ class Near:
         x, y = other if isinstance(other, Near) else Near(other), self
         of_x, rough = size(x.value), y.roughly
         made = of_x * (y.error + rough.ulps(1))
-        if x.error is not ZERO:
-            far = np.any(x.error.top > _WIDE * of_x.top)  # terms of y that cancel count where x is no rounded number
-            made = made + x.error * (y.size if far else rough + y.error)
+        made = made if x.error is ZERO else made + x.error * (rough + y.error)
         return type(self)(x.value * y.value, made, of_x * rough)
 
     __rmul__ = __mul__
