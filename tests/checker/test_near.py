@@ -288,11 +288,3 @@ def test_a_table_keeps_what_is_not_known() -> None:
         near.Polynomials(lambda v: v.log())
     with pytest.raises(ArithmeticError, match="not accurate"):
         near._table([arb(1), arb("nan")])
-
-
-def test_a_wide_factor_counts_what_is_left_of_terms_that_cancel() -> None:
-    """1000 X - 999 X times a number of [0, 1]: its error is half the norm of X, and not of two thousand times that."""
-    X = Square(np.eye(3))
-    left = X * Near(np.float64(1000.0)) - X * Near(np.float64(999.0))
-    found = left * Near(np.float64(0.5), Above(np.float64(0.5)))
-    assert np.sqrt(3) / 2 <= float(found.error.top) < 0.9
