@@ -111,7 +111,7 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
         )
     except CertificateFormatError:
         raise
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise CertificateFormatError(f"{name} is not a certificate: {type(error).__name__}: {error}.") from error
 
 

@@ -259,3 +259,17 @@ def test_the_limits_are_the_checker_s() -> None:
     assert producer_models._MOST_PRODUCTS == checker_ball._MOST_PRODUCTS
     page = (Path(checker_document.__file__).parent / "FORMAT.md").read_text()
     assert f"at most {limits.MOST_DIGITS:,} digits" in page and f"at most {limits.MOST_NODES:,} nodes" in page
+
+
+@pytest.mark.parametrize("of", [[9], []])
+def test_a_step_of_no_vector_is_no_certificate(of: list[int], tmp_path: Path) -> None:
+    from certify.certificates.reading import read_certificate
+    from certify.errors import CertificateFormatError
+
+    result = certify_roa(*scalar_tanh(), tmp_path)
+    assert result.certificate is not None
+    data = json.loads(result.certificate.read_text())
+    data["networks"][0]["steps"][0]["of"] = of
+    result.certificate.write_text(json.dumps(data))
+    with pytest.raises(CertificateFormatError, match="is not a certificate"):
+        read_certificate(result.certificate)

@@ -15,6 +15,7 @@ import torch
 
 from certify.errors import InputError
 from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_policy
+from certify.loop.policies import file as policy_file
 from tests.support import plain
 from tests.support.loops import pendulum_network
 
@@ -183,3 +184,15 @@ def test_truncated_and_missing_files(tmp_path: Path) -> None:
         load_policy(tmp_path / "b.pt")
     with pytest.raises(InputError, match="cannot be read"):
         load_policy(tmp_path)
+
+
+@pytest.mark.parametrize("weight", [np.ones((1, 2))[0, 0:1].reshape(()), np.ones(3)])
+def test_a_weight_that_is_no_matrix_is_refused(weight: np.ndarray) -> None:
+    data = {"format": "certify-policy/1", "activation": "tanh", "weights": [weight], "biases": [np.zeros(1)]}
+    with pytest.raises(InputError, match="layer 0 must have a weight"):
+        policy_file._read_layers(data)
+
+
+def test_expressions_are_a_list() -> None:
+    with pytest.raises(InputError, match="expressions` must be a text of expressions as lists"):
+        policy_file._read_observation({"names": ["a"], "expressions": '{"a": 1}'}, "steps[0]")

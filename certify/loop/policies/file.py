@@ -23,8 +23,9 @@ from certify.loop.activations import ACTIVATIONS
 from certify.loop.expressions import Symbol, from_tree, to_tree
 from certify.loop.files.arrays import Numbers
 from certify.loop.files.plain import array_in, layers_in, origin_in, read_plain, require_keys, tensors, write_plain
-from certify.loop.networks import Affine, Clip, Concat, Map, Network, Observe, Product, Step, Sum, layered
+from certify.loop.networks import Affine, Clip, Concat, Map, Network, Observe, Product, Step, Sum
 from certify.loop.policies.network import Array, Centre, PolicyNetwork, Squash
+from certify.loop.policies.programmed import chain
 
 FORMAT = "certify-policy/1"
 # The same with `output.clip`, a pair of tensors, or `valid`, a tensor (n, 2), or both; others stay version 1.
@@ -280,7 +281,7 @@ def _read_layers(data: Mapping[str, Any]) -> Network:
     version, function = data["format"], data["activation"]
     _require_activation(version, function)
     weights, biases = layers_in(data)
-    network = Network(int(np.shape(weights[0])[-1]) if weights else 0, layered(weights, biases, function, "the policy"))
+    network = chain(weights, biases, function)
     if len(weights) == 1 and function != "tanh":
         raise InputError(f"`activation` must be 'tanh' of a policy with one layer; found {function!r}.")
     return network
@@ -325,6 +326,8 @@ def _read_observation(step: Mapping[str, Any], name: str) -> list[Any]:
     symbols = {s: Symbol(s) for s in names}
     try:
         trees = json.loads(text)
+        if not isinstance(trees, list):
+            raise ValueError("it is no list")
         expressions = tuple(from_tree(tree, symbols) for tree in trees)
     except (ValueError, TypeError, RecursionError, CertificateFormatError) as error:
         raise InputError(f"`{name}.expressions` must be a text of expressions as lists: {error}.") from error
