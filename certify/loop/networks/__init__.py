@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from certify.loop.networks.floats import Gradients, Tangent, Tangents, tangent_at, values
-from certify.loop.networks.layers import frozen, frozen_layers, like, sha256_of, tanh, through, widths
+from certify.loop.networks.layers import clipped, frozen, frozen_layers, like, sha256_of, tanh, through, widths
 from certify.loop.networks.steps import (
     Affine,
     Algebra,
@@ -33,6 +33,7 @@ __all__ = [
     "Sum",
     "Tangent",
     "Tangents",
+    "clipped",
     "frozen",
     "frozen_layers",
     "layered",

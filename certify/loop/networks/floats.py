@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from certify.loop.expressions import Expression, Symbol, numerical
-from certify.loop.networks.layers import like
+from certify.loop.networks.layers import clipped, like
 from certify.loop.networks.steps import Affine, Algebra, Array, Clip, Concat, Map, Network, Observe, Product, Sum
 
 
@@ -23,8 +23,7 @@ class _Values(Algebra[Any]):
         return step.phi(v)
 
     def clip(self, step: Clip, v: Any) -> Any:
-        lo, hi = like(step.lo, v), like(step.hi, v)
-        return np.minimum(np.maximum(v, lo), hi) if isinstance(v, np.ndarray) else v.clamp(lo, hi)
+        return clipped(v, like(step.lo, v), like(step.hi, v))
 
     def sum(self, step: Sum, *vectors: Any) -> Any:
         return reduce(lambda a, b: a + b, vectors)

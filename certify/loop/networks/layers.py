@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.loop.activations import ACTIVATIONS, Activation
+from certify.loop.activations import ACTIVATIONS
 
 Array = NDArray[np.float64]
 
@@ -85,11 +85,11 @@ def sha256_of(head: bytes, arrays: Iterable[Array], words: str = "") -> str:
     return digest.hexdigest()
 
 
-def through(weights: Sequence[Array], biases: Sequence[Array], x: Any, phi: Activation = ACTIVATIONS["tanh"]) -> Any:
-    """Apply the layers to the last axis of x, in x's arithmetic (numpy array or torch tensor)."""
+def through(weights: Sequence[Array], biases: Sequence[Array], x: Any) -> Any:
+    """Apply layers with tanh between them to the last axis of x, in x's arithmetic (numpy array or torch tensor)."""
     for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         if k:
-            x = phi(x)
+            x = tanh(x)
         x = x @ like(weight.T, x) + like(bias, x)
     return x
 
@@ -97,6 +97,13 @@ def through(weights: Sequence[Array], biases: Sequence[Array], x: Any, phi: Acti
 def tanh(x: Any) -> Any:
     """tanh of a number, a numpy array or a torch tensor."""
     return ACTIVATIONS["tanh"](x)
+
+
+def clipped(x: Any, lo: Any, hi: Any) -> Any:
+    """`min(max(x, lo), hi)` of a number, a numpy array or a torch tensor, with ends of its kind."""
+    if isinstance(x, np.ndarray | float):
+        return np.minimum(np.maximum(x, lo), hi)
+    return x.clamp(lo, hi)
 
 
 def like(array: Array, x: Any) -> Any:

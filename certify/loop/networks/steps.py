@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from certify.errors import InputError
 from certify.loop.activations import Activation, activation
 from certify.loop.expressions import Expression, Symbol, differentiate, nodes, symbols_of, to_tree
-from certify.loop.networks.layers import frozen, frozen_layers
+from certify.loop.networks.layers import frozen_layers
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -366,20 +366,3 @@ class Algebra(ABC, Generic[V]):
             for i in spent:
                 del vectors[i]
         return vectors[len(network.steps)]
-
-
-__all__ = [
-    "Affine",
-    "Algebra",
-    "Clip",
-    "Concat",
-    "Map",
-    "Network",
-    "Observe",
-    "Product",
-    "Step",
-    "Sum",
-    "frozen",
-    "layered",
-    "repeated",
-]

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.loop.networks import Affine, Clip, Map, Network, frozen, like, sha256_of, tangent_at, tanh, values
+from certify.loop.networks import Affine, Clip, Map, Network, clipped, frozen, like, sha256_of, tangent_at, tanh, values
 from certify.loop.policies.arithmetic import Arithmetic
 from certify.loop.policies.programmed import WHOSE, Programmed, chain
 
@@ -170,7 +170,7 @@ class PolicyNetwork(Programmed):
         if self.clip is None:
             return u
         if arithmetic is None:
-            return _clip(u, *(like(end, u) for end in self.clip))
+            return clipped(u, *(like(end, u) for end in self.clip))
         ends = ([Fraction(float(v)) for v in end] for end in self.clip)
         return [arithmetic.clip(v, lo, hi) for v, lo, hi in zip(u, *ends, strict=True)]
 
@@ -264,7 +264,7 @@ class _Arrays:
         return tanh(v)
 
     def clip(self, v: Any, lo: Fraction, hi: Fraction) -> Any:
-        return _clip(v, float(lo), float(hi))
+        return clipped(v, float(lo), float(hi))
 
 
 _ARRAYS = _Arrays()
@@ -280,9 +280,3 @@ def _limits(clip: Any, m: int) -> tuple[Array, Array]:
         j = int(np.argmin(lo < hi))
         raise InputError(f"`clip` must satisfy lo < hi; found [{lo[j]}, {hi[j]}] for input {j}.")
     return lo, hi
-
-
-def _clip(x: Any, lo: Any, hi: Any) -> Any:
-    if isinstance(x, np.ndarray | float):
-        return np.minimum(np.maximum(x, lo), hi)
-    return x.clamp(lo, hi)

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.networks import Affine
+from certify.loop.networks import Step
 from certify.loop.policies import PolicyNetwork
 from certify.loop.rigorous import centring_with_errors
 from certify.provers.bounds.arrays import Array, joined
@@ -141,12 +141,12 @@ class StepsEnclosure(Enclosure):
     def __init__(self, network: PolicyNetwork, centring: Sequence[Array]) -> None:
         super().__init__(network, centring)
         self.network, self.origin = network.network, network.origin if network.is_moved else None
-        self.norms = {k: norm_of(step.weight) for k, step in enumerate(self.network.steps) if isinstance(step, Affine)}
+        self.norms: dict[Step, float] = {step: norm_of(step.weight) for step in self.network.affine}
 
     def _inside(self, x: Array, x_error: Array, batch: int) -> Parts:
         if self.origin is not None:
             x, x_error = moved(x, x_error, self.origin)
-        boxes = StepsOnBoxes({self.network.steps[k]: norm for k, norm in self.norms.items()})
+        boxes = StepsOnBoxes(self.norms)
         value = boxes.value(self.network, x, x_error)
         if np.any(self.shift):
             value = boxes.shifted(value, self.shift, self.shift_error)
