@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates.membership import tube_start
+from certify.certificates.ellipsoids import tube_start
 from certify.lyapunov import extents, semi_axes, volume
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.symbolic import Symbolic

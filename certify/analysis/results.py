@@ -23,7 +23,8 @@ from certify.analysis.json_object import to_dict
 from certify.analysis.stated import in_one_line, stated
 from certify.certificates import parse_certificate, write_atomically
 from certify.certificates.claims import Problem
-from certify.certificates.membership import Region, sublevel_set, tube_start
+from certify.certificates.ellipsoids import sublevel_set, tube_start
+from certify.certificates.membership import Region
 from certify.certificates.timing import Timing, reach_time
 from certify.certificates.verdict import Stop, Verdict
 from certify.errors import InputError
