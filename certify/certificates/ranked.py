@@ -90,6 +90,23 @@ class Ranked:
             return Located(answer)
         return Located(answer, within=" and ".join(n for n in (self.ellipsoid.name, self.name) if n in used))
 
+    def ranks_at(self, states: Array) -> Array:
+        """The rank of the leaf that holds each state (N, n), in floats, NaN outside of the root and where nothing is said.
+
+        For pictures: angles are not turned.
+        """
+        lo, hi = (np.tile(end, (len(states), 1)) for end in (self.tree.lo, self.tree.hi))
+        inside = np.all((states >= lo) & (states <= hi), axis=1)
+        axes, node = np.frombuffer(self.tree.tree, np.uint8), np.zeros(len(states), dtype=np.int64)
+        while len(going := np.flatnonzero(axes[node] != LEAF)):
+            axis = axes[node[going]]
+            at = 0.5 * lo[going, axis] + 0.5 * hi[going, axis]
+            upper = states[going, axis] >= at
+            lo[going[upper], axis[upper]], hi[going[~upper], axis[~upper]] = at[upper], at[~upper]
+            node[going] = np.where(upper, self._upper[node[going]], node[going] + 1)
+        leaf = np.cumsum(axes == LEAF) - 1
+        return np.where(inside & self._proved[node], self.tree.ranks[leaf[node]].astype(np.float64), np.nan)
+
     def _in_leaves(self, x: Sequence[Fraction]) -> bool:
         ranges = []
         for i, v in enumerate(x):
@@ -199,6 +216,30 @@ def upper_children(tree: bytes) -> NDArray[np.int64]:
     if len(sizes) != 1:
         raise CertificateFormatError("the bytes of the tree of ranks must be exactly one tree.")
     return upper
+
+
+@dataclass(frozen=True, slots=True)
+class Count:
+    """Numbers of a tree of ranks: its leaves, those with a finite rank, their volume and its share of the root box, in
+    angles of one turn, both rounded down, and the most steps."""
+
+    leaves: int
+    proved: int
+    volume: float
+    share: float
+    steps: int
+
+
+def count(tree: RankTree, angles: Sequence[int] = ()) -> Count:
+    """The numbers of a tree.
+
+    Raises
+    ------
+    CertificateFormatError : the tree's bytes are not exactly one tree.
+    """
+    finite = tree.ranks[tree.ranks != UNPROVED]
+    most = int(finite.max()) if len(finite) else 0
+    return Count(len(tree.ranks), len(finite), *proved_volume(tree, angles), most)
 
 
 def proved_volume(tree: RankTree, angles: Sequence[int] = ()) -> tuple[float, float]:
