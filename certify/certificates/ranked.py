@@ -91,7 +91,7 @@ class Ranked:
         return Located(answer, within=" and ".join(n for n in (self.ellipsoid.name, self.name) if n in used))
 
     def ranks_at(self, states: Array) -> Array:
-        """The rank of the leaf that holds each state (N, n), in floats, NaN outside of the root and where nothing is said.
+        """The ranks of leaves that hold states (N, n), in floats; NaN outside of the root and where nothing is said.
 
         For pictures: angles are not turned.
         """

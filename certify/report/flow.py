@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.certificates.membership import angles_in
 from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
 from certify.loop.plants import System
@@ -46,6 +47,7 @@ class Flow:
     period : over which the input is held, the longest that is allowed, in seconds; 0 if it follows the state at once.
     discrete : whether F(x) is the state one step later, and not the rate of change.
     cost : of F at one state, in multiplications' worth.
+    angles : the numbers of states in which full turns are the same place: they are kept within half a turn of 0.
     """
 
     field: Field
@@ -56,6 +58,7 @@ class Flow:
     period: float = 0.0
     discrete: bool = False
     cost: float = 0.0
+    angles: tuple[int, ...] = ()
 
     @classmethod
     def of(cls, system: System, network: PolicyNetwork) -> Flow:
@@ -83,7 +86,8 @@ class Flow:
             return np.asarray(f(x, u))
 
         period = 0.0 if system.sample is None else float(system.sample[1])
-        return cls(field, policy, *domain_bounds(system), plant, period, system.time == "discrete", cost_of(network))
+        steps, angles = system.time == "discrete", angles_in(system)
+        return cls(field, policy, *domain_bounds(system), plant, period, steps, cost_of(network), angles)
 
     def fitting(self, step: float) -> float:
         """The largest step of a simulation up to `step`, in seconds, that divides the period; in discrete time 1."""
@@ -108,8 +112,12 @@ class Flow:
     def advance(self, x: Array, u: Array | None, step: float) -> Array:
         """States one step later, (..., n), with the input held at u if there is one."""
         if self.discrete:
-            return self.field(x)
-        return rk4_step(self.field if u is None else lambda y: self.plant(y, u), x, step)
+            after = self.field(x)
+        else:
+            after = rk4_step(self.field if u is None else lambda y: self.plant(y, u), x, step)
+        for i in self.angles:
+            after[..., i] -= 2 * np.pi * np.round(after[..., i] / (2 * np.pi))
+        return after
 
 
 def cost_of(network: PolicyNetwork) -> float:

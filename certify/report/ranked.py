@@ -24,7 +24,7 @@ def with_ranks(words: Words, angles: Sequence[str]) -> Words:
     """The words of a claim with ranks; `angles` are names of states."""
     turned = listed([symbol(name) for name in angles]) if angles else ""
     place = f"; states that differ by full turns, multiples of 2π in {turned}, are the same place" if angles else ""
-    inside = f"its states but for {turned} are" if angles else "it is"
+    inside = f"all states but {turned} are" if angles else "the state is"
     boxes = (
         "Boxes",
         "A box of rank 0 lies in {V ≤ c₂}. From every other box with a rank r, after its number k of steps, every "
@@ -77,8 +77,8 @@ def with_constraints(words: Words, *, ranked: bool) -> Words:
     part = ("Constraints", f"Each of the constraints above, g(x, π(x)) < 0, holds {where}$meanwhile", _ON_ALL)
     other = (
         "Other constraints.",
-        "Only the inequalities named are kept, by the policy's exact input. That nothing else breaks, and how much "
-        "room they hold, is not part of the claim.",
+        "Only the inequalities named are kept, by the policy's exact input. That nothing else breaks, and with how "
+        "much room they hold, is not part of the claim.",
     )
     return replace(
         words,

@@ -69,7 +69,7 @@ def simulated_roa(scene: Scene) -> SimulatedRoa | None:
         effort=scene.effort.share(_GRID),
         start=scene.start,
         centre=scene.centre,
-        beyond=scene.in_outer,
+        beyond=scene.in_more,
     )
 
 

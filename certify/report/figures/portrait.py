@@ -84,6 +84,8 @@ def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
             f"Magenta: the {scene.word} outer set {{N ≤ n₂}} in the domain, from which every trajectory enters the "
             f"blue one{'' if scene.word == 'proved' else ', if the claim is true'}; its outline is that on a grid. "
         )
+    elif scene.ranked is not None:
+        meaning += "The boxes with ranks, from which it is reached, are in a picture of their own. "
     about = _ABOUT if scene.centre is None else _ABOUT_A_PATH
     about = (about if scene.beyond is None else _ABOUT_AN_OUTER_SET) if len(scene.pairs) > 1 else ""
     meaning += _unseen(scene)
@@ -213,7 +215,8 @@ def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region |
             axes.contour(a, b, change, levels=[0.0], colors=[GROWTH], linewidths=1.0, zorder=3)
     size = view.hi - view.lo
     for which, colour, style, _ in _kinds(scene, runs):
-        lines = [thin(runs.path[:, k][:, [i, j]], size) for k in np.flatnonzero(which)]
+        paths = [piece for k in np.flatnonzero(which) for piece in _unbroken(runs.path[:, k], scene.flow.angles)]
+        lines = [thin(path[:, [i, j]], size) for path in paths]
         lines = [path for path in lines if len(path) > 1]
         width = 0.4 if scene.timing.discrete else 0.8  # the lines join steps, which are the dots
         axes.add_collection(
@@ -251,6 +254,14 @@ def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region |
     if scene.n == 2:
         axes.spines[["left", "bottom"]].set_visible(False)  # the domain's box is frame enough
     return bool(np.any(growing))
+
+
+def _unbroken(path: Array, angles: Sequence[int]) -> list[Array]:
+    """The pieces of a path between its full turns."""
+    if not angles:
+        return [path]
+    turns = np.any(np.abs(np.diff(path[:, list(angles)], axis=0)) > np.pi, axis=1)
+    return np.split(path, np.flatnonzero(turns) + 1)
 
 
 def _moments(band: Band) -> Array:

@@ -11,27 +11,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates.ellipsoids import sublevel_set
-from certify.certificates.membership import angles_in
 from certify.certificates.ranked import Ranked
 from certify.report.figures.geometry import ellipse
 from certify.report.figures.pairs import Pair
 from certify.report.figures.scene import Scene
-from certify.report.figures.sets import tree_of
 from certify.report.figures.style import MUTED, SET, Picture, add_axes, figure_of, to_svg
 from certify.report.words import symbol
 
 Array = NDArray[np.float64]
 _POINTS = 480  # of a map along each side
-_COLOURS = "YlGnBu"  # light is near
+_COLOURS = "viridis_r"  # light is near, and no colour is white
 
 
 def rank_maps(scene: Scene) -> list[Picture]:
     """A map for each pair of states, or of the line; none without ranks."""
-    tree = tree_of(scene.certificate)
-    if tree is None:
+    ranked = scene.ranked
+    if ranked is None:
         return []
-    ranked = Ranked(tree, sublevel_set(scene.P, scene.outer), angles_in(scene.system))
     if scene.n == 1:
         return [_picture(scene, ranked, (0, 0))]
     return [_picture(scene, ranked, pair) for pair in scene.pairs]

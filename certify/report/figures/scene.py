@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates import Certificate, PartitionTree, leaves
+from certify.certificates.membership import region_of
 from certify.effort import Effort
 from certify.errors import CertificateFormatError
 from certify.loop.policies import PolicyNetwork
@@ -31,6 +32,7 @@ from certify.report.figures.sets import (
     reach_of_tube,
     slabs_of,
     start_of,
+    tree_of,
 )
 from certify.report.flow import Flow, cost_of, time_scales
 from certify.report.phrases import phrases_of
@@ -114,9 +116,13 @@ class Scene:
         self.kind = "asymptotic" if certificate.claim.floor is None else "practical"
         self.word = "proved" if accepted else "claimed"
         self.system, self.P = certificate.system, certificate.P
+        if certificate.claim.ranks is None:  # full turns are then no claim's same place
+            self.system = replace(self.system, angles=())
         self.inner, self.outer = inner_of(certificate), certificate.roa
         self.n = self.system.n
         self.reach = extents(self.P, self.outer)
+        tree = tree_of(certificate)
+        self.ranked = None if tree is None else region_of(certificate).ranked
         self.inner_reach = extents(self.P, self.inner)
         self.start, self.slabs = start_of(certificate), slabs_of(certificate)
         self.start_reach = None if self.start is None else extents(self.start, 1.0)
@@ -232,6 +238,14 @@ class Scene:
         with np.errstate(all="ignore"):
             low = self.beyond.function(x) <= self.beyond.level
         return np.asarray(low & np.all((x >= self.lo) & (x <= self.hi), axis=-1))
+
+    def in_more(self, x: Array) -> NDArray[np.bool_]:
+        """True for each state (..., n) in the outer set or in a box with a rank, in float64."""
+        inside = self.in_outer(x)
+        if self.ranked is None:
+            return inside
+        found = self.ranked.ranks_at(x.reshape(-1, self.n)).reshape(x.shape[:-1])
+        return np.asarray(inside | np.isfinite(found))
 
     def outline(self, pair: Pair) -> tuple[Array, Array, Array] | None:
         """Axes of a fine grid over the domain along two states and N less its level there, all other states 0.

@@ -22,7 +22,7 @@ def runs_from(scene: Scene, begin: ArrayLike, steps: int | None = None) -> Runs:
     every = min(max(int(wanted / step), 1), _MOST_SHORT) if scene.flow.period else 1  # of short periods some are kept
     count = steps or min(int((scene.duration + 0.5 * scene.horizon) / step) + 1, every * scene.detail.steps)
     starts, target = np.asarray(begin, dtype=np.float64), scene.settling_level
-    begins = scene.start, scene.centre, scene.in_outer
+    begins = scene.start, scene.centre, scene.in_more
     runs = runs_of(scene.flow, starts, scene.P, scene.outer, target, step, count, scene.effort, *begins)
     if not scene.timing.is_plain:  # the rate of change jumps where the input does
         return Runs(runs.path[::every], every * step, runs.settled, runs.left)
