@@ -262,3 +262,12 @@ def test_the_command_checks_and_draws(proved: Any, tmp_path: Path, capsys: pytes
     assert _run(["plot", str(path), "--out", str(tmp_path / "roa.doc")], False) == 2
     assert "one of pdf, svg, png" in capsys.readouterr().err
     assert hashlib.sha256(out.read_bytes()).hexdigest() == before  # nothing was half-written
+
+
+def test_states_that_nothing_couples_are_still_paired_with_others() -> None:
+    a, b, c, u = symbols("a b c u")
+    system = System(
+        name="apart", states=(a, b, c), inputs=(u,), parameters={}, dynamics=(u - a, -b, -c), u_eq=(Number(0),),
+        domain=box(1, 1, 1), input_bounds=box(1),
+    )  # fmt: skip
+    assert all(i != j for i, j in pairs_of(system, np.eye(3), np.full(3, 0.5)))

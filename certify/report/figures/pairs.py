@@ -70,7 +70,7 @@ def pairs_of(system: System, P: Array, shares: Array) -> list[Pair]:
     pairs = rates(system)
     for i in np.argsort(-shares, kind="stable").tolist():
         if not any(i in pair for pair in pairs):
-            j = int(np.argmax(coupled[i]))
+            j = int(np.argmax(np.where(np.arange(n) == i, -1.0, coupled[i])))  # another state, also if P couples none
             pairs.append((min(i, j), max(i, j)))
     pairs = sorted(dict.fromkeys(pairs), key=lambda pair: -max(shares[list(pair)]))[:MOST]
     # Then the states that P couples most, until rows of two are full.
