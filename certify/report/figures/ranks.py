@@ -35,7 +35,7 @@ def rank_maps(scene: Scene) -> list[Picture]:
 
 def _picture(scene: Scene, ranked: Ranked, pair: Pair) -> Picture:
     """The map of one plane, with the ellipse of {V <= c2} on top."""
-    figure, axes = figure_of(5.0, 4.2 if scene.n > 1 else 1.6, right=0.85)
+    figure, axes = figure_of(4.2, 3.6 if scene.n > 1 else 1.6, right=0.8)
     i, j = pair
     lo, hi = ranked.tree.lo, ranked.tree.hi
     most = float(scene.certificate.claim.ranks.steps) if scene.certificate.claim.ranks is not None else 1.0
@@ -66,7 +66,6 @@ def _picture(scene: Scene, ranked: Ranked, pair: Pair) -> Picture:
         f"the latest{unless}{other}. White: nothing is {scene.word}.{place}",
         to_svg(figure),
         simulated=False,
-        wide=scene.n == 2,
     )
 
 
@@ -97,7 +96,7 @@ def _scale(figure: Any, axes: Any, most: float, show: dict[str, Any]) -> None:
     """The colours of the numbers of steps, to the right of the map."""
     (width, _), place = figure.get_size_inches(), axes.get_position()
     height = figure.get_size_inches()[1]
-    bar = add_axes(figure, width - 0.72, place.y0 * height, 0.14, place.height * height)
+    bar = add_axes(figure, width - 0.66, place.y0 * height, 0.14, place.height * height)
     bar.imshow(np.linspace(0.0, most, 256)[:, None], extent=(0.0, 1.0, 0.0, most), aspect="auto", **show)
     bar.set_xticks([])
     bar.yaxis.tick_right()
