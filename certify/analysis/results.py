@@ -23,7 +23,7 @@ from certify.analysis.json_object import to_dict
 from certify.analysis.stated import in_one_line, stated
 from certify.certificates import parse_certificate, write_atomically
 from certify.certificates.claims import Problem
-from certify.certificates.ellipsoids import sublevel_set, tube_start
+from certify.certificates.ellipsoids import Ellipsoid, sublevel_set, tube_start
 from certify.certificates.membership import Region
 from certify.certificates.ranked import Ranked
 from certify.certificates.timing import Timing, reach_time
@@ -147,11 +147,8 @@ class RoaResult:
         tube, outer = self.tube, self.outer
         starts = () if tube is None else (tube_start(tube.start, tube.centre),)
         beyond = None if outer is None else Sublevel(outer.function, outer.level, tuple(self.system.domain))
-        inner, names = sublevel_set(self.P, self.levels.roa), [s.name for s in self.system.states]
-        ranked = None
-        if self.ranks is not None:
-            ranked = Ranked(self.ranks.tree, inner, tuple(map(names.index, self.ranks.angles)))
-        return Region((inner, *starts), beyond, ranked)
+        inner = sublevel_set(self.P, self.levels.roa)
+        return Region((inner, *starts), beyond, None if self.ranks is None else _ranked(self.ranks, inner, self.system))
 
     def contains(self, x: ArrayLike, *, deviations: bool = False) -> bool | NDArray[np.bool_]:
         """True for states that lie in the proved set, decided in rationals: no state is let in by rounding.
@@ -246,6 +243,11 @@ class RoaResult:
     def to_dict(self) -> dict[str, Any]:
         """The JSON object of `certify roa --json`; lengths along the states are in their units."""
         return to_dict(self)
+
+
+def _ranked(ranks: RankFacts, inner: Ellipsoid, system: System) -> Ranked:
+    names = [s.name for s in system.states]
+    return Ranked(ranks.tree, inner, tuple(map(names.index, ranks.angles)))
 
 
 def _entries(x: ArrayLike) -> NDArray[Any]:

@@ -139,7 +139,7 @@ class Claim:
         return self.local
 
     def _beside(self) -> dict[str, Any]:
-        """What a claim may state beside its levels."""
+        """The parts that a claim may state beside its levels, by their fields."""
         return {"rate": self.rate, "outer": self.outer, "ranks": self.ranks, "keep": self.keep}
 
     @property

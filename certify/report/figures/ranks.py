@@ -15,10 +15,11 @@ from certify.certificates.ranked import Ranked
 from certify.report.figures.geometry import ellipse
 from certify.report.figures.pairs import Pair
 from certify.report.figures.scene import Scene
-from certify.report.figures.style import MUTED, SET, Picture, add_axes, figure_of, to_svg
+from certify.report.figures.style import MUTED, PAPER, SET, Picture, add_axes, figure_of, to_svg
 from certify.report.words import symbol
 
 Array = NDArray[np.float64]
+_LINE = (PAPER, 3.0), (SET, 1.6)  # an outline that is seen on every colour
 _POINTS = 480  # of a map along each side
 _COLOURS = "viridis_r"  # light is near, and no colour is white
 
@@ -48,7 +49,8 @@ def _picture(scene: Scene, ranked: Ranked, pair: Pair) -> Picture:
         axes.set_ylabel(scene.labels[j])
     else:
         for end in (-scene.reach[0], scene.reach[0]):
-            axes.axvline(end, color=SET, lw=1.6, zorder=4)
+            for colour, width in _LINE:
+                axes.axvline(end, color=colour, lw=width, zorder=4)
         axes.set_yticks([])
     axes.set_xlim(*box[:2])
     axes.set_ylim(*box[2:])
@@ -89,7 +91,8 @@ def _outline(axes: Any, scene: Scene, ranked: Ranked, pair: Pair) -> None:
     turns = [(-1, 0, 1) if k in ranked.angles else (0,) for k in pair]
     for v in turns[0]:
         for w in turns[1]:
-            axes.plot(x + 2 * np.pi * v, y + 2 * np.pi * w, color=SET, lw=1.6, zorder=4)
+            for colour, width in _LINE:
+                axes.plot(x + 2 * np.pi * v, y + 2 * np.pi * w, color=colour, lw=width, zorder=4)
 
 
 def _scale(figure: Any, axes: Any, most: float, show: dict[str, Any]) -> None:

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates import Certificate, PartitionTree, leaves
-from certify.certificates.membership import region_of
 from certify.effort import Effort
 from certify.errors import CertificateFormatError
 from certify.loop.policies import PolicyNetwork
@@ -29,10 +28,11 @@ from certify.report.figures.sets import (
     inner_of,
     is_ellipsoid,
     is_local_enough,
+    ranked_of,
     reach_of_tube,
     slabs_of,
     start_of,
-    tree_of,
+    system_of,
 )
 from certify.report.flow import Flow, cost_of, time_scales
 from certify.report.phrases import phrases_of
@@ -115,14 +115,11 @@ class Scene:
         self.words = words_for(certificate.kind, self.timing, Additions(beyond=self.beyond is not None))
         self.kind = "asymptotic" if certificate.claim.floor is None else "practical"
         self.word = "proved" if accepted else "claimed"
-        self.system, self.P = certificate.system, certificate.P
-        if certificate.claim.ranks is None:  # full turns are then no claim's same place
-            self.system = replace(self.system, angles=())
+        self.system, self.P = system_of(certificate), certificate.P
         self.inner, self.outer = inner_of(certificate), certificate.roa
         self.n = self.system.n
         self.reach = extents(self.P, self.outer)
-        tree = tree_of(certificate)
-        self.ranked = None if tree is None else region_of(certificate).ranked
+        self.ranked = ranked_of(certificate)
         self.inner_reach = extents(self.P, self.inner)
         self.start, self.slabs = start_of(certificate), slabs_of(certificate)
         self.start_reach = None if self.start is None else extents(self.start, 1.0)

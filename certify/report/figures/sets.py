@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates import Certificate, PartitionTree, RankTree, Slab
+from certify.certificates.ellipsoids import sublevel_set
+from certify.certificates.membership import angles_in
+from certify.certificates.ranked import Ranked
+from certify.loop.plants import System
 from certify.lyapunov import is_positive_definite
 
 Array = NDArray[np.float64]
@@ -61,6 +65,25 @@ def slabs_of(certificate: Certificate) -> tuple[Slab, ...]:
 def tree_of(certificate: Certificate) -> RankTree | None:
     """The tree of the boxes with ranks; None without any."""
     return certificate.evidence.ranks if isinstance(certificate.evidence, PartitionTree) else None
+
+
+def ranked_of(certificate: Certificate) -> Ranked | None:
+    """The boxes with ranks, with {V <= c2}; None without any.
+
+    Raises
+    ------
+    CertificateFormatError : a rejected file's tree is none.
+    """
+    tree = tree_of(certificate)
+    if tree is None:
+        return None
+    return Ranked(tree, sublevel_set(certificate.P, certificate.roa), angles_in(certificate.system))
+
+
+def system_of(certificate: Certificate) -> System:
+    """The plant as pictures simulate it: with its angles only where the claim takes full turns for the same place."""
+    system = certificate.system
+    return system if certificate.claim.ranks is not None else replace(system, angles=())
 
 
 @dataclass(frozen=True, slots=True)
