@@ -205,6 +205,8 @@ class _Refused:
         """The certificate with a weaker claim and less evidence; None without such a claim."""
         if claim is None:
             return None
+        if claim.ranks is None:
+            evidence = {"ranks": None, **evidence}
         return replace(self.certificate, claim=claim, evidence=replace(self.evidence, **evidence))
 
 

@@ -1,13 +1,18 @@
-"""Facts on an outer set: its size, what limits it, why a level that was asked for is missed."""
+"""Facts on an outer set: its size, what limits it, why a level that was asked for is missed; facts on boxes with ranks,
+and constraints as people read them."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
-from certify.analysis.facts import OuterFacts
+from certify.analysis.facts import OuterFacts, RankFacts
 from certify.analysis.options import RoaOptions
+from certify.certificates import Certificate, PartitionTree
 from certify.certificates.claims import Claim, Outer, Problem
+from certify.certificates.ranked import count
+from certify.loop.plants import constraints_of_values
 from certify.lyapunov import sampled_volume
 from certify.lyapunov.rigorous import evaluate_rise
 
@@ -30,6 +35,24 @@ def outer_facts(problem: Problem, claim: Claim, outer: Outer, found: OuterProof)
         None if found.witness is None else tuple(found.witness.x.tolist()),
         None if found.witness is None else found.witness.level,
     )
+
+
+def rank_facts(certificate: Certificate, rounds: int | None = None) -> RankFacts | None:
+    """The facts on the boxes with ranks of a certificate; None without any."""
+    ranks, evidence = certificate.claim.ranks, certificate.evidence
+    if ranks is None or not isinstance(evidence, PartitionTree) or evidence.ranks is None:
+        return None
+    names = [s.name for s in certificate.system.states]
+    found = count(evidence.ranks, [names.index(name) for name in ranks.angles])
+    return RankFacts(
+        evidence.ranks, ranks.angles, found.leaves, found.proved, found.share, found.volume, found.steps, rounds
+    )
+
+
+def constraints_in_words(certificate: Certificate) -> dict[str, str]:
+    """The claim's constraints by name, over the states' values, as in `p - 3/2 < 0`."""
+    stated = replace(certificate.system, constraints=certificate.constraints)
+    return {name: f"{g} < 0" for name, g in constraints_of_values(stated).items()}
 
 
 def short_of(problem: Problem, claim: Claim, options: RoaOptions, found: OuterProof | None) -> str:

@@ -1,4 +1,4 @@
-"""The parts of a result: levels, candidates, a tube, an outer set, and what limits it."""
+"""The parts of a result: levels, candidates, a tube, an outer set, boxes with ranks, and what limits it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates.membership import tube_start
+from certify.certificates import RankTree
+from certify.certificates.ellipsoids import tube_start
 from certify.lyapunov import extents, semi_axes, volume
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.symbolic import Symbolic
@@ -125,6 +126,36 @@ class OuterFacts:
         )
         numbers = {name: getattr(self, name) for name in self.__slots__ if name not in ("function", "witness")}
         return {**stated, **numbers, "witness": self.witness and list(self.witness)}
+
+
+@dataclass(frozen=True, slots=True)
+class RankFacts:
+    """Boxes with ranks, from which {V <= c2} is reached.
+
+    Parameters
+    ----------
+    tree : the evidence.
+    angles : names of states in which 2 pi more is the same place.
+    leaves, proved : the number of all leaves, and of those with a rank.
+    covered, volume : the share of the tree's box that these take, in angles of one turn, and their volume, both rounded
+        down.
+    steps : the most steps from one of them.
+    rounds : of the search; None if it was not counted.
+    """
+
+    tree: RankTree
+    angles: tuple[str, ...]
+    leaves: int
+    proved: int
+    covered: float
+    volume: float
+    steps: int
+    rounds: int | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: the numbers, and the corners of the box that was cut."""
+        stated: dict[str, Any] = {name: getattr(self, name) for name in self.__slots__ if name != "tree"}
+        return {**stated, "angles": list(self.angles), "lo": self.tree.lo.tolist(), "hi": self.tree.hi.tolist()}
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,6 +46,8 @@ def to_dict(result: RoaResult) -> dict[str, Any]:
         else {s.name: str(q) for s, q in zip(system.states, result.reach_from, strict=True)},
         "tube": None if result.tube is None else result.tube.to_dict(),
         "outer": None if result.outer is None else result.outer.to_dict(),
+        "ranks": None if result.ranks is None else result.ranks.to_dict(),
+        "constraints": dict(result.constraints),
         "witness": None if result.witness is None else _witness(result.witness),
         "eigenvalues": list(result.eigenvalues),
         "rest": None if result.rest is None else _rest(result, result.rest),

@@ -18,12 +18,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certify.analysis.facts import Diagnosis, Levels, OuterFacts, Tried, TubeFacts
+from certify.analysis.facts import Diagnosis, Levels, OuterFacts, RankFacts, Tried, TubeFacts
 from certify.analysis.json_object import to_dict
 from certify.analysis.stated import in_one_line, stated
 from certify.certificates import parse_certificate, write_atomically
 from certify.certificates.claims import Problem
-from certify.certificates.membership import Region, sublevel_set, tube_start
+from certify.certificates.ellipsoids import sublevel_set, tube_start
+from certify.certificates.membership import Region
+from certify.certificates.ranked import Ranked
 from certify.certificates.timing import Timing, reach_time
 from certify.certificates.verdict import Stop, Verdict
 from certify.errors import InputError
@@ -50,7 +52,8 @@ class RoaResult:
     `rest` is the loop's equilibrium, if not the origin. `candidate` is the source of P, `tried` all that were tried,
     `notice` says what is not as it was asked for. `reach_from` is the state that was asked about, by the states'
     values; if the verdict on it is UNKNOWN by `Stop.PATH`, `certificate` and `levels` are of a proved set without it.
-    If the verdict is UNKNOWN by `Stop.BEYOND` they, and `outer`, are of a smaller set than was asked for.
+    If the verdict is UNKNOWN by `Stop.BEYOND` they, and `outer`, are of a smaller set than was asked for. `constraints`
+    are those that are proved, in words by their names.
     `checker` is the checker's answer, None if it was not reached, about `raw`, the certificate's bytes; `solver` has
     dReal's version and every query with its answer, None if it was not asked. `notices` are facts about plant and
     policy known before the run, such as a domain that was cut; `folder` keeps a temporary folder of the certificate
@@ -72,6 +75,8 @@ class RoaResult:
     levels: Levels = field(default_factory=Levels)
     tube: TubeFacts | None = None
     outer: OuterFacts | None = None
+    ranks: RankFacts | None = None
+    constraints: Mapping[str, str] = field(default_factory=dict)
     reach_from: tuple[Fraction, ...] | None = None
     witness: Witness | None = None
     eigenvalues: tuple[str, ...] = ()
@@ -120,7 +125,8 @@ class RoaResult:
         """A certain lower bound of the proved set's volume, in the product of the states' units; None without a set.
 
         With a tube it is that of the larger one of {V <= c2} and the tube's start, of which the set is the union; with
-        an outer set it is that of {V <= c2} alone: `outer.volume` is an estimate of the union's.
+        an outer set it is that of {V <= c2} alone: `outer.volume` is an estimate of the union's. With ranks too:
+        `ranks.volume` is that of their boxes, rounded down.
         """
         return None if self.ellipsoid is None else volume(*self.ellipsoid)
 
@@ -135,20 +141,25 @@ class RoaResult:
 
     @property
     def _region(self) -> Region | None:
-        """The union of the sets of the levels, the tube and the outer set; None if there is no level c2."""
+        """The union of the sets of the levels, the tube, the outer set and the ranks; None if there is no level c2."""
         if self.P is None or self.levels.roa is None:
             return None
         tube, outer = self.tube, self.outer
         starts = () if tube is None else (tube_start(tube.start, tube.centre),)
         beyond = None if outer is None else Sublevel(outer.function, outer.level, tuple(self.system.domain))
-        return Region((sublevel_set(self.P, self.levels.roa), *starts), beyond)
+        inner, names = sublevel_set(self.P, self.levels.roa), [s.name for s in self.system.states]
+        ranked = None
+        if self.ranks is not None:
+            ranked = Ranked(self.ranks.tree, inner, tuple(map(names.index, self.ranks.angles)))
+        return Region((inner, *starts), beyond, ranked)
 
     def contains(self, x: ArrayLike, *, deviations: bool = False) -> bool | NDArray[np.bool_]:
         """True for states that lie in the proved set, decided in rationals: no state is let in by rounding.
 
         The set is {V <= c2}, and with a tube the union of that and the tube's start. With an outer set it is the union
         of that and {N <= n2} within the domain, decided in balls of growing precision: a state at which N is exactly n2
-        may not be let in.
+        may not be let in. With ranks the boxes of finite rank belong to it, and states that differ from one of its own
+        by multiples of 2 pi in angles.
 
         Parameters
         ----------

@@ -19,7 +19,7 @@ def in_one_line(result: RoaResult) -> str:
     shown = [verdict, *(said[name] for name in ("plant", "in time", "set") if name in said)]
     shown += [
         f"{name} {said[name]}"
-        for name in ("rate", "length", "area", "volume", "with N", "limited by", "reason")
+        for name in ("rate", "length", "area", "volume", "with N", "with boxes", "kept", "limited by", "reason")
         if name in said
     ]
     return "; ".join(shown)
@@ -44,6 +44,19 @@ def stated(result: RoaResult) -> list[tuple[str, str]]:
             wider = f", and N <= {below(result.outer.level)} in the domain"
         rows.append(("set", f"V <= {below(level)}{wider}"))
         rows.append((volume_name(result.system.n), f"{below(size)} {unit}".rstrip()))
+        if result.ranks is not None:
+            ranks, steps = result.ranks, "steps" if result.system.sample is None else "sampling instants"
+            rows[-1] = (rows[-1][0], f"{rows[-1][1]}, of V <= {below(level)}")
+            size_of_boxes = f"{volume_name(result.system.n)} {below(ranks.volume)} {unit}".rstrip()
+            rows.append(
+                (
+                    "with boxes",
+                    f"{size_of_boxes}, {below(100 * ranks.covered, 4)} % of what was cut, "
+                    f"at most {ranks.steps:,} {steps} away",
+                )
+            )
+        if result.constraints:
+            rows.append(("kept", "; ".join(result.constraints.values())))
         if result.outer is not None:
             rows[-1] = (rows[-1][0], f"{rows[-1][1]}, of V <= {below(level)}")
             rows.append(("with N", estimated(result.outer.volume, result.outer.deviation, unit)))

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         LocalBall,
         OuterTree,
         PartitionTree,
+        RankTree,
         Slab,
         TrustedSolver,
         Waypoint,
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from certify.certificates.limits import require_short, require_within_limits
     from certify.certificates.model import Certificate, loop_sections
     from certify.certificates.reading import parse_certificate, read_certificate, read_raw
-    from certify.certificates.tree import leaves
+    from certify.certificates.tree import leaves, leaves_within
     from certify.certificates.writing import (
         SEARCH,
         earlier_aside,
@@ -37,11 +38,20 @@ if TYPE_CHECKING:
 _NAMES = {
     "checking": ("run_checker",),
     "encoding": ("decode", "encode"),
-    "evidence": ("Contraction", "LocalBall", "OuterTree", "PartitionTree", "Slab", "TrustedSolver", "Waypoint"),
+    "evidence": (
+        "Contraction",
+        "LocalBall",
+        "OuterTree",
+        "PartitionTree",
+        "RankTree",
+        "Slab",
+        "TrustedSolver",
+        "Waypoint",
+    ),
     "limits": ("require_short", "require_within_limits"),
     "model": ("Certificate", "loop_sections"),
     "reading": ("parse_certificate", "read_certificate", "read_raw"),
-    "tree": ("leaves",),
+    "tree": ("leaves", "leaves_within"),
     "writing": ("SEARCH", "earlier_aside", "remove", "set_aside", "sole_writer", "write_atomically", "write_beside"),
 }
 _PLACES = {name: module for module, names in _NAMES.items() for name in names}
@@ -53,6 +63,7 @@ __all__ = [
     "LocalBall",
     "OuterTree",
     "PartitionTree",
+    "RankTree",
     "Slab",
     "TrustedSolver",
     "Waypoint",
@@ -60,6 +71,7 @@ __all__ = [
     "earlier_aside",
     "encode",
     "leaves",
+    "leaves_within",
     "loop_sections",
     "parse_certificate",
     "read_certificate",

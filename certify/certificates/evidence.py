@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates.encoding import decode, encode
+from certify.certificates.tree import LEAF
+from certify.errors import InputError
 
 Array = NDArray[np.float64]
 _OF_A_BALL = ("J", "multipliers", "weight")
@@ -100,6 +102,38 @@ class OuterTree:
 
 
 @dataclass(frozen=True, slots=True)
+class RankTree:
+    """Evidence of a claim's ranks: a partition of the box lo <= x <= hi.
+
+    Parameters
+    ----------
+    lo, hi : (n,) each, the box's corners.
+    tree : the partition in preorder, one byte for each node.
+    ranks : (N,), of each leaf in the tree's order: from it {V <= c2} is reached after so many steps at the latest, 0
+        within it, 65,535 where nothing is said.
+    steps : (N,), of each leaf: after so many steps its image lies in leaves of lower ranks, or in {V <= c2}.
+
+    Raises
+    ------
+    InputError : corners, ranks and steps do not have shapes of one tree.
+    """
+
+    lo: Array
+    hi: Array
+    tree: bytes
+    ranks: NDArray[np.uint16]
+    steps: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        found = self.tree.count(LEAF)
+        if self.lo.shape != self.hi.shape or self.lo.ndim != 1 or {len(self.ranks), len(self.steps)} != {found}:
+            raise InputError(
+                f"a tree of ranks must have two corners of one length, and a rank and steps for each of its {found} "
+                f"leaves; found {self.lo.shape}, {self.hi.shape}, {len(self.ranks)} and {len(self.steps)}."
+            )
+
+
+@dataclass(frozen=True, slots=True)
 class PartitionTree:
     """Evidence that the checker replays.
 
@@ -113,6 +147,7 @@ class PartitionTree:
     order : of the series in time on its leaves, where the input is held over a period.
     contraction : of a claim of a nearby equilibrium.
     outer : of a claim with an outer set.
+    ranks : of a claim with ranks.
     """
 
     T: Array
@@ -124,6 +159,7 @@ class PartitionTree:
     order: int = 1
     contraction: Contraction | None = None
     outer: OuterTree | None = None
+    ranks: RankTree | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +190,7 @@ def evidence_section(evidence: PartitionTree | TrustedSolver) -> dict[str, Any]:
                 for slab in evidence.tube
             ],
             "outer": None if evidence.outer is None else _outer_tree(evidence.outer),
-        }
+        } | ({} if evidence.ranks is None else {"ranks": _rank_tree(evidence.ranks)})
     return {
         "kind": "trusted-solver",
         "solver": evidence.solver,
@@ -186,6 +222,7 @@ def read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSol
             int(data["order"]),
             None if data["contraction"] is None else _read_contraction(data["contraction"], n),
             None if data["outer"] is None else _read_outer_tree(data["outer"], n),
+            _read_rank_tree(data["ranks"], n) if "ranks" in data else None,
         )
     queries = tuple((str(name), str(answer)) for name, answer in data["queries"])
     return TrustedSolver(str(data["solver"]), str(data["version"]), float.fromhex(data["precision"]), queries)
@@ -199,6 +236,19 @@ def _outer_tree(evidence: OuterTree) -> dict[str, Any]:
 def _read_outer_tree(data: Mapping[str, Any], n: int) -> OuterTree:
     tree, *faces = (base64.b64decode(nodes) for nodes in (data["tree"], *data["faces"]))
     return OuterTree(decode(data["T"], (n, n)), decode(data["root"], (n,)), tree, tuple(faces))
+
+
+def _rank_tree(evidence: RankTree) -> dict[str, str]:
+    numbers = {"ranks": evidence.ranks.astype("<u2").tobytes(), "steps": evidence.steps.astype("u1").tobytes()}
+    parts = {"tree": evidence.tree, **numbers}
+    corners = {"lo": encode(evidence.lo), "hi": encode(evidence.hi)}
+    return corners | {name: base64.b64encode(part).decode("ascii") for name, part in parts.items()}
+
+
+def _read_rank_tree(data: Mapping[str, str], n: int) -> RankTree:
+    tree, ranks, steps = (base64.b64decode(data[name]) for name in ("tree", "ranks", "steps"))
+    corners = decode(data["lo"], (n,)), decode(data["hi"], (n,))
+    return RankTree(*corners, tree, np.frombuffer(ranks, "<u2").astype(np.uint16), np.frombuffer(steps, np.uint8))
 
 
 def _ball(evidence: LocalBall | Slab) -> dict[str, str]:

@@ -11,6 +11,7 @@ from fractions import Fraction
 
 import numpy as np
 
+from certify.certificates.claims import MOST_KEPT
 from certify.errors import InputError
 from certify.loop.expressions import Expression, Operation, Tree, constant_of, gathered, nodes, to_tree
 from certify.loop.networks import Observe
@@ -32,7 +33,7 @@ def require_within_limits(system: System, network: PolicyNetwork) -> None:
     InputError : a limit of the format is exceeded; the message names it.
     """
     observations = [e for step in network.network.steps if isinstance(step, Observe) for e in step.expressions]
-    dynamics = (*system.uncertain_dynamics(), *observations)
+    dynamics = (*system.uncertain_dynamics(), *observations, *system.uncertain_constraints().values())
     deepest = max(e.depth for e in dynamics)
     if deepest > MOST_DEPTH:
         raise InputError(_too_large(system, "levels of nesting in an equation", deepest, MOST_DEPTH))
@@ -51,6 +52,7 @@ def require_within_limits(system: System, network: PolicyNetwork) -> None:
     for what, found, most in (
         ("states", system.n, MOST_STATES),
         ("inputs", system.m, MOST_STATES),
+        ("constraints", len(system.constraints), MOST_KEPT),
         ("steps of the policy", len(network.network.steps), MOST_STEPS),
         ("units in a layer", max(network.network.sizes), MOST_ROWS),
         ("nodes in the equations", len(listed), MOST_NODES),

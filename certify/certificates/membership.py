@@ -3,7 +3,8 @@
 The proved set consists of {V <= c2} and, under a claim with a tube, the tube's start. These are ellipsoids and so
 convex: a box of states lies in one of them exactly if its corners do, and the corners' values are rational numbers.
 Under a claim with an outer set, {N <= n2} within the domain belongs to it too and need not be convex. Then a box is cut
-into pieces until each piece lies in one of the sets, or a state is found that lies in none.
+into pieces until each piece lies in one of the sets, or a state is found that lies in none. Under a claim with ranks
+the leaves of finite rank belong to it (ranked.py).
 Answers are about bytes that the checker accepted; a file that it rejects has no proved set.
 """
 
@@ -21,67 +22,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates import Certificate, parse_certificate, read_raw, run_checker
+from certify.certificates import Certificate, PartitionTree, parse_certificate, read_raw, run_checker
+from certify.certificates.ellipsoids import Box, Ellipsoid, steepest, sublevel_set, tube_start
 from certify.certificates.formats import version_in
-from certify.certificates.verdict import Answer
+from certify.certificates.located import Containment, Located
+from certify.certificates.ranked import Ranked
 from certify.errors import InputError
 from certify.loop.plants import System, with_origin
-from certify.lyapunov import are_inside, volume
+from certify.lyapunov import volume
 from certify.lyapunov.sublevel import Sublevel
 
 Array = NDArray[np.float64]
-Box = tuple[tuple[Fraction, Fraction], ...]
 _CORNERS = 16  # 2 to the power of this many corners are looked at one by one
 _PIECES = 4096  # of a box, that are looked at
-
-
-class Containment(Answer):
-    """The answer to: do all states of a box lie in a proved set?
-
-    CONTAINED: all do. NOT_CONTAINED: some state does not. UNDECIDED: neither was shown.
-    """
-
-    CONTAINED = "contained"
-    NOT_CONTAINED = "not contained"
-    UNDECIDED = "undecided"
-
-    @property
-    def exit_status(self) -> int:
-        """Exit status of the command line: 0 contained, 1 not contained, 3 undecided."""
-        return {Containment.CONTAINED: 0, Containment.NOT_CONTAINED: 1}.get(self, 3)
-
-
-@dataclass(frozen=True, slots=True)
-class Ellipsoid:
-    """{(x - c)'P(x - c) <= level} with its name; P (n, n), c = `centre` (n,), empty for 0."""
-
-    name: str
-    P: Array
-    level: float
-    centre: tuple[float, ...] = ()
-
-    def around(self, box: Box) -> Box:
-        """A box as deviations from the centre."""
-        shift = [Fraction(v) for v in self.centre] or [Fraction(0)] * len(box)
-        return tuple((lo - c, hi - c) for (lo, hi), c in zip(box, shift, strict=True))
-
-    def holds(self, points: Iterable[Sequence[Fraction | float]]) -> list[bool]:
-        """True for each state that lies in the ellipsoid."""
-        return are_inside(self.P, self.level, points, self.centre)
-
-    def covers(self, box: Box) -> bool:
-        """True if a bound of (x - c)'P(x - c) shows that the whole box lies in the ellipsoid."""
-        return _largest(self.P, self.around(box)) <= Fraction(float(self.level))
-
-
-@dataclass(frozen=True, slots=True)
-class Located:
-    """The location of a box: `within` names the set that contains it, or the sets that do so together; `outside` is a
-    state of the box in none of them, (n,)."""
-
-    answer: Containment
-    within: str | None = None
-    outside: tuple[Fraction, ...] | None = None
 
 
 NOTHING_PROVED = Located(Containment.UNDECIDED)
@@ -90,10 +43,12 @@ NOTHING_PROVED = Located(Containment.UNDECIDED)
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """The union of `ellipsoids` and, where a claim has one, of an `outer` set, in deviations from x_eq."""
+    """The union of `ellipsoids` and, where a claim has them, of an `outer` set or of `ranked` boxes, in deviations from
+    x_eq."""
 
     ellipsoids: tuple[Ellipsoid, ...]
     outer: Sublevel | None = None
+    ranked: Ranked | None = None
 
     @property
     def largest(self) -> Ellipsoid:
@@ -108,16 +63,17 @@ class Region:
         points = list(states)
         found = [e.holds(points) for e in self.ellipsoids]
         inside = [any(each) for each in zip(*found, strict=True)]
-        if self.outer is None:
+        more = self.ranked if self.outer is None else self.outer
+        if more is None:
             return inside
-        beyond = iter(self.outer.holds(x for x, known in zip(points, inside, strict=True) if not known))
+        beyond = iter(more.holds(x for x, known in zip(points, inside, strict=True) if not known))
         return [known or next(beyond) for known in inside]
 
     def excludes(self, states: Iterable[Sequence[Fraction | float]]) -> list[bool]:
         """True for each state, as a deviation from x_eq, that is shown to lie outside the set."""
         points = list(states)
         found = [[not inside for inside in e.holds(points)] for e in self.ellipsoids]
-        found += [] if self.outer is None else [self.outer.excludes(points)]
+        found += [more.excludes(points) for more in (self.outer, self.ranked) if more is not None]
         return [all(each) for each in zip(*found, strict=True)]
 
     def locate(self, box: Box) -> Located:
@@ -125,7 +81,8 @@ class Region:
 
         If at most 16 intervals have a width, the corners decide, unless one ellipsoid holds some of them and another
         the rest. With more, a bound of x'Px on the box may show that it is contained, and a corner that it is not.
-        With an outer set the question is put to pieces of the box, at most 4,096.
+        With an outer set the question is put to pieces of the box, at most 4,096; with ranks to the leaves that it
+        meets.
 
         Raises
         ------
@@ -136,7 +93,7 @@ class Region:
             raise InputError(f"a box must have {n} intervals lo <= hi; found {_shown(box)}.")
         wide = [i for i, (lo, hi) in enumerate(box) if lo < hi]
         if len(wide) > _CORNERS:
-            corners = [_steepest(e, box) for e in self.ellipsoids]
+            corners = [steepest(e, box) for e in self.ellipsoids]
             contained = [e.covers(box) for e in self.ellipsoids]
         else:
             ends = (pair if pair[0] < pair[1] else pair[:1] for pair in box)
@@ -148,6 +105,8 @@ class Region:
         for corner, outside in zip(corners, self.excludes(corners), strict=True):
             if outside:
                 return Located(Containment.NOT_CONTAINED, outside=corner)
+        if self.ranked is not None:
+            return self.ranked.locate(box)
         return Located(Containment.UNDECIDED) if self.outer is None else self._by_pieces(box, self.outer)
 
     def _by_pieces(self, box: Box, outer: Sublevel) -> Located:
@@ -245,22 +204,13 @@ def set_of(raw: bytes, name: str) -> ProvedSet:
     return ProvedSet(
         region.ellipsoids,
         region.outer,
+        region.ranked,
         system=read.system,
         claim=read.kind,
         policy_sha256=read.network.sha256(),
         certificate_sha256=hashlib.sha256(raw).hexdigest(),
         origin=tuple(read.network.origin.tolist()) if read.network.is_moved else (),
     )
-
-
-def sublevel_set(P: Array, roa: float) -> Ellipsoid:
-    """{V <= c2}, V = x'Px."""
-    return Ellipsoid("{V <= c2}", P, roa)
-
-
-def tube_start(P: Array, centre: tuple[float, ...] | None = None) -> Ellipsoid:
-    """The set from which a tube leads to {V <= c2}."""
-    return Ellipsoid("the tube's start", P, 1.0, centre or ())
 
 
 def region_of(read: Certificate) -> Region:
@@ -270,33 +220,17 @@ def region_of(read: Certificate) -> Region:
     outer = (
         None if claim.outer is None else Sublevel(claim.outer.function, claim.outer.level, tuple(read.system.domain))
     )
-    return Region((sublevel_set(read.P, claim.roa), *starts), outer)
-
-
-def _symmetric(P: Array) -> list[list[Fraction]]:
-    rows = [[Fraction(float(v)) for v in row] for row in P]
-    return [[(rows[i][j] + rows[j][i]) / 2 for j in range(len(rows))] for i in range(len(rows))]
-
-
-def _middle(box: Box) -> tuple[list[Fraction], list[Fraction]]:
-    return [(lo + hi) / 2 for lo, hi in box], [(hi - lo) / 2 for lo, hi in box]
-
-
-def _largest(P: Array, box: Box) -> Fraction:
-    """A bound of x'Px on a box: with x = c + d, |d| <= r, `c'Pc + 2 |Pc| r + r'|P|r`."""
-    S, (c, r) = _symmetric(P), _middle(box)
-    Sc = [sum((s * v for s, v in zip(row, c, strict=True)), Fraction(0)) for row in S]
-    curved = sum(
-        (abs(s) * a * b for row, a in zip(S, r, strict=True) for s, b in zip(row, r, strict=True)), Fraction(0)
+    inner, tree = (
+        sublevel_set(read.P, claim.roa),
+        read.evidence.ranks if isinstance(read.evidence, PartitionTree) else None,
     )
-    return sum((v * g + 2 * abs(g) * w for v, g, w in zip(c, Sc, r, strict=True)), Fraction(0)) + curved
+    ranked = None if claim.ranks is None or tree is None else Ranked(tree, inner, angles_in(read.system))
+    return Region((inner, *starts), outer, ranked)
 
 
-def _steepest(ellipsoid: Ellipsoid, box: Box) -> tuple[Fraction, ...]:
-    """The corner to which (x - c)'P(x - c) rises at the middle of the box."""
-    S, (c, _) = _symmetric(ellipsoid.P), _middle(ellipsoid.around(box))
-    slopes = [sum((s * v for s, v in zip(row, c, strict=True)), Fraction(0)) for row in S]
-    return tuple(hi if slope >= 0 else lo for (lo, hi), slope in zip(box, slopes, strict=True))
+def angles_in(system: System) -> tuple[int, ...]:
+    """The numbers of a plant's angles among its states."""
+    return tuple(i for i, s in enumerate(system.states) if s.name in system.angles)
 
 
 def _shown(box: Box) -> str:

@@ -17,7 +17,7 @@ from certify.certificates.encoding import encode, network_section
 from certify.certificates.evidence import PartitionTree, TrustedSolver, evidence_section
 from certify.certificates.formats import SCHEMA
 from certify.errors import InputError
-from certify.loop.expressions import to_tree
+from certify.loop.expressions import Expression, to_tree
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
@@ -41,7 +41,8 @@ class Certificate:
 
     Raises
     ------
-    InputError : the policy has an origin other than 0 under a claim or a centring that does not allow it.
+    InputError : the policy has an origin other than 0 under a claim or a centring that does not allow it, or only one
+        of claim and evidence has ranks.
     """
 
     system: System
@@ -57,11 +58,20 @@ class Certificate:
                 f"`origin` of a policy must be 0 with centre {self.network.centre!r} and claim {self.kind!r}; found "
                 f"{self.network.origin.tolist()}."
             )
+        tree = self.evidence.ranks if isinstance(self.evidence, PartitionTree) else None
+        if (self.claim.ranks is None) is not (tree is None):
+            raise InputError("a claim with ranks must have evidence with ranks, and another claim none.")
 
     @property
     def P(self) -> Array:
         """The matrix of V, (n, n)."""
         return self.V.P
+
+    @property
+    def constraints(self) -> dict[str, Expression]:
+        """The claim's constraints: g of each condition g < 0, by its name in the plant, or else by its number."""
+        named = {g: name for name, g in self.system.uncertain_constraints().items()}
+        return {named.get(g, f"constraint_{k}"): g for k, g in enumerate(self.claim.keep, 1)}
 
     @property
     def kind(self) -> str:
@@ -89,7 +99,8 @@ class Certificate:
                 "sample": None if system.sample is None else [str(h) for h in system.sample],
                 "outer": None if self.claim.outer is None else _outer(self.claim.outer, system),
             }
-            | _start(self.claim),
+            | _start(self.claim)
+            | _ranks(self.claim),
             "networks": [
                 network_section(POLICY, network.network),
                 *_networks(self.claim.outer),
@@ -98,7 +109,7 @@ class Certificate:
             "lyapunov": {"kind": "quadratic", "P": encode(self.V.P)},
             "levels": {name: float(level).hex() for name, level in self.claim.levels.items()},
             "evidence": evidence_section(self.evidence),
-            "provenance": {k: str(v) for k, v in self.provenance.items()} | _for_people(system),
+            "provenance": {k: str(v) for k, v in self.provenance.items()} | _for_people(system) | _names_of(self),
         }
         lines = [f"{json.dumps(k)}: {json.dumps(v)}" for k, v in sections.items()]
         return "{\n" + ",\n".join(lines) + "\n}\n"
@@ -137,6 +148,13 @@ def _start(claim: Claim) -> dict[str, str]:
     return start if claim.centre is None else {**start, "centre": encode(np.array(claim.centre))}
 
 
+def _ranks(claim: Claim) -> dict[str, Any]:
+    """The ranks and the constraints; nothing where there are none."""
+    ranks = claim.ranks
+    stated = {} if ranks is None else {"ranks": {"angles": list(ranks.angles), "steps": ranks.steps}}
+    return stated | ({"keep": [to_tree(g) for g in claim.keep]} if claim.keep else {})
+
+
 def _networks(outer: Outer | None) -> list[dict[str, Any]]:
     """The networks that N calls."""
     if outer is None or not isinstance(outer.function, Neural):
@@ -148,6 +166,12 @@ def _outer(outer: Outer, system: System) -> dict[str, Any]:
     N = outer.function
     called: list[Any] = ["network", N_NAME, 0, *(s.name for s in system.states)]
     return {"expression": called if isinstance(N, Neural) else to_tree(N.expression), "level": float(outer.level).hex()}
+
+
+def _names_of(certificate: Certificate) -> dict[str, list[str]]:
+    """The provenance's entry for names of constraints, in their order; none without constraints."""
+    names = list(certificate.constraints)
+    return {"constraints": names} if names else {}
 
 
 def _for_people(system: System) -> dict[str, dict[str, str]]:

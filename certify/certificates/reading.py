@@ -12,7 +12,7 @@ import os
 import re
 import stat
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates.claims import CLAIMS, Claim, Outer
+from certify.certificates.claims import CLAIMS, Claim, Outer, Ranks
 from certify.certificates.encoding import decode, network_named, read_network
 from certify.certificates.evidence import read_evidence
 from certify.certificates.formats import SCHEMA, other_version
@@ -98,14 +98,15 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
         kind = data["claim"]["kind"]
         if kind not in CLAIMS:
             raise CertificateFormatError(f"{name}: `claim.kind` must be one of {', '.join(CLAIMS)}; found {kind!r}.")
-        states = tuple(Symbol(s) for s in data["plant"]["states"])
-        n = len(states)
+        n = len(data["plant"]["states"])
         provenance, people = _read_provenance(data["provenance"], data["plant"])
+        system = _read_system(data["plant"], data["claim"]["sample"], people)
+        claim, names = _read_claim(data, system), provenance.pop("constraints", "")
         return Certificate(
-            system=_read_system(data["plant"], data["claim"]["sample"], people),
+            system=_with_constraints(system, claim, names),
             network=_read_network(data["policy"], data["networks"], n, len(data["plant"]["inputs"])),
             V=Quadratic(decode(data["lyapunov"]["P"], (n, n))),
-            claim=_read_claim(data, states),
+            claim=claim,
             evidence=read_evidence(data["evidence"], n),
             provenance=provenance,
         )
@@ -163,11 +164,25 @@ def _read_provenance(data: Any, plant: Mapping[str, Any]) -> tuple[dict[str, str
     return {k: str(v) for k, v in found.items() if not read.get(k)}, read
 
 
-def _read_claim(data: Mapping[str, Any], states: tuple[Symbol, ...]) -> Claim:
-    n, stated = len(states), data["claim"]
+def _with_constraints(system: System, claim: Claim, names: str) -> System:
+    """The plant with the claim's angles, and its constraints by the names that the file has for people, if it has a
+    usable one for each."""
+    found = re.findall(r"'([A-Za-z_][A-Za-z0-9_]{0,63})'", names)
+    usable = len(found) == len(claim.keep) and len(set(found)) == len(found)
+    called = found if usable else [f"constraint_{k + 1}" for k in range(len(claim.keep))]
+    angles = () if claim.ranks is None else claim.ranks.angles
+    return replace(system, angles=angles, constraints=dict(zip(called, claim.keep, strict=True)))
+
+
+def _read_claim(data: Mapping[str, Any], system: System) -> Claim:
+    states, n, stated = system.states, system.n, data["claim"]
     claim = CLAIMS[stated["kind"]]
     levels: dict[str, Any] = {k: float.fromhex(v) for k, v in data["levels"].items()}
     levels["rate"] = float.fromhex(stated["rate"])
+    if "ranks" in stated:
+        levels["ranks"] = Ranks(tuple(map(str, stated["ranks"]["angles"])), int(stated["ranks"]["steps"]))
+    named = {s.name: s for s in (*states, *system.inputs, *(s for s, _ in system.uncertain))}
+    levels["keep"] = tuple(from_tree(g, named) for g in stated.get("keep", ()))
     if stated["outer"] is not None:  # never with a tube
         return claim(**levels, outer=_read_outer(stated["outer"], data["networks"], states))
     own, tube = {f.name for f in fields(claim)}, dict[str, Any]()

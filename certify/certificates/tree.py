@@ -17,7 +17,18 @@ LEAF = 255
 
 
 def leaves(tree: bytes, root: Array) -> tuple[Array, Array]:
-    """The boxes `lo <= z <= hi` that the preorder bytes stand for, both (N, n), in the order of the tree.
+    """The boxes `lo <= z <= hi` of a partition of |z| <= root, both (N, n): `leaves_within` that box.
+
+    Examples
+    --------
+    >>> leaves(bytes([0, 255, 255]), np.ones(1))[0].tolist()
+    [[-1.0], [0.0]]
+    """
+    return leaves_within(tree, -np.asarray(root), np.asarray(root))
+
+
+def leaves_within(tree: bytes, lo: Array, hi: Array) -> tuple[Array, Array]:
+    """The boxes that the preorder bytes stand for, lower and upper corners, both (N, n), in the order of the tree.
 
     A byte below n splits that axis at the float `0.5 * lo + 0.5 * hi`, lower half first; 255 is a leaf. Parents are
     found in one pass over the bytes, boxes level by level, so that a million nodes take seconds, not minutes.
@@ -25,24 +36,19 @@ def leaves(tree: bytes, root: Array) -> tuple[Array, Array]:
     Parameters
     ----------
     tree : one byte per node.
-    root : (n,) half-widths of the root box.
+    lo, hi : (n,), the root box.
 
     Raises
     ------
     CertificateFormatError : the bytes are not exactly one tree over n axes.
-
-    Examples
-    --------
-    >>> leaves(bytes([0, 255, 255]), np.ones(1))[0].tolist()
-    [[-1.0], [0.0]]
     """
     nodes = np.frombuffer(tree, dtype=np.uint8)
-    n = len(root)
+    n = len(lo)
     if np.any((nodes >= n) & (nodes != LEAF)):
         raise CertificateFormatError(f"the partition tree splits an axis that does not exist; it has {n}.")
     parents, upper_child, depth = _parents(nodes)
     lower, upper = np.empty((len(nodes), n)), np.empty((len(nodes), n))
-    lower[0], upper[0] = -np.asarray(root), root
+    lower[0], upper[0] = lo, hi
     order = np.argsort(depth, kind="stable")
     bounds = np.searchsorted(depth[order], np.arange(1, int(depth.max()) + 2))
     for start, stop in pairwise(bounds.tolist()):

@@ -13,7 +13,8 @@ from certify.cli.shared import Json, Patient
 from certify.cli.terminal import say
 
 if TYPE_CHECKING:
-    from certify.certificates.membership import Box, Located
+    from certify.certificates.ellipsoids import Box
+    from certify.certificates.located import Located
     from certify.loop.plants import System
 
 
@@ -60,7 +61,8 @@ def stated(found: Located, box: Box, system: System) -> dict[str, Any]:
 
 def text(found: Located, box: Box, system: System) -> str:
     """The answer in words, in values of the states."""
-    from certify.certificates.membership import NOTHING_PROVED, Containment
+    from certify.certificates.located import Containment
+    from certify.certificates.membership import NOTHING_PROVED
 
     at = system.exact_x_eq()
     shown = ", ".join(

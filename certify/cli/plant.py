@@ -91,7 +91,7 @@ def _page(s: System, A: Matrix, B: Matrix, eigenvalues: Sequence[complex], reach
 
 
 def _facts(s: System, eigenvalues: Sequence[complex], reach: Controllability) -> list[tuple[str, str]]:
-    from certify.loop.plants import residuals, rests_where
+    from certify.loop.plants import constraints_of_values, residuals, rests_where
 
     steps = s.time == "discrete"
     largest = max(abs(e) - 1 if steps else e.real for e in eigenvalues)
@@ -112,6 +112,9 @@ def _facts(s: System, eigenvalues: Sequence[complex], reach: Controllability) ->
     off = [f"{name} moves by {r:.6g}" if steps else f"{name}' = {r:.6g}" for name, r in found.items()]
     rest = f"f(x_eq, u_eq) = {rests_where(s)}" if not off else f"no equilibrium: {', '.join(off)} at (x_eq, u_eq)"
     rows.insert(0, ("at rest", rest))
+    rows += [(f"asked: {name}", f"{e} < 0") for name, e in constraints_of_values(s).items()]
+    if s.angles:
+        rows.append(("angles", f"{', '.join(s.angles)}: the same place after a full turn, 2 pi"))
     if s.ranges:
         rows.append(
             ("uncertain", f"{', '.join(s.ranges)}: any value in their ranges, at any time; A, B at nominal ones")

@@ -102,7 +102,7 @@ def page_of(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[st
 
 def describe(s: System) -> dict[str, Any]:
     """A plant as plain values; equations, operating point and domain are in the states' values, not deviations."""
-    from certify.loop.plants import domain_of_values, dynamics_of_values
+    from certify.loop.plants import constraints_of_values, domain_of_values, dynamics_of_values
 
     domain, x_eq, u_eq = domain_of_values(s), s.exact_x_eq(), s.exact_u_eq()
     return {
@@ -120,6 +120,8 @@ def describe(s: System) -> dict[str, Any]:
         "x_eq": {x.name: str(q) for x, q in zip(s.states, x_eq, strict=True)},
         "u_eq": {u.name: str(q) for u, q in zip(s.inputs, u_eq, strict=True)},
         "units": dict(s.units),
+        "angles": list(s.angles),
+        "constraints": {name: f"{e} < 0" for name, e in constraints_of_values(s).items()},
     }
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from certify.errors import CertificateFormatError
 from certify.report.phrases import phrases_of
+from certify.report.ranked import with_constraints, with_ranks
 from certify.report.timing import PLAIN, TimingInWords
 from certify.report.words import PRACTICAL, exact_number
 
@@ -24,7 +25,8 @@ Part = tuple[str, str, str]
 class Words:
     """One kind of claim in words. In texts, {inner} and {outer} stand for its levels in digits, {duration} for how long
     its tube is, {centre} for the state that it begins around, {speed} for what a rate says (TimingInWords.speed),
-    {constant} for the words that ask what is uncertain to be constant, {beyond} for the level of N.
+    {constant} for the words that ask what is uncertain to be constant, {beyond} for the level of N, {steps} and
+    {constraints} for what stands in ranked.py.
 
     Parameters
     ----------
@@ -315,11 +317,23 @@ def _with_outer(words: Words) -> Words:
     )
 
 
-def words_for(kind: str, timing: TimingInWords = PLAIN, *, ball: bool = False, beyond: bool = False) -> Words:
+@dataclass(frozen=True, slots=True)
+class Additions:
+    """The parts that a claim may have: `ball` in its evidence, a set `beyond` {V <= c2}, boxes that are `ranked`, with
+    names of `angles`, and constraints that are `kept`."""
+
+    ball: bool = False
+    beyond: bool = False
+    ranked: bool = False
+    angles: tuple[str, ...] = ()
+    kept: bool = False
+
+
+NONE = Additions()
+
+
+def words_for(kind: str, timing: TimingInWords = PLAIN, has: Additions = NONE) -> Words:
     """The words of a claim about a loop in which time passes so.
-
-    `ball` is True if its evidence has a ball, `beyond` if the claim has an outer set.
-
 
     Raises
     ------
@@ -327,8 +341,10 @@ def words_for(kind: str, timing: TimingInWords = PLAIN, *, ball: bool = False, b
     """
     if kind not in CLAIMS:
         raise CertificateFormatError(f"reports know the claims {', '.join(CLAIMS)}; found {kind!r}.")
-    words = _with_outer(CLAIMS[kind]) if beyond else CLAIMS[kind]
-    words = replace(words, parts=tuple(_in_steps(kind, _with_ball(kind, words.parts, ball), timing)))
+    words = _with_outer(CLAIMS[kind]) if has.beyond else CLAIMS[kind]
+    words = replace(words, parts=tuple(_in_steps(kind, _with_ball(kind, words.parts, has.ball), timing)))
+    words = with_ranks(words, has.angles) if has.ranked else words
+    words = with_constraints(words, ranked=has.ranked) if has.kept else words
     phrases = phrases_of(timing)
     return Words(**{f.name: _filled(getattr(words, f.name), phrases) for f in fields(Words)})
 

@@ -29,6 +29,15 @@ def typeset(left: str, expression: Expression) -> Any:
     return Markup(f'<math display="block">{left}<mo>=</mo>{_row(multiplied_out(expression), SUM)}</math>')
 
 
+def inequality(name: str, expression: Expression) -> Any:
+    """`name: expression < 0` as MathML."""
+    from markupsafe import Markup
+
+    said = f"<mtext>{_escape(name)}:</mtext>{_SPACE}{_SPACE}{_SPACE}"
+    below = f"{_row(multiplied_out(expression), SUM)}<mo>&lt;</mo><mn>0</mn>"
+    return Markup(f'<math display="block">{said}{below}</math>')
+
+
 def multiplied_out(expression: Expression) -> Expression:
     """The expression with each part that is a number replaced by that number, and without terms that are 0."""
     found: dict[Expression, Expression] = {}

@@ -13,6 +13,7 @@ def phrases_of(timing: TimingInWords) -> Mapping[str, str]:
     return {
         **_when(timing),
         **_how_fast(timing),
+        **_by_boxes(timing),
         "held": held,
         "each": timing.each(),
         "every": timing.each(proper=True),
@@ -72,6 +73,17 @@ def _when(timing: TimingInWords) -> dict[str, str]:
         "kept": f" Between two instants V {'stays below its value at the first, or c₀' if always else 'may rise'}.",
         "unique": ": between two sampling instants solutions are unique",
     }
+
+
+def _by_boxes(timing: TimingInWords) -> dict[str, str]:
+    """The phrases about boxes with ranks and about constraints."""
+    if timing.discrete or timing.is_plain:
+        return {
+            "steps": "steps",
+            "meanwhile": "",
+            "always_kept": "at every step" if timing.discrete else "at all times",
+        }
+    return {"steps": "sampling instants", "meanwhile": ", at all times in between too", "always_kept": "at all times"}
 
 
 def _how_fast(timing: TimingInWords) -> dict[str, str]:

@@ -8,7 +8,7 @@ from typing import Any
 from unicodedata import normalize
 
 from certify.certificates.timing import reach_time
-from certify.report.claims import Words, words_for
+from certify.report.claims import Additions, Words, words_for
 from certify.report.limits import AT_A_POINT, hardest, limited_by, outer_limited_by
 from certify.report.timing import TimingInWords
 from certify.report.words import (
@@ -102,6 +102,10 @@ def _set_rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
         rows.append(("tube", _tube(result)))
     if result.get("outer"):
         rows += _outer(result["outer"])
+    if result.get("ranks"):
+        rows += _ranks(result)
+    if result.get("constraints"):
+        rows.append(("kept" if shown else "asked to keep", "; ".join(_constraints(result["constraints"]))))
     if result.get("volume") is not None:
         unit = volume_unit(units)
         size = f"{below(result['volume'])} {unit}".rstrip()
@@ -225,6 +229,32 @@ def _outer(outer: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [("outer set", about), *named, ("its limit", outer_limited_by(outer)), ("its work", work)]
 
 
+def _ranks(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The boxes with ranks: their number, their share of the box that was cut, their size, and the work."""
+    ranks, names, units = result["ranks"], state_names(result), state_units(result)
+    timing = TimingInWords.of_result(result)
+    steps = "steps" if timing.sample is None else "sampling instants"
+    share = f"{below(100 * ranks['covered'], 4)} % of the box that was cut"
+    about = (
+        f"{ranks['proved']:,} of {ranks['leaves']:,}, {share}: from each of them every trajectory is in {{V <= c2}} "
+        f"after {ranks['steps']:,} {steps} at the latest"
+    )
+    rows = [("boxes with ranks", about)]
+    if ranks["angles"]:
+        turned = ", ".join(symbol(name) for name in ranks["angles"])
+        rows.append(("angles", f"{turned}: states that differ by full turns are the same place"))
+    unit = volume_unit(units)
+    rows.append((f"their {volume_name(len(names))}", f"{below(ranks['volume'])} {unit}".rstrip()))
+    if ranks.get("rounds"):
+        rows.append(("their work", f"{ranks['rounds']:,} rounds"))
+    return rows
+
+
+def _constraints(constraints: Mapping[str, str]) -> list[str]:
+    """Each constraint with its name."""
+    return [f"{name}: {text}" for name, text in constraints.items()]
+
+
 def _diagnosis_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The loop's modes, the states that cost the proof most, and the next thing to try."""
     found, rows = result.get("diagnosis"), []
@@ -256,7 +286,7 @@ def _times(spent: Mapping[str, float | None]) -> str:
 def of_which(result: Mapping[str, Any]) -> str:
     """Name the set that the sizes describe, if there are two; empty if there is only one."""
     tube = result.get("tube")
-    if result.get("outer"):
+    if result.get("outer") or result.get("ranks"):
         return ", of {V <= c2} alone"
     if not tube:
         return ""
@@ -275,7 +305,14 @@ def inner_of(result: Mapping[str, Any]) -> float | None:
 
 
 def words_of(result: Mapping[str, Any]) -> Words:
-    return words_for(kind_of(result), TimingInWords.of_result(result), beyond=bool(result.get("outer")))
+    ranks = result.get("ranks") or {}
+    has = Additions(
+        beyond=bool(result.get("outer")),
+        ranked=bool(ranks),
+        angles=tuple(ranks.get("angles", ())),
+        kept=bool(result.get("constraints")),
+    )
+    return words_for(kind_of(result), TimingInWords.of_result(result), has)
 
 
 def uncertain_of(result: Mapping[str, Any]) -> list[Varying]:

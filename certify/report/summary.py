@@ -26,6 +26,7 @@ from certify.report.words import (
     below,
     deviation,
     inner_level,
+    listed,
     pretty_unit,
     varying,
 )
@@ -66,7 +67,7 @@ def summary(result: Mapping[str, Any]) -> RenderableType:
     parts: list[RenderableType] = [head, Text(), grid]
     if shown and result.get("extents"):
         parts += [Text(), _reach(result)]
-    if shown and (result.get("tube") or result.get("outer")):
+    if shown and any(result.get(part) for part in ("tube", "outer", "ranks")):
         parts.append(Text(f"lengths{of_which(result)}", style="dim"))
     return Group(*parts, Text())
 
@@ -88,6 +89,8 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
             inner="?" if inner is None else inner_level(kind, inner),
             speed=TimingInWords.of_result(result).headline_rate(),
             beyond=below(result["outer"]["level"]) if result.get("outer") else "",
+            steps=f"{result['ranks']['steps']:,}" if result.get("ranks") else "",
+            constraints=listed(list(result.get("constraints") or ())),
             constant="where what is uncertain is constant in time, " if result.get("uncertain") else "",
         )
         word = ", if the solver is right: nothing checked its answers" if verdict == "TRUSTED" else ""

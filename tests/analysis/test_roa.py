@@ -22,7 +22,7 @@ from certify.analysis.candidates.trials import Trial, trial
 from certify.analysis.run import RoaOptions, certify_roa
 from certify.certificates import Certificate, checking, run_checker, sole_writer
 from certify.certificates.claims import Problem
-from certify.certificates.membership import Containment
+from certify.certificates.located import Containment
 from certify.certificates.verdict import Verdict
 from certify.effort import WHOLE
 from certify.errors import BackendError, InputError, SoundnessError

@@ -19,7 +19,9 @@ from hypothesis import strategies as st
 from certify import PolicyNetwork, certify_roa
 from certify.analysis.arguments import region
 from certify.certificates import parse_certificate
-from certify.certificates.membership import Box, Containment, Ellipsoid, Located, ProvedSet, proved_set
+from certify.certificates.ellipsoids import Box, Ellipsoid
+from certify.certificates.located import Containment, Located
+from certify.certificates.membership import ProvedSet, proved_set
 from certify.cli.main import _run
 from certify.errors import CertificateFormatError, InputError
 from certify.loop.expressions import Number, Symbol, cos, sin, symbols

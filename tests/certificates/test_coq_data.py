@@ -228,6 +228,8 @@ def test_names_say_nothing_to_coq() -> None:
 UNSUPPORTED = {
     "claims of kind practical": ("claim.kind", "practical"),
     "an outer set": ("claim.outer", {"expression": "x", "level": (1.0).hex()}),
+    "boxes with ranks": ("claim.ranks", {"angles": [], "steps": 1}),
+    "constraints": ("claim.keep", ["x"]),
     "an input that is held": ("claim.sample", ["0", "1/10"]),
     "plants in discrete time": ("plant.time", "discrete"),
     "uncertain quantities": ("plant.uncertain", [{"name": "q", "range": ["0", "1"]}]),

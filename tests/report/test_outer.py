@@ -32,7 +32,7 @@ from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import Neural, Polynomial, Symbolic, sampled_volume
 from certify.lyapunov.function import Quadratic
 from certify.report import render_html, summary
-from certify.report.claims import CLAIMS, words_for
+from certify.report.claims import CLAIMS, Additions, words_for
 from certify.report.figures import draw, simulated_roa
 from certify.report.figures.paper import set_figure
 from certify.report.figures.scene import Scene
@@ -182,7 +182,7 @@ def test_a_practical_claim_keeps_its_words(practical: Case) -> None:
     assert "enters the smaller set {V(x) ≤ 0.0625} in finite time, and stays there from then on." in claim["statement"]
     assert "Moreover every trajectory that starts in the outer set" in claim["statement"]
     assert "N(x) ≤ 0.9 and no others" in claim["statement"] and len(claim["parts"]) == 7
-    words = words_for("practical", beyond=True)
+    words = words_for("practical", has=Additions(beyond=True))
     assert "Anything inside {V ≤ c₀}." in dict(words.excluded)
     said = "V may rise above c₂; that it comes down to c₂ in finite time is proved. That V falls below c₀"
     assert words.decay.format(word="proved").startswith(said)
@@ -190,7 +190,7 @@ def test_a_practical_claim_keeps_its_words(practical: Case) -> None:
 
 @pytest.mark.parametrize("kind", ["asymptotic", "practical", "nearby"])
 def test_nothing_is_said_of_an_outer_set_without_one(kind: str) -> None:
-    plain, beyond = words_for(kind), words_for(kind, beyond=True)
+    plain, beyond = words_for(kind), words_for(kind, has=Additions(beyond=True))
     for name in ("statement", "headline", "sets"):
         assert "N(x)" not in getattr(plain, name) and "outer" not in getattr(plain, name).replace("{outer}", "")
         assert getattr(plain, name) != getattr(beyond, name)

@@ -33,7 +33,7 @@ from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
 from certify.report import render_html, summary
-from certify.report.claims import CLAIMS, words_for
+from certify.report.claims import CLAIMS, Additions, words_for
 from certify.report.flow import Flow, simulate, time_scales
 from certify.report.limits import limited_by
 from certify.report.sampling import growth, quadratic, runs_of, simulated_roa_fraction
@@ -162,7 +162,7 @@ def test_without_anything_new_the_words_are_those_of_continuous_time() -> None:
 def test_every_place_is_filled(kind: str, timing: str, rate: float) -> None:
     how = TIMINGS[timing]
     how = TimingInWords(how.discrete, how.sample, rate)
-    words = words_for(kind, how, ball=True)
+    words = words_for(kind, how, Additions(ball=True))
     for text in every_text(words):
         assert "$" not in text and "  " not in text
         if timing != "plain":

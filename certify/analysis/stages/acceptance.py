@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from certify.analysis.acceptance import Accepted, Clerk
-from certify.analysis.beyond import outer_facts, short_of
+from certify.analysis.beyond import constraints_in_words, outer_facts, rank_facts, short_of
 from certify.analysis.outcome import limit_of, short_of_target, with_levels
 from certify.analysis.results import RoaResult
 from certify.analysis.stages.state import State, Tools
@@ -114,6 +114,8 @@ def _with_facts(state: State, accepted: Accepted) -> State:
         result = replace(result, claim=claim.kind)
     if claim.start is None:
         result = replace(result, tube=None)
+    constraints = constraints_in_words(accepted.certificate)
+    result = replace(result, ranks=rank_facts(accepted.certificate), constraints=constraints)
     if state.beyond is not None:
         if claim.outer is not None:
             result = replace(result, outer=outer_facts(problem, claim, claim.outer, state.beyond))

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from certify.certificates.claims.claim import (
     CLAIMS,
+    MOST_KEPT,
+    MOST_RANK,
+    UNPROVED,
     Asymptotic,
     Claim,
     Enlarged,
@@ -11,6 +14,7 @@ from certify.certificates.claims.claim import (
     Outer,
     Practical,
     Problem,
+    Ranks,
     Reached,
 )
 from certify.certificates.claims.conditions import (
@@ -26,6 +30,9 @@ from certify.certificates.claims.conditions import (
 
 __all__ = [
     "CLAIMS",
+    "MOST_KEPT",
+    "MOST_RANK",
+    "UNPROVED",
     "Asymptotic",
     "BeforeClip",
     "Claim",
@@ -39,6 +46,7 @@ __all__ = [
     "Practical",
     "Problem",
     "Radicand",
+    "Ranks",
     "Reached",
     "Vdot",
     "conditions",

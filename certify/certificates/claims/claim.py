@@ -9,15 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Expression
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.symbolic import Symbolic
 
 Kind = Literal["asymptotic", "practical"]
+UNPROVED = 65_535
+"""The rank of a leaf of which nothing is said."""
+MOST_RANK, MOST_KEPT = UNPROVED - 1, 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,14 +67,39 @@ class Outer:
 
 
 @dataclass(frozen=True, slots=True)
+class Ranks:
+    """Leaves of a tree of boxes, in the evidence, from which every trajectory is in {V <= c2} after at most `steps`
+    steps; states that differ by multiples of 2 pi in `angles`, names of states, are the same place.
+
+    Raises
+    ------
+    InputError : an angle is named twice, or the number of steps is not from 1 to 65,534.
+    """
+
+    angles: tuple[str, ...]
+    steps: int
+
+    def __post_init__(self) -> None:
+        if len(set(self.angles)) != len(self.angles):
+            raise InputError(f"`angles` must be different names of states; found {', '.join(self.angles)}.")
+        if not 1 <= self.steps <= MOST_RANK:
+            raise InputError(f"`steps` of ranks must be an integer from 1 to {MOST_RANK:,}; found {self.steps}.")
+
+
+@dataclass(frozen=True, slots=True)
 class Claim:
     """`roa` is c2: the claim is about every trajectory that starts in {V <= c2}.
 
     `local` is c1, the level from which the ring reaches outwards to c2: below it what is shown is shown on a ball.
     `rate` is lambda: V falls at least as exp(-2 lambda t) where it is claimed to fall. `outer` is a set from which
-    trajectories enter {V <= c2}.
+    trajectories enter {V <= c2}. `ranks` says the same of boxes, where V is compared at the ends of steps. Along all
+    trajectories g < 0 for each g of `keep`, expressions in states, inputs and uncertain quantities.
 
     A method that gives another claim gives None where this one has no such form.
+
+    Raises
+    ------
+    InputError : `keep` or `ranks` stands beside a tube or an outer set, or `keep` has more than 64 expressions.
     """
 
     kind: ClassVar[str]
@@ -80,6 +109,14 @@ class Claim:
     local: float
     rate: float = field(default=0.0, kw_only=True)
     outer: Outer | None = field(default=None, kw_only=True)
+    ranks: Ranks | None = field(default=None, kw_only=True)
+    keep: tuple[Expression, ...] = field(default=(), kw_only=True)
+
+    def __post_init__(self) -> None:
+        if (self.ranks is not None or self.keep) and (self.start is not None or self.outer is not None):
+            raise InputError("a claim with a tube or an outer set can have neither ranks nor constraints.")
+        if len(self.keep) > MOST_KEPT:
+            raise InputError(f"`keep` must have at most {MOST_KEPT} expressions; found {len(self.keep)}.")
 
     @property
     def floor(self) -> float | None:
@@ -101,6 +138,10 @@ class Claim:
         """The level from which the ring reaches outwards to c2."""
         return self.local
 
+    def _beside(self) -> dict[str, Any]:
+        """What a claim may state beside its levels."""
+        return {"rate": self.rate, "outer": self.outer, "ranks": self.ranks, "keep": self.keep}
+
     @property
     def levels(self) -> Mapping[str, float]:
         """The section `levels` of the certificate, in its order."""
@@ -108,12 +149,17 @@ class Claim:
         return {**floor, "local": self.local, "roa": self.roa}
 
     def lowered(self, level: float) -> Claim | None:
-        """The same about {V <= level}, a smaller set that the ring still reaches."""
-        return replace(self, roa=level) if self.inner < level < self.roa else None
+        """The same about {V <= level}, a smaller set that the ring still reaches; without ranks, which lead into the
+        larger one."""
+        return replace(self, roa=level, ranks=None) if self.inner < level < self.roa else None
 
     def without_outer(self) -> Claim | None:
         """The same without the set beyond the ellipsoid."""
         return None if self.outer is None else replace(self, outer=None)
+
+    def without_ranks(self) -> Claim | None:
+        """The same without the boxes from which {V <= c2} is reached."""
+        return None if self.ranks is None else replace(self, ranks=None)
 
     def local_only(self, level: float) -> Claim | None:
         """Asymptotic stability on {V <= level} alone, of which the ring is not asked."""
@@ -149,10 +195,12 @@ class Asymptotic(Claim):
 
     def local_only(self, level: float) -> Claim | None:
         """Asymptotic stability on {V <= level} alone, of which the ring is not asked."""
-        return Asymptotic(level, level, rate=self.rate)
+        return Asymptotic(level, level, rate=self.rate, keep=self.keep)
 
     def with_tube(self, start: Quadratic, centre: tuple[float, ...] | None = None) -> Claim | None:
         """The same, and every trajectory from {W(x - c) <= 1}, W = `start`, c = `centre`, reaches {V <= c2}."""
+        if self.ranks is not None or self.keep:
+            return None
         if centre is None:
             return Enlarged(self.roa, self.local, start, rate=self.rate, outer=self.outer)
         return Reached(self.roa, self.local, start, centre, rate=self.rate, outer=self.outer)
@@ -198,7 +246,7 @@ class Practical(Claim):
 
     def converging(self) -> Claim | None:
         """The same, and trajectories converge to one equilibrium."""
-        return Nearby(self.roa, self.local, self.floor, rate=self.rate, outer=self.outer)
+        return Nearby(self.roa, self.local, self.floor, **self._beside())
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +258,7 @@ class Nearby(Practical):
 
     def without_equilibrium(self) -> Claim | None:
         """The same without the equilibrium to which trajectories converge."""
-        return Practical(self.roa, self.local, self.floor, rate=self.rate, outer=self.outer)
+        return Practical(self.roa, self.local, self.floor, **self._beside())
 
 
 CLAIMS: Mapping[str, type[Claim]] = {c.kind: c for c in (Asymptotic, Practical, Nearby, Enlarged, Reached)}

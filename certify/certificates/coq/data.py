@@ -45,7 +45,8 @@ _STEP_KEYS = ({"kind", "of", "shape", "weight", "bias"}, {"kind", "of", "functio
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}", re.ASCII)
 _WHAT_IS = (
     "a proof in Coq is there for claims of kind asymptotic in continuous time, nothing of the plant uncertain, no "
-    "input held over a period, no clip, no set beyond the ellipsoid, no network but the policy's, V = x'Px"
+    "input held over a period, no clip, no set beyond the ellipsoid, no constraints, no network but the policy's, "
+    "V = x'Px"
 )
 
 
@@ -159,6 +160,8 @@ def _require_supported(claim: Any, networks: Any, plant: Any, policy: Any, lyapu
     found = {
         f"claims of kind {claim['kind']}": claim["kind"] != "asymptotic",
         "an outer set": claim["outer"] is not None,
+        "boxes with ranks": "ranks" in claim,
+        "constraints": "keep" in claim,
         "an input that is held over a period": claim["sample"] is not None,
         f"plants in {plant['time']} time": plant["time"] != "continuous",
         "more than one network": len(networks) > 1,

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from certify.loop.plants.deviations import domain_of_values, dynamics_of_values, in_deviations, with_origin
+from certify.loop.plants.deviations import (
+    constraints_of_values,
+    domain_of_values,
+    dynamics_of_values,
+    in_deviations,
+    with_origin,
+)
 from certify.loop.plants.floating_point import mean_rate
 from certify.loop.plants.linear import Controllability, Matrix, controllability, in_floats, linearise
 from certify.loop.plants.operating_point import require_equilibrium, residuals, rests_where
@@ -18,6 +24,7 @@ __all__ = [
     "at_values",
     "available_systems",
     "chosen_system",
+    "constraints_of_values",
     "controllability",
     "corners",
     "domain_of_values",

@@ -43,21 +43,33 @@ def with_origin(system: System, origin: Sequence[Fraction], u: Sequence[Fraction
     """
     by = map(Number, origin)
     x_eq = tuple(q if e == Number(0) else e + q if q.value else e for e, q in zip(system.x_eq, by, strict=True))
+    held = tuple(constraints_of_values(system).values())
     return replace(
         system,
         dynamics=in_deviations(dynamics_of_values(system), system.states, x_eq, system.time),
         u_eq=tuple(map(Number, u)),
         x_eq=x_eq,
+        constraints=dict(zip(system.constraints, in_deviations(held, system.states, x_eq), strict=True)),
         domain=tuple((lo - q, hi - q) for (lo, hi), q in zip(system.domain, origin, strict=True)),
     )
 
 
 def dynamics_of_values(system: System) -> tuple[Expression, ...]:
     """f over the states' values x_eq + x, as people write it, with the parameters by name."""
-    found, none = system.dynamics, Number(0)
-    shifts = [(s, at) for s, at in zip(system.states, system.x_eq, strict=True) if at != none]
+    found = system.dynamics
     if system.time == "discrete":
         found = tuple(_without(e, at) for e, at in zip(found, system.x_eq, strict=True))
+    return _of_values(system, found)
+
+
+def constraints_of_values(system: System) -> dict[str, Expression]:
+    """The constraints' g by name over the states' values x_eq + x, with the parameters by name."""
+    return dict(zip(system.constraints, _of_values(system, tuple(system.constraints.values())), strict=True))
+
+
+def _of_values(system: System, found: Sequence[Expression]) -> tuple[Expression, ...]:
+    """Expressions in deviations from x_eq as expressions of the states' values."""
+    shifts = [(s, at) for s, at in zip(system.states, system.x_eq, strict=True) if at != Number(0)]
     whole = {Operation("+", at, s): Symbol(f" {s.name}") for s, at in shifts}
     rest = {s: Operation("+", s, -at) for s, at in shifts}
     plain = {Symbol(f" {s.name}"): s for s, _ in shifts}

@@ -65,6 +65,38 @@ def parse_expression(
     return found
 
 
+def parse_constraint(
+    text: str,
+    names: Mapping[str, Expression],
+    known: str = "state, input, parameter or disturbance",
+    networks: Mapping[str, Network] | None = None,
+) -> Expression:
+    """The expression g of a constraint g < 0: of a comparison `a <= b` or `b >= a` the difference a - b, of another
+    text itself. Strict and other comparisons mean the same, since g < 0 is what is proved.
+
+    Raises
+    ------
+    InputError : the text is neither one comparison of two expressions nor an expression.
+    """
+    source = " ".join(str(text).split())
+    try:
+        tree = ast.parse(source, mode="eval").body
+    except (SyntaxError, RecursionError, ValueError, MemoryError):
+        tree = None
+    if not isinstance(tree, ast.Compare) or not source.isascii() or "#" in source:
+        return parse_expression(text, names, known, networks)
+    if len(tree.ops) != 1 or not isinstance(tree.ops[0], ast.Lt | ast.LtE | ast.Gt | ast.GtE):
+        raise InputError(
+            f"constraint {source!r}: it must compare two expressions by <=, <, >= or >; write two constraints for a "
+            "value between two others."
+        )
+    left, right = (
+        parse_expression(source[side.col_offset : side.end_col_offset], names, known, networks)
+        for side in (tree.left, tree.comparators[0])
+    )
+    return left - right if isinstance(tree.ops[0], ast.Lt | ast.LtE) else right - left
+
+
 def _size(expression: Expression) -> int:
     """The number of nodes of the tree, with the expressions that its names stand for."""
     known: dict[Expression, int] = {}

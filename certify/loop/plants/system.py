@@ -92,12 +92,14 @@ class System:
         else is said; empty for the states.
     calls : networks that the dynamics call, whose results stand there as symbols; see `certify.loop.composition`.
     rest_of_calls : exact values of results at the operating point, by their symbols' names, where they are given.
+    angles : names of states of which 2 pi more is the same place.
+    constraints : expressions g by name, as the dynamics; g < 0 is asked for along trajectories.
 
     Raises
     ------
     InputError : counts do not match, a domain does not contain 0 in its interior, a parameter that
-        must be positive is not, an expression is outside the grammar, x_eq is irrational, or a name with a range is
-    neither a parameter nor a disturbance.
+        must be positive is not, an expression is outside the grammar, x_eq is irrational, a name with a range is
+        neither a parameter nor a disturbance, or an angle is no state.
     """
 
     name: str
@@ -119,9 +121,11 @@ class System:
     observations: tuple[Expression, ...] = ()
     calls: tuple[Call, ...] = ()
     rest_of_calls: Mapping[str, Fraction] = field(default_factory=dict)
+    angles: tuple[str, ...] = ()
+    constraints: Mapping[str, Expression] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for key in ("parameters", "ranges", "units", "rest_of_calls"):
+        for key in ("parameters", "ranges", "units", "rest_of_calls", "constraints"):
             object.__setattr__(self, key, MappingProxyType(dict(getattr(self, key))))
         for symbol in (*self.states, *self.inputs, *self.disturbances):
             if not isinstance(symbol, Symbol):
@@ -217,10 +221,18 @@ class System:
         """
         return self._with_numbers(self.ranges)
 
-    def _with_numbers(self, acting: Collection[str]) -> tuple[Expression, ...]:
+    def uncertain_constraints(self) -> dict[str, Expression]:
+        """The constraints' g by name, with uncertain quantities free, like states and inputs."""
+        found = self._with_numbers(self.ranges, tuple(self.constraints.values()))
+        return dict(zip(self.constraints, found, strict=True))
+
+    def _with_numbers(
+        self, acting: Collection[str], expressions: Sequence[Expression] | None = None
+    ) -> tuple[Expression, ...]:
         numbers = {Symbol(name): Number(q) for name, q in self.parameters.items() if name not in acting}
         numbers |= {s: Number(0) for s in self.disturbances if s.name not in acting}
-        return tuple(_substituted(self, e, numbers) for e in self.dynamics)
+        each = self.dynamics if expressions is None else expressions
+        return tuple(_substituted(self, e, numbers) for e in each)
 
     def exact_u_eq(self) -> tuple[Fraction, ...]:
         """The equilibrium input as exact rationals, shape (m,)."""

@@ -25,7 +25,7 @@ from certify.loop.expressions import (
 )
 from certify.loop.plants.calls import Call, Named
 from certify.loop.plants.deviations import in_deviations
-from certify.loop.plants.equations import nearest, parse_expression
+from certify.loop.plants.equations import nearest, parse_constraint, parse_expression
 from certify.loop.plants.operating_point import require_equilibrium
 from certify.loop.plants.source import PlantFile, read_plant_file
 from certify.loop.plants.system import Interval, System, Time, exact
@@ -44,7 +44,10 @@ _KEYS = (
     "time",
     "observations",
     "networks",
+    "angles",
+    "constraints",
 )
+_TURN = "2*pi"  # the only period of an angle
 
 
 def load_system(path: Path) -> System:
@@ -75,6 +78,7 @@ def build_system(file: PlantFile) -> System:
         shorthand = _shorthand(file, symbol, networks)
         known = "state, input, parameter or disturbance" + (", and not defined in [where] above" if shorthand else "")
         dynamics = [_equation(file, "dynamics", s, symbol | shorthand, known, networks=networks) for s in states]
+        constraints = _constraints(file, symbol | shorthand, known, networks)
         calls = [call for network in networks.values() for call in network.made()]
         at = [symbol[s] for s in states], x_eq
         u_eq = [_equation(file, "u_eq", s, constants, "parameter") for s in inputs]
@@ -98,6 +102,8 @@ def build_system(file: PlantFile) -> System:
             ranges={w: interval for w, interval in acting.items() if interval is not None},
             calls=tuple(replace(call, arguments=in_deviations(call.arguments, *at)) for call in _in_order(calls)),
             rest_of_calls={name: q for network in networks.values() for name, q in network.at_rest().items()},
+            angles=_angles(file, states),
+            constraints=dict(zip(constraints, in_deviations(list(constraints.values()), *at), strict=True)),
             observations=tuple(_observations(file, {s: symbol[s] for s in (*states, *parameters)})),
         )
     except InputError as error:
@@ -183,6 +189,36 @@ def _observations(file: PlantFile, symbol: Mapping[str, Expression]) -> Iterator
         if not name.isidentifier():
             raise file.refuse("must be a name.", "observations", name)
         yield _equation(file, "observations", name, symbol, "state or parameter")
+
+
+def _angles(file: PlantFile, states: list[str]) -> tuple[str, ...]:
+    """The table `angles`: states of which a full turn more is the same place."""
+    file.require_known("angles", states, "state")
+    for name, value in file.table("angles").items():
+        if value != _TURN:
+            raise file.refuse(
+                f'an angle repeats after a full turn: write {name} = "{_TURN}"; found {value!r}.', "angles", name
+            )
+    return tuple(name for name in states if name in file.table("angles"))
+
+
+def _constraints(
+    file: PlantFile, names: Mapping[str, Expression], known: str, networks: Mapping[str, Named]
+) -> dict[str, Expression]:
+    """The table `constraints`: g by name, over the states' values, of comparisons such as `p <= 1.5`."""
+    found = dict[str, Expression]()
+    for name, value in file.table("constraints").items():
+        if not isinstance(value, str):
+            raise file.refuse(
+                f"must be a comparison as text, such as 'p <= 1.5'; found {value!r}.", "constraints", name
+            )
+        try:
+            found[name] = parse_constraint(value, names, known, networks)
+        except InputError as error:
+            raise file.refuse(str(error), "constraints", name) from error
+        if not symbols_of(found[name]):
+            raise file.refuse(f"must depend on a state or an input; found {value!r}.", "constraints", name)
+    return found
 
 
 def _time(file: PlantFile) -> Time:

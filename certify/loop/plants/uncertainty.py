@@ -32,6 +32,7 @@ def with_input_errors(system: System, bounds: Mapping[str, Fraction]) -> System:
     return replace(
         system,
         dynamics=tuple(substitute(e, moved) for e in system.dynamics),
+        constraints={name: substitute(e, moved) for name, e in system.constraints.items()},
         disturbances=(*system.disturbances, *symbols(names)),
         ranges={**system.ranges, **ranges},
         units={**system.units, **units},
@@ -70,8 +71,10 @@ def at_values(system: System, values: Mapping[str, Fraction]) -> System:
     known = {name: q for name, q in values.items() if name in system.parameters}
     held = {s: Number(values.get(s.name, Fraction(0))) for s in system.disturbances}
     dynamics = tuple(substitute(e, held) for e in system.dynamics)
+    constraints = {name: substitute(e, held) for name, e in system.constraints.items()}
     u_eq = tuple(map(Number, system.exact_u_eq()))
-    return replace(system.with_parameters(known), dynamics=dynamics, u_eq=u_eq, disturbances=(), ranges={})
+    plant = system.with_parameters(known)
+    return replace(plant, dynamics=dynamics, constraints=constraints, u_eq=u_eq, disturbances=(), ranges={})
 
 
 def corners(system: System, most: int = 64) -> tuple[dict[str, Fraction], ...]:

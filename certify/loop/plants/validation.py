@@ -7,7 +7,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from certify.errors import InputError
-from certify.loop.expressions import Symbol, nodes, symbols_of
+from certify.loop.expressions import Expression, Symbol, constant_of, nodes, symbols_of
 from certify.loop.expressions.gathering import MOST_BITS
 
 if TYPE_CHECKING:
@@ -27,6 +27,8 @@ def validate(system: System) -> None:
     _check_parameters(system)
     _check_equations(system)
     _check_observations(system)
+    _check_angles(system)
+    _check_constraints(system)
     system.exact_x_eq()
     _check_ranges(system)
     _check_sample(system)
@@ -108,6 +110,33 @@ def _check_equations(system: System) -> None:
                 raise InputError(
                     f"an equation of {system.name} uses {node}, which is no state, input, parameter or disturbance."
                 )
+
+
+def _check_angles(system: System) -> None:
+    names = [s.name for s in system.states]
+    for name in system.angles:
+        if name not in names:
+            raise InputError(
+                f"an angle of {system.name} must be one of its states, {', '.join(names)}; found {name!r}."
+            )
+        if system.angles.count(name) > 1:
+            raise InputError(f"`angles` of {system.name} must name each state once; found {name!r} twice.")
+
+
+def _check_constraints(system: System) -> None:
+    known = {*system.states, *system.inputs, *map(Symbol, system.parameters), *system.disturbances}
+    known |= {symbol for call in system.calls for _, symbol in call.results}
+    for name, e in system.constraints.items():
+        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]{0,63}", name):
+            raise InputError(f"names in {system.name} must be identifiers of at most 64 letters; found {name!r}.")
+        if not isinstance(e, Expression):
+            raise InputError(f"constraint {name} of {system.name} must be an expression; found {e!r:.60}.")
+        constant_of(e)
+        odd = sorted(s.name for s in symbols_of(e) - known)
+        if odd:
+            raise InputError(
+                f"constraint {name} of {system.name} uses {odd[0]}, which is no state, input, parameter or disturbance."
+            )
 
 
 def _check_ranges(system: System) -> None:

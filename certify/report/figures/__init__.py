@@ -19,6 +19,7 @@ from certify.report.figures.pairs import Pair
 from certify.report.figures.partition import partition
 from certify.report.figures.policy import curves, surface
 from certify.report.figures.portrait import Region, portraits
+from certify.report.figures.ranks import rank_maps
 from certify.report.figures.scene import Scene
 from certify.report.figures.style import RC, Picture
 from certify.report.figures.trajectories import runs_from, starts
@@ -83,7 +84,13 @@ def _on_the_line(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
     (low, high), shares = scene.begin_on_line, (-0.999, -0.5, 0.5, 0.999)
     begin = [[(low + high) / 2 + share * (high - low) / 2] for share in shares]
     runs = runs_from(scene, begin)
-    return [line_figure(scene, roa), *tube(scene, runs), curves(scene), decay(scene, runs.path, runs.step)]
+    return [
+        line_figure(scene, roa),
+        *rank_maps(scene),
+        *tube(scene, runs),
+        curves(scene),
+        decay(scene, runs.path, runs.step),
+    ]
 
 
 def _in_planes(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
@@ -95,6 +102,7 @@ def _in_planes(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
         pictures.append(near_origin(scene))
     if scene.leaves is not None and not scene.local_is_enough:
         pictures.append(partition(scene, scene.leaves))
+    pictures += rank_maps(scene)
     pictures.append(surface(scene, scene.pairs[0]))
     pictures.append(decay(scene, from_set.path, runs.step))
     return pictures

@@ -19,7 +19,7 @@ from certify.effort import Effort
 from certify.errors import CertificateFormatError
 from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import extents
-from certify.report.claims import words_for
+from certify.report.claims import Additions, words_for
 from certify.report.figures.geometry import Box
 from certify.report.figures.pairs import Pair, pairs_of
 from certify.report.figures.sets import (
@@ -110,7 +110,7 @@ class Scene:
             raise CertificateFormatError("P must be positive definite and the levels positive and in order.")
         self.timing = TimingInWords.of(certificate.system, certificate.claim.rate)
         self.certificate, self.beyond = certificate, certificate.claim.outer
-        self.words = words_for(certificate.kind, self.timing, beyond=self.beyond is not None)
+        self.words = words_for(certificate.kind, self.timing, Additions(beyond=self.beyond is not None))
         self.kind = "asymptotic" if certificate.claim.floor is None else "practical"
         self.word = "proved" if accepted else "claimed"
         self.system, self.P = certificate.system, certificate.P

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates import Certificate, PartitionTree, Slab
+from certify.certificates import Certificate, PartitionTree, RankTree, Slab
 from certify.lyapunov import is_positive_definite
 
 Array = NDArray[np.float64]
@@ -56,6 +56,11 @@ def centre_of(certificate: Certificate) -> Array | None:
 def slabs_of(certificate: Certificate) -> tuple[Slab, ...]:
     """The tube's slabs; none where the claim has no tube."""
     return certificate.evidence.tube if isinstance(certificate.evidence, PartitionTree) else ()
+
+
+def tree_of(certificate: Certificate) -> RankTree | None:
+    """The tree of the boxes with ranks; None without any."""
+    return certificate.evidence.ranks if isinstance(certificate.evidence, PartitionTree) else None
 
 
 @dataclass(frozen=True, slots=True)

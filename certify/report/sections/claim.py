@@ -20,8 +20,8 @@ from certify.loop.plants import System, input_errors
 from certify.lyapunov import Neural, extents
 from certify.report.claims import CHECKED_ALWAYS, INPUTS
 from certify.report.figures.sets import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of, start_of
-from certify.report.mathml import typeset
-from certify.report.sections.shared import centre_in_words, duration_in_words, timing_of, words_of
+from certify.report.mathml import inequality, typeset
+from certify.report.sections.shared import centre_in_words, duration_in_words, ranks_of, timing_of, words_of
 from certify.report.timing import TimingInWords
 from certify.report.words import (
     MINUS,
@@ -30,6 +30,7 @@ from certify.report.words import (
     inner_level,
     is_free,
     kept_apart,
+    listed,
     network_name,
     pretty_unit,
     shortest,
@@ -66,6 +67,8 @@ def claim_of(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict
         centre=centre_in_words(certificate),
         speed=timing.speed(inner_of(certificate) if practical else None, certificate.roa) if drawable else "",
         constant="where what is uncertain is constant in time, " if system.ranges else "",
+        steps="" if certificate.claim.ranks is None else f"{certificate.claim.ranks.steps:,}",
+        constraints=listed(list(certificate.constraints)) if certificate.constraints else "",
     )
     return {
         "statement": stated_for(varying_in(system), statement, by_steps=timing.discrete),
@@ -74,6 +77,9 @@ def claim_of(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict
         "enlarged": certificate.claim.start is not None,
         "centre": certificate.claim.centre is not None,
         "beyond": beyond,
+        "ranked": certificate.claim.ranks is not None,
+        "turned": [symbol(name) for name in system.angles] if certificate.claim.ranks is not None else [],
+        "constraints": [inequality(name, g) for name, g in certificate.constraints.items()],
         "level": outer,
         "inner": inner,
         "bounds": bounds,
@@ -100,7 +106,7 @@ def _notes(certificate: Certificate, answer: Mapping[str, Any] | None, bounds: S
         notes["Ring"] = f"Shown on {answer.get('ring_leaves', 0):,} of {answer.get('leaves', 0):,} leaves"
         if ring is not None:
             notes["Ring"] += f"; {_smallest(timing_of(certificate))} is {below(ring, 3)}."
-    return notes | _tube_notes(certificate) | _outer_notes(answer)
+    return notes | _tube_notes(certificate) | _outer_notes(answer) | _rank_notes(certificate)
 
 
 def _parts(certificate: Certificate, notes: Mapping[str, str]) -> list[tuple[str, str, str]]:
@@ -187,6 +193,16 @@ def _tube_notes(certificate: Certificate) -> dict[str, str]:
         "Tube": f"{slabs}, {duration_in_words(certificate)} in all.",
         "Along the tube": f"At the start {sides}.",
     }
+
+
+def _rank_notes(certificate: Certificate) -> dict[str, str]:
+    """The number of boxes with ranks, and of the constraints."""
+    found, notes = ranks_of(certificate), dict[str, str]()
+    if found is not None:
+        notes["Boxes"] = f"{found.proved:,} of {found.leaves:,} boxes have a rank."
+    if certificate.constraints:
+        notes["Constraints"] = f"{', '.join(certificate.constraints)}."
+    return notes
 
 
 def _outer_notes(answer: Mapping[str, Any] | None) -> dict[str, str]:

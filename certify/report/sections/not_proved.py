@@ -27,7 +27,7 @@ def not_proved_of(certificate: Certificate, words: Words) -> list[tuple[str, str
         *_other_times(timing_of(certificate)),
         _rounding(certificate.system),
         *words.excluded[-1:],
-        ("Wrapped angles.", "States are real numbers: an angle of a full turn is not the origin."),
+        *_turns(certificate),
         (
             "Simulated figures.",
             "Trajectories, grids and the share of the simulated region are illustrations in floating point"
@@ -51,6 +51,15 @@ def not_proved_of(certificate: Certificate, words: Words) -> list[tuple[str, str
             )
         )
     return items
+
+
+def _turns(certificate: Certificate) -> Iterator[tuple[str, str]]:
+    """The gap about angles, unless full turns of them are the same place."""
+    ranks, said = certificate.claim.ranks, "States are real numbers: an angle of a full turn is not the origin."
+    if ranks is None or not ranks.angles:
+        yield ("Wrapped angles.", said)
+    elif certificate.system.n > len(ranks.angles):
+        yield ("Other angles.", f"Full turns are the same place in {listed([symbol(a) for a in ranks.angles])} alone.")
 
 
 def _other_times(timing: TimingInWords) -> Iterator[tuple[str, str]]:

@@ -14,12 +14,13 @@ from certify.certificates.claims import Outer
 from certify.errors import CertifyError
 from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov import Neural, domain_limit, extents, sampled_volume, semi_axes, volume
-from certify.report.figures.sets import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of
+from certify.report.figures.sets import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of, tree_of
 from certify.report.limits import limited_by, outer_limited_by
 from certify.report.sections.shared import (
     Ellipsoid,
     duration_in_words,
     ellipsoids_of,
+    ranks_of,
     read_in_words,
     shares_of,
     timing_of,
@@ -38,8 +39,10 @@ from certify.report.words import (
     is_free,
     network_name,
     number,
+    pretty_unit,
     seconds,
     shortest,
+    symbol,
     volume_name,
     volume_unit,
 )
@@ -62,6 +65,7 @@ def tables_of(
     return {
         "levels": _levels(certificate, result),
         "size": _sizes(certificate, sets),
+        "ranked": _ranked(certificate),
         "estimated": _estimated(certificate, result) if drawn else "",
         "geometry": _geometry(certificate),
         "reach": reach,
@@ -114,6 +118,28 @@ def _sizes(certificate: Certificate, sets: Sequence[Ellipsoid]) -> Rows:
     return [
         (kind + (f" of {one.name}" if len(sets) > 1 else ""), f"{below(volume(one.P, one.level))} {unit}".rstrip())
         for one in sets
+    ]
+
+
+def _ranked(certificate: Certificate) -> Rows:
+    """The boxes with ranks: how many, how large, how far away."""
+    found, tree, system = ranks_of(certificate), tree_of(certificate), certificate.system
+    if found is None or tree is None:
+        return []
+    sides = zip(system.states, tree.lo.tolist(), tree.hi.tolist(), strict=True)
+    units = system.units
+    box = [
+        f"{symbol(s.name)} ∈ [{number(a, 8)}, {number(b, 8)}] {pretty_unit(units.get(s.name, ''))}".rstrip()
+        for s, a, b in sides
+    ]
+    steps = "steps" if system.sample is None else "sampling instants"
+    size = f"{below(found.volume)} {_unit_of(certificate)}".rstrip()
+    return [
+        ("boxes with ranks", f"{found.proved:,} of {found.leaves:,}"),
+        (f"most {steps} to {{V ≤ c₂}}", f"{found.steps:,}"),
+        (f"{volume_name(system.n)} of these boxes", size),
+        ("share of the box that was cut", f"{below(100 * found.share, 4)} %"),
+        ("that box", ", ".join(box)),
     ]
 
 

@@ -13,8 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates import Certificate, PartitionTree
-from certify.report.claims import Words, words_for
-from certify.report.figures.sets import centre_of, slabs_of, start_of
+from certify.certificates.membership import angles_in
+from certify.certificates.ranked import Count, count
+from certify.errors import CertificateFormatError
+from certify.report.claims import Additions, Words, words_for
+from certify.report.figures.sets import centre_of, slabs_of, start_of, tree_of
 from certify.report.timing import TimingInWords
 from certify.report.words import ABSENT, above, number, point, symbol
 
@@ -26,9 +29,28 @@ def timing_of(certificate: Certificate) -> TimingInWords:
 
 def words_of(certificate: Certificate) -> Words:
     """Its kind of claim in words."""
-    evidence = certificate.evidence
-    ball = isinstance(evidence, PartitionTree) and evidence.local is not None
-    return words_for(certificate.kind, timing_of(certificate), ball=ball, beyond=certificate.claim.outer is not None)
+    return words_for(certificate.kind, timing_of(certificate), additions_of(certificate))
+
+
+def additions_of(certificate: Certificate) -> Additions:
+    """The parts that its claim has beside its levels, and a ball in its evidence."""
+    evidence, claim = certificate.evidence, certificate.claim
+    return Additions(
+        ball=isinstance(evidence, PartitionTree) and evidence.local is not None,
+        beyond=claim.outer is not None,
+        ranked=claim.ranks is not None,
+        angles=() if claim.ranks is None else claim.ranks.angles,
+        kept=bool(claim.keep),
+    )
+
+
+def ranks_of(certificate: Certificate) -> Count | None:
+    """The numbers of its boxes with ranks; None without any, and where a rejected file's tree is none."""
+    tree = tree_of(certificate)
+    try:
+        return None if tree is None else count(tree, angles_in(certificate.system))
+    except CertificateFormatError:
+        return None
 
 
 @dataclass(frozen=True, slots=True)

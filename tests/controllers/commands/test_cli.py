@@ -16,7 +16,8 @@ import pytest
 from typer.testing import CliRunner
 
 from certify import certify_roa, get_system
-from certify.certificates.membership import Containment, proved_set
+from certify.certificates.located import Containment
+from certify.certificates.membership import proved_set
 from certify.errors import InputError
 from certify.loop.policies import load_policy, save_policy
 from controllers.cli import app

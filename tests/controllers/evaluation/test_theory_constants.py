@@ -14,7 +14,8 @@ import pytest
 import scipy.linalg
 from typer.testing import CliRunner
 
-from certify.certificates.membership import Ellipsoid, ProvedSet
+from certify.certificates.ellipsoids import Ellipsoid
+from certify.certificates.membership import ProvedSet
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, Symbol, substitute, symbols
