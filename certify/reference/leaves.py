@@ -1,4 +1,4 @@
-"""Rules `tree`, `ring`, `inputs` and `flow`: the leaves of the partition.
+"""Rules `tree`, `ring`, `inputs`, `flow` and `keep`: the leaves of the partition.
 
 The policy is enclosed on several leaves at a time.
 """
@@ -15,10 +15,11 @@ from .affine import batch
 from .balls import ZERO, bounded_by_form, total, within_bounds
 from .document import Certificate
 from .evidence import Covering, Tree
+from .keep import kept
 from .motion import Motion, Stage
 from .rational import inverse_diagonal
 from .refusal import require
-from .taylor import Taylor
+from .taylor import Taylor, is_negative, kinks
 
 LEAF = 255
 MAX_WAITING = 4096  # boxes of the tree beside the one in hand
@@ -213,23 +214,8 @@ class Leaves(Motion):
         return bool(self.diagonal_part(box.least()) - self.cross_part(box) >= self.inner)
 
 
-def is_negative(D: Taylor, slacks: Sequence[Taylor]) -> bool:
-    """True if D, or D + k times one of the others for some k > 0, is certainly negative."""
-    if D.is_negative():
-        return True
-    return any(k > 0 and (D + slack.scaled(k)).is_negative() for slack in slacks for k in kinks(D, slack))
-
-
-def kinks(D: Taylor, slack: Taylor) -> list[arb]:
-    """Each k at which a coefficient of the first order vanishes in D + k slack."""
-    if D.g is None or slack.g is None:
-        return []
-    each = zip(D.g.entries(), slack.g.entries(), strict=True)
-    return [-(g / w).mid() for g, w in each if not w.is_zero()]
-
-
 def check_leaves(leaves: Leaves, evidence: Tree) -> None:
-    """Rules `inputs`, `flow` and `ring`; in each batch of leaves they are taken in this order.
+    """Rules `inputs`, `flow`, `keep` and `ring`; in each batch of leaves they are taken in this order.
 
     An inside leaf has been covered by rule `local` where there is a ball. Without one nothing has: there the inputs are
     asked, and in continuous time that F has a finite model, but where time has steps that V stays below c0.
@@ -244,6 +230,9 @@ def check_leaves(leaves: Leaves, evidence: Tree) -> None:
             good = bounded or within_bounds(c, leaf.ranges())
             require(good, "inputs", f"leaf {leaf.box.number}", "an input is not certain to stay in its bounds")
         reached = [None if c.sample is None else leaves.reached(leaf) for leaf in enclosed]
+        if c.keep is not None:
+            for leaf, within in zip(enclosed, reached, strict=True):
+                kept(leaves, leaf, within, [Taylor(leaves.outer) + -leaves.V(leaf)])
         for leaf, within in zip(enclosed, reached, strict=True):
             if leaves.is_inside(leaf.box) and not leaves.steps:
                 leaves.F(leaf)
