@@ -77,12 +77,14 @@ def _examine(path: str, jobs: int, patient: bool) -> tuple[int, dict[str, Any]]:
     if isinstance(c.evidence, document.Trusted):
         answers = [": ".join(pair) for pair in c.evidence.queries]
         answer |= {"solver": c.evidence.solver, "version": c.evidence.version, "answers": answers}
-    else:
+    elif isinstance(c.evidence, document.Partition):
         margins = {"local": tally.local_margin, "ring": tally.ring_margin, "outer": tally.outer_margin}
         answer |= {"leaves": tally.rules["tree"], "ring_leaves": tally.rules["ring"], "margins": margins}
         if c.outer is not None and c.evidence.outer is not None:
             leaves = {"leaves": c.evidence.outer.tree.count(LEAF), "face_leaves": tally.rules["faces"]}
             answer["outer"] = {"level": c.outer.level, **leaves}
+    if c.ranks is not None:
+        answer["ranks"] = {"leaves": len(c.ranks.steps), "steps": c.ranks.most, "of": sum(map(bool, c.ranks.steps))}
     if c.start is not None:
         centre, longest = None if c.centre is None else c.centre.tolist(), words.duration(c)
         answer |= {"start": c.start.tolist(), "centre": centre, "time": longest if math.isfinite(longest) else None}

@@ -127,6 +127,11 @@ class Ball:
         F = evaluate(self.case.c.dynamics, self.constant, [*self.shared(states), *self.inputs, *quantities], called)
         return [f if f.units is units else f.among(units) for f in F]
 
+    def constraints(self, states: Sequence[Jet], quantities: Sequence[Jet]) -> list[Jet]:
+        """The expressions that have to stay negative."""
+        keep = self.case.c.keep
+        return evaluate(keep, self.constant, [*self.shared(states), *self.inputs, *quantities]) if keep else []
+
     def shared(self, states: Sequence[Jet]) -> list[Jet]:
         """The states as jets with the inputs' errors."""
         return [replace(x, B=Near(np.zeros(self.units.count)), units=self.units) for x in states]

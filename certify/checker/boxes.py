@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import islice
+from typing import Any
 
 import numpy as np
 from flint import fmpq_mat
@@ -35,16 +36,19 @@ class Leaves:
     inputs: Near  # (m, B)
     bound: Array  # an upper bound of the margin
     hold: Array  # where what is asked holds
+    kept: Array  # where each constraint holds, (K, B)
 
 
 class Boxes(ABC):
     """Boxes with corners lo and hi (n, B) in z, batched; S = T'PT."""
 
-    def __init__(self, case: Case, T: Array, S: fmpq_mat, more: int = 0) -> None:
-        """`more` symbols come after those of the box, the inputs, the uncertain quantities, and entries of calls."""
+    def __init__(self, case: Case, T: Array, S: fmpq_mat, more: int = 0, doubts: int = 0) -> None:
+        """`doubts` symbols come after those of the box; then those of the inputs, the uncertain quantities, and entries
+        of calls; then `more`."""
         self.case, self.c, self.T, self.net = case, case.c, T, case.net
         self.n, self.m, self.k = len(case.c.states), len(case.c.inputs), len(case.c.uncertain)
-        self.calls = self.n + self.m + self.k  # the first symbol of an entry of a call
+        self.errors = self.n + doubts  # the first symbol of an input's error
+        self.calls = self.errors + self.m + self.k  # the first symbol of an entry of a call
         self.symbols = self.calls + self.c.dynamics.entries + more
         prepare(*self.networks)
         rows = [all_near(fraction(v) for v in row) for row in S.tolist()]
@@ -68,7 +72,7 @@ class Boxes(ABC):
         """The tree's leaves in batches."""
 
     @abstractmethod
-    def examine(self, first: int, lo: Array, hi: Array) -> Leaves:
+    def examine(self, first: int, lo: Array, hi: Array) -> Any:
         """The leaves with these corners, numbered from `first`, of which anything is asked."""
 
     def levels(self, lo: Array, hi: Array) -> tuple[Array, Array]:
@@ -93,10 +97,11 @@ class Boxes(ABC):
         return Form(z).through(self.T)
 
     def models(self, x: Form, u: Form) -> tuple[list[Taylor], list[Taylor]]:
-        """States and inputs on the boxes; symbols: n box coordinates, m input errors, k uncertain quantities, entries
-        of calls, and the period if it has a range."""
+        """States and inputs on the boxes; symbols: n box coordinates and what else x has, m input errors, k uncertain
+        quantities, entries of calls, and the period if it has a range."""
         batch = u.error.v.shape[1]
-        zeros, errors = np.zeros((self.symbols - self.n, batch)), np.eye(self.m)[:, :, None] * u.error.top[:, None]
+        zeros = np.zeros((self.symbols - self.errors, batch))
+        errors = np.eye(self.m)[:, :, None] * u.error.top[:, None]
         states = [affine(x.value[0, i], np.concatenate([x.value[1:, i], zeros]), x.error[i]) for i in range(self.n)]
         inputs = [
             affine(u.value[0, j], np.concatenate([u.value[1:, j], errors[j], zeros[self.m :]])) for j in range(self.m)
@@ -105,7 +110,7 @@ class Boxes(ABC):
 
     def quantities(self, batch: int) -> list[Taylor]:
         """The uncertain quantities, each with its symbol."""
-        return [self.number(pair, self.n + self.m + j, batch) for j, pair in enumerate(self.c.ranges)]
+        return [self.number(pair, self.errors + self.m + j, batch) for j, pair in enumerate(self.c.ranges)]
 
     def constant(self, batch: int) -> Callable[[Fraction], Taylor]:
         """The function that gives a rational's model."""
@@ -114,6 +119,10 @@ class Boxes(ABC):
     def f(self, states: list[Taylor], held: list[Taylor]) -> list[Taylor]:
         """f of states, and of inputs and uncertain quantities."""
         return evaluate(self.c.dynamics, self.constant(len(held[0].c)), [*states, *held], self.called)
+
+    def constraints(self, states: list[Taylor], held: list[Taylor]) -> list[Taylor]:
+        """The expressions that have to stay negative, of states, and of inputs and uncertain quantities."""
+        return evaluate(self.c.keep, self.constant(len(held[0].c)), [*states, *held]) if self.c.keep else []
 
     def called(self, call: Call, arguments: list[Taylor]) -> list[Taylor]:
         """Entries of a network's value, each with its symbol for the error."""
@@ -185,6 +194,14 @@ def keeps_inputs(leaves: Leaves) -> Failures:
         if not np.all(hold):
             yield f"{leaves.place}{leaves.numbers[np.argmin(hold)]}", f"{name} may leave its bounds"
     return int(leaves.inputs.value.size)
+
+
+def keeps_constraints(leaves: Leaves) -> Failures:
+    """`keep`: every constraint is negative."""
+    for j, hold in enumerate(leaves.kept):
+        if not np.all(hold):
+            yield f"{leaves.place}{leaves.numbers[np.argmin(hold)]}", f"constraint {j} may be violated"
+    return int(leaves.kept.size)
 
 
 def is_whole(tree: bytes, axes: Sequence[int], where: str = "") -> Failures:

@@ -10,7 +10,7 @@ from itertools import product
 
 from flint import fmpq_mat
 
-from .document import Array, Certificate, Intervals, LocalBall, Outer, OuterTree, Partition, Slab
+from .document import Array, Certificate, Intervals, LocalBall, Outer, OuterTree, Partition, Ranks, Slab, Trusted
 from .exact import exactly, gershgorin_lower, inverse_diagonal
 from .near import near
 from .network import Folded, fold
@@ -32,6 +32,20 @@ class Case:
         if not isinstance(self.c.evidence, Partition):
             raise TypeError("this rule is about a partition tree")
         return self.c.evidence
+
+    @property
+    def order(self) -> int:
+        """The order of the series in time on leaves."""
+        if isinstance(self.c.evidence, Trusted):
+            raise TypeError("this rule is about leaves")
+        return self.c.evidence.order
+
+    @property
+    def ranks(self) -> Ranks:
+        """The ranks, of a certificate that has them."""
+        if self.c.ranks is None:
+            raise TypeError("this rule is about ranks")
+        return self.c.ranks
 
     @property
     def local(self) -> LocalBall:

@@ -22,7 +22,8 @@ from .strict import MAX_VALUES, load
 MAX_STATES, MAX_SLABS = 64, 10**4
 MAX_ORDER = 8  # of a series in time
 MAX_CELLS, MAX_CUTS = 4096, 64  # of the box of uncertain quantities in all, and of one range
-CLAIMS = ("asymptotic", "practical", "nearby", "enlarged", "reached")
+MAX_CONSTRAINTS, MAX_RANK = 64, 2**16 - 1  # that rank is none
+CLAIMS = ("asymptotic", "practical", "nearby", "enlarged", "reached", "reaches")
 PRACTICAL = ("practical", "nearby")
 WITH_TUBE = ("enlarged", "reached")
 Array = NDArray[np.float64]
@@ -137,6 +138,27 @@ class OuterTree:
 
 
 @dataclass(frozen=True)
+class Ranks:
+    """The states that are angles, by their numbers, and the most steps to the target; as evidence a partition tree of
+    the box lo <= x <= hi, and of each leaf its rank and the number of its steps."""
+
+    angles: tuple[int, ...]
+    most: int
+    lo: Array
+    hi: Array
+    tree: bytes
+    ranks: bytes
+    steps: bytes
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """Evidence by ranks alone, of a claim without V; the order of the series in time on leaves."""
+
+    order: int
+
+
+@dataclass(frozen=True)
 class Trusted:
     """Evidence that cannot be replayed: a solver's name and version, and its answers as (query, answer)."""
 
@@ -149,7 +171,8 @@ class Trusted:
 class Certificate:
     """The claim and its evidence. Provenance is not kept: nothing may depend on it.
 
-    `levels` are as stated: c0 (`floor`) of a practical claim, the inner edge of the ring c1 (`local`), and c2 (`roa`).
+    `levels` are as stated: c0 (`floor`) of a practical claim, the inner edge of the ring c1 (`local`), and c2 (`roa`);
+    under `reaches` there are none, and P has no entries.
     """
 
     claim: str
@@ -169,11 +192,14 @@ class Certificate:
     policy: Policy
     P: Array
     levels: dict[str, float]
-    evidence: Partition | Trusted
+    evidence: Partition | Trusted | Ranked
     sha256: str
     start: Array | None = None  # P_0 of a claim with a tube
     centre: Array | None = None  # c_0 of a claim whose tube follows a path
     outer: Outer | None = None  # whose set trajectories leave into {V <= c2} only
+    ranks: Ranks | None = None  # of the leaves from which trajectories reach the target
+    target: Tape | None = None  # whose outputs are at most 0 there; None if the target is {V <= c2}
+    keep: Tape | None = None  # whose outputs stay negative
 
     @property
     def practical(self) -> bool:
@@ -216,8 +242,44 @@ def certificate(data: Any, sha256: str) -> Certificate:
     stated = _plant(plant, networks)
     n, m = len(stated["states"]), len(stated["inputs"])
     stated["policy"] = _policy(policy, networks, n, m, kind in PRACTICAL)
+    stated["networks"], stated["sha256"] = tuple(networks.values()), sha256
+    provenance.must(isinstance(provenance.raw, dict), "an object")
+    read_rest = _reaching if kind == "reaches" else _attracting
+    return read_rest(stated, claim, lyapunov, levels, evidence)
+
+
+def _reaching(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: Value, evidence: Value) -> Certificate:
+    """The rest of a certificate without V."""
+    n, names = len(stated["states"]), stated["states"]
+    _, sample, target, ranks, *others = claim.keys(f"kind sample target ranks{claim.maybe('keep')}")
+    periods = _sample(sample)
+    sample.must(periods is None or not stated["discrete"], "null where time is discrete")
+    lyapunov.must(lyapunov.raw is None, "null under this claim")
+    levels.keys("")
+    kind, order, found = evidence.keys("kind order ranks")
+    kind.choice("ranks")
+    return Certificate(
+        "reaches",
+        0.0,
+        periods,
+        **stated,
+        P=np.zeros((0, 0)),
+        levels={},
+        evidence=Ranked(order.integer(1, _most_order(stated, periods))),
+        ranks=_ranks(ranks, found, n, stated, periods),
+        target=_constraints(target, names),
+        keep=_constraints(others[0], _names(stated)) if others else None,
+    )
+
+
+def _attracting(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: Value, evidence: Value) -> Certificate:
+    """The rest of a certificate with V."""
+    n, networks, kind = len(stated["states"]), {net.name: net for net in stated["networks"]}, claim.raw["kind"]
     stated_of = {"enlarged": " start", "reached": " start centre"}
-    _, rate, sample, beyond, *of_tube = claim.keys("kind rate sample outer" + stated_of.get(kind, ""))
+    may_be = claim.maybe("ranks") + claim.maybe("keep")
+    _, rate, sample, beyond, *more = claim.keys(f"kind rate sample outer{stated_of.get(kind, may_be)}")
+    of_tube, others = (more, []) if kind in WITH_TUBE else ([], more)
+    optional = dict(zip(may_be.split(), others, strict=True)) if kind not in WITH_TUBE else {}
     fall, periods = rate.binary64(), _sample(sample)
     rate.must(0 <= fall < math.inf and (fall == 0 or kind not in WITH_TUBE), "0, or a rate where a claim may have one")
     plain = periods is None and not stated["discrete"]
@@ -225,34 +287,67 @@ def certificate(data: Any, sha256: str) -> Certificate:
     sample.must(periods is None or kind != "nearby", "null under this claim")
     sample.must(periods is None or not stated["discrete"], "null where time is discrete")
     outer = _outer(beyond, stated["states"], networks)
+    beyond.must(outer is None or "keep" not in optional, "null with constraints")
     beyond.must(outer is None or (plain and fall == 0 and kind not in WITH_TUBE), "null under this claim")
     form, P = lyapunov.keys("kind P")
     form.choice("quadratic")
     edges = (*(("floor",) if kind in PRACTICAL else ()), "local", "roa")
     numbers = {edge: level.binary64() for edge, level in zip(edges, levels.keys(" ".join(edges)), strict=True)}
-    provenance.must(isinstance(provenance.raw, dict), "an object")
+    ranks, keep = optional.get("ranks"), optional.get("keep")
+    by_tree = _evidence(
+        evidence,
+        n,
+        len(stated["uncertain"]),
+        kind,
+        _most_order(stated, periods),
+        outer is not None,
+        plain and fall == 0 and outer is None and not optional,
+        ranks is not None,
+    )
     return Certificate(
         kind,
         fall,
         periods,
         **stated,
-        networks=tuple(networks.values()),
         P=P.array(n, n),
         levels=numbers,
-        evidence=_evidence(
-            evidence,
-            n,
-            len(stated["uncertain"]),
-            kind,
-            MAX_ORDER if periods is not None and not stated["dynamics"].calls else 1,
-            outer is not None,
-            plain and fall == 0 and outer is None,
-        ),
-        sha256=sha256,
+        evidence=by_tree,
         start=of_tube[0].array(n, n) if of_tube else None,
         centre=of_tube[1].array(n) if kind == "reached" else None,
         outer=outer,
+        ranks=_ranks(ranks, evidence.entry("ranks"), n, stated, periods) if ranks else None,
+        keep=None if keep is None else _constraints(keep, _names(stated)),
     )
+
+
+def _most_order(stated: Mapping[str, Any], periods: tuple[Fraction, Fraction] | None) -> int:
+    return MAX_ORDER if periods is not None and not stated["dynamics"].calls else 1
+
+
+def _names(stated: Mapping[str, Any]) -> tuple[str, ...]:
+    return (*stated["states"], *stated["inputs"], *stated["uncertain"])
+
+
+def _constraints(value: Value, names: tuple[str, ...]) -> Tape:
+    """Expressions that call no networks."""
+    return parse(value.listed(lambda tree: tree.raw, 1, MAX_CONSTRAINTS), names, value.at)
+
+
+def _ranks(
+    claim: Value,
+    evidence: Value,
+    n: int,
+    stated: Mapping[str, Any],
+    periods: tuple[Fraction, Fraction] | None,
+) -> Ranks:
+    claim.must(stated["discrete"] or periods is not None, "missing where time does not go in steps")
+    angles, most = claim.keys("angles steps")
+    states = stated["states"]
+    named = angles.listed(lambda name: states.index(name.choice(*states)), 0, n)
+    angles.must(len(set(named)) == len(named), "different names")
+    lo, hi, tree, ranks, steps = evidence.keys("lo hi tree ranks steps")
+    octets = tree.octets(), ranks.octets(), steps.octets()
+    return Ranks(named, most.integer(1, MAX_RANK - 1), lo.array(n), hi.array(n), *octets)
 
 
 def _plant(plant: Value, networks: Mapping[str, Network]) -> dict[str, Any]:
@@ -375,9 +470,11 @@ def check_hash(policy: Policy, stated: Any) -> None:
         raise Rejected("hash", "policy.sha256", "does not match the network in the file")
 
 
-def _evidence(value: Value, n: int, k: int, claim: str, most: int, outer: bool, plain: bool) -> Partition | Trusted:
+def _evidence(
+    value: Value, n: int, k: int, claim: str, most: int, outer: bool, plain: bool, ranked: bool
+) -> Partition | Trusted:
     """k quantities are uncertain; series in time have an order of at most `most`; `outer` says that a function is
-    stated, `plain` that none is, nor a rate, of a loop without steps."""
+    stated, `plain` that none is, nor a rate, of a loop without steps, `ranked` that there are ranks."""
     kinds = (
         "partition-tree",
         *(("trusted-solver",) if plain and not k and claim not in (*WITH_TUBE, "nearby") else ()),
@@ -385,8 +482,8 @@ def _evidence(value: Value, n: int, k: int, claim: str, most: int, outer: bool, 
     known = isinstance(value.raw, dict) and value.raw.get("kind") in kinds
     value.must(known, f"an object of kind {' or '.join(kinds)}")
     if value.raw["kind"] == "partition-tree":
-        keys = "kind T root tree order cells local contraction tube outer"
-        _, T, root, tree, order, cells, local, contraction, tube, beyond = value.keys(keys)
+        keys = f"kind T root tree order cells local contraction tube outer{' ranks' if ranked else ''}"
+        _, T, root, tree, order, cells, local, contraction, tube, beyond, *_ = value.keys(keys)
         cuts = cells.listed(lambda cut: cut.integer(1, MAX_CUTS), k)
         cells.must(math.prod(cuts) <= MAX_CELLS, f"{MAX_CELLS} parts in all")
         value.must(k == 0 or claim not in WITH_TUBE, "another where quantities are uncertain")

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from math import prod
 
 from .case import Case, Failures
-from .document import Array, Certificate, Partition
+from .document import Array, Certificate, Partition, Trusted
 from .expression import Tape
 from .networks import Map, Network
 
@@ -92,6 +92,7 @@ class Sizes:
         self.d = self.n + (c.claim == "reached")
         self.t = 2 * self.d**2 + self.d * (self.d + 1) * (self.d + 2) // 6
         self.a = c.dynamics.size + c.policy.network.operations
+        self.a += sum(tape.size for tape in (c.keep, c.target) if tape is not None)
         self.net = Net(_called(c.dynamics), [c.policy.network])
 
     # ------------------------------------------------------------------------------------------------------ numbers
@@ -100,12 +101,11 @@ class Sizes:
         """Held at once."""
         found = 4 * self.net.entries
         if not isinstance(self.evidence, Partition):
-            return found
+            return found + self.of_following()
         order = max(self.evidence.order, self.evidence.local.order if self.evidence.local else 1)
         values = (4 * order if self.c.sample else 1) * self.a + 2 * self.n + 8
         if self.asked or self.c.outer:
-            found += values * (self.s + 1) ** 2 + 2**14 * (self.n + self.m + self.z)
-            found += self.net.held_on_leaves(self.s + self.m + self.z)
+            found += self.on_leaves(order, self.s)
         if self.evidence.local or self.evidence.contraction or self.evidence.tube:
             found += values * (self.t + self.d * self.y + self.m + self.z) + self.d**4 // 4
             found += self.net.held_on_a_ball(self.d, self.t)
@@ -114,21 +114,35 @@ class Sizes:
             N, of_tape = Net(_called(tape)), tape.size
             found += 4 * N.entries + sum(2 * rows * area for rows, *_ in N.steps) + 8 * of_tape * area
             found += N.held_on_leaves(self.s + 1)
-        return found
+        return found + self.of_following()
+
+    def on_leaves(self, order: int, symbols: int) -> int:
+        """On as many leaves as are examined at once."""
+        values = (4 * order if self.c.sample else 1) * self.a + 2 * self.n + 8
+        held = self.net.held_on_leaves(symbols + self.m + self.z)
+        return values * (symbols + 1) ** 2 + 2**14 * (self.n + self.m + self.z) + held
+
+    def of_following(self) -> int:
+        """Where leaves are followed by steps."""
+        if self.c.ranks is None or isinstance(self.evidence, Trusted):
+            return 0
+        return 2**4 * len(self.c.ranks.tree) + self.on_leaves(self.evidence.order, self.s + self.n)
 
     # --------------------------------------------------------------------------------------------------------- work
 
     def work(self) -> int:
         """Elementary operations."""
-        found = 2**15 * self.a + self.net.folded + self.inverse(self.bits(self.c.P))
-        if not self.c.practical:
+        found = 2**15 * self.a + self.net.folded
+        found += self.inverse(self.bits(self.c.P)) if self.c.target is None else 0
+        if not self.c.practical and self.c.target is None:
             found += 2**12 * self.net.entries + 2**19 * Net(_called(self.c.dynamics)).entries
+        found += self.of_ranks()
         if not isinstance(self.evidence, Partition):
             return found
         seen = min(2 * self.bits(self.evidence.T) + self.bits(self.c.P) + 16, 2**16 // self.n)
         found += self.inverse(seen) + 2**8 * len(self.evidence.tree)
         if self.asked:
-            found += self.of_ring(self.evidence.tree.count(LEAF))
+            found += self.of_leaves(self.evidence.tree.count(LEAF), self.evidence.order, self.s)
         return found + self.of_balls() + self.of_tube() + self.of_outer()
 
     @property
@@ -160,15 +174,26 @@ class Sizes:
         of_each = 8 * area * models + area * (values + 4) * (32 * models + calls) // 2**9
         return leaves * (of_each + 2**11 + 2**7 * self.n + self.n**3)
 
-    def policies(self, leaves: int) -> int:
-        each, batches = self.net.on_a_leaf(self.s), 1 + leaves * self.net.widest // 2**14
-        times = self.evaluations(self._partition.order) if self.z else 1  # of calls, in those of the equations
+    def policies(self, leaves: int, order: int, symbols: int) -> int:
+        each, batches = self.net.on_a_leaf(symbols), 1 + leaves * self.net.widest // 2**14
+        times = self.evaluations(order) if self.z else 1  # of calls, in those of the equations
         return times * (leaves * each // 8 + batches * self.net.paths)
 
-    def of_ring(self, leaves: int) -> int:
-        order, calls = self._partition.order, self.n * self.s**2 + 160 * self.net.reads
+    def of_leaves(self, leaves: int, order: int, symbols: int) -> int:
+        """The loop on so many leaves."""
+        calls = self.n * symbols**2 + 160 * self.net.reads
         models = self.a * self.evaluations(order) + self.n**2 + 4 * self.n
-        return self.boxes(leaves, models, self.a * (order + 1), self.s, calls) + self.policies(leaves)
+        found = self.boxes(leaves, models, self.a * (order + 1), symbols, calls)
+        return found + self.policies(leaves, order, symbols)
+
+    def of_ranks(self) -> int:
+        """Steps from leaves, and the leaves that their images meet."""
+        ranks = self.c.ranks
+        if ranks is None or isinstance(self.evidence, Trusted):
+            return 0
+        leaves = len(ranks.steps)
+        of_all = self.of_leaves(leaves + sum(ranks.steps), self.evidence.order, self.s + self.n)
+        return 2**9 * len(ranks.tree) + 2**17 * leaves + of_all
 
     @property
     def ball(self) -> int:
@@ -219,7 +244,7 @@ class Sizes:
         found += (faces + leaves) * N.on_a_leaf(self.n + 1) // 8 + (1 + faces + leaves) * N.paths
         models, calls = self.a + 8 * of_tape + 4 * self.n, calls + self.n * self.s**2 + 160 * self.net.reads
         found += self.boxes(leaves, models, max(values, self.a), self.s, calls)
-        return found + leaves * N.models((self.s + 4) ** 2) + self.policies(leaves)
+        return found + leaves * N.models((self.s + 4) ** 2) + self.policies(leaves, self._partition.order, self.s)
 
     @property
     def _partition(self) -> Partition:

@@ -174,6 +174,21 @@ def stays(local: Local) -> Failures:
     return len(c.states)
 
 
+def keeps_constraints(local: Local) -> Failures:
+    """`keep`: every constraint is negative on the ball, during a period too."""
+    c, count = local.case.c, 0
+    if c.keep is None:
+        return 0
+    whole = c.sample is not None and local.way is not None
+    for cell in [None] if whole else local.case.cells:
+        states = local.during(local.way) if local.way is not None and whole else local.states
+        for j, g in enumerate(local.constraints(states, local.ranges if cell is None else local.symbols(cell))):
+            if not g.range.ends[1] < 0:
+                yield local.at, f"constraint {j} may be violated"
+            count += 1
+    return count
+
+
 def decreases(local: Local) -> Failures:
     """`local`: D + 2 lambda V < 0 on the ball without its centre, or as far as V >= c0."""
     count = 0

@@ -539,6 +539,7 @@ _TANH, _SECH2 = _table(_TANHS), _table(1 - t * t for t in _TANHS)
 _SIN, _COS = _table(x.sin() for x in _GRID), _table(x.cos() for x in _GRID)
 _EXP, _ATAN = _table(x.exp() for x in _GRID), _table(x.atan() for x in _GRID[: int(1 / _STEP) + 1])
 _RIGHT_ANGLE = near_ball(arb.pi() / 2).value
+TURN = near_ball(2 * arb.pi())
 
 
 def _split(y: Array, end: float) -> tuple[Any, Array]:

@@ -242,7 +242,8 @@ class Beyond(Boxes):
             rise, [below.at, lambda few: self.gap(centre[:, few], radius[:, few], self.c.c2, -1.0)]
         )
         finite = np.all([np.isfinite(v.size.top) for v in (N, *F)], axis=0)
-        return Leaves(self, first + left, "outer leaf ", u.range, bound, (bound < 0) & finite)
+        none_kept = np.zeros((0, len(left)), dtype=bool)
+        return Leaves(self, first + left, "outer leaf ", u.range, bound, (bound < 0) & finite, none_kept)
 
     def is_outside(self, x: Form) -> Array:
         """True on each box that certainly lies outside the domain, along one of the states."""

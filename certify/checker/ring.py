@@ -32,71 +32,48 @@ class RingLeaves(Leaves):
     ends: Array  # (2, n, B): the state lies between these during a period; none if nothing is held
 
 
-class Ring(Boxes):
-    """The bounds on boxes, lo and hi (n, B) in the coordinates z, that the rules for a leaf ask for."""
+@dataclass(frozen=True)
+class Motion:
+    """A step on boxes: G; states and what else f reads, as they may be at any time of the step; between what a state
+    lies during a period, (2, n, B), of no entries if nothing is held."""
 
-    def __init__(self, case: Case) -> None:
-        lo, hi = case.c.sample or (0, 0)
-        super().__init__(case, case.partition.T, case.S, lo < hi)
-        self.c2 = fmpq(*self.c.c2.as_integer_ratio())
+    G: list[Taylor]
+    states: list[Taylor]
+    held: list[Taylor]
+    ends: Array
+
+
+class Moving(Boxes):
+    """Boxes from which the state moves, in steps or continuously."""
+
+    order: int  # of the series in time
+    widest: list[float]  # the largest |x_i| that matters at the beginning of a period
 
     @property
     def batch(self) -> int:
         """The number of leaves per batch."""
-        values = self.c.dynamics.size * (self.case.partition.order + 1)
+        values = self.c.dynamics.size * (self.order + 1)
         numbers = max(self.width * (self.symbols + 4), self.symbols * self.symbols * (values + 4))
         return int(max(1, min(4096, _BATCH_NUMBERS // numbers)))
 
-    def leaves(self) -> Iterator[Batch]:
-        """The tree's leaves in batches."""
-        root = self.case.partition.root
-        return batches(self.case.partition.tree, -root, root, self.batch)
-
-    def examine(self, first: int, lo: Array, hi: Array) -> RingLeaves:
-        """The leaves with these corners, numbered from `first`."""
-        outside, inside, beyond = self.misses(lo, hi)
-        met = np.flatnonzero(np.logical_not(outside | inside if self.case.covered else outside))
-        lo, hi, meet, beyond = lo[:, met], hi[:, met], np.logical_not(inside[met]), beyond[met]
-        centre, radius = middle(lo, hi)
-        x = self.states(centre, radius)
-        u = enclose_on_boxes(self.net, x)
-        states, held = self.models(x, u)
-        G, ends = self.increment(states, held)
-        rise = self.rise(states, G)
-        if self.c.rate:
-            rise = combination((1.0, rise), (2 * self.c.rate, self.gap(centre, radius, 0.0, -1.0)))
-        if self.case.covered or not self.c.step:
-            bound = self.bound(rise, centre, radius)
-        else:
-            bound = np.where(beyond, self.bound(rise, centre, radius), self.bound_of_steps(rise, centre, radius))
-        hold = bound < 0
-        if not (self.case.covered or self.c.step or np.all(meet)):
-            # a division by a range that contains 0 has no finite model
-            hold = np.where(meet, hold, np.all([np.isfinite(g.size.top) for g in G], axis=0))
-        return RingLeaves(self, first + met, "leaf ", u.range, bound, hold, meet, ends)
-
-    def misses(self, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
-        """True on boxes with certainly V > c2 everywhere; with certainly V < c1; with certainly V >= c1."""
-        least, most = self.levels(lo, hi)
-        return least > self.c.c2, most < self.c.c1, least >= self.c.c1
-
-    def increment(self, states: list[Taylor], inputs: list[Taylor]) -> tuple[list[Taylor], Array]:
-        """G, and between what a state lies during a period."""
+    def motion(self, states: list[Taylor], inputs: list[Taylor]) -> Motion:
+        """G, and where the state may be until the step is done."""
         batch, nothing = len(inputs[0].c), np.zeros((2, 0, 0))
         ranges = self.quantities(batch)
         if not self.c.sample:
             F = self.f(states, [*inputs, *ranges])
-            return [f + -x for f, x in zip(F, states, strict=True)] if self.c.discrete else F, nothing
+            G = [f + -x for f, x in zip(F, states, strict=True)] if self.c.discrete else F
+            return Motion(G, states, [*inputs, *ranges], nothing)
         loose = [*inputs, *(_between(v) for v in ranges)]
         during, F = self.way(states, loose)
-        order, h = self.case.partition.order, self.number(self.c.sample, self.symbols - 1, batch)
-        G = [self.of_mean(f) for f in self.f(during if order == 1 else states, [*inputs, *ranges])]
-        if order > 1:
+        h = self.number(self.c.sample, self.symbols - 1, batch)
+        G = [self.of_mean(f) for f in self.f(during if self.order == 1 else states, [*inputs, *ranges])]
+        if self.order > 1:
             from .flow import later
 
-            rising = later(self.c.dynamics, self.constant(batch), states, during, loose, h, order, _itself)
+            rising = later(self.c.dynamics, self.constant(batch), states, during, loose, h, self.order, _itself)
             G = [x + h * more for x, more in zip(G, rising, strict=True)]
-        return G, self.hull(states, F)
+        return Motion(G, during, loose, self.hull(states, F))
 
     def way(self, states: list[Taylor], held: list[Taylor]) -> tuple[list[Taylor], list[Taylor]]:
         """Enclose the states during a period, and f of them; NaN where none of a few attempts is an enclosure."""
@@ -115,10 +92,9 @@ class Ring(Boxes):
         return during, F
 
     def hull(self, states: list[Taylor], F: list[Taylor]) -> Array:
-        """Between what the states lie that start in {V <= c2} and move as fast as F for a period at most."""
+        """Between what the states lie that start at |x_i| <= `widest` and move as fast as F for a period at most."""
         h, found = self.case.longest, []
-        for x, f, p in zip(states, F, self.case.P_inverse, strict=True):
-            widest = near(fraction(root_above(self.c2 * fmpq(p.numerator, p.denominator)))).ends[1]
+        for x, f, widest in zip(states, F, self.widest, strict=True):
             (lo, hi), (slowest, fastest) = x.range.ends, f.range.ends
             down, up = (Above(np.maximum(v, 0.0)) * h for v in (-slowest, fastest))
             low, high = Near(np.maximum(lo, -widest), down), Near(np.minimum(hi, widest), up)
@@ -128,12 +104,59 @@ class Ring(Boxes):
     def of_mean(self, f: Taylor) -> Taylor:
         """A model with the symbols of uncertain quantities, and of the errors of calls, which change within a period
         too, as their means: what is of second order in them, whose mean is another, becomes part of the remainder."""
-        last = self.calls + self.c.dynamics.entries
-        i, j = ((self.n + self.m <= index) & (index < last) for index in pairs(self.symbols))
+        first, last = self.errors + self.m, self.calls + self.c.dynamics.entries
+        i, j = ((first <= index) & (index < last) for index in pairs(self.symbols))
         own = self.symbols + np.flatnonzero(i & j)
         p = f.p.copy()
         p[own] = 0.0
         return Taylor(f.c, p, f.r + size(f.p[own]).sum())
+
+
+class Ring(Moving):
+    """The bounds on boxes, lo and hi (n, B) in the coordinates z, that the rules for a leaf ask for."""
+
+    def __init__(self, case: Case) -> None:
+        lo, hi = case.c.sample or (0, 0)
+        super().__init__(case, case.partition.T, case.S, lo < hi)
+        c2, self.order = fmpq(*self.c.c2.as_integer_ratio()), case.partition.order
+        roots = (root_above(c2 * fmpq(p.numerator, p.denominator)) for p in case.P_inverse)
+        self.widest = [near(fraction(root)).ends[1] for root in roots]
+
+    def leaves(self) -> Iterator[Batch]:
+        """The tree's leaves in batches."""
+        root = self.case.partition.root
+        return batches(self.case.partition.tree, -root, root, self.batch)
+
+    def examine(self, first: int, lo: Array, hi: Array) -> RingLeaves:
+        """The leaves with these corners, numbered from `first`."""
+        outside, inside, beyond = self.misses(lo, hi)
+        met = np.flatnonzero(np.logical_not(outside | inside if self.case.covered else outside))
+        lo, hi, meet, beyond = lo[:, met], hi[:, met], np.logical_not(inside[met]), beyond[met]
+        centre, radius = middle(lo, hi)
+        x = self.states(centre, radius)
+        u = enclose_on_boxes(self.net, x)
+        states, held = self.models(x, u)
+        motion = self.motion(states, held)
+        rise = self.rise(states, motion.G)
+        if self.c.rate:
+            rise = combination((1.0, rise), (2 * self.c.rate, self.gap(centre, radius, 0.0, -1.0)))
+        if self.case.covered or not self.c.step:
+            bound = self.bound(rise, centre, radius)
+        else:
+            bound = np.where(beyond, self.bound(rise, centre, radius), self.bound_of_steps(rise, centre, radius))
+        hold = bound < 0
+        if not (self.case.covered or self.c.step or np.all(meet)):
+            # a division by a range that contains 0 has no finite model
+            hold = np.where(meet, hold, np.all([np.isfinite(g.size.top) for g in motion.G], axis=0))
+        gaps = [lambda left: self.gap(centre[:, left], radius[:, left], self.c.c2, 1.0)]
+        kept = [self.least_bound(g, gaps) < 0 for g in self.constraints(motion.states, motion.held)]
+        held_back = np.array(kept, dtype=bool).reshape(len(kept), len(met))
+        return RingLeaves(self, first + met, "leaf ", u.range, bound, hold, held_back, meet, motion.ends)
+
+    def misses(self, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
+        """True on boxes with certainly V > c2 everywhere; with certainly V < c1; with certainly V >= c1."""
+        least, most = self.levels(lo, hi)
+        return least > self.c.c2, most < self.c.c1, least >= self.c.c1
 
     def rise(self, states: list[Taylor], G: list[Taylor]) -> Taylor:
         """D = sum_i G_i (2 P x + h P G)_i."""

@@ -92,7 +92,7 @@ def centring(case: Case) -> Failures:
         limits = zip(*(end.tolist() for end in policy.clip), u_eq, strict=True)
         if not all(Fraction(lo) < u < Fraction(hi) for lo, hi, u in limits):
             yield "policy.clip", "u_eq must lie strictly inside the clip"
-    if policy.centre == "none" and not case.c.practical:
+    if policy.centre == "none" and not case.c.practical and case.c.target is None:
         try:
             shown = policy_at_origin(policy) == list(u_eq)
         except Undecided:
@@ -114,16 +114,22 @@ ON_THE_BALL: Table[local.Local] = (
     ("inputs", ball.keeps_inputs),
     ("local", ball.is_not_clipped),
     ("flow", local.stays),
+    ("keep", local.keeps_constraints),
     ("local", local.decreases),
 )
 OF_THE_TREE: Table[Case] = (("tree", ring.is_partition),)
-ON_LEAVES: Table[ring.RingLeaves] = (("inputs", boxes.keeps_inputs), ("flow", ring.stays), ("ring", ring.decreases))
+ON_LEAVES: Table[ring.RingLeaves] = (
+    ("inputs", boxes.keeps_inputs),
+    ("flow", ring.stays),
+    ("keep", boxes.keeps_constraints),
+    ("ring", ring.decreases),
+)
 _KEPT = 4_000_000  # numbers, just below the 2^25 bytes up to which glibc adapts
 READ = {"format": 1, "hash": 1}  # rules of document.py, which have held
 RULES = (
     *READ,
     *dict.fromkeys(name for table in (STATED, ON_THE_BALL, OF_THE_TREE, ON_LEAVES) for name, _ in table),
-    *("tube", "contraction", "outer", "faces"),  # of features: their modules have the tables
+    *("tube", "contraction", "outer", "faces", "angles", "ranks"),  # of features: their modules have the tables
 )
 
 
@@ -174,13 +180,20 @@ def check(c: Certificate, jobs: int = 1, patient: bool = False) -> Tally:
     """
     self_test()
     np.empty(_KEPT)  # given back at once: an allocator that adapts then keeps arrays, and need not ask for each anew
-    replayed = isinstance(c.evidence, Partition)
+    replayed, without_V = isinstance(c.evidence, Partition), c.claim == "reaches"
     spared = {"equilibrium": c.practical, "coordinates": not replayed, "root": not replayed}
+    spared |= dict.fromkeys(("levels", "lyapunov", "equilibrium", "domain"), True) if without_V else {}
     with np.errstate(all="ignore"):  # overflow becomes infinity or NaN, and every test then fails
         tally, case = Tally(), Case(c, jobs, patient)
         tally.hold([(name, rule) for name, rule in STATED if not spared.get(name)], case)
         if replayed:
             _examine(tally, case)
+        if c.ranks is not None:
+            from . import ranks
+
+            tally.hold(ranks.OF_RANKS, case)
+            steps = ranks.Steps(case)
+            tally.hold_on_leaves(ranks.ON_RANK_LEAVES, steps, c.ranks.tree, lambda _: np.zeros(0))
     return tally
 
 

@@ -37,7 +37,15 @@ class Value:
         self.must(
             isinstance(self.raw, dict) and set(self.raw) == set(keys), f"an object with exactly the keys: {names}"
         )
-        return [Value(self.raw[key], f"{self.at}.{key}".lstrip(".")) for key in keys]
+        return [self.entry(key) for key in keys]
+
+    def entry(self, name: str) -> Value:
+        """The entry of an object at a key that it has."""
+        return Value(self.raw[name], f"{self.at}.{name}".lstrip("."))
+
+    def maybe(self, name: str) -> str:
+        """The name, after a space, if the object has such a key: for `keys`."""
+        return f" {name}" if isinstance(self.raw, dict) and name in self.raw else ""
 
     def listed(self, read: Callable[[Value], T], least: int, most: int | None = None) -> tuple[T, ...]:
         """The entries of a list, each as `read` has it; `least` of them, or up to `most`."""

@@ -7,6 +7,7 @@ from fractions import Fraction
 from typing import Any
 
 from .document import Array, Certificate, Partition, Policy
+from .expression import Tape
 from .networks import Map, Network, Observe, Product, Step, Sum, hashed
 
 CLAIMS = {
@@ -59,8 +60,32 @@ def claim(c: Certificate) -> list[str]:
             f"N(x) <= {c.outer.level!r} stays in this union, enters V <= {c.c2!r} in finite time, and from then on is "
             "one of those above; u stays in its bounds; states outside the domain are not meant, whatever N is there"
         )
+    if c.ranks is not None and c.claim != "reaches":
+        lines.append(f"  and every trajectory that {_by_ranks(c)}, and from then on is one of those above")
+    if c.keep is not None:
+        until = ", until it is in the target" if c.claim == "reaches" else ""
+        kept = ", ".join(f"{expression(tree)} < 0" for tree in c.keep.trees)
+        lines.append(
+            f"  and along every trajectory of these, {'at every step' if c.discrete else 'at all times'}{until}: {kept}"
+        )
+    if c.claim == "reaches":
+        return [f"claim: every trajectory of the closed loop that {_by_ranks(c)}; nothing is claimed of later", *lines]
     said = CLAIMS[c.claim].format(c=c, time=duration(c), when=when)
     return [f"claim: {said}; u stays in its bounds", *lines]
+
+
+def _by_ranks(c: Certificate) -> str:
+    """The statement of chapter ranks."""
+    if c.ranks is None:
+        return ""
+    target = f"V <= {c.c2!r}" if c.target is None else "the target"
+    angles = ", ".join(c.states[i] for i in c.ranks.angles)
+    places = f" up to multiples of 2 pi in {angles}" if angles else ""
+    others = f"each state but {angles}" if angles else "the state"
+    return (
+        f"starts in a leaf of finite rank is in {target}{places} after as many steps as the rank is, at the latest, "
+        f"{c.ranks.most} at most; until then {others} is in the interior of the domain and u stays in its bounds"
+    )
 
 
 def _falls(c: Certificate) -> str:
@@ -87,7 +112,9 @@ def _falling(c: Certificate) -> str:
 def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
     """The plant, the policy, V, what is claimed of them, what held, and the verdict, line by line."""
     inputs = zip(c.inputs, c.input_bounds, c.u_eq, strict=True)
-    if answer["result"] == "TRUSTED":
+    if c.claim == "reaches":
+        rest, verdict = f"leaves {answer['ranks']['leaves']}", answer["result"]
+    elif answer["result"] == "TRUSTED":
         rest = f"not checked, the solver's word: {', '.join(answer['answers'])}"
         verdict = f"TRUSTED {answer['solver']} {answer['version']}"
     else:
@@ -113,7 +140,7 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         f"{_clip(c.policy)}"
         f"sha256 {c.policy.sha256()}",
         *([] if c.policy.origin is None else [f"  its network reads ({_matrix(c.policy.origin[None])}) + x"]),
-        f"V(x) = x'Px with P = {_matrix(c.P)}",
+        *([f"V(x) = x'Px with P = {_matrix(c.P)}"] if c.target is None else _target(c.target)),
         *([] if c.start is None else [f"S = {_matrix(c.start)}"]),
         *([] if c.centre is None else [f"c = {' '.join(map(repr, c.centre.tolist()))}"]),
         *([] if c.outer is None else [f"N(x) = {expression(c.outer.function.trees[0])}"]),
@@ -121,9 +148,20 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items()),
         "modules that were used: " + ", ".join(answer["modules"]),
         rest,
-        f"{verdict} {f'c0={c.c0!r} ' if c.practical else ''}c1={c.c1!r} c2={c.c2!r}"
-        f"{'' if c.outer is None else f' n2={c.outer.level!r}'} sha256={c.sha256}",
+        f"{verdict} {_levels(c)}sha256={c.sha256}",
     ]
+
+
+def _target(target: Tape) -> list[str]:
+    """The region that is reached."""
+    return [f"target: {', '.join(f'{expression(tree)} <= 0' for tree in target.trees)}"]
+
+
+def _levels(c: Certificate) -> str:
+    """The levels, each with a space after it."""
+    inner = f"c0={c.c0!r} " if c.practical else ""
+    both = f"{inner}c1={c.c1!r} c2={c.c2!r} " if c.levels else ""
+    return both if c.outer is None else f"{both}n2={c.outer.level!r} "
 
 
 def _network(network: Network) -> str:

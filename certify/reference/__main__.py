@@ -18,7 +18,7 @@ from fractions import Fraction
 from typing import Any
 
 from .document import MAX_BYTES, Certificate
-from .evidence import Trusted
+from .evidence import Tree
 from .limits import MAX_IN_PATIENCE
 from .rules import Verdict, judge
 
@@ -36,7 +36,7 @@ def read_once(path: str) -> bytes:
 
 
 def in_words(c: Certificate) -> str:
-    return of_trajectories(c) + further(c)
+    return (of_ranks(c) if c.target is not None else of_trajectories(c) + further(c) + in_ranks(c)) + kept(c)
 
 
 def of_trajectories(c: Certificate) -> str:
@@ -77,6 +77,51 @@ def further(c: Certificate) -> str:
         f"certificate states, stays in the union of that set and V <= {c.outer!r}, enters V <= {c.outer!r} in finite "
         f"time, and is one of these from then on, with {', '.join(c.plant.inputs)} within the input bounds{whatever(c)}"
     )
+
+
+def of_ranks(c: Certificate) -> str:
+    """The statement of a claim without V."""
+    reached = f"each of the {len(c.target.results)} expressions" if c.target is not None else ""
+    return (
+        f"{c.plant.name}, policy {c.policy.sha256}{stepping(c)}: {from_leaves(c)} where {reached} that the certificate "
+        f"states as its target is at most 0{on_the_way(c)}; nothing is said of what happens there"
+    )
+
+
+def in_ranks(c: Certificate) -> str:
+    """The statement about ranks beside that about V."""
+    if c.ranks is None:
+        return ""
+    return f"; and {from_leaves(c)} in V <= {c.outer!r}{on_the_way(c)}, and is one of these from then on"
+
+
+def from_leaves(c: Certificate) -> str:
+    """The words for the starts and the time; a state follows where the trajectory is then."""
+    most = 0 if c.ranks is None else c.ranks.steps
+    after = "steps" if c.plant.discrete else "periods"
+    return (
+        f"every trajectory that starts in a box of the certificate's tree of ranks whose rank is r < 65535 is, after r "
+        f"{after} at the latest ({most} at most),"
+    )
+
+
+def on_the_way(c: Certificate) -> str:
+    """The words for what holds until then, and for places."""
+    angles = () if c.ranks is None else c.ranks.angles
+    others = [name for name in c.plant.states if name not in angles]
+    places = f" (states that differ by multiples of 2 pi in {', '.join(angles)} being the same)" if angles else ""
+    inside = f", and {', '.join(others)} inside the domain" if others else ""
+    return f"{places}, until then with {', '.join(c.plant.inputs)} within the input bounds{inside}{whatever(c)}"
+
+
+def kept(c: Certificate) -> str:
+    """The words for constraints."""
+    if c.keep is None:
+        return ""
+    until = ", until it is there" if c.target is not None else ""
+    when = "at every step" if c.plant.discrete else "at all times"
+    count = len(c.keep.results)
+    return f"; and along each of these trajectories the {count} expressions of keep are negative {when}{until}"
 
 
 def stepping(c: Certificate) -> str:
@@ -127,7 +172,7 @@ def centre_numbers(c: Certificate) -> list[float] | None:
 
 def time_of_tube(c: Certificate) -> float | None:
     """The sum of the durations, rounded upwards; None without a tube, and where no binary64 number is as large."""
-    if c.start is None or isinstance(c.evidence, Trusted):
+    if c.start is None or not isinstance(c.evidence, Tree):
         return None
     exactly = sum((Fraction(slab.duration) for slab in c.evidence.tube), Fraction(0))
     try:
@@ -139,7 +184,9 @@ def time_of_tube(c: Certificate) -> float | None:
 
 
 def level_names(c: Certificate) -> tuple[tuple[str, str, float], ...]:
-    """Key in the file, letter, value."""
+    """Key in the file, letter, value; none without V."""
+    if c.target is not None:
+        return ()
     least = () if c.floor is None else (("floor", "c0", c.floor),)
     return *least, ("local", "c1", c.inner), ("roa", "c2", c.outer)
 
@@ -148,8 +195,8 @@ def line(verdict: Verdict) -> str:
     sha256, c = verdict.certificate_sha256, verdict.certificate
     if c is None or verdict.result == "REJECTED":
         return f"REJECTED rule={verdict.rule} at={verdict.at}: {verdict.detail}"
-    levels = " ".join(f"{letter}={value!r}" for _, letter, value in level_names(c))
-    return f"{verdict.result} {levels} sha256={sha256}" + (f": {verdict.detail}" if verdict.detail else "")
+    levels = "".join(f"{letter}={value!r} " for _, letter, value in level_names(c))
+    return f"{verdict.result} {levels}sha256={sha256}" + (f": {verdict.detail}" if verdict.detail else "")
 
 
 def as_json(verdict: Verdict, seconds: float) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from typing import Any
 
 from flint import fmpq, fmpq_mat
 
-from .evidence import WITH_FLOOR, WITH_TUBE, Tree, Trusted, read_evidence
+from .evidence import REACHES, WITH_FLOOR, WITH_TUBE, Ranked, Tree, Trusted, read_evidence
 from .expressions import Equations, equations, rational
 from .fields import IDENTIFIER, MAX_NAMES, binary64, column, entries, exact, keys, numbers, square
 from .networks import Network, packed, read_networks
@@ -19,7 +20,8 @@ from .refusal import Refused, require
 
 MAX_BYTES, MAX_BYTES_BEYOND_ASCII = 256 * 2**20, 16 * 2**20
 MAX_TOKENS = 10**6  # commas and opening brackets
-SCHEMA, CLAIMS = "certify-certificate/9", ("asymptotic", *WITH_FLOOR, *WITH_TUBE)
+MAX_EXPRESSIONS, MAX_RANK = 64, 65_534  # of `keep` or of `target`; of a leaf that is claimed
+SCHEMA, CLAIMS = "certify-certificate/9", ("asymptotic", *WITH_FLOOR, *WITH_TUBE, REACHES)
 
 Interval = tuple[fmpq, fmpq]
 
@@ -68,12 +70,26 @@ class Function:
 
 
 @dataclass(frozen=True)
+class Ranks:
+    """The statement about boxes with ranks, none of which is above `steps`.
+
+    States that differ by multiples of 2 pi in `angles` are one place.
+    """
+
+    angles: tuple[str, ...]
+    steps: int
+
+
+@dataclass(frozen=True)
 class Certificate:
     """`inner` and `outer`, between which the leaves show that V falls, are c1 and c2; `floor` is c0, if there is one.
 
     V falls at the `rate` lambda, D + 2 lambda V < 0. With a `sample` inputs are held for a time in this range.
     `start` is P_0 of a claim with a tube, `centre` the column c_0 around which it lies where the tube follows a path.
-    `beyond` is the second function of a claim with an outer set, called `outer` in the file.
+    `beyond` is the second function of a claim with an outer set, called `outer` in the file. Expressions of `keep` are
+    claimed to be negative, those of `target` to become at most 0.
+
+    A claim with a target has no V: P has no entries and its levels are no numbers, so that no rule about V can hold.
     """
 
     claim: str
@@ -82,13 +98,16 @@ class Certificate:
     start: fmpq_mat | None
     centre: fmpq_mat | None
     beyond: Function | None
+    ranks: Ranks | None
+    keep: Equations | None
+    target: Equations | None
     plant: Plant
     policy: Policy
     P: fmpq_mat
     floor: float | None
     inner: float
     outer: float
-    evidence: Tree | Trusted
+    evidence: Tree | Ranked | Trusted
 
     @property
     def n(self) -> int:
@@ -111,7 +130,7 @@ class Certificate:
     @property
     def ends_at_origin(self) -> bool:
         """True if the claim is about the equilibrium at the origin; every model is at rest there."""
-        return self.claim not in WITH_FLOOR
+        return self.claim not in (*WITH_FLOOR, REACHES)
 
     @property
     def step(self) -> fmpq:
@@ -127,12 +146,8 @@ def read(raw: bytes) -> Certificate:
     data = keys(parsed(raw), "file", *sections)
     require(data["schema"] == SCHEMA, "format", "schema", f"'{SCHEMA}' was expected")
     require(isinstance(data["provenance"], dict), "format", "provenance", "an object was expected")
-    said = data["claim"]
-    named = isinstance(said, dict) and said.get("kind") in CLAIMS
-    require(named, "format", "claim.kind", f"one of {', '.join(CLAIMS)} was expected")
+    said = read_claim(data["claim"])
     claim = str(said["kind"])
-    more = {"enlarged": ("start",), "reached": ("start", "centre")}.get(claim, ())
-    said = keys(said, "claim", "kind", "rate", "sample", "outer", *more)
     rate, sample = read_rate(said["rate"], claim), read_sample(said["sample"])
     networks = read_networks(data["networks"], "networks")
     plant = read_plant(data["plant"], networks)
@@ -149,20 +164,78 @@ def read(raw: bytes) -> Certificate:
     simple = not (claim in WITH_TUBE or rate > 0 or sample is not None or plant.discrete)
     plainly = beyond is None or simple
     require(plainly, "format", "claim.outer", "null was expected with a tube, a rate, a sample and in discrete time")
+    ranks, keep, target = read_more(said, plant, claim in WITH_TUBE or beyond is not None)
     policy = read_policy(data["policy"], networks, n, len(plant.inputs), claim)
-    lyapunov = keys(data["lyapunov"], "lyapunov", "kind", "P")
-    require(lyapunov["kind"] == "quadratic", "format", "lyapunov.kind", "'quadratic' was expected")
-    P = square(lyapunov["P"], "lyapunov.P", n)
-    named_levels = ("floor", "local", "roa") if claim in WITH_FLOOR else ("local", "roa")
+    P = read_P(data["lyapunov"], n, claim)
+    named_levels = () if claim == REACHES else ("floor", "local", "roa") if claim in WITH_FLOOR else ("local", "roa")
     levels = keys(data["levels"], "levels", *named_levels)
-    *floor, inner, outer = (binary64(levels[name], f"levels.{name}") for name in named_levels)
+    *floor, inner, outer = [binary64(levels[name], f"levels.{name}") for name in named_levels] or [math.nan] * 2
     least = floor[0] if floor else None
     further = beyond is not None
     longer = sample is not None and not plant.dynamics.calls  # a series goes through no network
-    evidence = read_evidence(data["evidence"], n, len(plant.uncertain), claim, longer, further)
-    replayed = isinstance(evidence, Tree) or (simple and not further)
-    require(replayed, "format", "evidence.kind", "a rate, a sample, discrete time and another set must be replayed")
-    return Certificate(claim, rate, sample, start, centre, beyond, plant, policy, P, least, inner, outer, evidence)
+    evidence = read_evidence(
+        data["evidence"], n, len(plant.uncertain), claim, longer, further, ranked=ranks is not None
+    )
+    replayed = not isinstance(evidence, Trusted) or (simple and not further and keep is None)
+    words = "a rate, a sample, discrete time, another set and constraints must be replayed"
+    require(replayed, "format", "evidence.kind", words)
+    more = (start, centre, beyond, ranks, keep, target)
+    return Certificate(claim, rate, sample, *more, plant, policy, P, least, inner, outer, evidence)
+
+
+def read_claim(value: Any) -> dict[str, Any]:
+    """Its keys by its kind. A claim without V has no rate and no outer set, as if these were 0 and null."""
+    named = isinstance(value, dict) and value.get("kind") in CLAIMS
+    require(named, "format", "claim.kind", f"one of {', '.join(CLAIMS)} was expected")
+    if value["kind"] == REACHES:
+        said = keys(value, "claim", "kind", "sample", "target", "ranks", maybe=("keep",))
+        return {**said, "rate": (0.0).hex(), "outer": None}
+    more = {"enlarged": ("start",), "reached": ("start", "centre")}.get(value["kind"], ())
+    return keys(value, "claim", "kind", "rate", "sample", "outer", *more, maybe=("ranks", "keep"))
+
+
+def read_more(
+    said: Mapping[str, Any], plant: Plant, tube_or_outer: bool
+) -> tuple[Ranks | None, Equations | None, Equations | None]:
+    """`ranks`, `keep` and `target`, of which each may be missing."""
+    ranks = keep = target = None
+    if "ranks" in said:
+        steps = plant.discrete or said["sample"] is not None
+        require(steps, "format", "claim.ranks", "it was not expected in continuous time without a sample")
+        ranks = read_ranks(said["ranks"], plant.states)
+    if "keep" in said:
+        require(not tube_or_outer, "format", "claim.keep", "it was not expected with a tube or an outer set")
+        keep = read_expressions(said["keep"], "claim.keep", {*plant.states, *plant.inputs, *plant.uncertain})
+    if "target" in said:
+        target = read_expressions(said["target"], "claim.target", set(plant.states))
+    return ranks, keep, target
+
+
+def read_ranks(value: Any, states: tuple[str, ...]) -> Ranks:
+    at = "claim.ranks"
+    ranks = keys(value, at, "angles", "steps")
+    angles, steps = entries(ranks["angles"], f"{at}.angles"), ranks["steps"]
+    known = all(isinstance(name, str) and name in states for name in angles)
+    require(known and len(set(angles)) == len(angles), "format", f"{at}.angles", "different states were expected")
+    good = type(steps) is int and 1 <= steps <= MAX_RANK  # True is an int to isinstance
+    require(good, "format", f"{at}.steps", f"an integer from 1 to {MAX_RANK} was expected")
+    return Ranks(tuple(angles), steps)
+
+
+def read_expressions(value: Any, at: str, names: set[str]) -> Equations:
+    """A list of expressions that call no networks."""
+    nodes = entries(value, at)
+    require(1 <= len(nodes) <= MAX_EXPRESSIONS, "format", at, f"1 to {MAX_EXPRESSIONS} expressions are allowed")
+    return equations(nodes, names, at)
+
+
+def read_P(value: Any, n: int, claim: str) -> fmpq_mat:
+    if claim == REACHES:
+        require(value is None, "format", "lyapunov", f"null was expected with claim '{claim}'")
+        return fmpq_mat(0, 0)
+    lyapunov = keys(value, "lyapunov", "kind", "P")
+    require(lyapunov["kind"] == "quadratic", "format", "lyapunov.kind", "'quadratic' was expected")
+    return square(lyapunov["P"], "lyapunov.P", n)
 
 
 def read_rate(value: Any, claim: str) -> fmpq:

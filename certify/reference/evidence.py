@@ -21,6 +21,7 @@ MAX_SLABS = 10**4
 MAX_PARTS, MAX_CELLS = 64, 4096  # of one range; of all of them together
 MAX_ORDER = 8  # of a series in time
 WITH_TUBE = ("enlarged", "reached")  # claims about a set of starts that is no level set of V
+REACHES = "reaches"  # the claim without V
 WITH_FLOOR = ("practical", "nearby")  # claims about a set in which everything ends, {V <= c0}, and not the origin
 WORD = re.compile(r"[A-Za-z0-9_.+-]{1,80}")
 
@@ -89,10 +90,22 @@ class Covering:
 
 
 @dataclass(frozen=True)
+class Ranking:
+    """A tree over the box from `lo` to `hi`, whose leaves have two bytes of `ranks` each and one of `steps`."""
+
+    lo: array[float]
+    hi: array[float]
+    tree: bytes
+    ranks: bytes
+    steps: bytes
+
+
+@dataclass(frozen=True)
 class Tree:
     """Evidence that can be replayed. `tube` belongs to claims that have a start, `contraction` to `nearby`.
 
-    `covering`, which is `outer` in the file, belongs to claims that go beyond {V <= c2} by another function.
+    `covering`, which is `outer` in the file, belongs to claims that go beyond {V <= c2} by another function, `ranking`,
+    which is `ranks`, to those that go beyond it by ranks of boxes.
 
     Claims that have a floor may do without a `ball`.
     `cells` has a number for each uncertain quantity: into how many equal parts rule `local` cuts its range. `order` is
@@ -108,6 +121,15 @@ class Tree:
     contraction: Contraction | None
     tube: tuple[Slab, ...]
     covering: Covering | None
+    ranking: Ranking | None
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """Evidence for a claim without V, that can be replayed as well."""
+
+    order: int
+    ranking: Ranking
 
 
 @dataclass(frozen=True)
@@ -118,15 +140,20 @@ class Trusted:
     version: str
 
 
-def read_evidence(value: Any, n: int, k: int, claim: str, sampled: bool, further: bool) -> Tree | Trusted:
-    """`sampled` says whether a series in time may have an order above 1, `further` whether the claim has an `outer`."""
+def read_evidence(
+    value: Any, n: int, k: int, claim: str, sampled: bool, further: bool, ranked: bool
+) -> Tree | Ranked | Trusted:
+    """`sampled` says whether a series in time may have an order above 1, `further` whether the claim has an `outer`,
+    `ranked` whether it has `ranks`."""
+    if claim == REACHES:
+        return read_ranked(value, n, sampled)
     if isinstance(value, dict) and value.get("kind") == "trusted-solver":
         said = claim not in (*WITH_TUBE, "nearby")
         require(said, "format", "evidence.kind", f"claim '{claim}' must be replayed")
         require(k == 0, "format", "evidence.kind", "what is uncertain must be replayed")
         return read_trusted(value)
     names = ("kind", "T", "root", "tree", "order", "cells", "local", "contraction", "tube", "outer")
-    evidence = keys(value, "evidence", *names)
+    evidence = keys(value, "evidence", *names, *(("ranks",) if ranked else ()))
     require(evidence["kind"] == "partition-tree", "format", "evidence.kind", "an unknown kind")
     T, root = square(evidence["T"], "evidence.T", n), numbers(evidence["root"], "evidence.root", n)
     tree = decoded(evidence["tree"], "evidence.tree")
@@ -143,7 +170,21 @@ def read_evidence(value: Any, n: int, k: int, claim: str, sampled: bool, further
     moves = claim == "reached"
     slabs = tuple(read_slab(v, f"evidence.tube.{k}", n, moves) for k, v in enumerate(tube))
     covering = read_covering(evidence["outer"], n, further)
-    return Tree(T, root, tree, order, cells, ball, contraction, slabs, covering)
+    ranking = read_ranking(evidence["ranks"], n) if ranked else None
+    return Tree(T, root, tree, order, cells, ball, contraction, slabs, covering, ranking)
+
+
+def read_ranked(value: Any, n: int, sampled: bool) -> Ranked:
+    evidence = keys(value, "evidence", "kind", "order", "ranks")
+    require(evidence["kind"] == "ranks", "format", "evidence.kind", f"'ranks' was expected with claim '{REACHES}'")
+    return Ranked(read_order(evidence["order"], "evidence.order", sampled), read_ranking(evidence["ranks"], n))
+
+
+def read_ranking(value: Any, n: int) -> Ranking:
+    at = "evidence.ranks"
+    ranking = keys(value, at, "lo", "hi", "tree", "ranks", "steps")
+    lo, hi = (numbers(ranking[end], f"{at}.{end}", n) for end in ("lo", "hi"))
+    return Ranking(lo, hi, *(decoded(ranking[key], f"{at}.{key}") for key in ("tree", "ranks", "steps")))
 
 
 def read_covering(value: Any, n: int, further: bool) -> Covering | None:

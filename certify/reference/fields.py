@@ -8,6 +8,7 @@ import math
 import re
 import sys
 from array import array
+from collections.abc import Sequence
 from typing import Any
 
 from flint import fmpq, fmpq_mat
@@ -18,8 +19,9 @@ MAX_NAMES = 64
 IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
 
 
-def keys(value: Any, at: str, *names: str) -> dict[str, Any]:
-    good = isinstance(value, dict) and set(value) == set(names)
+def keys(value: Any, at: str, *names: str, maybe: Sequence[str] = ()) -> dict[str, Any]:
+    """An object with these keys, of which those that are `maybe` there may be missing."""
+    good = isinstance(value, dict) and set(names) <= set(value) <= {*names, *maybe}
     require(good, "format", at, f"an object with the keys {', '.join(names)} was expected")
     return dict(value)
 

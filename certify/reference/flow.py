@@ -13,7 +13,7 @@ enough.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -148,8 +148,10 @@ def beyond(x: Model, far: arb, turned: arb) -> Model:
     return replace(x, off=x.off + far, slack=x.slack + turned)
 
 
-def in_domain(c: Certificate, states: Sequence[arb], F: Sequence[arb], at: str) -> None:
+def in_domain(c: Certificate, states: Sequence[arb], F: Sequence[arb], at: str, free: Collection[str] = ()) -> None:
     """x_i + t f_i lies strictly inside for 0 <= t <= hi, so that phi does: it is x_i and t times a mean of f_i.
+
+    States that are `free` are not asked.
 
     By their ends: the product of two balls also holds what would be the least t f_i if t could be negative.
     """
@@ -157,7 +159,7 @@ def in_domain(c: Certificate, states: Sequence[arb], F: Sequence[arb], at: str) 
     for x, f, (lo, hi), name in zip(states, F, c.plant.domain, c.plant.states, strict=True):
         down, up = (period * arb(f.lower())).min(ZERO), (period * arb(f.upper())).max(ZERO)
         inside = arb(x.lower()) + down > arb(lo) and arb(x.upper()) + up < arb(hi)
-        require(inside, "flow", at, f"{name} is not certain to stay in the domain within a period")
+        require(inside or name in free, "flow", at, f"{name} is not certain to stay in the domain within a period")
 
 
 # ------------------------------------------------------------------------------------------------------------ on a leaf
@@ -165,16 +167,19 @@ def in_domain(c: Certificate, states: Sequence[arb], F: Sequence[arb], at: str) 
 
 @dataclass(frozen=True)
 class Moving:
-    """The numbers of a leaf by their names: `symbols` are models in d, `anything` what is uncertain without a symbol.
+    """The numbers of a leaf by their names, models in d, `anything` being what is uncertain without a symbol.
 
-    `bounds` are those of the |x_i| that count, and `called` gives the entries of calls.
+    `bounds` are those of the |x_i| that count, None where all do, and `free` names states whose domain is not asked.
+    The symbols of quantities, and those of calls behind them, begin at `first`; `called` gives the entries of calls.
     """
 
     states: Mapping[str, Taylor]
     inputs: Mapping[str, Taylor]
     uncertain: Mapping[str, Taylor]
     anything: Mapping[str, Taylor]
-    bounds: Sequence[arb]
+    bounds: Sequence[arb] | None
+    free: Collection[str]
+    first: int
     called: Called
 
 
@@ -192,9 +197,10 @@ def reached_from(c: Certificate, leaf: Moving, at: str) -> dict[str, Taylor]:
         ranges = [arb((-(-f).bound()).lower()).union(arb(f.bound().upper())) for f in F]
         most = [arb((hi * abs(v)).upper()) for v in ranges]
         if all(v < k for v, k in zip(most, far, strict=True)):
-            each = zip(leaf.states.values(), leaf.bounds, strict=True)
-            states = [within_both(x.c + (x.first + x.r) * SPREAD, w) for x, w in each]
-            in_domain(c, states, ranges, at)
+            states = [x.c + (x.first + x.r) * SPREAD for x in leaf.states.values()]
+            if leaf.bounds is not None:
+                states = [within_both(x, w) for x, w in zip(states, leaf.bounds, strict=True)]
+            in_domain(c, states, ranges, at, leaf.free)
             return dict(zip(names, map(widened, leaf.states.values(), most), strict=True))
         far = [MORE * v + LEAST for v in most]
     raise Refused("flow", at, "no bound of how far the state goes within a period was found")
@@ -214,7 +220,7 @@ def mean_on(
     c: Certificate, leaf: Moving, within: Mapping[str, Taylor], order: int, period: Taylor, at: str
 ) -> list[Taylor]:
     """G on a leaf, or a refusal; `period` is h, with a symbol of its own where it may be one of many."""
-    start, place = within if order == 1 else leaf.states, c.n + c.m
+    start = within if order == 1 else leaf.states
 
     def times_h(v: Taylor) -> Taylor:
         return v.scaled(period.c) if period.g is None else period * v
@@ -225,7 +231,7 @@ def mean_on(
         tail = later(c.plant.dynamics, leaf.states, within, held, constant, order, lambda v: v, times_h)
     except Refused as no:
         raise Refused("flow", at, no.detail) from None
-    x_1 = [f.averaged(range(place, place + c.k + c.plant.dynamics.entries)) for f in x_1]
+    x_1 = [f.averaged(range(leaf.first, leaf.first + c.k + c.plant.dynamics.entries)) for f in x_1]
     G = [f if t is None else f + t for f, t in zip(x_1, tail, strict=True)]
     require(all(g.is_finite() for g in G), "flow", at, "the series of F has no finite model")
     return G

@@ -1,4 +1,4 @@
-"""Rules `tree`, `ring`, `inputs` and `flow`: the leaves of the partition.
+"""Rules `tree`, `ring`, `inputs`, `flow` and `keep`: the leaves of the partition.
 
 The policy is enclosed on several leaves at a time.
 """
@@ -11,17 +11,15 @@ from itertools import islice
 
 from flint import arb, arb_mat, fmpq_mat
 
-from .affine import Form, OnBoxes, batch, called, clip
-from .balls import ZERO, beta, bounded_by_form, total, within_bounds
+from .affine import batch
+from .balls import ZERO, bounded_by_form, total, within_bounds
 from .document import Certificate
 from .evidence import Covering, Tree
-from .expressions import Call
-from .flow import Moving, mean_on, reached_from
-from .function import net_at_0
-from .networks import Map
+from .keep import kept
+from .motion import Motion, Stage
 from .rational import inverse_diagonal
-from .refusal import Refused, require
-from .taylor import Taylor, constant
+from .refusal import require
+from .taylor import Taylor, is_negative, kinks
 
 LEAF = 255
 MAX_WAITING = 4096  # boxes of the tree beside the one in hand
@@ -77,42 +75,29 @@ def cut(least: list[float], most: list[float], tree: bytes) -> Iterator[Box]:
 
 
 @dataclass(frozen=True)
-class Leaf:
-    """A box as z = centre + radius d with what is affine in d: x, 2 P x, and the inputs within an error.
-
-    `x` and `gradient` are lists [constant, coefficients of d]; `u` has (constant, coefficients of d, error).
-    """
+class Leaf(Stage):
+    """A box as z = centre + radius d with what is affine in d: x, the inputs within an error, and 2 P x."""
 
     box: Box
     centre: list[arb]
     radius: list[arb]
-    x: list[list[arb]]
     gradient: list[list[arb]]
-    u: list[tuple[arb, list[arb], arb]]
-
-    def ranges(self) -> list[tuple[arb, arb]]:
-        """The centre and the radius of each input's enclosure."""
-        return [(mid, total(abs(v) for v in slopes) + error) for mid, slopes, error in self.u]
 
 
-class Leaves:
+class Leaves(Motion):
     """Data and bounds shared by all leaves of a certificate."""
 
     def __init__(self, c: Certificate, T: fmpq_mat, S: fmpq_mat) -> None:
         if not isinstance(c.evidence, Tree):
             raise TypeError("a solver's word has no leaves")
-        self.c, self.n, self.calls = c, c.n, c.n + c.m + c.k  # the symbol of the first entry of a call
-        self.symbols = self.calls + c.plant.dynamics.entries + c.varies
-        self.order, self.alone = c.evidence.order, c.evidence.ball is None
-        self.step, self.steps = arb(c.step), c.step > 0
-        self.P, self.rate = arb_mat(c.P), arb(2 * c.rate)
         squares = inverse_diagonal(c.P, "lyapunov") if c.sample is not None else []
-        self.bounds = [(arb(c.outer) * arb(square)).sqrt() for square in squares]
+        super().__init__(c, c.n, c.evidence.order, [(arb(c.outer) * arb(square)).sqrt() for square in squares])
+        self.alone, self.step, self.steps = c.evidence.ball is None, arb(c.step), c.step > 0
+        self.P, self.rate = arb_mat(c.P), arb(2 * c.rate)
         self.T, self.PT2 = arb_mat(T), arb_mat(2 * (c.P * T))
         self.S = [arb(S[i, i]) for i in range(c.n)]
         self.cross = [(i, j, arb(2 * abs(S[i, j]))) for j in range(c.n) for i in range(j) if S[i, j] != 0]
         self.inner, self.outer = arb(c.inner), arb(c.outer)
-        self.shifts, self.offset = centred(c)
 
     # ------------------------------------------------------------------------------------------------- which leaves
 
@@ -135,7 +120,7 @@ class Leaves:
     def is_below(self, level: arb, box: Box) -> bool:
         return bool(self.diagonal_part(box.largest()) + self.cross_part(box) < level)
 
-    # --------------------------------------------------------------------------------------------------- the policy
+    # -------------------------------------------------------------------------------------------------- the box
 
     def enclose(self, some: Sequence[Box]) -> list[Leaf]:
         """Each leaf with its models of x, 2 P x and the policy."""
@@ -152,71 +137,18 @@ class Leaves:
         states, gradients, at = x.tolist(), (self.PT2 * z).tolist(), range(0, stride * len(some), stride)
         return [
             Leaf(
+                f"leaf {box.number}",
+                [row[k : k + stride] for row in states],
+                [row[b] for row in u],
                 box,
                 centres[b],
                 radii[b],
-                [row[k : k + stride] for row in states],
                 [row[k : k + stride] for row in gradients],
-                [row[b] for row in u],
             )
             for b, (box, k) in enumerate(zip(some, at, strict=True))
         ]
 
-    def policy(self, x: arb_mat, count: int) -> list[list[Form]]:
-        """For each input and each leaf, given x on the leaves; the network reads x from its origin."""
-        policy, algebra, rows = self.c.policy, OnBoxes(count), x.tolist()
-        first = algebra.shifted(algebra.given(rows), map(arb, policy.origin))
-        net = algebra.shifted(policy.network.run(algebra, first), self.shifts)
-        if policy.squash == "tanh":
-            net = algebra.map(Map((), self.c.m, "tanh"), net)
-        inputs = range(self.c.m)
-        return [[self.output(j, form) for form in forms] for j, forms in enumerate(algebra.forms(net, inputs))]
-
-    def output(self, j: int, squashed: Form) -> Form:
-        """Input j from the squash of the network's output."""
-        policy, (mid, slopes, error) = self.c.policy, squashed
-        scale, limits = arb(policy.scale[j]), policy.limits(j)
-        u = scale * mid + self.offset[j], [scale * v for v in slopes], abs(scale) * error
-        return u if limits is None else clip(u, arb(limits[0]), arb(limits[1]))
-
     # ----------------------------------------------------------------------------------------------------- the ring
-
-    def numbers(self, leaf: Leaf) -> Moving:
-        """Models by their names; an input's error and what is uncertain have a symbol each."""
-        n, plant = self.n, self.c.plant
-        states = {name: self.affine(row) for name, row in zip(plant.states, leaf.x, strict=True)}
-        inputs = {
-            name: self.moving(mid, slopes, n + j, error)
-            for j, (name, (mid, slopes, error)) in enumerate(zip(plant.inputs, leaf.u, strict=True))
-        }
-        uncertain, anything = dict[str, Taylor](), dict[str, Taylor]()
-        for j, (name, (lo, hi)) in enumerate(zip(plant.uncertain, plant.ranges, strict=True)):
-            middle, half = arb((lo + hi) / 2), arb((hi - lo) / 2)
-            uncertain[name] = self.moving(middle, [ZERO] * n, n + self.c.m + j, half)
-            anything[name] = Taylor(middle, r=half)
-        return Moving(states, inputs, uncertain, anything, self.bounds, self.called)
-
-    def called(self, call: Call, given: Sequence[Taylor]) -> list[Taylor]:
-        return called(call, given, self.symbols, self.calls)
-
-    def affine(self, row: list[arb]) -> Taylor:
-        """A list [constant, coefficients of d]."""
-        return Taylor(row[0], arb_mat(1, self.symbols, row[1:] + [ZERO] * (self.symbols - self.n)))
-
-    def F(self, leaf: Leaf) -> list[Taylor]:
-        """Models of f(x, pi(x), q), all of them finite."""
-        known, place = self.numbers(leaf), f"leaf {leaf.box.number}"
-        names = {**known.states, **known.inputs, **known.uncertain}
-        try:
-            result = self.c.plant.dynamics.evaluate(names, constant, self.called)
-        except Refused as no:
-            raise Refused(no.rule, place, no.detail) from None
-        require(all(f.is_finite() for f in result), "ring", place, "F has no finite model")
-        return result
-
-    def reached(self, leaf: Leaf) -> dict[str, Taylor]:
-        """Rule `flow`: the states of a whole period."""
-        return reached_from(self.c, self.numbers(leaf), f"leaf {leaf.box.number}")
 
     def G(self, leaf: Leaf, within: dict[str, Taylor] | None = None) -> list[Taylor]:
         """The states' change over a step, divided by its length: F in continuous time.
@@ -228,20 +160,7 @@ class Leaves:
             if not self.c.plant.discrete:
                 return F
             return [f + -self.affine(row) for f, row in zip(F, leaf.x, strict=True)]
-        return mean_on(self.c, self.numbers(leaf), within, self.order, self.period(), f"leaf {leaf.box.number}")
-
-    def period(self) -> Taylor:
-        """With the last symbol, where it may be one of many."""
-        lo, hi = self.c.sample or (self.c.step, self.c.step)
-        middle = arb((lo + hi) / 2)
-        if not self.c.varies:
-            return Taylor(middle)
-        return self.moving(middle, [ZERO] * self.n, self.symbols - 1, arb((hi - lo) / 2))
-
-    def moving(self, mid: arb, slopes: list[arb], symbol: int, size: arb) -> Taylor:
-        """mid + slopes.d + size times a symbol of its own."""
-        own = [size if i == symbol else ZERO for i in range(self.n, self.symbols)]
-        return Taylor(mid, arb_mat(1, self.symbols, slopes + own))
+        return self.mean(leaf, within)
 
     def D(self, leaf: Leaf, within: dict[str, Taylor] | None = None) -> Taylor:
         """(2 P x + h P G)'G: Vdot in continuous time. What V changes by over a step, by its length.
@@ -295,36 +214,8 @@ class Leaves:
         return bool(self.diagonal_part(box.least()) - self.cross_part(box) >= self.inner)
 
 
-def centred(c: Certificate) -> tuple[list[arb], list[arb]]:
-    """The shift by which centring changes the network's output, and the offset with what it adds to that."""
-    policy, nothing, offset = c.policy, [ZERO] * c.m, [arb(v) for v in c.policy.offset]
-    if policy.centre == "none":
-        return nothing, offset
-    at_0 = net_at_0(c)
-    if policy.centre == "preactivation":
-        return [at - v for v, at in zip(at_0, beta(c), strict=True)], offset
-    each = zip(policy.scale, at_0, c.plant.u_eq, strict=True)
-    squashed = policy.squash == "tanh"
-    return nothing, [arb(u_eq) - arb(s) * (v.tanh() if squashed else v) for s, v, u_eq in each]
-
-
-def is_negative(D: Taylor, slacks: Sequence[Taylor]) -> bool:
-    """True if D, or D + k times one of the others for some k > 0, is certainly negative."""
-    if D.is_negative():
-        return True
-    return any(k > 0 and (D + slack.scaled(k)).is_negative() for slack in slacks for k in kinks(D, slack))
-
-
-def kinks(D: Taylor, slack: Taylor) -> list[arb]:
-    """Each k at which a coefficient of the first order vanishes in D + k slack."""
-    if D.g is None or slack.g is None:
-        return []
-    each = zip(D.g.entries(), slack.g.entries(), strict=True)
-    return [-(g / w).mid() for g, w in each if not w.is_zero()]
-
-
 def check_leaves(leaves: Leaves, evidence: Tree) -> None:
-    """Rules `inputs`, `flow` and `ring`; in each batch of leaves they are taken in this order.
+    """Rules `inputs`, `flow`, `keep` and `ring`; in each batch of leaves they are taken in this order.
 
     An inside leaf has been covered by rule `local` where there is a ball. Without one nothing has: there the inputs are
     asked, and in continuous time that F has a finite model, but where time has steps that V stays below c0.
@@ -339,6 +230,9 @@ def check_leaves(leaves: Leaves, evidence: Tree) -> None:
             good = bounded or within_bounds(c, leaf.ranges())
             require(good, "inputs", f"leaf {leaf.box.number}", "an input is not certain to stay in its bounds")
         reached = [None if c.sample is None else leaves.reached(leaf) for leaf in enclosed]
+        if c.keep is not None:
+            for leaf, within in zip(enclosed, reached, strict=True):
+                kept(leaves, leaf, within, [Taylor(leaves.outer) + -leaves.V(leaf)])
         for leaf, within in zip(enclosed, reached, strict=True):
             if leaves.is_inside(leaf.box) and not leaves.steps:
                 leaves.F(leaf)

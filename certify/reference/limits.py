@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from .document import Certificate
-from .evidence import Covering, Tree
+from .evidence import Covering, Ranked, Tree, Trusted
 from .expressions import Equations
 from .networks import Affine, Clip, Map, Network, Observe, Product, Step
 from .rational import bits
@@ -152,11 +152,12 @@ class Sizes:
 def sizes_of(c: Certificate) -> Sizes:
     f, policy = c.plant.dynamics, c.policy.network
     y, z, a = c.k + c.varies, f.entries, len(f.steps) + observing(policy, *called(f))
+    a += sum(len(more.steps) for more in (c.keep, c.target) if more is not None)
     return Sizes(c.n, c.m, z, c.n + c.m + y + z, c.n + (c.claim == "reached"), y, a, nets(called(f), policy))
 
 
-def asked_of_leaves(c: Certificate, evidence: Tree) -> bool:
-    return evidence.ball is None or c.inner != c.outer
+def asked_of_leaves(c: Certificate, evidence: Tree | Ranked) -> bool:
+    return isinstance(evidence, Tree) and (evidence.ball is None or c.inner != c.outer)
 
 
 def evaluations(c: Certificate, order: int) -> int:
@@ -171,13 +172,16 @@ def numbers(c: Certificate) -> int:
     """An estimate of how many numbers are held at once."""
     z, evidence = sizes_of(c), c.evidence
     count, square = 4 * z.nets.weights, (z.s + 1) ** 2
-    if not isinstance(evidence, Tree):
+    if isinstance(evidence, Trusted):
         return count
-    order = max(evidence.order, evidence.ball.order if evidence.ball else 1)
+    ball = evidence.ball if isinstance(evidence, Tree) else None
+    order = max(evidence.order, ball.order if ball else 1)
     values = z.a * (1 if c.sample is None else 4 * order) + 2 * z.n + 8
-    if asked_of_leaves(c, evidence) or c.beyond is not None:
-        count += values * square + 2**14 * (z.n + z.m + z.z + z.nets.read + 8 * z.nets.waiting * (z.s + z.m + z.z))
-    if evidence.ball or evidence.contraction or evidence.tube:
+    if evidence.ranking is not None:
+        count += 2**4 * len(evidence.ranking.tree) + held_on_leaves(with_errors(z), values)
+    elif asked_of_leaves(c, evidence) or c.beyond is not None:
+        count += held_on_leaves(z, values)
+    if isinstance(evidence, Tree) and (ball or evidence.contraction or evidence.tube):
         count += values * (z.t + z.d * z.y + z.m + z.z) + z.d**4 // 4
         count += sum(4 * p * (z.d + g) for p, _, g in z.nets.shapes) + 3 * z.nets.units * z.t
     if c.beyond is not None:
@@ -189,13 +193,25 @@ def numbers(c: Certificate) -> int:
     return count
 
 
+def held_on_leaves(z: Sizes, values: int) -> int:
+    return values * (z.s + 1) ** 2 + 2**14 * (z.n + z.m + z.z + z.nets.read + 8 * z.nets.waiting * (z.s + z.m + z.z))
+
+
+def with_errors(z: Sizes) -> Sizes:
+    """The same with a symbol more for each state."""
+    return replace(z, s=z.s + z.n)
+
+
 # ------------------------------------------------------------------------------------------------------ the operations
 
 
 def operations(c: Certificate) -> int:
     """Elementary operations on numbers, in all."""
     z, evidence = sizes_of(c), c.evidence
-    work = 2**15 * z.a + z.nets.folding + inverting(z.n, bits(c.P))
+    work = 2**15 * z.a + z.nets.folding
+    if isinstance(evidence, Ranked):
+        return work + in_ranks(c, z, evidence)
+    work += inverting(z.n, bits(c.P))
     if c.ends_at_origin:
         work += 2**12 * z.nets.weights + 2**19 * nets(called(c.plant.dynamics)).weights
     if not isinstance(evidence, Tree):
@@ -203,10 +219,25 @@ def operations(c: Certificate) -> int:
     of_S = min(2 * bits(evidence.T) + bits(c.P) + 16, 2**16 // z.n)
     work += inverting(z.n, of_S) + 2**8 * len(evidence.tree)
     if asked_of_leaves(c, evidence):
-        leaves, order = evidence.tree.count(LEAF), evidence.order
-        models, calls = z.a * evaluations(c, order) + z.n**2 + 4 * z.n, z.n * z.s**2 + 160 * z.nets.read
-        work += on_boxes(leaves, z.n, models, z.a * (order + 1), z.s, calls) + on_leaves(c, z, leaves, order)
-    return work + on_balls(c, z, evidence) + in_tube(c, z, evidence) + beyond(c, z, evidence)
+        leaves = evidence.tree.count(LEAF)
+        work += models_on_leaves(c, z, leaves, evidence.order) + on_leaves(c, z, leaves, evidence.order)
+    return work + on_balls(c, z, evidence) + in_tube(c, z, evidence) + beyond(c, z, evidence) + in_ranks(c, z, evidence)
+
+
+def models_on_leaves(c: Certificate, z: Sizes, leaves: int, order: int) -> int:
+    models, calls = z.a * evaluations(c, order) + z.n**2 + 4 * z.n, z.n * z.s**2 + 160 * z.nets.read
+    return on_boxes(leaves, z.n, models, z.a * (order + 1), z.s, calls)
+
+
+def in_ranks(c: Certificate, z: Sizes, evidence: Tree | Ranked) -> int:
+    """Operations for the leaves with ranks and all their steps."""
+    ranking = evidence.ranking
+    if ranking is None:
+        return 0
+    leaves, steps, wider = ranking.tree.count(LEAF), sum(ranking.steps), with_errors(z)
+    work = 2**9 * len(ranking.tree) + 2**17 * leaves
+    work += models_on_leaves(c, wider, steps + leaves, evidence.order)
+    return work + on_leaves(c, wider, steps, evidence.order)
 
 
 def inverting(n: int, length: int) -> int:

@@ -16,13 +16,14 @@ from .document import Certificate, Interval
 from .evidence import Ball
 from .fields import exact
 from .flow import steps_on
+from .keep import kept_on_ball
 from .loop import Field, Loop
 from .rational import identity
 from .refusal import require
 
 
 def local(loop: Loop, ball: Ball, parts: Sequence[int]) -> None:
-    """Check the file's ball first, then rules `inputs` and `flow`, then the decrease in each cell."""
+    """Check the file's ball first, then rules `inputs`, `flow` and `keep`, then the decrease in each cell."""
     c: Certificate = loop.c
     holds = contains(ball, c.P, exact(c.inner) * identity(c.n))
     require(holds, "local", "ball", "it does not contain {V <= c1}: J'PJ - c1 I is not positive definite")
@@ -37,6 +38,8 @@ def local(loop: Loop, ball: Ball, parts: Sequence[int]) -> None:
             return decreases(ball, c.P, R, G, h)
         return decreases_around(ball, c.P, R, G, h, exact(level))
 
+    if c.keep is not None:
+        kept_on_ball(steps, cells(c.plant.ranges, parts), "ball")
     for number, cell in enumerate(cells(c.plant.ranges, parts)):
         at = f"cell {number}" if parts else "ball"
         everywhere = whatever_y(steps.change(cell, "local", at), falls)

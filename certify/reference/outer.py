@@ -19,9 +19,9 @@ from .document import Certificate
 from .evidence import Covering, Tree
 from .fields import exact
 from .function import Models
-from .leaves import Box, Leaf, Leaves, boxes, cut, is_negative, structure
+from .leaves import Box, Leaf, Leaves, boxes, cut, structure
 from .refusal import Refused, require
-from .taylor import Taylor
+from .taylor import Taylor, is_negative
 
 RULE, FACES = "outer", "faces"
 

@@ -11,12 +11,14 @@ from . import rational
 from .balls import ON_LEAVES, PRECISION
 from .contraction import contraction
 from .document import Certificate, read
-from .evidence import WITH_TUBE, Trusted
+from .evidence import WITH_TUBE, Ranked, Tree, Trusted
 from .leaves import Leaves, check_leaves, structure
 from .limits import limits
 from .local import local
 from .loop import Loop
 from .outer import outer
+from .periodic import angles
+from .ranks import ranks
 from .refusal import Refused
 from .tube import tube
 
@@ -52,6 +54,9 @@ def judge(raw: bytes, operations: int | None = None) -> Verdict:
 
 def check(c: Certificate) -> int | None:
     """Every rule in its order; the number of leaves, or None where the evidence cannot be replayed."""
+    if isinstance(c.evidence, Ranked):
+        rational.centring(c)
+        return with_ranks(c, c.evidence)
     rational.levels(c)
     inverse = rational.inverse_diagonal(c.P, "lyapunov")
     if c.ends_at_origin:
@@ -81,4 +86,13 @@ def check(c: Certificate) -> int | None:
     if c.beyond is not None:
         with ctx.workprec(ON_LEAVES):
             outer(c, evidence)
+    if evidence.ranking is not None:
+        with_ranks(c, evidence)
     return leaves
+
+
+def with_ranks(c: Certificate, evidence: Tree | Ranked) -> int:
+    """Rules `angles` and `ranks`; the number of leaves that have a rank."""
+    angles(c)
+    with ctx.workprec(ON_LEAVES):
+        return ranks(c, evidence)

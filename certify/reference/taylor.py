@@ -251,3 +251,18 @@ def positive_part(v: arb) -> arb:
 
 def constant(q: fmpq) -> Taylor:
     return Taylor(arb(q))
+
+
+def is_negative(D: Taylor, slacks: Sequence[Taylor]) -> bool:
+    """True if D, or D + k times one of the others for some k > 0, is certainly negative."""
+    if D.is_negative():
+        return True
+    return any(k > 0 and (D + slack.scaled(k)).is_negative() for slack in slacks for k in kinks(D, slack))
+
+
+def kinks(D: Taylor, slack: Taylor) -> list[arb]:
+    """Each k at which a coefficient of the first order vanishes in D + k slack."""
+    if D.g is None or slack.g is None:
+        return []
+    each = zip(D.g.entries(), slack.g.entries(), strict=True)
+    return [-(g / w).mid() for g, w in each if not w.is_zero()]

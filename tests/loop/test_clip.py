@@ -37,7 +37,7 @@ from certify.loop.rigorous import eigenvalues, evaluate_policy
 from certify.provers.ball.local import prove_local
 from certify.provers.bounds import policy as producer
 from certify.provers.falsify import falsify
-from certify.reference import leaves as reference
+from certify.reference import affine as reference
 from certify.reference import rules as reference_rules
 from certify.report import render_html
 from tests.support import plain

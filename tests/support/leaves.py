@@ -20,7 +20,8 @@ def on_boxes(ring: Ring, centre: Array, radius: Array) -> tuple[list[Model], lis
     """Models of the states and of G on boxes (n, B) in the coordinates z, and the ends of the states in a period."""
     x = ring.states(centre, radius)
     states, held = ring.models(x, enclose_on_boxes(ring.net, x))
-    G, ends = ring.increment(states, held)
+    motion = ring.motion(states, held)
+    G, ends = motion.G, motion.ends
     return states, G, ends
 
 

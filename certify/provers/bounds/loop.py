@@ -26,14 +26,15 @@ class LoopModels(NamedTuple):
 def loop_models(
     system: System, x: Array, error: Array, mid: Array, slopes: Array, wide: Array, more: int = 0
 ) -> LoopModels:
-    """Models in n box coordinates, m input errors, the uncertain quantities, and `more` symbols that none of them uses.
+    """Models in k symbols (box coordinates and others), m input errors, the uncertain quantities, and `more` symbols
+    that none of them uses.
 
     Parameters
     ----------
-    x, error : (n, n + 1, B) and (n, B): states are `x[:, 0] + x[:, 1:] d` within the error.
-    mid, slopes, wide : (m, B), (m, n, B), (m, B): inputs are `mid + slopes d` within `wide`.
+    x, error : (n, k + 1, B) and (n, B): states are `x[:, 0] + x[:, 1:] d` within the error.
+    mid, slopes, wide : (m, B), (m, k, B), (m, B): inputs are `mid + slopes d` within `wide`.
     """
-    n, m, batch = system.n, system.m, x.shape[2]
+    n, m, batch = x.shape[1] - 1, system.m, x.shape[2]
     k = len(system.uncertain) + more
     zeros = np.zeros((n + m + k, n + m + k, batch))
     none = zeros[0, : m + k]

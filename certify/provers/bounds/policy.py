@@ -54,11 +54,11 @@ class Enclosure(ABC):
 
         Parameters
         ----------
-        x : (n, n + 1, B); x_error : (n, B)
+        x : (n, k + 1, B) in k symbols, by default the n box coordinates; x_error : (n, B)
 
         Returns
         -------
-        mid (m, B), slopes (m, n, B), error (m, B), share (n, B) : share says how much each axis spreads the
+        mid (m, B), slopes (m, k, B), error (m, B), share (k, B) : share says how much each axis spreads the
             first layer, which is where a split reduces the error.
         """
         h, error, share = self._in_pieces(x, x_error)
@@ -87,12 +87,12 @@ class Enclosure(ABC):
 
 
 class LayersEnclosure(Enclosure):
-    """Layers with one function between them, maybe behind an observation."""
+    """Layers with one function between them, maybe behind an observation; states are forms in so many symbols."""
 
     @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
-    def __init__(self, network: PolicyNetwork, centring: Sequence[Array]) -> None:
+    def __init__(self, network: PolicyNetwork, centring: Sequence[Array], symbols: int | None = None) -> None:
         super().__init__(network, centring)
-        self.n, self.observation, self.origin = network.n, network.network.observation, None
+        self.symbols, self.observation, self.origin = symbols or network.n, network.network.observation, None
         layers = network.network.affine
         weights, biases = [step.weight.copy() for step in layers], [step.bias.copy() for step in layers]
         magnitudes, bias_errors = [np.abs(w) for w in weights], [np.zeros_like(b) for b in biases]
@@ -127,7 +127,7 @@ class LayersEnclosure(Enclosure):
         try:
             layers = self._spare.pop()
         except IndexError:
-            layers = FusedLayers(self.layers, self.n, self.squash, self.scale, self.piece, self.activation)
+            layers = FusedLayers(self.layers, self.symbols, self.squash, self.scale, self.piece, self.activation)
         form, error, share = layers(loops(self.units * batch), x, x_error)
         self._spare.append(layers)
         if bent is not None:
@@ -174,10 +174,11 @@ def operations_of_policy(network: PolicyNetwork) -> float:
     return _ENTRY * of.entries * (network.n + network.m + 3) + _NEURON * of.units + observations
 
 
-def policy_enclosure(loop: ClosedLoop) -> Enclosure:
-    """Affine enclosures of pi."""
-    kind = LayersEnclosure if loop.network.network.is_observed_chain else StepsEnclosure
-    return kind(loop.network, centring_with_errors(loop))
+def policy_enclosure(loop: ClosedLoop, symbols: int | None = None) -> Enclosure:
+    """Affine enclosures of pi in so many symbols, by default one for each state."""
+    if loop.network.network.is_observed_chain:
+        return LayersEnclosure(loop.network, centring_with_errors(loop), symbols)
+    return StepsEnclosure(loop.network, centring_with_errors(loop))
 
 
 def clipped(mid: Array, slopes: Array, error: Array, least: Array, most: Array) -> tuple[Array, Array, Array]:

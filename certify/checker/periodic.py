@@ -1,0 +1,128 @@
+"""The rule for angles: the loop is the same after a full turn, but for the turn itself.
+
+Every number has a winding for each angle: by how many turns it grows where the angle grows by one. Sums and products
+with integers keep that; sin and cos do not see it; all else is asked only of numbers that do not wind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import reduce
+from operator import add
+
+from .case import Case, Failures
+from .expression import Call, Tape, evaluate
+from .networks import Affine, Algebra, Clip, Concat, Map, Observe, Product, Sum
+
+
+class Winds(Exception):
+    """A number that winds where none may."""
+
+
+@dataclass(frozen=True)
+class Winding:
+    """The turns of a number, one integer for each angle, and its value if it is a rational that stands there."""
+
+    turns: tuple[int, ...]
+    value: Fraction | None = None
+
+    def __add__(self, other: Winding) -> Winding:
+        return Winding(tuple(a + b for a, b in zip(self.turns, other.turns, strict=True)))
+
+    def __neg__(self) -> Winding:
+        return Winding(tuple(-a for a in self.turns))
+
+    def __mul__(self, other: Winding) -> Winding:
+        for factor, v in ((self, other), (other, self)):
+            if factor.value is not None and factor.value.denominator == 1:
+                return v.times(factor.value)
+        return self.still() + other.still()
+
+    def times(self, k: Fraction) -> Winding:
+        """The product with a number, an integer unless nothing winds."""
+        if k.denominator != 1:
+            return self.still()
+        return Winding(tuple(k.numerator * a for a in self.turns))
+
+    def still(self) -> Winding:
+        """A number that is a function of this one, which must not wind."""
+        if any(self.turns):
+            raise Winds
+        return Winding(self.turns)
+
+    def function(self, name: str) -> Winding:
+        """phi(v) for a function phi of the table."""
+        return Winding((0,) * len(self.turns)) if name in ("sin", "cos") else self.still()
+
+
+class Windings(Algebra[list[Winding]]):
+    """Networks of such numbers."""
+
+    def affine(self, step: Affine, v: list[Winding]) -> list[Winding]:
+        nothing = Winding((0,) * len(v[0].turns))
+        turning = [(i, x) for i, x in enumerate(v) if any(x.turns)]
+        return [
+            reduce(add, (x.times(Fraction(row[i])) for i, x in turning), nothing)
+            for row in step.weight[:, : len(v)].tolist()
+        ]
+
+    def map(self, step: Map, v: list[Winding]) -> list[Winding]:
+        return [x.function(step.function) for x in v]
+
+    def clip(self, step: Clip, v: list[Winding]) -> list[Winding]:
+        return [x.still() for x in v]
+
+    def sum(self, step: Sum, vectors: Sequence[list[Winding]]) -> list[Winding]:
+        return [reduce(add, entries) for entries in zip(*vectors, strict=True)]
+
+    def concat(self, step: Concat, vectors: Sequence[list[Winding]]) -> list[Winding]:
+        return [x for v in vectors for x in v]
+
+    def product(self, step: Product, v: list[Winding], w: list[Winding]) -> list[Winding]:
+        return [v[i % len(v)].still() + w[i % len(w)].still() for i in range(step.size)]
+
+    def observe(self, step: Observe, v: list[Winding]) -> list[Winding]:
+        return windings(step.tape, v)
+
+    def entries(self, call: Call, arguments: list[Winding]) -> list[Winding]:
+        """A call in equations."""
+        value = self.run(call.network, arguments)
+        return [value[i] for i in call.entries]
+
+
+def windings(tape: Tape, variables: Sequence[Winding]) -> list[Winding]:
+    """The windings of expressions."""
+    still = (0,) * len(variables[0].turns)
+    return evaluate(tape, lambda q: Winding(still, q), variables, Windings().entries)
+
+
+def is_periodic(case: Case) -> Failures:
+    """`angles`: policy, constraints, target and equations do not see a full turn; in discrete time a step adds it."""
+    c, angles = case.c, case.ranks.angles
+    n = len(c.states)
+    states = [Winding(tuple(int(i == j) for j in angles)) for i in range(n)]
+    still = Winding((0,) * len(angles))
+    others = [still] * (len(c.inputs) + len(c.uncertain))
+
+    def value(tape: Tape, read: list[Winding]) -> list[tuple[int, ...] | None]:
+        try:
+            return [v.turns for v in windings(tape, read)]
+        except Winds:
+            return [None]
+
+    try:
+        u = [v.still() for v in Windings().run(c.policy.network, states)]
+    except Winds:
+        yield "policy", "the policy must be periodic in each angle"
+        return 0
+    for name, tape, read in (("keep", c.keep, [*states, *others]), ("target", c.target, states)):
+        if tape is not None and any(turns != still.turns for turns in value(tape, read)):
+            yield f"claim.{name}", "must be periodic in each angle"
+    found = value(c.dynamics, [*states, *others])
+    wanted = [v.turns if c.discrete else still.turns for v in states]
+    for name, turns, asked in zip(c.states, found if len(found) == n else [None] * n, wanted, strict=True):
+        if turns != asked:
+            yield f"plant.dynamics, {name}", "must be periodic in each angle, but for the turn itself in discrete time"
+    return len(angles) + len(u)

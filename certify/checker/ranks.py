@@ -1,0 +1,275 @@
+"""The rules for ranks: from each leaf of a finite rank a few steps lead to the target, or to leaves of lower ranks.
+
+A leaf is followed step by step: its image is affine in the symbols of the leaf, within an error for each state, which
+is a symbol of its own in the next step. `Cover` decides which leaves the last image meets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import cached_property, reduce
+from itertools import product as every
+from operator import add
+
+import numpy as np
+from flint import fmpq_mat
+
+from .boxes import LEAF, batches, is_whole, middle
+from .case import Case, Failures
+from .document import MAX_RANK
+from .expression import evaluate
+from .near import TURN, Above, Array, Form, Near, near, size, within
+from .network import enclose_on_boxes, forms
+from .periodic import is_periodic
+from .processes import Batch
+from .ring import Moving
+from .taylor import Taylor, affine, combination, constants, upper_bound
+
+_MOST_NODES = 2**14  # of the tree that an image may meet
+Failing = tuple[str, str]  # a place, and what fails there
+
+
+@dataclass
+class Course:
+    """The first failure of each rule on a batch of leaves, and how often each was decided."""
+
+    failed: dict[str, Failing] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
+
+    def note(self, rule: str, hold: Array, numbers: Array, detail: str) -> None:
+        """Take in what a rule says of leaves."""
+        self.counts[rule] = self.counts.get(rule, 0) + len(numbers)
+        if rule not in self.failed and not np.all(hold):
+            self.failed[rule] = f"rank leaf {numbers[np.argmin(hold)]}", detail
+
+
+class Cover:
+    """The tree as arrays: which boxes meet only leaves of low ranks."""
+
+    def __init__(self, case: Case) -> None:
+        ranks = case.ranks
+        self.lo, self.hi, self.angles = ranks.lo, ranks.hi, ranks.angles
+        count = len(ranks.tree)
+        self.axis = np.frombuffer(ranks.tree, dtype=np.uint8).astype(np.int64)
+        self.split, self.right = np.zeros(count), np.zeros(count, dtype=np.int64)
+        self.most, self.least = np.full(count, MAX_RANK), np.zeros(count, dtype=np.int64)
+        self._fill(ranks.tree, ranks.lo.tolist(), ranks.hi.tolist(), two_bytes(ranks.ranks).tolist())
+
+    def _fill(self, tree: bytes, lo: list[float], hi: list[float], ranks: list[int]) -> None:
+        """Splits, upper halves, and the highest and the lowest rank below each node, in preorder."""
+        waiting, leaf = [(lo, hi, -1)], 0
+        for node, axis in enumerate(tree):
+            lo, hi, parent = waiting.pop()
+            if parent >= 0:
+                self.right[parent] = node
+            if axis == LEAF:
+                self.most[node] = self.least[node] = ranks[leaf]
+                leaf += 1
+                continue
+            left, right = hi.copy(), lo.copy()
+            left[axis] = right[axis] = self.split[node] = 0.5 * lo[axis] + 0.5 * hi[axis]
+            waiting += [(right, hi, node), (lo, left, -1)]
+        for node in range(len(tree) - 1, -1, -1):
+            if tree[node] != LEAF:
+                below = [node + 1, self.right[node]]
+                self.most[node], self.least[node] = max(self.most[below]), min(self.least[below])
+
+    def meets_low(self, lo: Array, hi: Array, bound: Array) -> Array:
+        """True on boxes (n, B), as places, that lie in the root box and meet no leaf of a rank above a bound (B,)."""
+        good = np.ones(len(bound), dtype=bool)
+        for low, high in self.places(lo, hi):
+            good &= self._descend(low, high, bound)
+        return good
+
+    def places(self, lo: Array, hi: Array) -> Iterator[tuple[Array, Array]]:
+        """Boxes in the root box whose union has all places of these; where there is nothing to move, the boxes."""
+        pieces = [self._turned(i, lo[i], hi[i]) for i in self.angles]
+        for chosen in every(*pieces):
+            low, high = lo.copy(), hi.copy()
+            for i, (a, b) in zip(self.angles, chosen, strict=True):
+                low[i], high[i] = a, b
+            yield low, high
+
+    def _turned(self, i: int, lo: Array, hi: Array) -> list[tuple[Array, Array]]:
+        """Two intervals in the root's that have all places of one in an angle; they may be the same, or all of it."""
+        least, most = self.lo[i], self.hi[i]
+        turns = np.rint((0.5 * lo + 0.5 * hi - (0.5 * least + 0.5 * most)) / TURN.value)
+        a, b = moved(lo, -turns)[0], moved(hi, -turns)[1]
+        one = np.ones_like(a)
+        after, before = moved(a, one)[0], moved(b, -one)[1]
+        low, high = a < least, b > most
+        known = np.where(
+            low, ~high & (b >= least) & (after >= least), np.where(high, (a <= most) & (before <= most), a <= b)
+        )
+        whole = np.isfinite(a) & np.isfinite(b) & ~known
+        first = np.where(whole, least, np.maximum(a, least)), np.where(whole, most, np.minimum(b, most))
+        second = np.where(low, after, least), np.where(low, most, before)
+        split = known & (low | high)
+        return [first, (np.where(split, second[0], first[0]), np.where(split, second[1], first[1]))]
+
+    def _descend(self, lo: Array, hi: Array, bound: Array) -> Array:
+        """Descend with all boxes at once; a box that has met too many nodes fails."""
+        inside = np.all((lo >= self.lo[:, None]) & (hi <= self.hi[:, None]), axis=0)
+        good, seen = inside.copy(), np.zeros(len(bound), dtype=np.int64)
+        box, node = np.flatnonzero(inside), np.zeros(int(np.sum(inside)), dtype=np.int64)
+        while len(box):
+            seen += np.bincount(box, minlength=len(bound))
+            good[box[(self.least[node] > bound[box]) | (seen[box] > _MOST_NODES)]] = False
+            further = (self.most[node] > bound[box]) & good[box]
+            box, node = box[further], node[further]
+            axis, split = self.axis[node], self.split[node]
+            below, above = lo[axis, box] <= split, hi[axis, box] >= split
+            box, node = np.append(box[below], box[above]), np.append(node[below] + 1, self.right[node[above]])
+        return good
+
+
+class Steps(Moving):
+    """Leaves and their images."""
+
+    def __init__(self, case: Case) -> None:
+        n, (lo, hi) = len(case.c.states), case.c.sample or (0, 0)
+        identity = fmpq_mat([[int(i == j) for j in range(n)] for i in range(n)])
+        super().__init__(case, np.eye(n), identity, lo < hi, n)
+        self.order, self.widest, self.ranks = case.order, [np.inf] * n, case.ranks
+        self.rank, self.count = two_bytes(self.ranks.ranks), np.frombuffer(self.ranks.steps, np.uint8).astype(np.int64)
+        self.straight = [i for i in range(n) if i not in self.ranks.angles]  # states that are no angles
+
+    @cached_property
+    def cover(self) -> Cover:
+        return Cover(self.case)
+
+    def leaves(self) -> Iterator[Batch]:
+        """The tree's leaves in batches; the cover is made before there are several processes."""
+        self.cover  # noqa: B018
+        return batches(self.ranks.tree, self.ranks.lo, self.ranks.hi, self.batch)
+
+    def examine(self, first: int, lo: Array, hi: Array) -> Course:
+        """The leaves with these corners, numbered from `first`, and all steps from them."""
+        course, numbers = Course(), first + np.arange(lo.shape[1])
+        centre, radius = middle(lo, hi)
+        x = Form(np.concatenate([centre[None], np.eye(self.n)[:, :, None] * radius]), Above(np.zeros_like(centre)))
+        rank, count = self.rank[numbers], self.count[numbers]
+        there = np.flatnonzero(rank == 0)
+        course.note("ranks", self.is_in_target(x[:, there]), numbers[there], "the leaf must lie in the target")
+        moving = np.flatnonzero((rank > 0) & (rank < MAX_RANK))
+        x = x[:, moving]
+        for k in range(1, int(np.max(count[moving], initial=0)) + 1):
+            left = np.flatnonzero(count[moving] >= k)
+            moving, x = moving[left], self.step(x[:, left], numbers[moving[left]], course)
+            done = np.flatnonzero(count[moving] == k)
+            arrived, bound = moving[done], rank[moving[done]] - k
+            hold = self.arrives(x[:, done], bound)
+            course.note("ranks", hold, numbers[arrived], "the steps may not lead to the target or to lower ranks")
+        return course
+
+    def step(self, x: Form, numbers: Array, course: Course) -> Form:
+        """The images of forms (n + 1, n, B) after a step, and what the rules say of it."""
+        n, c = self.n, self.c
+        whole = Form(np.concatenate([x.value, np.eye(n)[:, :, None] * x.error.top]))
+        u = enclose_on_boxes(self.net, whole)
+        if not self.case.bounded:
+            hold = [within(bounds, u.range[j]) for j, bounds in enumerate(c.input_bounds)]
+            course.note("inputs", np.all(hold, axis=0), numbers, "an input may leave its bounds")
+        states, inputs = self.models(whole, u)
+        motion = self.motion(states, inputs)
+        if c.sample:
+            hold = self.in_domain(*motion.ends)
+            course.note("flow", hold, numbers, "the state may leave the domain during a period")
+        if c.keep is not None:
+            hold = [upper_bound(g) < 0 for g in self.constraints(motion.states, motion.held)]
+            course.note("keep", np.all(hold, axis=0), numbers, "a constraint may be violated")
+        hold = self.in_domain(*whole.range.ends)
+        course.note("ranks", hold, numbers, "the state may leave the domain")
+        later = forms(self.after(states, motion.G))
+        course.note("ranks", np.all(np.isfinite(later.size.top), axis=0), numbers, "F may be undefined")
+        return Form(later.value[: n + 1], later.error + size(later.value[n + 1 :]).sum())
+
+    def after(self, states: list[Taylor], G: list[Taylor]) -> list[Taylor]:
+        """x + h G."""
+        if self.c.sample is None:
+            return [x + g for x, g in zip(states, G, strict=True)]
+        h = self.number(self.c.sample, self.symbols - 1, len(states[0].c))
+        return [x + h * g for x, g in zip(states, G, strict=True)]
+
+    def in_domain(self, lo: Array, hi: Array) -> Array:
+        """True on boxes with states strictly inside the domain, but for angles."""
+        inside = np.ones(lo.shape[1], dtype=bool)
+        for i in self.straight:
+            (_, least), (most, _) = (near(end).ends for end in self.c.domain[i])
+            inside &= (lo[i] > least) & (hi[i] < most)
+        return inside
+
+    def arrives(self, x: Form, bound: Array) -> Array:
+        """True where forms lie in the target, or meet leaves of ranks up to a bound (B,) alone."""
+        good = self.is_in_target(x)
+        left = np.flatnonzero(np.logical_not(good))
+        lo, hi = x[:, left].range.ends
+        good[left] = self.cover.meets_low(lo, hi, bound[left])
+        return good
+
+    def is_in_target(self, x: Form) -> Array:
+        """True where forms certainly lie in the target, as places."""
+        value, error = x.value.copy(), x.error
+        if self.c.target is None:
+            for i in self.ranks.angles:
+                turned = Near(value[0, i]) + TURN * Near(-np.rint(value[0, i] / TURN.value))
+                value[0, i], error = turned.value, error + Above(np.eye(self.n)[i][:, None] * turned.error.top)
+        g = np.concatenate([value[1:], np.eye(self.n)[:, :, None] * error.top])
+        states = [affine(value[0, i], g[:, i]) for i in range(self.n)]
+        hold: Array = np.all([upper_bound(v) <= 0 for v in self.beyond(states)], axis=0)
+        return hold
+
+    def beyond(self, states: list[Taylor]) -> list[Taylor]:
+        """What is at most 0 in the target: V - c2, or expressions."""
+        number = constants(states[0])
+        if self.c.target is not None:
+            return evaluate(self.c.target, number, states)
+        rows = [combination(*zip(row, states, strict=True)) for row in self.c.P.tolist()]
+        V = [x * row for x, row in zip(states, rows, strict=True)]
+        return [reduce(add, [*V, number(Fraction(-self.c.c2))])]
+
+
+def moved(x: Array, turns: Array) -> tuple[Array, Array]:
+    """Numbers moved by so many turns, rounded down and up."""
+    below, above = (Near(x) + TURN * Near(turns)).ends
+    return np.where(turns == 0, x, below), np.where(turns == 0, x, above)
+
+
+def two_bytes(octets: bytes) -> Array:
+    """Numbers of two bytes each, the lower first."""
+    return np.frombuffer(octets, dtype="<u2").astype(np.int64)
+
+
+def is_stated(case: Case) -> Failures:
+    """`ranks`: a root box with its tree, that has all places of an angle, and for each leaf a rank and its steps."""
+    ranks, n = case.ranks, len(case.c.states)
+    for i, (lo, hi) in enumerate(zip(ranks.lo.tolist(), ranks.hi.tolist(), strict=True)):
+        least = Fraction(TURN.ends[1]) if i in ranks.angles else Fraction(0)
+        if not Fraction(hi) - Fraction(lo) > least:
+            yield f"evidence.ranks, axis {i}", "lo must be below hi, in an angle by more than 2 pi"
+    leaves = yield from is_whole(ranks.tree, range(n), "ranks, ")
+    if (len(ranks.ranks), len(ranks.steps)) != (2 * leaves, leaves):
+        yield "evidence.ranks", f"there must be two bytes of ranks and one of steps for each of {leaves} leaves"
+    rank, count = two_bytes(ranks.ranks), np.frombuffer(ranks.steps, dtype=np.uint8).astype(np.int64)
+    resting = (rank == 0) | (rank == MAX_RANK)
+    hold = np.where(resting, count == 0, (count > 0) & (count <= rank) & (rank <= ranks.most))
+    if not np.all(hold):
+        yield f"rank leaf {np.argmin(hold)}", "its steps must be 0 at rank 0 and 65535, else 0 < steps <= rank <= most"
+    return leaves
+
+
+def _holds(rule: str) -> Callable[[Course], Failures]:
+    """The rule on a batch of leaves."""
+
+    def holds(course: Course) -> Failures:
+        if rule in course.failed:
+            yield course.failed[rule]
+        return course.counts.get(rule, 0)
+
+    return holds
+
+
+OF_RANKS = (("angles", is_periodic), ("ranks", is_stated))
+ON_RANK_LEAVES = tuple((rule, _holds(rule)) for rule in ("inputs", "flow", "keep", "ranks"))

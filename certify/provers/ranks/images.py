@@ -1,0 +1,203 @@
+"""Images of boxes after several steps of a loop: affine in the coordinates of the box, with an error for each state.
+
+The error of a state is a symbol of its own in the next step, so that the policy's answer to it cancels it there, as it
+does in truth; after the step all that is not of first order in the box's coordinates is an error again. FORMAT.md has
+the same in its chapter on ranks; boxes here are wider by more than rounding makes of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from certify.certificates.claims import Problem
+from certify.loop.expressions import Expression, evaluate
+from certify.loop.policies import bounded_by_form
+from certify.provers.bounds import Flow, Models, Taylor, loop_models, policy_enclosure, upper_bound
+from certify.provers.bounds.taylor import EPS, TINY
+from certify.provers.boxes.rule import input_bounds_kept, operations_of_box
+
+TURN = 2 * np.pi
+_WIDER = 1e-7  # share of a box's width, beyond all that two programs' rounding may differ by
+_ENDS = 1e-9  # relative distance kept from ends of the domain
+_WIDEST = 0.15  # share of the root box beyond which an image is of no use
+_MORE = 2.0  # operations of a step of a box, relative to those of a box's bound, whose symbols are fewer
+
+
+class Images(NamedTuple):
+    """Images of boxes (n, B) after so many steps each, K of them.
+
+    Parameters
+    ----------
+    lo, hi : (K, n, B); NaN where there is none that is of use.
+    there : (K, B), the image lies in the target.
+    inside : (B,), the box itself does.
+    steep : (n, B), by how much each axis of the box widens its first image that reaches far, relative to the root.
+    """
+
+    lo: Array
+    hi: Array
+    there: Mask
+    inside: Mask
+    steep: Array
+
+
+@dataclass(frozen=True)
+class Form:
+    """States `x[:, 0] + x[:, 1:] d` within e: (n, n + 1, B) and (n, B)."""
+
+    x: Array
+    e: Array
+
+    def at(self, index: Array | Mask) -> Form:
+        """Some of the boxes."""
+        return Form(self.x[..., index], self.e[..., index])
+
+    @property
+    def box(self) -> tuple[Array, Array]:
+        """Their corners, (n, B) each, a little farther out."""
+        reach = np.abs(self.x[:, 1:]).sum(1) + self.e
+        reach = reach * (1 + _WIDER) + 4 * EPS * np.abs(self.x[:, 0])
+        return self.x[:, 0] - reach, self.x[:, 0] + reach
+
+
+class Course:
+    """The course of boxes of states through a loop in discrete time, or with held inputs.
+
+    Parameters
+    ----------
+    problem, level : the loop, and the target {V <= level}.
+    angles : the states that are angles, by their numbers.
+    keep : expressions that have to stay negative.
+    root : the widths of the root box, (n,).
+    counts : the numbers of steps after which images are wanted, ascending.
+    """
+
+    piece = 512
+
+    def __init__(
+        self,
+        problem: Problem,
+        level: float,
+        angles: Sequence[int],
+        keep: Sequence[Expression],
+        root: Array,
+        counts: Sequence[int],
+        order: int = 2,
+    ) -> None:
+        loop = problem.loop
+        self.system, self.P, self.level, self.keep = loop.system, problem.V.P, level, tuple(keep)
+        self.angles, self.root, self.counts = tuple(angles), root, tuple(counts)
+        self.straight = [i for i in range(self.system.n) if i not in self.angles]
+        self.policy = policy_enclosure(loop, 2 * self.system.n)
+        self.dynamics = self.system.uncertain_dynamics()
+        self.check_inputs = not bounded_by_form(loop.network, self.system.input_bounds)
+        sample = self.system.sample
+        self.flow = None if sample is None else Flow(self.dynamics, sample, order)
+        self.ends = np.array([[float(end) for end in pair] for pair in self.system.domain]).T[:, :, None]
+        self.operations = _MORE * self.counts[-1] * operations_of_box(loop, order)
+
+    @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
+    def __call__(self, lo: Array, hi: Array, inner: float, outer: float) -> Images:
+        """The images of boxes lo, hi (n, B); levels of V do not matter here."""
+        n, batch, K = *lo.shape, len(self.counts)
+        centre = 0.5 * lo + 0.5 * hi
+        radius = np.maximum(hi - centre, centre - lo) * (1 + EPS)
+        slopes = np.eye(n)[:, :, None] * radius
+        form = Form(np.concatenate([centre[:, None], slopes], 1), np.zeros_like(centre))
+        found = Images(
+            np.full((K, n, batch), np.nan),
+            np.full((K, n, batch), np.nan),
+            np.zeros((K, batch), dtype=bool),
+            self.is_there(form),
+            np.abs(slopes).sum(0) / self.root[:, None],
+        )
+        left = np.flatnonzero(~found.inside)
+        form, widest = form.at(left), np.zeros(batch)
+        for count in range(1, self.counts[-1] + 1):
+            if not len(left):
+                break
+            form, kept = self.step(form)
+            below, above = form.box
+            width = ((above - below) / self.root[:, None]).max(0)
+            good = kept & (width < _WIDEST)
+            if count in self.counts:
+                k = self.counts.index(count)
+                there = good & self.is_there(form)
+                found.lo[k, :, left[good]], found.hi[k, :, left[good]] = below[:, good].T, above[:, good].T
+                found.there[k, left] = there
+                further = good & (width > widest[left])
+                steep = np.abs(form.x[:, 1:]) / self.root[:, None, None]
+                found.steep[:, left[further]] = steep.sum(0)[:, further]
+                widest[left] = np.maximum(widest[left], np.where(good, width, 0.0))
+                good &= ~there
+            left, form = left[good], form.at(good)
+        return found
+
+    def step(self, form: Form) -> tuple[Form, Mask]:
+        """The states after a step, and where (B,) all that is asked for on the way holds."""
+        n, system = self.system.n, self.system
+        x = np.concatenate([form.x, np.eye(n)[:, :, None] * form.e], 1)
+        error = 4 * EPS * np.abs(x).sum(1) + TINY
+        mid, slopes, wide, _ = self.policy(x, error)
+        below, above = form.box
+        kept = self.in_domain(below, above)
+        if self.check_inputs:
+            for inside, _ in input_bounds_kept(system, mid, slopes, wide):
+                kept = kept & inside
+        states, inputs, quantities = loop_models(
+            system, x, error, mid, slopes, wide, 0 if self.flow is None else self.flow.symbols
+        )
+        values = {**states, **inputs, **quantities}
+        here = list(states.values())
+        models = Models(here[0])
+        if self.flow is None:
+            known: dict[Expression, Taylor] = {}
+            after = [evaluate(expression, values, models, known) for expression in self.dynamics]
+        else:
+            mean = self.flow(states, inputs, quantities, 2 * n + system.m)
+            after = [v + self.flow.times_period(rate) for v, rate in zip(here, mean.G, strict=True)]
+            most = self.flow.most
+            down, up = below + most * np.minimum(mean.least, 0.0), above + most * np.maximum(mean.most, 0.0)
+            kept = kept & mean.exists & self.in_domain(down, up)
+            far = most * np.maximum(np.abs(mean.least), np.abs(mean.most)) * (1 + _WIDER)
+            moved = {s: Taylor(v.c, v.g, v.Q, v.r + own) for (s, v), own in zip(states.items(), far, strict=True)}
+            values = {**moved, **inputs, **quantities}
+        for expression in self.keep:
+            kept = kept & (upper_bound(evaluate(expression, values, models, {}))[0] < 0)
+        return _form(after, n), kept & np.all([np.isfinite(v.c + v.radius()) for v in after], axis=0)
+
+    def in_domain(self, below: Array, above: Array) -> Mask:
+        """True on boxes (n, B) inside the domain, but for angles."""
+        inside = np.ones(below.shape[1], dtype=bool)
+        for i in self.straight:
+            low, high = self.ends[:, i]
+            slack = _ENDS * (np.abs(low) + np.abs(high))
+            inside &= (below[i] > low + slack) & (above[i] < high - slack)
+        return inside
+
+    def is_there(self, form: Form) -> Mask:
+        """True where the states lie in the target, as places."""
+        n, x = self.system.n, form.x.copy()
+        for i in self.angles:
+            x[i, 0] -= TURN * np.rint(x[i, 0] / TURN)
+        error = 8 * EPS * (np.abs(form.x).sum(1) + TURN) + TINY
+        g = np.concatenate([x[:, 1:], np.eye(n)[:, :, None] * form.e], 1)
+        zeros = np.zeros((2 * n, 2 * n, x.shape[2]))
+        states = [Taylor(x[i, 0], g[i], zeros, error[i]) for i in range(n)]
+        rows = Models(states[0]).combined(self.P, states)
+        V = states[0] * rows[0]
+        for state, row in zip(states[1:], rows[1:], strict=True):
+            V = V + state * row
+        there: Mask = upper_bound(V.shifted(-self.level))[0] < -_ENDS * self.level
+        return there
+
+
+def _form(models: Sequence[Taylor], n: int) -> Form:
+    """The part of models that is of first order in the first n symbols; all else is an error."""
+    x = np.stack([np.concatenate([v.c[None], v.g[:n]]) for v in models])
+    e = np.stack([np.abs(v.g[n:]).sum(0) + np.abs(v.Q).sum((0, 1)) + v.r for v in models])
+    return Form(x, e * (1 + 1e-12))

@@ -1,0 +1,62 @@
+"""Rule `keep`: expressions in states, inputs and uncertain quantities that are negative wherever the loop is.
+
+With a sample they are so at all times of a period, in which the inputs are held: then they are taken at the states of
+the whole period, and what is uncertain may be any number of its range at each place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from .document import Interval
+from .flow import Steps
+from .model import Model
+from .motion import Motion, Stage
+from .refusal import Refused, require
+from .taylor import Taylor, constant, is_negative
+
+RULE = "keep"
+
+
+def kept(motion: Motion, at: Stage, within: Mapping[str, Taylor] | None, slacks: Sequence[Taylor]) -> None:
+    """The rule on a box, or where on it each of some slacks is not negative.
+
+    With a sample `within` are the states of the whole period.
+    """
+    expressions, known = motion.c.keep, motion.numbers(at)
+    if expressions is None:
+        return
+    names = {**known.states, **known.inputs, **known.uncertain}
+    if within is not None:
+        names |= {**within, **known.anything}
+    try:
+        values: list[Taylor] = expressions.evaluate(names, constant)
+    except Refused as no:
+        raise Refused(RULE, at.place, no.detail) from None
+    for i, g in enumerate(values):
+        holds = g.is_finite() and is_negative(g, slacks)
+        require(holds, RULE, at.place, f"expression {i} is not certain to be negative")
+
+
+def kept_on_ball(steps: Steps, cells: Iterable[Sequence[Interval]], at: str) -> None:
+    """The rule on a ball, for each cell of what is uncertain."""
+    loop, known = steps.loop, steps.known
+    if steps.within is not None:
+        negative_on_ball(steps, {**known.names, **steps.within, **loop.anything(known)}, at)
+        return
+    for cell in cells:
+        negative_on_ball(steps, {**known.names, **loop.varying(known, cell)}, at)
+
+
+def negative_on_ball(steps: Steps, names: Mapping[str, Any], at: str) -> None:
+    expressions = steps.loop.c.keep
+    if expressions is None:
+        return
+    try:
+        values: list[Model] = expressions.evaluate(names, steps.known.constant)
+    except Refused as no:
+        raise Refused(RULE, at, no.detail) from None
+    for i, g in enumerate(values):
+        holds = g.is_finite() and bool(g.v + g.reach < 0)
+        require(holds, RULE, at, f"expression {i} is not certain to be negative")

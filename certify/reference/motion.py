@@ -1,0 +1,144 @@
+"""The closed loop on boxes of states that are affine in some symbols: the policy, and models of what a step does.
+
+A leaf of the partition has a symbol for each coordinate. A box that some steps have moved has one more for each state,
+for all of it that is not affine in those of the leaf.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+from flint import arb, arb_mat
+
+from .affine import Form, OnBoxes, called, clip
+from .balls import ZERO, beta, total
+from .document import Certificate
+from .expressions import Call
+from .flow import Moving, mean_on, reached_from
+from .function import net_at_0
+from .networks import Map
+from .refusal import Refused, require
+from .taylor import Taylor, constant
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A box that `place` names: `x` are lists [constant, coefficients of d], `u` the inputs' forms within errors."""
+
+    place: str
+    x: list[list[arb]]
+    u: list[Form]
+
+    def ranges(self) -> list[tuple[arb, arb]]:
+        """The centre and the radius of each input's enclosure."""
+        return [(mid, total(abs(v) for v in slopes) + error) for mid, slopes, error in self.u]
+
+
+class Motion:
+    """Models in `d` symbols of the states, with one more for each input's error, uncertain quantity, entry of a call,
+    and for a period that may be one of many, in this order.
+
+    Refusals are of the rule `rule`, where it is not `inputs` or `flow`. With a sample `free` are states whose domain is
+    not asked, and of the others no |x_i| counts beyond its bound, where there are `bounds`.
+    """
+
+    rule = "ring"
+
+    def __init__(
+        self, c: Certificate, d: int, order: int, bounds: Sequence[arb] | None = None, free: Collection[str] = ()
+    ) -> None:
+        self.c, self.n, self.d = c, c.n, d
+        self.quantities = d + c.m
+        self.calls = self.quantities + c.k
+        self.symbols = self.calls + c.plant.dynamics.entries + c.varies
+        self.order, self.bounds, self.free = order, bounds, free
+        self.shifts, self.offset = centred(c)
+
+    # --------------------------------------------------------------------------------------------------- the policy
+
+    def policy(self, x: arb_mat, count: int) -> list[list[Form]]:
+        """For each input and each leaf, given x on the leaves; the network reads x from its origin."""
+        policy, algebra, rows = self.c.policy, OnBoxes(count), x.tolist()
+        first = algebra.shifted(algebra.given(rows), map(arb, policy.origin))
+        net = algebra.shifted(policy.network.run(algebra, first), self.shifts)
+        if policy.squash == "tanh":
+            net = algebra.map(Map((), self.c.m, "tanh"), net)
+        inputs = range(self.c.m)
+        return [[self.output(j, form) for form in forms] for j, forms in enumerate(algebra.forms(net, inputs))]
+
+    def output(self, j: int, squashed: Form) -> Form:
+        """Input j from the squash of the network's output."""
+        policy, (mid, slopes, error) = self.c.policy, squashed
+        scale, limits = arb(policy.scale[j]), policy.limits(j)
+        u = scale * mid + self.offset[j], [scale * v for v in slopes], abs(scale) * error
+        return u if limits is None else clip(u, arb(limits[0]), arb(limits[1]))
+
+    # --------------------------------------------------------------------------------------------------- the models
+
+    def numbers(self, at: Stage) -> Moving:
+        """Models by their names; an input's error and what is uncertain have a symbol each."""
+        plant = self.c.plant
+        states = {name: self.affine(row) for name, row in zip(plant.states, at.x, strict=True)}
+        inputs = {
+            name: self.moving(mid, slopes, self.d + j, error)
+            for j, (name, (mid, slopes, error)) in enumerate(zip(plant.inputs, at.u, strict=True))
+        }
+        uncertain, anything = dict[str, Taylor](), dict[str, Taylor]()
+        for j, (name, (lo, hi)) in enumerate(zip(plant.uncertain, plant.ranges, strict=True)):
+            middle, half = arb((lo + hi) / 2), arb((hi - lo) / 2)
+            uncertain[name] = self.moving(middle, [ZERO] * self.d, self.quantities + j, half)
+            anything[name] = Taylor(middle, r=half)
+        return Moving(states, inputs, uncertain, anything, self.bounds, self.free, self.quantities, self.called)
+
+    def called(self, call: Call, given: Sequence[Taylor]) -> list[Taylor]:
+        return called(call, given, self.symbols, self.calls)
+
+    def affine(self, row: list[arb]) -> Taylor:
+        """A list [constant, coefficients of d]."""
+        return Taylor(row[0], arb_mat(1, self.symbols, row[1:] + [ZERO] * (self.symbols - self.d)))
+
+    def F(self, at: Stage) -> list[Taylor]:
+        """Models of f(x, pi(x), q), all of them finite."""
+        known = self.numbers(at)
+        names = {**known.states, **known.inputs, **known.uncertain}
+        try:
+            result = self.c.plant.dynamics.evaluate(names, constant, self.called)
+        except Refused as no:
+            raise Refused(self.rule, at.place, no.detail) from None
+        require(all(f.is_finite() for f in result), self.rule, at.place, "F has no finite model")
+        return result
+
+    def reached(self, at: Stage) -> dict[str, Taylor]:
+        """Rule `flow`: the states of a whole period."""
+        return reached_from(self.c, self.numbers(at), at.place)
+
+    def mean(self, at: Stage, within: dict[str, Taylor]) -> list[Taylor]:
+        """The mean of f over a period in which the states are `within`."""
+        return mean_on(self.c, self.numbers(at), within, self.order, self.period(), at.place)
+
+    def period(self) -> Taylor:
+        """With the last symbol, where it may be one of many."""
+        lo, hi = self.c.sample or (self.c.step, self.c.step)
+        middle = arb((lo + hi) / 2)
+        if not self.c.varies:
+            return Taylor(middle)
+        return self.moving(middle, [ZERO] * self.d, self.symbols - 1, arb((hi - lo) / 2))
+
+    def moving(self, mid: arb, slopes: list[arb], symbol: int, size: arb) -> Taylor:
+        """mid + slopes.d + size times a symbol of its own."""
+        own = [size if i == symbol else ZERO for i in range(self.d, self.symbols)]
+        return Taylor(mid, arb_mat(1, self.symbols, slopes + own))
+
+
+def centred(c: Certificate) -> tuple[list[arb], list[arb]]:
+    """The shift by which centring changes the network's output, and the offset with what it adds to that."""
+    policy, nothing, offset = c.policy, [ZERO] * c.m, [arb(v) for v in c.policy.offset]
+    if policy.centre == "none":
+        return nothing, offset
+    at_0 = net_at_0(c)
+    if policy.centre == "preactivation":
+        return [at - v for v, at in zip(at_0, beta(c), strict=True)], offset
+    each = zip(policy.scale, at_0, c.plant.u_eq, strict=True)
+    squashed = policy.squash == "tanh"
+    return nothing, [arb(u_eq) - arb(s) * (v.tanh() if squashed else v) for s, v, u_eq in each]

@@ -1,0 +1,256 @@
+"""Rules `ranks`, `inputs`, `flow` and `keep` on boxes with ranks: each leads to lower ones, and so to the target.
+
+A leaf of rank r with k steps is followed for these steps as a box that is affine in the leaf's symbols, with an error
+for each state. Where it ends all of it is in the target, or every leaf that it meets has a rank of at most r - k.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import product
+
+from flint import arb, arb_mat
+
+from .balls import ZERO, bounded_by_form, total, within_bounds
+from .document import Certificate, Ranks
+from .evidence import Ranked, Ranking, Tree
+from .keep import kept
+from .leaves import LEAF, Box, cut, structure
+from .motion import Motion, Stage
+from .refusal import Refused, require
+from .taylor import Taylor, constant
+
+RULE, UNRANKED = "ranks", 65_535
+MAX_MET = 2**14  # nodes of the tree that one image meets
+Rows = list[list[arb]]  # for each state the constant, the coefficients of the leaf's symbols, and those of the errors
+Range = tuple[float, float]
+
+
+def ranks(c: Certificate, evidence: Tree | Ranked) -> int:
+    """The tree with its ranks and steps first, then its leaves; their number."""
+    ranking = evidence.ranking
+    if c.ranks is None or ranking is None:
+        raise Refused("format", "evidence.ranks", "the claim needs boxes with ranks")
+    cover = Cover(c, c.ranks, ranking)
+    walk = Walk(c, evidence.order)
+    target = Target(c, c.ranks)
+    for box in cut(cover.lo, cover.hi, ranking.tree):
+        rank, steps, at = cover.ranks[box.number], cover.steps[box.number], f"ranks leaf {box.number}"
+        if rank == UNRANKED:
+            continue
+        rows = walk.start(box)
+        for _ in range(steps):
+            rows = walk.step(rows, at)
+        if target.holds(rows, at):
+            continue
+        require(rank > 0, RULE, at, "its rank is 0, and it is not certain to lie in the target")
+        cover.leads_to(rows, rank - steps, at)
+    return len(cover.ranks)
+
+
+class Cover:
+    """The tree with what is needed to find the leaves that a box meets."""
+
+    def __init__(self, c: Certificate, stated: Ranks, ranking: Ranking) -> None:
+        self.c, self.stated, self.tree = c, stated, ranking.tree
+        self.lo, self.hi = list(ranking.lo), list(ranking.hi)
+        self.turn = 2 * arb.pi()
+        for name, lo, hi in zip(c.plant.states, self.lo, self.hi, strict=True):
+            require(lo < hi, RULE, name, "lo < hi does not hold")
+            whole = name not in stated.angles or bool(arb(hi) - arb(lo) > self.turn)
+            require(whole, RULE, name, "an angle's ends are not certain to be more than 2 pi apart")
+        count = structure(self.tree, range(c.n), RULE)
+        require(len(ranking.ranks) == 2 * count, RULE, "ranks", f"two bytes for each of {count} leaves were expected")
+        require(len(ranking.steps) == count, RULE, "steps", f"a byte for each of {count} leaves was expected")
+        self.ranks = [ranking.ranks[2 * i] + 256 * ranking.ranks[2 * i + 1] for i in range(count)]
+        self.steps = list(ranking.steps)
+        for i, (r, k) in enumerate(zip(self.ranks, self.steps, strict=True)):
+            good = k == 0 if r in (0, UNRANKED) else 0 < k <= r <= stated.steps
+            require(good, RULE, f"ranks leaf {i}", f"{k} steps with rank {r}, of at most {stated.steps}")
+        self.middle, self.above, self.most = self.nodes()
+
+    def nodes(self) -> tuple[list[float], list[int], list[int]]:
+        """For each node of the tree where it is cut, its upper half, and the highest rank in it."""
+        size = len(self.tree)
+        middle, above, most = [0.0] * size, [0] * size, [0] * size
+        boxes = [(self.lo, self.hi)]
+        for node, axis in enumerate(self.tree):
+            lo, hi = boxes.pop()
+            if axis != LEAF:
+                middle[node] = 0.5 * lo[axis] + 0.5 * hi[axis]  # as in `cut`
+                below, upper = list(hi), list(lo)
+                below[axis] = upper[axis] = middle[node]
+                boxes += [(upper, hi), (lo, below)]
+        waiting, ranks = list[int](), list(self.ranks)
+        for node in reversed(range(size)):  # the upper half of a node is met before the lower one, and that before it
+            if self.tree[node] == LEAF:
+                most[node] = ranks.pop()
+            else:
+                lower, above[node] = waiting.pop(), waiting.pop()
+                most[node] = max(most[lower], most[above[node]])
+            waiting.append(node)
+        return middle, above, most
+
+    def leads_to(self, rows: Rows, rank: int, at: str) -> None:
+        """All leaves that the box of these rows meets, as places, have at most this rank, or a refusal."""
+        each = list[list[Range]]()
+        for name, row, lo, hi in zip(self.c.plant.states, rows, self.lo, self.hi, strict=True):
+            a, b = ends(row)
+            require(a.is_finite() and b.is_finite(), RULE, at, "its image is not finite")
+            if name in self.stated.angles:
+                each.append(around(a, b, lo, hi, self.turn))
+                continue
+            inside = bool(a >= arb(lo)) and bool(b <= arb(hi))
+            require(inside, RULE, at, f"its image is not certain to lie in the tree's box along {name}")
+            each.append([outward(a, b)])
+        left = MAX_MET
+        for box in product(*each):
+            left = self.below(box, rank, left, at)
+
+    def below(self, box: Sequence[Range], rank: int, left: int, at: str) -> int:
+        """The same for a box that lies in that of the tree; how many nodes may still be met after it."""
+        waiting = [0]
+        while waiting:
+            node, left = waiting.pop(), left - 1
+            require(left >= 0, RULE, at, f"its image meets more than {MAX_MET} nodes of the tree")
+            if self.most[node] <= rank:
+                continue
+            axis = self.tree[node]
+            require(axis != LEAF, RULE, at, f"its image meets a leaf whose rank is above {rank}")
+            if box[axis][0] <= self.middle[node]:
+                waiting.append(node + 1)
+            if box[axis][1] >= self.middle[node]:
+                waiting.append(self.above[node])
+        return left
+
+
+class Walk(Motion):
+    """Steps of boxes: of the states' symbols the first n are the leaf's, the others those of errors."""
+
+    rule = RULE
+
+    def __init__(self, c: Certificate, order: int) -> None:
+        angles = c.ranks.angles if c.ranks is not None else ()
+        super().__init__(c, 2 * c.n, order, None, angles)
+        self.bounded, self.domain = bounded_by_form(c), [(arb(lo), arb(hi)) for lo, hi in c.plant.domain]
+
+    def start(self, box: Box) -> Rows:
+        """x = centre + radius d."""
+        rows = list[list[arb]]()
+        for i, (a, b) in enumerate(zip(box.lo, box.hi, strict=True)):
+            radius = (arb(b) - arb(a)) / 2
+            rows.append([(arb(a) + arb(b)) / 2, *(radius if k == i else ZERO for k in range(self.d))])
+        return rows
+
+    def step(self, rows: Rows, at: str) -> Rows:
+        """The states after one step more, or a refusal."""
+        c = self.c
+        here = Stage(at, rows, [each[0] for each in self.policy(arb_mat(rows), 1)])
+        good = self.bounded or within_bounds(c, here.ranges())
+        require(good, "inputs", at, "an input is not certain to stay in its bounds")
+        within = None if c.sample is None else self.reached(here)
+        if c.keep is not None:
+            kept(self, here, within, [])
+        defined = all((mid + reach).is_finite() for mid, reach in here.ranges())
+        require(defined, RULE, at, "the policy has no finite model")
+        for name, row, (lo, hi) in zip(c.plant.states, rows, self.domain, strict=True):
+            a, b = ends(row)
+            inside = name in self.free or bool(a > lo and b < hi)
+            require(inside, RULE, at, f"{name} is not certain to be inside of the domain before a step")
+        return [self.settled(i, v, at) for i, v in enumerate(self.after(here, within))]
+
+    def after(self, here: Stage, within: dict[str, Taylor] | None) -> list[Taylor]:
+        """Models of the next state: F in discrete time, else x + h G."""
+        if within is None:
+            return self.F(here)
+        G, h = self.mean(here, within), self.period()
+        moved = [h * g if self.c.varies else g.scaled(h.c) for g in G]
+        return [self.affine(row) + g for row, g in zip(here.x, moved, strict=True)]
+
+    def settled(self, i: int, v: Taylor, at: str) -> list[arb]:
+        """State i as a row: what is not affine in the symbols of the leaf is its error."""
+        require(v.is_finite(), RULE, at, "the next state has no finite model")
+        slopes = v.slopes(self.symbols)
+        error = arb((total(map(abs, slopes[self.n :])) + v.second + v.r).upper())
+        return [v.c, *slopes[: self.n], *(error if k == i else ZERO for k in range(self.n))]
+
+
+class Target:
+    """The set that is reached: {V <= c2} as places, or that where no expression of the target is positive."""
+
+    def __init__(self, c: Certificate, stated: Ranks) -> None:
+        self.c, self.stated, self.turn = c, stated, 2 * arb.pi()
+        self.P = None if c.target is not None else arb_mat(c.P)
+
+    def holds(self, rows: Rows, at: str) -> bool:
+        """True if all of the box is certainly in the target; a refusal where an expression has no finite model."""
+        return all(bool(v.by_pairs() <= 0) or bool(v.from_corner() <= 0) for v in self.values(rows, at))
+
+    def values(self, rows: Rows, at: str) -> list[Taylor]:
+        """Models of numbers that are at most 0 in the target."""
+        if self.c.target is None:
+            return [self.V_beyond(rows, at)]
+        names = {name: Taylor(x, arb_mat([g])) for name, (x, *g) in zip(self.c.plant.states, rows, strict=True)}
+        try:
+            values: list[Taylor] = self.c.target.evaluate(names, constant)
+        except Refused as no:
+            raise Refused(RULE, at, no.detail) from None
+        require(all(v.is_finite() for v in values), RULE, at, "an expression of the target has no finite model")
+        return values
+
+    def V_beyond(self, rows: Rows, at: str) -> Taylor:
+        """V - c2, at the place near 0."""
+        if self.P is None:
+            raise TypeError("a claim with a target has no V")
+        n, centre = len(rows), [row[0] for row in rows]
+        for i, name in enumerate(self.c.plant.states):
+            if name in self.stated.angles:
+                centre[i] -= turns(centre[i], ZERO, self.turn) * self.turn
+        x, A = arb_mat(n, 1, centre), arb_mat([row[1:] for row in rows])
+        PA = self.P * A
+        V = (x.transpose() * (self.P * x))[0, 0]
+        model = Taylor(V - arb(self.c.outer), 2 * (x.transpose() * PA), A.transpose() * PA)
+        require(model.is_finite(), RULE, at, "V has no finite model")
+        return model
+
+
+def ends(row: Sequence[arb]) -> tuple[arb, arb]:
+    """The ends of a form, numbers."""
+    middle, *slopes = row
+    reach = total(map(abs, slopes))
+    return arb((middle - reach).lower()), arb((middle + reach).upper())
+
+
+def turns(value: arb, near: arb, turn: arb) -> int:
+    """The whole turns by which a number is away from another, nearly; any integer would do."""
+    away = float(((value - near) / turn).mid())
+    return round(away) if abs(away) < 2**53 else 0  # False of what is no number
+
+
+def around(a: arb, b: arb, lo: float, hi: float, turn: arb) -> list[Range]:
+    """Parts of [lo, hi], which is longer than a turn, that have every place of [a, b] between them.
+
+    Numbers below lo are less than a turn away from hi when they have been moved by one, as those above hi from lo.
+    """
+    w = turns((a + b) / 2, (arb(lo) + arb(hi)) / 2, turn)
+    a, b = arb((a - w * turn).lower()), arb((b - w * turn).upper())
+    first, last = arb(lo), arb(hi)
+    if a >= first and b <= last:
+        return [outward(a, b)]
+    parts = (
+        [(first, b), (arb((a + turn).lower()), last)] if a < first else [(a, last), (first, arb((b - turn).upper()))]
+    )
+    inside = all(p >= first and q <= last for p, q in parts)
+    found = [outward(p, q) for p, q in parts if not p > q]  # one that is empty has no place of [a, b]
+    return found if inside and found else [(lo, hi)]
+
+
+def outward(a: arb, b: arb) -> Range:
+    """Numbers of binary64 at or below a and at or above b, numbers; those of binary64 are their own."""
+    below, above = float(a), float(b)
+    while not arb(below) <= a:
+        below = math.nextafter(below, -math.inf)
+    while not arb(above) >= b:
+        above = math.nextafter(above, math.inf)
+    return below, above
