@@ -238,11 +238,9 @@ class Scene:
 
     def in_more(self, x: Array) -> NDArray[np.bool_]:
         """True for each state (..., n) in the outer set or in a box with a rank, in float64."""
-        inside = self.in_outer(x)
-        if self.ranked is None:
-            return inside
-        found = self.ranked.ranks_at(x.reshape(-1, self.n)).reshape(x.shape[:-1])
-        return np.asarray(inside | np.isfinite(found))
+        flat = x.reshape(-1, self.n)
+        ranked = False if self.ranked is None else np.isfinite(self.ranked.ranks_at(flat)).reshape(x.shape[:-1])
+        return np.asarray(self.in_outer(x) | ranked)
 
     def outline(self, pair: Pair) -> tuple[Array, Array, Array] | None:
         """Axes of a fine grid over the domain along two states and N less its level there, all other states 0.
