@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from certify.certificates import Certificate, PartitionTree, RankTree, leaves_within, parse_certificate
+from certify.certificates import Certificate, PartitionTree, RankTree, leaves_within, parse_certificate, run_checker
 from certify.certificates.claims import UNPROVED, Asymptotic, Nearby, Outer, Practical, Ranks
 from certify.certificates.located import Containment
-from certify.certificates.membership import Region, region_of, set_of
+from certify.certificates.membership import Region, proved_set, region_of, set_of
 from certify.certificates.ranked import Ranked, proved_volume
 from certify.certificates.turns import bounds_of, sign_against, turns_into
 from certify.errors import CertificateFormatError, InputError
 from certify.loop.expressions import Symbol
-from certify.lyapunov import Polynomial  # noqa: F401  (its module registers the kind)
 from certify.lyapunov.function import Quadratic
 from tests.support import ranks as made
 
@@ -51,6 +52,23 @@ def test_a_file_reads_back_as_it_was_written(certificate: Certificate) -> None:
     assert set(data["evidence"]["ranks"]) == {"lo", "hi", "tree", "ranks", "steps"}
     for name in ("lo", "hi", "ranks", "steps"):
         assert np.array_equal(getattr(tree_of(read), name), getattr(tree_of(certificate), name))
+
+
+@pytest.mark.parametrize("certificate", [made.linear(), made.pendulum()], ids=["linear", "pendulum"])
+def test_both_checkers_accept_them_and_a_state_is_asked_about(certificate: Certificate, tmp_path: Path) -> None:
+    path = tmp_path / "certificate.json"
+    path.write_text(certificate.to_json())
+    assert run_checker(path, program="reference")["result"] == "ACCEPTED"
+    assert proved_set(path).holds([[3.0, -2.0]]) == [True]
+    data = json.loads(path.read_text())
+    data["evidence"]["ranks"]["ranks"] = encode_ranks(np.zeros(len(tree_of(certificate).ranks)))
+    path.write_text(json.dumps(data))
+    with pytest.raises(InputError, match="rule=ranks"):
+        proved_set(path)
+
+
+def encode_ranks(ranks: np.ndarray) -> str:
+    return base64.b64encode(ranks.astype("<u2").tobytes()).decode()
 
 
 def test_a_file_without_them_keeps_its_keys() -> None:

@@ -24,7 +24,7 @@ from certify.certificates import Certificate, PartitionTree, RankTree, parse_cer
 from certify.certificates.claims import CLAIMS, UNPROVED, Ranks
 from certify.certificates.membership import region_of
 from certify.certificates.timing import Timing
-from certify.errors import InputError
+from certify.errors import InputError, SoundnessError
 from certify.loop.expressions import Number, symbols
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
@@ -45,6 +45,7 @@ def answer_to(certificate: Certificate, raw: bytes) -> dict[str, Any]:
         "certificate_sha256": hashlib.sha256(raw).hexdigest(),
         "policy_sha256": certificate.network.sha256(),
         "levels": dict(certificate.claim.levels),
+        "ranks": {"leaves": 3, "steps": certificate.claim.ranks.steps if certificate.claim.ranks else 0, "of": 2},
     }
 
 
@@ -83,6 +84,14 @@ def test_without_an_accepting_answer_nothing_is_proved() -> None:
     text = page("pendulum", accepted=False)
     assert "What the file claims, without proof" in text and "if the claim is true" in text
     assert "White: nothing is claimed." in text and "White: nothing is proved." not in text
+
+
+@pytest.mark.parametrize("said", [None, {"steps": 11}, {}])
+def test_an_answer_about_other_ranks_is_an_error(said: Any) -> None:
+    certificate = made.linear()
+    answer = answer_to(certificate, certificate.to_json().encode()) | {"ranks": said}
+    with pytest.raises(SoundnessError, match="steps of ranks"):
+        render_html(certificate, answer, None, Path("c.json"))
 
 
 @pytest.mark.parametrize("kind", ["asymptotic", "practical", "nearby"])

@@ -106,7 +106,7 @@ def _notes(certificate: Certificate, answer: Mapping[str, Any] | None, bounds: S
         notes["Ring"] = f"Shown on {answer.get('ring_leaves', 0):,} of {answer.get('leaves', 0):,} leaves"
         if ring is not None:
             notes["Ring"] += f"; {_smallest(timing_of(certificate))} is {below(ring, 3)}."
-    return notes | _tube_notes(certificate) | _outer_notes(answer) | _rank_notes(certificate)
+    return notes | _tube_notes(certificate) | _outer_notes(answer) | _rank_notes(certificate, answer)
 
 
 def _parts(certificate: Certificate, notes: Mapping[str, str]) -> list[tuple[str, str, str]]:
@@ -195,13 +195,14 @@ def _tube_notes(certificate: Certificate) -> dict[str, str]:
     }
 
 
-def _rank_notes(certificate: Certificate) -> dict[str, str]:
-    """The number of boxes with ranks, and of the constraints."""
-    found, notes = ranks_of(certificate), dict[str, str]()
+def _rank_notes(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[str, str]:
+    """The numbers of boxes with ranks, and of places at which the checker showed the constraints."""
+    found, notes, rules = ranks_of(certificate), dict[str, str](), (answer or {}).get("rules") or {}
     if found is not None:
         notes["Boxes"] = f"{found.proved:,} of {found.leaves:,} boxes have a rank."
     if certificate.constraints:
-        notes["Constraints"] = f"{', '.join(certificate.constraints)}."
+        asked = f"; asked {rules['keep']:,} times" if rules.get("keep") else ""
+        notes["Constraints"] = f"{listed(list(certificate.constraints))}{asked}."
     return notes
 
 

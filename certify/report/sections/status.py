@@ -52,7 +52,7 @@ def status_of(certificate: Certificate, sha256: str, answer: Mapping[str, Any] |
         return Status("NOT CHECKED", "The checker gave no verdict. Nothing here is proved.")
     levels = answer.get("levels")
     given = dict(levels) if isinstance(levels, Mapping) else {}
-    beyond, stated = answer.get("outer"), certificate.claim.outer
+    beyond, stated, ranks = answer.get("outer"), certificate.claim.outer, certificate.claim.ranks
     beyond = beyond if beyond is None or (isinstance(beyond, Mapping) and "level" in beyond) else {"level": "none"}
     for what, found, wanted in (
         ("bytes with sha256", answer.get("certificate_sha256"), sha256),
@@ -63,6 +63,7 @@ def status_of(certificate: Certificate, sha256: str, answer: Mapping[str, Any] |
             None if beyond is None else [beyond["level"]],
             None if stated is None else [stated.level],
         ),
+        ("steps of ranks", _steps(answer.get("ranks")), None if ranks is None else ranks.steps),
         ("evidence to replay", kind == "ACCEPTED", isinstance(certificate.evidence, PartitionTree)),
     ):
         if found != wanted:
@@ -82,6 +83,11 @@ def status_of(certificate: Certificate, sha256: str, answer: Mapping[str, Any] |
     both = (second.get("result"), second.get("certificate_sha256")) == ("ACCEPTED", sha256)
     also = " So did the reference, a second checker that shares no line with it." if both else ""
     return Status("ACCEPTED", f"The independent checker accepted the certificate.{also}", _modules(answer))
+
+
+def _steps(said: Any) -> Any:
+    """The most steps of ranks that an answer speaks of; None if it speaks of none."""
+    return said.get("steps", "none") if isinstance(said, Mapping) else said
 
 
 def _modules(answer: Mapping[str, Any]) -> tuple[str, ...]:
