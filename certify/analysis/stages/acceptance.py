@@ -102,8 +102,9 @@ class _Desk:
         return {**answer, "reference": second} if second["result"] == "ACCEPTED" else {**second, "by": "reference"}
 
     def _answered(self, path: Path, patient: bool) -> Mapping[str, Any]:
-        """The checker's answer; where many leaves make a long file, several processes share them."""
-        cores = len(os.sched_getaffinity(0)) if path.stat().st_size > _LONG else 1
+        """The checker's answer; where there are many leaves, several processes share them."""
+        ranked = self.state.claim is not None and self.state.claim.ranks is not None
+        cores = len(os.sched_getaffinity(0)) if ranked or path.stat().st_size > _LONG else 1
         return run_checker(path, jobs=self.state.options.jobs or min(cores, _MOST_JOBS), patient=patient)
 
 
