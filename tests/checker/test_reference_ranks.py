@@ -16,9 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from flint import arb
 
 from certify.reference import rules
 from certify.reference.__main__ import in_words
+from certify.reference.ranks import around
 from tests.support.ranked import (
     UNRANKED,
     Document,
@@ -28,6 +30,7 @@ from tests.support.ranked import (
     affine,
     around_level,
     dumped,
+    encode,
     mapped,
     ranked,
     raw,
@@ -414,6 +417,46 @@ def test_constraints_between_instants() -> None:
     assert verdict(document(rising, (0.5, 1.0), tree, [1], [1])) == "keep"  # -(x - 3)^2 is 0 at 3
 
 
+def test_the_domain_between_instants() -> None:
+    """From [1/2, 1] x' = 4 is at 5 after one period, and beyond 3 before."""
+    rising = Loop([["+", "4", ["*", "0", "u"]]], HALF, [["-", "4", "x"]], sample=("1", "1"))
+    assert verdict(document(rising, (0.5, 1.0), b"\xff", [1], [1])) is None
+    rising.domain = ("-9", "3")
+    assert verdict(document(rising, (0.5, 1.0), b"\xff", [1], [1])) == "flow"
+    rising.domain = ("1/2", "9")
+    assert verdict(document(rising, (0.5, 1.0), b"\xff", [1], [1])) == "flow"  # 1/2 is not inside
+
+
+def test_constraints_between_instants_on_a_ball() -> None:
+    """{x^2 <= 1/16} of x' = u, u = -x, as wide as 0.2525, and 1.25 times the way of a period more."""
+    data = around_level(certificate(HELD, repeated(held), within(0.25), (-2.0, 2.0), 6, 3)[0], 1.0, 1 / 16)
+    alone = edited(edited(data, "claim.ranks", ...), "evidence.ranks", ...)
+    for bound, rule in (("28/100", "keep"), ("1/2", None)):
+        assert verdict(edited(alone, "claim", lambda c, b=bound: c | {"keep": [["-", "x", b]]})) == rule
+    still = edited(alone, "claim", lambda c: c | {"keep": [["-", "u", "28/100"]]})
+    assert verdict(still) is None  # the input is held
+
+
+def test_constraints_where_a_leaf_reaches_beyond_the_level() -> None:
+    data = around_level(halving()[0], 1.0, 1 / 16)
+    small = around_level(halving()[0], 1.0, 1 / 1024)["evidence"]["local"]["J"]
+    data = edited(edited(data, "claim.ranks", ...), "evidence.ranks", ...)
+    data = edited(data, "levels.local", (1 / 1024).hex())
+    data = edited(edited(data, "evidence.local.J", small), "evidence.root", encode(0.5))
+    data = edited(data, "evidence.tree", raw(uniform([-0.5], [0.5], 3)[0]))  # the leaf [1/4, 3/8] is not outside
+    for bound, rule in (("3/10", None), ("24/100", "keep")):
+        assert verdict(edited(data, "claim", lambda c, b=bound: c | {"keep": [["-", "x", b]]})) == rule
+        assert verdict(edited(data, "claim", lambda c, b=bound: c | {"keep": [["-", ["-", "x"], b]]})) == rule
+
+
+def test_constraints_with_what_is_uncertain() -> None:
+    loop = Loop([["+", "u", "q"]], [affine([[-0.5]])], NEAR, uncertain=[("q", "-1/50", "1/50")])
+    data, *_ = certificate(loop, scaled(-0.5, 0.0, 0.02), within(0.25), (-2.0, 2.0), 6)
+    for bound, rule in (("21/1000", None), ("19/1000", "keep")):
+        loop.keep = [["-", "q", bound]]
+        assert verdict(edited(data, "claim", lambda c: c | {"keep": loop.keep})) == rule
+
+
 def test_constraints_beside_V() -> None:
     data = around_level(halving()[0], 1.0, 1 / 16)
     assert verdict(edited(data, "claim", lambda c: c | {"keep": [["-", "x", "3"], ["-", "u", "3"]]})) is None
@@ -502,6 +545,35 @@ def test_an_image_wider_than_a_turn_is_everywhere() -> None:
     assert verdict(document(loop, (-3.25, 3.25), tree, one, [int(i == 40) for i in range(64)])) == "ranks"
 
 
+def test_the_parts_of_an_interval_of_an_angle_have_all_its_places() -> None:
+    """And lie between the ends; parts that have no more than a turn have no more than the interval, but for a hair."""
+    chance, turn, seams = random.Random(3), 2 * arb.pi(), 0
+    for _ in range(3000):
+        lo = chance.choice([-3.1416, -3.25, 0.0, 7.0, -100.0, chance.uniform(-9, 9)])
+        hi = lo + chance.choice([6.2832, 6.3, 7.0, 12.0, 13.0, chance.uniform(6.2832, 20)])
+        a = chance.choice([lo, hi, chance.uniform(-30, 30)]) + chance.choice([0.0, 1e-9, -1e-9, 2 * math.pi, -0.1])
+        b = a + chance.choice([0.0, 1e-9, 0.2, 3.0, 6.0, 6.29, 9.0, chance.uniform(0, 8)])
+        parts = around(arb(a), arb(b), lo, hi, turn)
+        assert parts and all(lo <= p <= q <= hi for p, q in parts)
+        seams += len(parts) == 2
+        if parts != [(lo, hi)]:
+            assert sum(q - p for p, q in parts) <= b - a + (hi - lo - 2 * math.pi) + 1e-9
+        for x in (a, b, lo, hi, *(chance.uniform(a, b) for _ in range(5))):
+            if a <= x <= b:
+                turns = range(math.floor((lo - x) / 6.28) - 1, math.ceil((hi - x) / 6.28) + 2)
+                near = [x + w * 2 * math.pi for w in turns]
+                assert any(p - 1e-12 <= y <= q + 1e-12 for p, q in parts for y in near)
+    assert seams > 300
+
+
+def test_an_angle_of_many_turns_is_a_place() -> None:
+    turn = 2 * arb.pi()
+    ((p, q),) = around(arb(10**6), arb(10**6) + arb("0.01"), -3.25, 3.25, turn)
+    assert math.isclose(p, math.remainder(10**6, 2 * math.pi), abs_tol=1e-9) and math.isclose(q - p, 0.01, abs_tol=1e-9)
+    assert around(arb(10**30), arb(10**30), -3.25, 3.25, turn) == [(-3.25, 3.25)]  # nobody knows which
+    assert around(arb(0), arb(10) ** 400, -3.25, 3.25, turn) == [(-3.25, 3.25)]
+
+
 @pytest.mark.parametrize("hole", [0, 1, 62, 63])
 def test_a_hole_at_the_seam_is_seen_from_its_other_side(hole: int) -> None:
     data, ranks, steps = certificate(ROUND, scaled(1.0, 0.5), cosine, (-3.1416, 3.1416), 6)
@@ -581,6 +653,12 @@ def test_keys_of_other_claims() -> None:
     plain = edited(plain, "plant.dynamics", ["u"])
     assert rules.judge(dumped(plain)).result == "TRUSTED"
     assert verdict(edited(plain, "claim", lambda c: c | {"keep": ["-1"]})) == "format"
+    further = {"keep": ["-1"], "outer": {"expression": "x", "level": (1.0).hex()}}
+    found = rules.judge(dumped(edited(plain, "claim", lambda c: c | further)))
+    assert (found.rule, found.at) == ("format", "claim.keep")
+    tube = {"kind": "enlarged", "start": encode(1.0), "keep": ["-1"]}
+    found = rules.judge(dumped(edited(plain, "claim", lambda c: c | tube)))
+    assert (found.rule, found.at) == ("format", "claim.keep")
 
 
 def test_the_command_and_its_words(tmp_path: Path) -> None:

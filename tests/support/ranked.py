@@ -55,10 +55,11 @@ def hashed(policy: Document, steps: Sequence[Document]) -> str:
                 add(step[end], len(base64.b64decode(step[end])) // 8)
     for text in (policy["scale"], policy["offset"], *(policy["clip"] or ())):
         add(text, len(base64.b64decode(text)) // 8)
-    if [step["kind"] for step in steps] != ["affine"]:
+    words = [step.get("function", "affine") for step in steps]
+    if words != (["affine", "tanh"] * len(steps))[: len(steps)] or len(steps) % 2 == 0:
         for step in steps:
-            words = f"{step['kind']} {' '.join(map(str, step['of']))}"
-            digest.update(f"{words}{' ' + step['function'] if step['kind'] == 'map' else ''}\0".encode())
+            named = f"{step['kind']} {' '.join(map(str, step['of']))}"
+            digest.update(f"{named}{' ' + step['function'] if step['kind'] == 'map' else ''}\0".encode())
     return digest.hexdigest()
 
 
