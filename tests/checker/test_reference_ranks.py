@@ -20,7 +20,9 @@ from flint import arb
 
 from certify.reference import rules
 from certify.reference.__main__ import in_words
-from certify.reference.ranks import around
+from certify.reference.document import read
+from certify.reference.leaves import Box
+from certify.reference.ranks import Walk, around
 from tests.support.ranked import (
     UNRANKED,
     Document,
@@ -721,3 +723,60 @@ def test_accepted_mutants_are_true() -> None:
                 x = chance.choice([*box[0], chance.uniform(*box[0])])
                 assert reaches(x, lambda: chance.choice([-0.02, 0.02]), r)
     assert min(found.values()) > 10
+
+
+PENDULUM = [["+", "y", ["*", "q", ["cos", "x"]]], ["+", ["*", "2", ["sin", "x"]], ["*", "u", ["+", "1", "q"]], ["*", "x", "y", "1/9"]]]  # fmt: skip  # noqa: E501
+TANH = [affine([[-0.7, 0.2], [0.4, -0.9]], [0.1, -0.3]), mapped("tanh", 1), affine([[-1.5, 0.8]], of=2)]
+
+
+def policy(x: float, y: float) -> float:
+    return -1.5 * math.tanh(-0.7 * x + 0.2 * y + 0.1) + 0.8 * math.tanh(0.4 * x - 0.9 * y - 0.3)
+
+
+def rates(x: float, y: float, u: float, q: float) -> tuple[float, float]:
+    return y + q * math.cos(x), 2 * math.sin(x) + u * (1 + q) + x * y / 9
+
+
+def moved(x: float, y: float, h: float, q: Callable[[], float]) -> tuple[float, float]:
+    """By steps of Runge and Kutta, the input held, with another q in each of four parts of the period."""
+    u, part, values = policy(x, y), h / 40, [q() for _ in range(4)]
+    for k in range(40):
+        now = values[k // 10]
+        a, b = rates(x, y, u, now)
+        c, d = rates(x + part / 2 * a, y + part / 2 * b, u, now)
+        e, f = rates(x + part / 2 * c, y + part / 2 * d, u, now)
+        g, i = rates(x + part * e, y + part * f, u, now)
+        x, y = x + part / 6 * (a + 2 * c + 2 * e + g), y + part / 6 * (b + 2 * d + 2 * f + i)
+    return x, y
+
+
+@pytest.mark.parametrize("order", [0, 1, 2, 3, 5])
+def test_boxes_hold_all_trajectories(order: int) -> None:
+    """Each state is within the error of its form, at the same d, after some steps; order 0 is discrete time."""
+    sample = ("1/20", "1/10") if order else None
+    loop = Loop(PENDULUM, TANH, [["-", "x", "9"]], ("x", "y"), sample, max(order, 1), [("q", "-1/10", "1/5")])
+    c = read(dumped(loop.document([0.5, -0.5], [0.6, -0.4], b"\xff", two_bytes([3]), b"\3")))
+    chance, walk = random.Random(order), Walk(c, max(order, 1))
+    rows = [walk.start(Box(0, [0.5, -0.5], [0.6, -0.4]))]
+    for _ in range(3):
+        rows.append(walk.step(rows[-1], "here"))
+    nearest = 0.0
+    for _ in range(150):
+        d = [chance.choice([-1.0, 1.0, chance.uniform(-1, 1)]) for _ in range(2)]
+        far = chance.choice([-0.1, 0.2])
+
+        def q(far: float = far) -> float:
+            return chance.choice([far, far, chance.uniform(-0.1, 0.2)])
+
+        state = 0.55 + 0.05 * d[0], -0.45 + 0.05 * d[1]
+        for row in rows[1:]:
+            if order:
+                state = moved(*state, chance.choice([0.05, 0.1, chance.uniform(0.05, 0.1)]), q)
+            else:
+                state = rates(*state, policy(*state), q())
+            for i, x in enumerate(state):
+                middle, *slopes = (float(v.mid()) for v in row[i])
+                error = abs(x - middle - slopes[0] * d[0] - slopes[1] * d[1])
+                assert error <= slopes[2 + i] + 1e-9 and not slopes[3 - i]
+                nearest = max(nearest, error / slopes[2 + i])
+    assert nearest > 0.3
