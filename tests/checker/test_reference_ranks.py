@@ -21,8 +21,10 @@ from flint import arb
 from certify.reference import rules
 from certify.reference.__main__ import in_words
 from certify.reference.document import read
+from certify.reference.evidence import Ranked
 from certify.reference.leaves import Box
-from certify.reference.ranks import Walk, around
+from certify.reference.ranks import Cover, Walk, around
+from certify.reference.refusal import Refused
 from tests.support.ranked import (
     UNRANKED,
     Document,
@@ -33,6 +35,7 @@ from tests.support.ranked import (
     around_level,
     dumped,
     encode,
+    hashed,
     mapped,
     ranked,
     raw,
@@ -584,6 +587,43 @@ def test_a_hole_at_the_seam_is_seen_from_its_other_side(hole: int) -> None:
     assert verdict(reranked(data, holed, [*steps[:hole], 0, *steps[hole + 1 :]])) == "ranks"
 
 
+def test_two_seams_meet_in_four_corners() -> None:
+    """The leaf [0, 1.625]^2, moved by 2.4 in both angles."""
+    loop = Loop(["x", "y"], [affine([[0.0, 0.0]])], ["1"], ("x", "y"), angles=("x", "y"))
+    tree, leaves = uniform([-3.25, -3.25], [3.25, 3.25], 4)
+    corners = [i for i, box in enumerate(leaves) if all(abs(p + q) > 3.5 for p, q in box)]
+    assert len(corners) == 4
+    rows = [[arb("3.2125"), arb("0.8125"), 0, 0, 0], [arb("3.2125"), 0, arb("0.8125"), 0, 0]]
+    rows = [[arb(v) for v in row] for row in rows]
+    for hole in (None, *corners):
+        ranks = [5 if i in corners and i != hole else UNRANKED for i in range(16)]
+        c = read(dumped(document(loop, (-3.25, 3.25), tree, ranks, [int(r == 5) for r in ranks])))
+        assert c.ranks is not None and isinstance(c.evidence, Ranked)
+        cover = Cover(c, c.ranks, c.evidence.ranking)
+        for rank in (4, 5):
+            if rank == 5 and hole is None:
+                cover.leads_to(rows, rank, "here")
+            else:
+                with pytest.raises(Refused):
+                    cover.leads_to(rows, rank, "here")
+
+
+def test_centring_of_a_policy_without_V() -> None:
+    """The equilibrium is not asked, but a centring must exist."""
+    data, *_ = halving()
+
+    def recentred(**more: Any) -> str | None:
+        made = edited(data, "policy", lambda p: p | more)
+        return verdict(edited(made, "policy.sha256", hashed(made["policy"], made["networks"][0]["steps"])))
+
+    assert recentred(centre="output") is None
+    assert recentred(centre="preactivation", squash="tanh", scale=encode(0.125)) is not None  # u is too little
+    assert recentred(centre="preactivation", squash="tanh", offset=encode(2.0)) == "centring"
+    assert recentred(centre="output", clip=[encode(0.0), encode(9.0)]) == "centring"
+    assert recentred(clip=[encode(-1.0), encode(1.0)]) is None
+    assert recentred(clip=[encode(-0.01), encode(0.01)]) == "ranks"
+
+
 # -------------------------------------------------------------------------------------------------------------- format
 
 
@@ -733,28 +773,33 @@ def policy(x: float, y: float) -> float:
     return -1.5 * math.tanh(-0.7 * x + 0.2 * y + 0.1) + 0.8 * math.tanh(0.4 * x - 0.9 * y - 0.3)
 
 
-def rates(x: float, y: float, u: float, q: float) -> tuple[float, float]:
-    return y + q * math.cos(x), 2 * math.sin(x) + u * (1 + q) + x * y / 9
+def rates(x: float, y: float, u: float, q: float, calls: int) -> tuple[float, float]:
+    return y + q * math.cos(x), 2 * math.sin(x) + u * (1 + q) + x * y / 9 + calls * policy(y, q) / 3
 
 
-def moved(x: float, y: float, h: float, q: Callable[[], float]) -> tuple[float, float]:
+def moved(x: float, y: float, h: float, q: Callable[[], float], calls: int) -> tuple[float, float]:
     """By steps of Runge and Kutta, the input held, with another q in each of four parts of the period."""
     u, part, values = policy(x, y), h / 40, [q() for _ in range(4)]
     for k in range(40):
         now = values[k // 10]
-        a, b = rates(x, y, u, now)
-        c, d = rates(x + part / 2 * a, y + part / 2 * b, u, now)
-        e, f = rates(x + part / 2 * c, y + part / 2 * d, u, now)
-        g, i = rates(x + part * e, y + part * f, u, now)
+        a, b = rates(x, y, u, now, calls)
+        c, d = rates(x + part / 2 * a, y + part / 2 * b, u, now, calls)
+        e, f = rates(x + part / 2 * c, y + part / 2 * d, u, now, calls)
+        g, i = rates(x + part * e, y + part * f, u, now, calls)
         x, y = x + part / 6 * (a + 2 * c + 2 * e + g), y + part / 6 * (b + 2 * d + 2 * f + i)
     return x, y
 
 
-@pytest.mark.parametrize("order", [0, 1, 2, 3, 5])
-def test_boxes_hold_all_trajectories(order: int) -> None:
-    """Each state is within the error of its form, at the same d, after some steps; order 0 is discrete time."""
+@pytest.mark.parametrize(("order", "calls"), [(0, 0), (1, 0), (2, 0), (3, 0), (5, 0), (0, 1), (1, 1)])
+def test_boxes_hold_all_trajectories(order: int, calls: int) -> None:
+    """Each state is within the error of its form, at the same d, after some steps; order 0 is discrete time.
+
+    Also where the equations call a network, of a state and of what is uncertain.
+    """
     sample = ("1/20", "1/10") if order else None
-    loop = Loop(PENDULUM, TANH, [["-", "x", "9"]], ("x", "y"), sample, max(order, 1), [("q", "-1/10", "1/5")])
+    called = ["*", "1/3", ["network", "pi", 0, "y", "q"]]
+    dynamics = [PENDULUM[0], [*PENDULUM[1], called]] if calls else PENDULUM
+    loop = Loop(dynamics, TANH, [["-", "x", "9"]], ("x", "y"), sample, max(order, 1), [("q", "-1/10", "1/5")])
     c = read(dumped(loop.document([0.5, -0.5], [0.6, -0.4], b"\xff", two_bytes([3]), b"\3")))
     chance, walk = random.Random(order), Walk(c, max(order, 1))
     rows = [walk.start(Box(0, [0.5, -0.5], [0.6, -0.4]))]
@@ -771,9 +816,9 @@ def test_boxes_hold_all_trajectories(order: int) -> None:
         state = 0.55 + 0.05 * d[0], -0.45 + 0.05 * d[1]
         for row in rows[1:]:
             if order:
-                state = moved(*state, chance.choice([0.05, 0.1, chance.uniform(0.05, 0.1)]), q)
+                state = moved(*state, chance.choice([0.05, 0.1, chance.uniform(0.05, 0.1)]), q, calls)
             else:
-                state = rates(*state, policy(*state), q())
+                state = rates(*state, policy(*state), q(), calls)
             for i, x in enumerate(state):
                 middle, *slopes = (float(v.mid()) for v in row[i])
                 error = abs(x - middle - slopes[0] * d[0] - slopes[1] * d[1])
