@@ -45,6 +45,7 @@ _BENT = 1.0  # bends of the hidden units, as a share of the linear part, that ar
 _TELLING = 1000  # boxes: a limit below it is what ended the search, and says nothing of the policy
 _SAME, _BELOW = 1e-6, 0.99  # relative: rates that are as good as equal; a rate that is safely below another
 _FEW = 3  # states, for which a function beyond the ellipsoid is suggested
+_ALL = 0.995  # share of the box that has ranks: more effort gains little
 _ENDED = (Stop.EFFORT, Stop.BOXES, Stop.LOCAL)
 
 
@@ -169,6 +170,8 @@ def _next(
 ) -> Step:
     if (correction := _correction(result, options, asked[0])) is not None:
         return correction
+    if (boxes := _boxes(result, options)) is not None:
+        return boxes
     if result.claim in ("practical", "nearby") and (centre := _centring(*asked)) is not None:
         return Step(
             (("--centre", centre),),
@@ -220,6 +223,20 @@ def _another_candidate(result: RoaResult, options: RoaOptions) -> Step:
         why = "what this V can show is proved; a function of higher degree may show more, beyond the ellipsoid"
         return Step((("--candidate", "polynomial"),), why)
     return Step((), "what this V can show is proved; a larger set needs another policy or another kind of V")
+
+
+def _boxes(result: RoaResult, options: RoaOptions) -> Step | None:
+    """The step where boxes of the domain may be proved to lead into the set; None where they may not, or are."""
+    free = options.level is None and options.P is None and not options.resume and options.engine == "bounds"
+    if result.verdict is not Verdict.PROVED or not result.system.in_steps or result.system.n > _FEW or not free:
+        return None
+    if options.ranks:
+        found = result.ranks
+        if found is None or found.covered > _ALL:
+            return None
+        why = f"{number(100 * (1 - found.covered), 2)} % of the box has no rank yet, and its boxes get smaller"
+        return Step((("--effort", _round(4 * options.effort)),), why)
+    return Step((("--ranks", ""),), "boxes of the domain may be proved to lead into this set")
 
 
 def _may_go_beyond(result: RoaResult, options: RoaOptions) -> bool:
