@@ -20,6 +20,7 @@ from certify.certificates.claims import Claim, Problem
 from certify.errors import BackendError, InputError, SoundnessError
 from certify.provers.ball.contraction import contraction
 from certify.provers.boxes.mend import below_leaf, split_again
+from certify.provers.ranks import without_leaf
 
 _SPLITS, _LOWERINGS = 3, 9  # the most splits and lowerings for leaves that the checker refuses
 _BELOW_LEAVES, _LEVELS = 2, 5  # weaker certificates: below a refused leaf so long, and with a lower level at all
@@ -168,8 +169,8 @@ def _leaf_of(answer: Mapping[str, Any]) -> int | None:
 
 
 def _finer(certificate: Certificate, problem: Problem, answer: Mapping[str, Any]) -> PartitionTree | None:
-    """The evidence with the leaf split that the checker refuses, of the tree, of an outer set's tree or of a face; None
-    if it refuses something else."""
+    """The evidence with the leaf split that the checker refuses, of the tree, of an outer set's tree or of a face, or
+    without one of ranks; None if it refuses something else."""
     from certify.provers.outer import mend as outer
 
     evidence, claim, leaf = certificate.evidence, certificate.claim, _leaf_of(answer)
@@ -177,6 +178,10 @@ def _finer(certificate: Certificate, problem: Problem, answer: Mapping[str, Any]
         return None
     if leaf is not None:
         return split_again(problem, evidence, claim, leaf)
+    refused = re.fullmatch(r"rank leaf (\d+)", str(answer.get("at", "")))
+    if refused is not None and evidence.ranks is not None:
+        lower = without_leaf(evidence.ranks, int(refused[1]))
+        return None if lower is None else replace(evidence, ranks=lower)
     found = re.fullmatch(r"(?:outer|face (\d+)) leaf (\d+)", str(answer.get("at", "")))
     if found is None or evidence.outer is None:
         return None

@@ -58,6 +58,7 @@ class Keywords(TypedDict, total=False):
     enlarge: bool | None
     box: Mapping[str, float] | None
     reach_from: Mapping[str, Exact] | None
+    ranks: bool | None
     lyapunov: str | os.PathLike[str] | Neural | Polynomial | Symbolic | None
     lyapunov_level: float | None
     candidate: Candidate | None

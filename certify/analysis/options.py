@@ -61,6 +61,9 @@ class RoaOptions:
         "Prove that this state converges too, with what lies around it: a tube around its trajectory leads into the "
         "proved set. A state that is not named is at the operating point."),
         written="As in x=0.5,y=-0.2.", python="Values by state.")
+    ranks: bool = option(False, "claim", "flag", help=(
+        "In discrete time and with held inputs: prove from which boxes of the domain every trajectory reaches the "
+        "proved set, in how many steps at most; angles of the plant count modulo 2 pi."))
     lyapunov: Neural | Polynomial | Symbolic | None = option(None, "claim", "file", metavar="FILE", help=(
         "A second function N: prove the largest outer set {N <= n2} in the domain, from which every trajectory enters "
         "the proved ellipsoid."),
@@ -187,6 +190,10 @@ _RULES: tuple[_Rule, ...] = (
     (
         lambda o: o.goes_beyond and (o.enlarges or bool(o.rate) or o.engine != "bounds"),
         "{0.beyond} needs the engine bounds, and a claim without a tube and without a rate.",
+    ),
+    (
+        lambda o: o.ranks and (o.enlarges or o.goes_beyond or o.engine != "bounds"),
+        "`ranks` needs the engine bounds, and a claim without a tube and without an outer set.",
     ),
     (
         lambda o: o.lyapunov is not None and o.learned is not None,

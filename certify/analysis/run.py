@@ -18,7 +18,7 @@ from certify.analysis.results import RoaResult
 from certify.analysis.saved_search import Keeper
 from certify.analysis.stages.acceptance import Acceptance, Confirmation
 from certify.analysis.stages.candidate import Candidate
-from certify.analysis.stages.further import Beyond, Equilibrium, Route, Tube
+from certify.analysis.stages.further import Beyond, ByRanks, Equilibrium, Route, Tube
 from certify.analysis.stages.ring import Ring
 from certify.analysis.stages.setting import Setting, setting_of
 from certify.analysis.stages.state import Report, Stage, State, Tools
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Report", "RoaOptions", "RoaResult", "certify_roa"]
 # Shares of the effort for candidates and ring, where more is to come:
-_BEFORE_TUBE, _BEFORE_OUTER = 0.5, 0.25
+_BEFORE_TUBE, _BEFORE_OUTER, _BEFORE_RANKS = 0.5, 0.25, 0.5
 
 
 def certify_roa(
@@ -151,6 +151,7 @@ def _through(state: State, tools: Tools) -> State:
     state = Setting(tools).extend(state, tools.effort)
     options = state.options
     share = _BEFORE_TUBE if options.enlarges else _BEFORE_OUTER if options.goes_beyond else 1.0
+    share = _BEFORE_RANKS if options.ranks else share
     search = tools.effort.share(share)
     state = _extended(state, [Candidate(tools), Ring(tools)], search)
     return _extended(state, _stages_after(state, tools), tools.effort)
@@ -173,6 +174,8 @@ def _stages_after(state: State, tools: Tools) -> list[Stage]:
             stages.append(Equilibrium(tools))
         if options.goes_beyond:
             stages.append(Beyond(tools))
+        if options.ranks:
+            stages.append(ByRanks(tools))
     stages.append(Acceptance(tools))
     if options.engine == "both":
         stages.append(Confirmation(tools))

@@ -222,7 +222,7 @@ class Steps(Moving):
         return hold
 
     def beyond(self, states: list[Taylor]) -> list[Taylor]:
-        """What is at most 0 in the target: V - c2, or expressions."""
+        """V - c2, or the expressions, which are at most 0 in the target."""
         number = constants(states[0])
         if self.c.target is not None:
             return evaluate(self.c.target, number, states)

@@ -102,8 +102,9 @@ class _Desk:
         return {**answer, "reference": second} if second["result"] == "ACCEPTED" else {**second, "by": "reference"}
 
     def _answered(self, path: Path, patient: bool) -> Mapping[str, Any]:
-        """The checker's answer; where many leaves make a long file, several processes share them."""
-        cores = len(os.sched_getaffinity(0)) if path.stat().st_size > _LONG else 1
+        """The checker's answer; where there are many leaves, several processes share them."""
+        ranked = self.state.claim is not None and self.state.claim.ranks is not None
+        cores = len(os.sched_getaffinity(0)) if ranked or path.stat().st_size > _LONG else 1
         return run_checker(path, jobs=self.state.options.jobs or min(cores, _MOST_JOBS), patient=patient)
 
 
@@ -115,7 +116,7 @@ def _with_facts(state: State, accepted: Accepted) -> State:
     if claim.start is None:
         result = replace(result, tube=None)
     constraints = constraints_in_words(accepted.certificate)
-    result = replace(result, ranks=rank_facts(accepted.certificate), constraints=constraints)
+    result = replace(result, ranks=rank_facts(accepted.certificate, state.rounds), constraints=constraints)
     if state.beyond is not None:
         if claim.outer is not None:
             result = replace(result, outer=outer_facts(problem, claim, claim.outer, state.beyond))

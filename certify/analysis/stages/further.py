@@ -1,4 +1,5 @@
-"""The stages that add to a proved set: one equilibrium inside, a tube from a larger set, a set of another function."""
+"""The stages that add to a proved set: one equilibrium inside, a tube from a larger set, a set of another function,
+boxes with ranks."""
 
 from __future__ import annotations
 
@@ -18,10 +19,11 @@ from certify.effort import Effort
 from certify.errors import OptionError
 from certify.lyapunov import Neural, Polynomial, are_inside, of_polynomial, volume
 from certify.lyapunov.function import Quadratic
-from certify.provers.base import Budget
+from certify.provers.base import Budget, Progress
 
 Array = NDArray[np.float64]
 _FOR_SEARCH = 0.5  # share of the effort that is left, the rest being for the check
+_FOR_RANKS = 0.7  # share of the effort that is left, the rest being for the check
 _FOR_LEARNING = 0.4  # share of the effort that is left, the rest being for the proof and its check
 
 
@@ -161,3 +163,35 @@ class Beyond:
             if options.learned == "neural":
                 return learn(problem.loop, problem.V, claim.roa, options.hidden, options.seed, share).function
             return fit_polynomial(problem.loop, problem.V, claim.roa, options.degree, options.seed, share).function
+
+
+@dataclass(frozen=True)
+class ByRanks:
+    """The stage that proves from which boxes of the domain trajectories reach the proved set."""
+
+    tools: Tools
+
+    def extend(self, state: State, effort: Effort) -> State:
+        """Add the boxes; a note says why there are none."""
+        from certify.provers.ranks import prove_ranks, root_box
+
+        tools, (claim, evidence), trial = self.tools, state.proved, state.contest.best.trial
+        system, problem = state.loop.system, trial.task.problem
+
+        def report(share: float, boxes: int, waiting: int) -> None:
+            tools.report(Progress(claim.roa, claim.roa, boxes, waiting, share, None), "ranks")
+
+        with tools.timing("ranks"):
+            tools.tell("ranks")
+            share = effort.share(_FOR_RANKS)
+            told = None if tools.progress is None else report
+            order, root = evidence.order, root_box(system)
+            found = prove_ranks(problem, claim.roa, claim.keep, root, share, tools.runner, told, order)
+        if found is None:
+            return state.noting("no box of the domain is proved to lead into the set")
+        return replace(
+            state,
+            rounds=found.rounds,
+            claim=replace(claim, ranks=found.ranks),
+            evidence=replace(evidence, ranks=found.evidence),
+        )

@@ -36,6 +36,10 @@ class Setting:
         require_one_that_knows(system, options)
         if options.box is not None:
             ellipsoid_in(system, options.box)
+        if options.ranks and not (system.time == "discrete" or system.sample is not None):
+            raise OptionError(
+                "`ranks` needs a loop whose time goes in steps: discrete time, or a held input (`sample`)."
+            )
         centre = None if options.reach_from is None else state_in(system, options.reach_from)
         state = replace(state, centre=centre)
         with self.tools.timing("candidate"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
-from certify.provers.ranks.search import RankProof, prove_ranks
+from certify.provers.ranks.mend import without_leaf
+from certify.provers.ranks.search import RankProof, prove_ranks, root_box
 
-__all__ = ["RankProof", "prove_ranks"]
+__all__ = ["RankProof", "prove_ranks", "root_box", "without_leaf"]

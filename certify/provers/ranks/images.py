@@ -17,6 +17,7 @@ from certify.certificates.claims import Problem
 from certify.loop.expressions import Expression, evaluate
 from certify.loop.policies import bounded_by_form
 from certify.provers.bounds import Flow, Models, Taylor, loop_models, policy_enclosure, upper_bound
+from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.bounds.taylor import EPS, TINY
 from certify.provers.boxes.rule import input_bounds_kept, operations_of_box
 
@@ -52,7 +53,7 @@ class Form:
     x: Array
     e: Array
 
-    def at(self, index: Array | Mask) -> Form:
+    def at(self, index: Index | Mask) -> Form:
         """Some of the boxes."""
         return Form(self.x[..., index], self.e[..., index])
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from certify.certificates import RankTree
 from certify.certificates.claims import Problem, Ranks
 from certify.effort import Effort
 from certify.loop.expressions import Expression
+from certify.loop.plants import System
 from certify.provers.bounds.arrays import Array, Index
 from certify.provers.execution import Runner
 from certify.provers.ranks.cover import Cover
@@ -24,6 +26,8 @@ from certify.provers.ranks.images import Course, Images
 
 NONE = 65_535
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
+_HALF_TURN = 3.1416  # and a little more
+_SLIVER = 1e-6
 _FIRST = 2**12  # leaves of the first tree
 _LARGEST = 0.7  # share of the leaves to be halved that are, the largest ones
 _MOST_LEAVES = 400_000
@@ -65,7 +69,8 @@ class Search:
     def unknown(self) -> Index:
         """Leaves without a rank."""
         leaves = self.cover.leaves
-        return leaves[self.rank[leaves] == NONE]
+        unknown: Index = leaves[self.rank[leaves] == NONE]
+        return unknown
 
     @property
     def share(self) -> float:
@@ -79,7 +84,7 @@ class Search:
         halves = self.cover.halve(nodes, axes)
         new = len(halves)
 
-        def longer(v: Array, fill: float) -> Array:
+        def longer(v: Any, fill: float) -> Any:
             return np.concatenate([v, np.full((*v.shape[:-1], new), fill, dtype=v.dtype)], -1)
 
         self.rank, self.steps = longer(self.rank, NONE), longer(self.steps, 0)
@@ -118,8 +123,9 @@ class Search:
                 break
             self.rank[new], self.steps[new] = best[new], by[new]
         some = np.logical_or.reduceat(self.rank[leaf] < NONE, starts) if len(starts) else np.zeros(0, dtype=bool)
-        near = np.unique(np.append(owners[some], node[~inside][:0]))
-        return near[self.rank[near] == NONE]
+        near: Index = np.unique(owners[some])
+        waiting: Index = near[self.rank[near] == NONE]
+        return waiting
 
     def _better(self, best: Index, by: Index, nodes: Index, ranks: Index, steps: Index) -> None:
         """Keep the lowest rank of each node, and its steps."""
@@ -136,8 +142,7 @@ class Search:
         return large, self.steep[:, large].argmax(0)
 
     def evidence(self) -> tuple[RankTree, int]:
-        """The evidence, with leaves that share a rank put together where that is all that splits them; the most
-        steps."""
+        """The evidence, and the most steps."""
         tree, leaves = self.cover.preorder()
         rank, steps = self.rank[leaves], self.steps[leaves]
         lo, hi = (end[:, 0].copy() for end in self.cover.root)
@@ -145,25 +150,34 @@ class Search:
         return RankTree(lo, hi, tree, rank.astype(np.uint16), steps.astype(np.uint8)), max(1, most)
 
 
+def root_box(system: System) -> tuple[Array, Array]:
+    """The box of places of a plant, corners (n,): a turn of each angle around 0, of other states the domain but for a
+    sliver along its ends."""
+    ends = np.array([[float(end) for end in pair] for pair in system.domain])
+    inwards = _SLIVER * np.abs(ends).max(1)
+    lo, hi = ends[:, 0] + inwards, ends[:, 1] - inwards
+    angles = np.array([s.name in system.angles for s in system.states])
+    return np.where(angles, -_HALF_TURN, lo), np.where(angles, _HALF_TURN, hi)
+
+
 def prove_ranks(
     problem: Problem,
     level: float,
-    angles: Sequence[str],
     keep: Sequence[Expression],
     root: tuple[Array, Array],
     effort: Effort,
     runner: Runner,
-    report: Callable[[float, int], None] | None = None,
+    report: Callable[[float, int, int], None] | None = None,
     order: int = 2,
 ) -> RankProof | None:
     """Prove from which leaves of a box trajectories reach {V <= level}.
 
     Parameters
     ----------
-    angles : the names of the states that are angles.
     keep : expressions that stay negative on the way.
     root : corners lo and hi (n,) of the box, in deviations; of an angle more than a turn apart.
-    report : called after every round with the share that is proved, and the number of leaves.
+    report : called after every round with the share that is proved, the boxes looked at, and the leaves that wait.
+    order : of the series in time, where inputs are held.
 
     Returns
     -------
@@ -171,7 +185,7 @@ def prove_ranks(
     """
     system = problem.loop.system
     lo, hi = root
-    named = [i for i, s in enumerate(system.states) if s.name in angles]
+    named = [i for i, s in enumerate(system.states) if s.name in system.angles]
     course = Course(problem, level, named, keep, hi - lo, COUNTS, order)
     search, rounds, done = Search(course, lo, hi), 0, False
     new = np.zeros(1, dtype=np.int64)
@@ -186,7 +200,7 @@ def prove_ranks(
             search.take(new, bound(search.cover.low[:, new], search.cover.high[:, new], 0.0, level))
             near, rounds = search.spread(), rounds + 1
             if report is not None:
-                report(search.share, len(search.cover.leaves))
+                report(search.share, search.boxes, len(search.unknown))
             done = not len(near)
             if done or effort.over or len(search.cover.leaves) > _MOST_LEAVES:
                 break
@@ -195,4 +209,4 @@ def prove_ranks(
     leaves = int((tree.ranks < NONE).sum())
     if not leaves:
         return None
-    return RankProof(Ranks(tuple(angles), most), tree, search.share, leaves, search.boxes, rounds, done)
+    return RankProof(Ranks(system.angles, most), tree, search.share, leaves, search.boxes, rounds, done)
