@@ -48,7 +48,13 @@ def row(policy: Path, arguments: argparse.Namespace) -> str:
         subprocess.run([sys.executable, "-m", "certify", "check", str(file)], check=True, capture_output=True)
         check, size = time.perf_counter() - start, file.stat().st_size / 1e6
     ranks, layers = answer.get("ranks") or {}, "-".join(map(str, answer["policy"]["layers"]))
-    cells = [policy.stem, layers, answer["claim"]["kind"], f"{answer['volume']:.3g}", f"{100 * ranks.get('covered', 0.0):.2f}"]
+    cells = [
+        policy.stem,
+        layers,
+        answer["claim"]["kind"],
+        f"{answer['volume']:.3g}",
+        f"{100 * ranks.get('covered', 0.0):.2f}",
+    ]
     cells += [f"{ranks.get('proved', 0):,}", str(ranks.get("steps", 0)), f"{answer['took']:.0f}", f"{check:.0f}"]
     return f"| {' | '.join([*cells, f'{size:.2f}'])} |"
 

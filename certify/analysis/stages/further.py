@@ -23,7 +23,7 @@ from certify.provers.base import Budget, Progress
 
 Array = NDArray[np.float64]
 _FOR_SEARCH = 0.5  # share of the effort that is left, the rest being for the check
-_FOR_RANKS = 0.7  # share of the effort that is left, the rest being for the check
+_FOR_RANKS = 0.35  # share of the whole effort, even if the search has left less
 _FOR_LEARNING = 0.4  # share of the effort that is left, the rest being for the proof and its check
 
 
@@ -176,16 +176,17 @@ class ByRanks:
         from certify.provers.ranks import prove_ranks, root_box
 
         tools, (claim, evidence), trial = self.tools, state.proved, state.contest.best.trial
-        system, problem = state.loop.system, trial.task.problem
+        problem = trial.task.problem
 
         def report(share: float, boxes: int, waiting: int) -> None:
             tools.report(Progress(claim.roa, claim.roa, boxes, waiting, share, None), "ranks")
 
         with tools.timing("ranks"):
             tools.tell("ranks")
-            share = effort.share(_FOR_RANKS)
+            least = _FOR_RANKS * tools.whole
+            share = effort.part(max(least, effort.left - least), even_if_over=True)
             told = None if tools.progress is None else report
-            order, root = evidence.order, root_box(system)
+            order, root = evidence.order, root_box(problem.loop)
             found = prove_ranks(problem, claim.roa, claim.keep, root, share, tools.runner, told, order)
         if found is None:
             return state.noting("no box of the domain is proved to lead into the set")

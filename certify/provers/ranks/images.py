@@ -35,7 +35,7 @@ class Images(NamedTuple):
     ----------
     lo, hi : (K, n, B); NaN where there is none that is of use.
     there : (K, B), the image lies in the target.
-    inside : (B,), the box itself does.
+    inside, meets : (B,), the box itself does; it may have states there.
     steep : (n, B), by how much each axis of the box widens its first image that reaches far, relative to the root.
     """
 
@@ -43,6 +43,7 @@ class Images(NamedTuple):
     hi: Array
     there: Mask
     inside: Mask
+    meets: Mask
     steep: Array
 
 
@@ -114,6 +115,7 @@ class Course:
             np.full((K, n, batch), np.nan),
             np.zeros((K, batch), dtype=bool),
             self.is_there(form),
+            ~(upper_bound(self.beyond(form).scaled(-1.0))[0] < 0),
             np.abs(slopes).sum(0) / self.root[:, None],
         )
         left = np.flatnonzero(~found.inside)
@@ -182,6 +184,11 @@ class Course:
 
     def is_there(self, form: Form) -> Mask:
         """True where the states lie in the target, as places."""
+        there: Mask = upper_bound(self.beyond(form))[0] < -_ENDS * self.level
+        return there
+
+    def beyond(self, form: Form) -> Taylor:
+        """V - level of the places that are nearest to 0."""
         n, x = self.system.n, form.x.copy()
         for i in self.angles:
             x[i, 0] -= TURN * np.rint(x[i, 0] / TURN)
@@ -193,8 +200,7 @@ class Course:
         V = states[0] * rows[0]
         for state, row in zip(states[1:], rows[1:], strict=True):
             V = V + state * row
-        there: Mask = upper_bound(V.shifted(-self.level))[0] < -_ENDS * self.level
-        return there
+        return V.shifted(-self.level)
 
 
 def _form(models: Sequence[Taylor], n: int) -> Form:

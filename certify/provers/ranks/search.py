@@ -17,20 +17,21 @@ import numpy as np
 from certify.certificates import RankTree
 from certify.certificates.claims import Problem, Ranks
 from certify.effort import Effort
+from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression
-from certify.loop.plants import System
 from certify.provers.bounds.arrays import Array, Index
 from certify.provers.execution import Runner
 from certify.provers.ranks.cover import Cover
-from certify.provers.ranks.images import Course, Images
+from certify.provers.ranks.images import TURN, Course, Images
 
 NONE = 65_535
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 _HALF_TURN = 3.1416  # and a little more
-_SLIVER = 1e-6
+_SLIVER, _SAMPLES = 1e-6, 64
 _FIRST = 2**12  # leaves of the first tree
 _LARGEST = 0.7  # share of the leaves to be halved that are, the largest ones
 _MOST_LEAVES = 400_000
+_ROUNDS, _GAIN = 6, 1e-4  # relative growth of what is proved, in so many rounds, below which the search ends
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,7 @@ class Search:
         K, n = len(course.counts), len(lo)
         self.rank, self.steps = np.full(1, NONE), np.zeros(1, dtype=np.int64)
         self.lo, self.hi = np.full((K, n, 1), np.nan), np.full((K, n, 1), np.nan)
-        self.there, self.steep = np.zeros((K, 1), dtype=bool), np.zeros((n, 1))
+        self.there, self.steep, self.meets = np.zeros((K, 1), dtype=bool), np.zeros((n, 1)), np.zeros(1, dtype=bool)
         self.boxes = 0
 
     @property
@@ -89,18 +90,23 @@ class Search:
 
         self.rank, self.steps = longer(self.rank, NONE), longer(self.steps, 0)
         self.lo, self.hi = longer(self.lo, np.nan), longer(self.hi, np.nan)
-        self.there, self.steep = longer(self.there, False), longer(self.steep, 0.0)
+        self.there, self.steep, self.meets = (
+            longer(self.there, False),
+            longer(self.steep, 0.0),
+            longer(self.meets, False),
+        )
         return halves
 
     def take(self, nodes: Index, found: Images) -> None:
         """Take in the images of leaves."""
         self.lo[..., nodes], self.hi[..., nodes] = found.lo, found.hi
-        self.there[:, nodes], self.steep[:, nodes] = found.there, found.steep
+        self.there[:, nodes], self.steep[:, nodes], self.meets[nodes] = found.there, found.steep, found.meets
         self.rank[nodes[found.inside]] = 0
         self.boxes += len(nodes)
 
     def spread(self) -> Index:
-        """Give ranks to all leaves that have one by now; those without whose images meet some leaf with a rank."""
+        """Give ranks to all leaves that have one by now; those without that may meet the target, or whose images meet
+        some leaf with a rank."""
         unknown, counts = self.unknown, np.array(self.course.counts)
         k, at = np.nonzero(np.isfinite(self.lo[:, 0, unknown]))
         node, there = unknown[at], self.there[k, unknown[at]]
@@ -123,7 +129,7 @@ class Search:
                 break
             self.rank[new], self.steps[new] = best[new], by[new]
         some = np.logical_or.reduceat(self.rank[leaf] < NONE, starts) if len(starts) else np.zeros(0, dtype=bool)
-        near: Index = np.unique(owners[some])
+        near: Index = np.unique(np.append(owners[some], unknown[self.meets[unknown]]))
         waiting: Index = near[self.rank[near] == NONE]
         return waiting
 
@@ -150,13 +156,25 @@ class Search:
         return RankTree(lo, hi, tree, rank.astype(np.uint16), steps.astype(np.uint8)), max(1, most)
 
 
-def root_box(system: System) -> tuple[Array, Array]:
+def turning(loop: ClosedLoop) -> list[int]:
+    """The plant's angles, by their numbers, if the policy is the same after a turn of each of them at samples; else
+    none: a policy that reads an angle itself counts turns."""
+    system = loop.system
+    angles = [i for i, s in enumerate(system.states) if s.name in system.angles]
+    x = np.random.default_rng(0).uniform(-1, 1, (_SAMPLES, system.n))
+    u = loop.policy(x)
+    moved = (loop.policy(x + TURN * np.eye(system.n)[i]) for i in angles)
+    return angles if all(np.allclose(u, v, rtol=1e-9, atol=1e-9) for v in moved) else []
+
+
+def root_box(loop: ClosedLoop) -> tuple[Array, Array]:
     """The box of places of a plant, corners (n,): a turn of each angle around 0, of other states the domain but for a
     sliver along its ends."""
+    system, turns = loop.system, turning(loop)
     ends = np.array([[float(end) for end in pair] for pair in system.domain])
     inwards = _SLIVER * np.abs(ends).max(1)
     lo, hi = ends[:, 0] + inwards, ends[:, 1] - inwards
-    angles = np.array([s.name in system.angles for s in system.states])
+    angles = np.isin(np.arange(system.n), turns)
     return np.where(angles, -_HALF_TURN, lo), np.where(angles, _HALF_TURN, hi)
 
 
@@ -185,7 +203,7 @@ def prove_ranks(
     """
     system = problem.loop.system
     lo, hi = root
-    named = [i for i, s in enumerate(system.states) if s.name in system.angles]
+    named = turning(problem.loop)
     course = Course(problem, level, named, keep, hi - lo, COUNTS, order)
     search, rounds, done = Search(course, lo, hi), 0, False
     new = np.zeros(1, dtype=np.int64)
@@ -195,13 +213,15 @@ def prove_ranks(
         widths[axis] /= 2
         new = search.halve(new, np.full(len(new), axis))
     with runner.start(course) as bound:
+        shares = [0.0]
         while True:
             effort.charge(len(new) * course.operations)
             search.take(new, bound(search.cover.low[:, new], search.cover.high[:, new], 0.0, level))
             near, rounds = search.spread(), rounds + 1
+            shares.append(search.share)
             if report is not None:
-                report(search.share, search.boxes, len(search.unknown))
-            done = not len(near)
+                report(shares[-1], search.boxes, len(search.unknown))
+            done = not len(near) or (len(shares) > _ROUNDS and 0 < shares[-1] <= (1 + _GAIN) * shares[-1 - _ROUNDS])
             if done or effort.over or len(search.cover.leaves) > _MOST_LEAVES:
                 break
             new = search.halve(*search.next(near))
@@ -209,4 +229,6 @@ def prove_ranks(
     leaves = int((tree.ranks < NONE).sum())
     if not leaves:
         return None
-    return RankProof(Ranks(system.angles, most), tree, search.share, leaves, search.boxes, rounds, done)
+    return RankProof(
+        Ranks(tuple(system.states[i].name for i in named), most), tree, search.share, leaves, search.boxes, rounds, done
+    )
