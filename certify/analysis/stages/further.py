@@ -189,7 +189,7 @@ class ByRanks:
             order, root = evidence.order, root_box(problem.loop)
             found = prove_ranks(problem, claim.roa, claim.keep, root, share, tools.runner, told, order)
         if found is None:
-            return state.noting("no box of the domain is proved to lead into the set")
+            return state.noting("no box of the domain beyond the set is proved to lead into it")
         return replace(
             state,
             rounds=found.rounds,

@@ -199,7 +199,7 @@ def prove_ranks(
 
     Returns
     -------
-    RankProof | None : None if no leaf has a rank.
+    RankProof | None : None if no leaf beyond the set has a rank.
     """
     system = problem.loop.system
     lo, hi = root
@@ -227,7 +227,7 @@ def prove_ranks(
             new = search.halve(*search.next(near))
     tree, most = search.evidence()
     leaves = int((tree.ranks < NONE).sum())
-    if not leaves:
+    if not np.any(tree.steps):
         return None
     return RankProof(
         Ranks(tuple(system.states[i].name for i in named), most), tree, search.share, leaves, search.boxes, rounds, done
