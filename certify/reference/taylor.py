@@ -197,7 +197,7 @@ class Taylor:
         if self.g is None:
             return result
         if self.Q is None:
-            return result + self.first
+            return result + total(map(abs, self.g.entries()))  # exact, where `first` is rounded
         for i, (g, row) in enumerate(zip(map(abs, self.g.entries()), self.Q.tolist(), strict=True)):
             q = row[i]
             if q < 0 and g <= -2 * q:

@@ -1,0 +1,782 @@
+"""Boxes with ranks, angles, constraints and the claim `reaches` in the reference: true claims, and many false ones.
+
+Every certificate is JSON by hand, and its ranks are found in floats (`tests.support.ranked`).
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import random
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from flint import arb
+
+from certify.reference import rules
+from certify.reference.__main__ import in_words
+from certify.reference.document import read
+from certify.reference.leaves import Box
+from certify.reference.ranks import Walk, around
+from tests.support.ranked import (
+    UNRANKED,
+    Document,
+    Image,
+    Interval,
+    Loop,
+    affine,
+    around_level,
+    dumped,
+    encode,
+    mapped,
+    ranked,
+    raw,
+    two_bytes,
+    uniform,
+)
+
+HALF = [affine([[-0.5]])]  # u = -x/2
+NEAR: list[Any] = [["-", ["**", "x", 2], "1/16"]]  # |x| <= 1/4
+TURNING: list[Any] = [["-", "9/10", ["cos", "x"]]]
+
+
+def verdict(data: Document) -> str | None:
+    """None if it is accepted, else the rule."""
+    found = rules.judge(dumped(data))
+    return None if found.result == "ACCEPTED" else found.rule
+
+
+def certificate(
+    loop: Loop,
+    image: Image,
+    inside: Callable[[Sequence[Interval]], bool],
+    ends: tuple[float, float] = (-2.0, 2.0),
+    depth: int = 5,
+    longest: int = 1,
+) -> tuple[Document, list[int], list[int]]:
+    n = len(loop.states)
+    tree, leaves = uniform([ends[0]] * n, [ends[1]] * n, depth)
+    angles = [loop.states.index(name) for name in loop.angles]
+    ranks, steps = ranked(leaves, image, inside, longest, angles)
+    return document(loop, ends, tree, ranks, steps), ranks, steps
+
+
+def document(
+    loop: Loop, ends: tuple[float, float], tree: bytes, ranks: Sequence[int], steps: Sequence[int]
+) -> Document:
+    n = len(loop.states)
+    return loop.document([ends[0]] * n, [ends[1]] * n, tree, two_bytes(ranks), bytes(steps))
+
+
+def repeated(step: Callable[[Sequence[Interval]], Sequence[Interval]]) -> Image:
+    def image(box: Sequence[Interval], count: int) -> Sequence[Interval]:
+        for _ in range(count):
+            box = step(box)
+        return box
+
+    return image
+
+
+def scaled(a: float, b: float = 0.0, wide: float = 0.0) -> Image:
+    """a x + b within `wide`."""
+    return repeated(lambda box: [(min(a * p, a * q) + b - wide, max(a * p, a * q) + b + wide) for p, q in box])
+
+
+def within(size: float) -> Callable[[Sequence[Interval]], bool]:
+    return lambda box: all(-size <= p and q <= size for p, q in box)
+
+
+def cosine(box: Sequence[Interval]) -> bool:
+    """cos x >= 9/10 on all of a box."""
+    (a, b), far = box[0], math.acos(0.9) - 1e-6
+    w = round((a + b) / 2 / (2 * math.pi)) * 2 * math.pi
+    return -far <= a - w and b - w <= far
+
+
+def edited(data: Document, path: str, value: Any) -> Document:
+    """With the entry at a path replaced by a value, or by value(old); without it where the value is `...`."""
+    result = copy.deepcopy(data)
+    *parents, last = path.split(".")
+    at = result
+    for key in parents:
+        at = at[int(key)] if isinstance(at, list) else at[key]
+    if value is ...:
+        del at[last]
+    else:
+        at[last] = value(at[last]) if callable(value) else value
+    return result
+
+
+def reranked(data: Document, ranks: Sequence[int], steps: Sequence[int]) -> Document:
+    made = edited(data, "evidence.ranks.ranks", raw(two_bytes(ranks)))
+    return edited(made, "evidence.ranks.steps", raw(bytes(steps)))
+
+
+HALVING = Loop([["+", "x", "u"]], HALF, NEAR)
+
+
+def halving(**more: Any) -> tuple[Document, list[int], list[int]]:
+    return certificate(Loop(**{**HALVING.__dict__, **more}), scaled(0.5), within(0.25 + 2e-7))
+
+
+# ------------------------------------------------------------------------------------------------------- what is true
+
+
+def test_the_half_of_x_comes_near() -> None:
+    data, ranks, steps = halving()
+    assert max(ranks) == 4 and set(steps) == {0, 1} and verdict(data) is None
+    c = rules.judge(dumped(data)).certificate
+    assert c is not None
+    words = in_words(c)
+    assert "1000 at most" in words and "u within the input bounds, and x inside the domain" in words
+    assert "nothing is said of what happens there" in words
+
+
+def spiral(box: Sequence[Interval], count: int) -> list[Interval]:
+    """Exact ends: two steps are a quarter of a turn, and a box in between is no longer one."""
+    corners = [complex(x, y) * (0.6 + 0.6j) ** count for x in box[0] for y in box[1]]
+    return [(min(part), max(part)) for part in ([z.real for z in corners], [z.imag for z in corners])]
+
+
+SPIRAL = Loop(
+    [["-", ["*", "3/5", "x"], ["*", "3/5", "y"]], ["+", ["*", "3/5", "x"], "u"]],
+    [affine([[0.0, 0.6]])],
+    [["-", ["+", ["**", "x", 2], ["**", "y", 2]], "1/2"]],
+    states=("x", "y"),
+)
+
+
+def far_corner(box: Sequence[Interval]) -> float:
+    return sum(max(p * p, q * q) for p, q in box)
+
+
+def test_two_states_that_wind_inwards_in_several_steps() -> None:
+    data, ranks, steps = certificate(SPIRAL, spiral, lambda b: far_corner(b) <= 0.49, (-2.0, 2.0), 8, 4)
+    assert max(steps) > 1 and UNRANKED not in ranks
+    assert verdict(data) is None
+
+
+def test_an_angle_goes_round_and_over_the_seam() -> None:
+    loop = Loop([["+", "x", "1/2", "u"]], [affine([[0.0]])], TURNING, angles=("x",))
+    data, ranks, _ = certificate(loop, scaled(1.0, 0.5), cosine, (-3.25, 3.25), 6)
+    assert UNRANKED not in ranks and max(ranks) > 10 and verdict(data) is None
+    backwards = Loop([["+", "x", "-1/2", "u"]], [affine([[0.0]])], TURNING, angles=("x",))
+    data, ranks, _ = certificate(backwards, scaled(1.0, -0.5), cosine, (-3.25, 3.25), 6)
+    assert UNRANKED not in ranks and verdict(data) is None
+    elsewhere, ranks, _ = certificate(loop, scaled(1.0, 0.5), cosine, (7.0, 13.5), 6)
+    assert UNRANKED not in ranks and verdict(elsewhere) is None
+    assert verdict(edited(data, "claim.ranks.angles", [])) == "ranks"  # it leaves the box of the tree
+
+
+def sines(box: Sequence[Interval]) -> list[Interval]:
+    ((a, b),) = box
+    return [(a - 0.5 * math.sin(a), b - 0.5 * math.sin(b))]  # increasing
+
+
+def test_a_policy_that_reads_the_sine_of_an_angle() -> None:
+    loop = Loop([["+", "x", "u"]], [mapped("sin", 0), affine([[-0.5]], of=1)], TURNING, angles=("x",))
+    data, ranks, _ = certificate(loop, repeated(sines), cosine, (-3.25, 3.25), 7)
+    assert ranks.count(UNRANKED) in range(2, 40) and verdict(data) is None
+
+
+HELD = Loop(["u"], [affine([[-1.0]])], NEAR, sample=("1/4", "1/2"), order=2)
+
+
+def held(box: Sequence[Interval]) -> list[Interval]:
+    ((a, b),) = box
+    return [(min(0.5 * a, 0.75 * a), max(0.5 * b, 0.75 * b))]
+
+
+def test_held_inputs_with_periods_in_a_range() -> None:
+    for order in (1, 2, 3):
+        loop = Loop(**{**HELD.__dict__, "order": order})
+        data, ranks, _ = certificate(loop, repeated(held), within(0.25), (-2.0, 2.0), 6, 3)
+        assert UNRANKED not in ranks and verdict(data) is None
+    assert verdict(edited(data, "claim.sample", ["0", "1/2"])) == "ranks"  # nothing has moved after no time
+    assert verdict(edited(data, "plant.domain", [["-2", "9"]])) in ("ranks", "flow")
+
+
+def test_what_is_uncertain_has_another_value_in_each_step() -> None:
+    """x+ = -9/10 x + q comes near 0 for each constant q, and is driven far by one that changes its sign."""
+    network, target = [affine([[-0.9]])], [["-", ["abs", "x"], "1/2"]]
+    loop = Loop([["+", "u", "q"]], network, target, uncertain=[("q", "-1/10", "1/10")])
+    true, found, _ = certificate(loop, scaled(-0.9, 0.0, 0.1), within(0.5), (-2.0, 2.0), 7, 6)
+    assert found.count(0) > 20 and verdict(true) is None
+    false, ranks, _ = certificate(loop, scaled(-0.9, 0.0, 0.02), within(0.5), (-1.0, 1.0), 7, 6)
+    assert UNRANKED not in ranks and verdict(false) == "ranks"
+
+
+def test_ranks_beside_an_asymptotic_claim() -> None:
+    data = around_level(halving()[0], 1.0, 1 / 16)
+    assert verdict(data) is None
+    c = rules.judge(dumped(data)).certificate
+    assert c is not None and "converges to the origin" in in_words(c) and "V <= 0.0625, until then" in in_words(c)
+    assert verdict(edited(data, "levels", {"local": (0.0624).hex(), "roa": (0.0624).hex()})) == "ranks"
+    held_too = around_level(certificate(HELD, repeated(held), within(0.25), (-2.0, 2.0), 6, 3)[0], 1.0, 1 / 16)
+    assert verdict(held_too) is None
+
+
+def test_a_level_set_of_V_as_a_place() -> None:
+    """x+ = x - sin(x)/2 on a box of an angle that does not hold 0, but 2 pi."""
+    loop = Loop([["+", "x", "u"]], [mapped("sin", 0), affine([[-0.5]], of=1)], None, angles=("x",))
+    data, ranks, _ = certificate(loop, repeated(sines), lambda box: within(0.25)([(p - 2 * math.pi, q - 2 * math.pi) for p, q in box]), (3.0, 9.5), 8)  # fmt: skip  # noqa: E501
+    assert ranks.count(0) > 5 and ranks.count(UNRANKED) < 100
+    ball = around_level(data, 1.0, 1 / 16)
+    ball["evidence"]["local"]["multipliers"] = around_level(halving()[0], 1.0, 1 / 16)["evidence"]["local"][
+        "multipliers"
+    ]
+    assert verdict(ball) is None
+    wrong = edited(ball, "claim.ranks.angles", [])
+    assert verdict(wrong) == "ranks"  # then 2 pi is far from {V <= c2}
+
+
+# ------------------------------------------------------------------------------------------------ ranks that are false
+
+
+def test_a_rank_that_is_too_low_by_one() -> None:
+    data, ranks, steps = halving()
+    lowered = 0
+    for i, r in enumerate(ranks):
+        if r > 1:
+            made = reranked(data, [*ranks[:i], r - 1, *ranks[i + 1 :]], steps)
+            lowered += verdict(made) == "ranks"
+    assert lowered == sum(r > 1 for r in ranks)
+
+
+def test_ranks_that_run_in_a_circle() -> None:
+    for sign in (1.0, -1.0):
+        loop = Loop(["u"], [affine([[sign]])], NEAR)
+        tree, leaves = uniform([-2.0], [2.0], 4)
+        near = [within(0.25)(box) for box in leaves]
+        for high in (1, 2, 7):
+            ranks = [0 if here else high if box[0][0] < 0 else 1 for here, box in zip(near, leaves, strict=True)]
+            steps = [int(r > 0) for r in ranks]
+            assert verdict(document(loop, (-2.0, 2.0), tree, ranks, steps)) == "ranks"
+            most = [0 if here else 7 for here in near]
+            long = [0 if here else 7 for here in near]
+            assert verdict(document(loop, (-2.0, 2.0), tree, most, long)) == "ranks"
+
+
+@pytest.mark.parametrize(("shift", "good"), [(1e-9, True), (-1e-9, False)])
+def test_an_image_that_leaves_the_tree_by_little(shift: float, good: bool) -> None:
+    """x+ = -x/2 + shift of the leaf at 2, where the tree begins at -1."""
+    loop = Loop(["u"], [affine([[-0.5]], [shift])], NEAR)
+    tree, leaves = uniform([-1.0], [2.0], 5)
+
+    def clipped(box: Sequence[Interval], count: int) -> list[Interval]:
+        return [(max(p, -0.9999), q) for p, q in scaled(-0.5)(box, count)]
+
+    ranks, steps = ranked(leaves, clipped, within(0.25))
+    assert UNRANKED not in ranks
+    assert (verdict(document(loop, (-1.0, 2.0), tree, ranks, steps)) is None) == good
+
+
+def test_a_leaf_that_is_met_at_its_edge_counts() -> None:
+    """x+ = x/2 takes the leaf [1, 2] to [1/2, 1], whose end it shares."""
+    tree = bytes([0, 0, 255, 255, 0, 255, 255])  # of [0, 4]: [0, 1], [1, 2], [2, 3], [3, 4]
+    loop = Loop([["+", "x", "u"]], HALF, [["-", "x", "1"]])
+    assert verdict(document(loop, (0.0, 4.0), tree, [0, 3, 5, 7], [0, 3, 2, 1])) is None
+    assert verdict(document(loop, (0.0, 4.0), tree, [0, 1, 2, 3], [0, 1, 1, 1])) is None  # [1/2, 1] is in the target
+    below = Loop([["+", "x", "u"]], HALF, [["-", "x", "999999999/1000000000"]])
+    assert verdict(document(below, (0.0, 4.0), tree, [0, 1, 2, 3], [0, 1, 1, 1])) == "ranks"
+
+
+@pytest.mark.parametrize("index", [0, -1])
+def test_wrong_numbers_of_bytes(index: int) -> None:
+    data, ranks, steps = halving()
+    both = two_bytes(ranks)
+    for wrong in (both[:-1], both[:-2], both + b"\0", both + b"\0\0", b"", both[::2]):
+        assert verdict(edited(data, "evidence.ranks.ranks", raw(wrong))) == "ranks"
+    for short in (bytes(steps[:-1]), bytes([*steps, 0]), b"", bytes(2 * len(steps))):
+        assert verdict(edited(data, "evidence.ranks.steps", raw(short))) == "ranks"
+    tree = uniform([-2.0], [2.0], 5)[0]
+    for cut in (tree[:-1], tree + b"\xff", b"\xff", b"", b"\x01" + tree[1:]):
+        assert verdict(edited(data, "evidence.ranks.tree", raw(cut))) == "ranks"
+
+
+def test_ranks_and_steps_that_do_not_fit() -> None:
+    data, ranks, steps = halving()
+    at_0, high = ranks.index(0), ranks.index(max(ranks))
+
+    def at(i: int, r: int, k: int) -> str | None:
+        return verdict(reranked(data, [*ranks[:i], r, *ranks[i + 1 :]], [*steps[:i], k, *steps[i + 1 :]]))
+
+    assert at(high, 900, 1) is None and at(high, 1000, 2) is None and at(high, UNRANKED, 0) is None
+    assert at(high, 1001, 1) == "ranks"  # above the claim's
+    assert at(high, 65_534, 1) == "ranks" and at(high, UNRANKED, 1) == "ranks"
+    assert at(high, 5, 0) == "ranks" and at(high, 2, 3) == "ranks" and at(high, 0, 0) == "ranks"
+    assert at(at_0, 0, 1) == "ranks" and at(at_0, 0, 255) == "ranks"
+    assert at(high, 3, 3) is None  # in the target after three steps
+    assert at(high, 2, 2) == "ranks"  # not yet: 2/4
+
+
+def test_the_lower_byte_of_a_rank_is_first() -> None:
+    data, ranks, steps = halving()
+    spread = [200 * r for r in ranks]
+    assert verdict(reranked(data, spread, steps)) is None
+    swapped = b"".join(r.to_bytes(2, "big") for r in spread)
+    assert verdict(edited(data, "evidence.ranks.ranks", raw(swapped))) == "ranks"
+    wrapped = edited(data, "claim.ranks.steps", 65_534)
+    assert verdict(reranked(wrapped, [16_000 * r for r in ranks], steps)) is None
+
+
+def test_a_target_that_is_missed() -> None:
+    data, ranks, _ = halving()
+    assert verdict(edited(data, "claim.target", [["-", ["**", "x", 2], "624/10000"]])) == "ranks"
+    assert verdict(edited(data, "claim.target", [*NEAR, ["-", "x", "249/1000"]])) == "ranks"
+    assert verdict(edited(data, "claim.target", [*NEAR, ["-", "x", "1/4"]])) is None
+    assert verdict(edited(data, "claim.target", [*NEAR, ["sqrt", "x"]])) == "ranks"  # it has no finite model
+    assert verdict(edited(data, "claim.target", [["/", "-1", "x"]])) == "ranks"
+    empty = reranked(data, [1 if r == 1 else UNRANKED for r in ranks], [int(r == 1) for r in ranks])
+    assert verdict(empty) is None  # what ends in the target need not meet a leaf of rank 0
+    assert verdict(edited(empty, "claim.target", ["1"])) == "ranks"
+
+
+# ------------------------------------------------------------------------------------------------------ before a step
+
+
+def test_inputs_and_domain_before_each_step() -> None:
+    data = halving()[0]
+    assert verdict(edited(data, "plant.input_bounds", [["-1", "1"]])) is None
+    assert verdict(edited(data, "plant.input_bounds", [["-1", "999999/1000000"]])) == "inputs"
+    assert verdict(edited(data, "plant.domain", [["-9", "2"]])) == "ranks"  # 2 is not inside
+    assert verdict(edited(data, "plant.domain", [["-9", "2000001/1000000"]])) is None
+    loop = Loop(["u"], [affine([[-3.0]])], [["-", ["*", "x", "x"], "1"]], bound="99")
+    tree = bytes([0, 255, 255])  # x+ = -3 x takes [1/4, 1/3] to [-1, -3/4]
+    away = Loop(**{**loop.__dict__, "domain": ("-2/5", "9")})
+    assert verdict(away.document([-5.0], [0.0], b"\xff", two_bytes([UNRANKED]), b"\0")) is None
+    steps = two_bytes([2, UNRANKED])
+    assert verdict(away.document([0.03], [0.3], tree, steps, b"\2\0")) == "ranks"  # the first state is outside
+    assert verdict(edited(away.document([0.03], [0.3], tree, steps, b"\2\0"), "claim.target", ["-1"])) == "ranks"
+    wide = Loop(**{**loop.__dict__, "domain": ("-1", "9"), "target": ["-1"]})
+    assert verdict(wide.document([0.03], [0.3], tree, steps, b"\2\0")) is None
+
+
+def test_the_domain_is_not_asked_of_angles() -> None:
+    loop = Loop([["+", "x", "1/2", "u"]], [affine([[0.0]])], TURNING, angles=("x",), domain=("-1", "1"))
+    assert verdict(certificate(loop, scaled(1.0, 0.5), cosine, (-3.25, 3.25), 6)[0]) is None
+
+
+@pytest.mark.parametrize(
+    ("keep", "good"),
+    [
+        (["-", "x", "2000001/1000000"], True),
+        (["-", "x", "1999999/1000000"], False),
+        (["-", ["abs", "u"], "1000001/1000000"], True),
+        (["-", ["abs", "u"], "999999/1000000"], False),
+        (["-", "x", "2"], False),  # 0 is not negative
+        (["/", "-1", ["+", "3", "x"]], True),
+        (["/", "-1", ["+", "2", "x"]], False),
+    ],
+)
+def test_constraints_in_steps(keep: Any, good: bool) -> None:
+    assert verdict(halving(keep=["-1", keep])[0]) == (None if good else "keep")
+
+
+def test_constraints_are_not_asked_in_the_target_and_of_leaves_without_a_rank() -> None:
+    above = ["-", "1/25", ["*", "x", "x"]]
+    data, ranks, _ = halving(keep=[above])  # |x| > 1/5
+    assert verdict(data) is None
+    far = edited(data, "claim.keep", [["-", "x", "1"]])
+    assert verdict(far) == "keep"
+    few = [r if r < 4 else UNRANKED for r in ranks]
+    assert verdict(reranked(far, few, [int(0 < r < UNRANKED) for r in few])) == "keep"
+    few = [r if i < 24 else UNRANKED for i, r in enumerate(ranks)]  # x < 1
+    assert verdict(reranked(far, few, [int(0 < r < UNRANKED) for r in few])) == "keep"  # at 1 it is 0
+    few = [r if i < 23 else UNRANKED for i, r in enumerate(ranks)]
+    assert verdict(reranked(far, few, [int(0 < r < UNRANKED) for r in few])) is None
+
+
+def test_constraints_in_the_middle_of_several_steps() -> None:
+    """x+ = -x/2 from [1, 2] in two steps: -1 comes between."""
+    loop = Loop(["u"], HALF, [["-", ["*", "x", "x"], "1"]])
+    tree = bytes([0, 255, 255])
+    for bound, good in (("1000001/1000000", True), ("999999/1000000", False)):
+        loop.keep = [["-", ["-", "x"], bound]]
+        data = document(loop, (0.0, 2.0), tree, [0, 2], [0, 2])
+        assert verdict(data) == (None if good else "keep")
+
+
+def test_constraints_between_instants() -> None:
+    """x' = u, u = -x: what holds at instants may not hold between them. x' = 4 goes past 2 before it is at 5."""
+    data, *_ = certificate(Loop(**{**HELD.__dict__, "keep": [["-", "x", "201/100"]]}), repeated(held), within(0.25), (-2.0, 2.0), 6, 3)  # fmt: skip  # noqa: E501
+    assert verdict(data) == "keep"  # xi is within kappa
+    assert verdict(edited(data, "claim.keep", [["-", "x", "7/2"]])) is None
+    rising = Loop(
+        [["+", "4", ["*", "0", "u"]]],
+        HALF,
+        [["-", "4", "x"]],
+        sample=("1", "1"),
+        keep=[["-", ["*", ["-", "x", "3"], ["-", "x", "3"]]]],
+    )
+    tree = b"\xff"
+    assert verdict(edited(document(rising, (0.5, 1.0), tree, [1], [1]), "claim.keep", ["-1"])) is None
+    assert verdict(document(rising, (0.5, 1.0), tree, [1], [1])) == "keep"  # -(x - 3)^2 is 0 at 3
+
+
+def test_the_domain_between_instants() -> None:
+    """From [1/2, 1] x' = 4 is at 5 after one period, and beyond 3 before."""
+    rising = Loop([["+", "4", ["*", "0", "u"]]], HALF, [["-", "4", "x"]], sample=("1", "1"))
+    assert verdict(document(rising, (0.5, 1.0), b"\xff", [1], [1])) is None
+    rising.domain = ("-9", "3")
+    assert verdict(document(rising, (0.5, 1.0), b"\xff", [1], [1])) == "flow"
+    rising.domain = ("1/2", "9")
+    assert verdict(document(rising, (0.5, 1.0), b"\xff", [1], [1])) == "flow"  # 1/2 is not inside
+
+
+def test_constraints_between_instants_on_a_ball() -> None:
+    """{x^2 <= 1/16} of x' = u, u = -x, as wide as 0.2525, and 1.25 times the way of a period more."""
+    data = around_level(certificate(HELD, repeated(held), within(0.25), (-2.0, 2.0), 6, 3)[0], 1.0, 1 / 16)
+    alone = edited(edited(data, "claim.ranks", ...), "evidence.ranks", ...)
+    for bound, rule in (("28/100", "keep"), ("1/2", None)):
+        assert verdict(edited(alone, "claim", lambda c, b=bound: c | {"keep": [["-", "x", b]]})) == rule
+    still = edited(alone, "claim", lambda c: c | {"keep": [["-", "u", "28/100"]]})
+    assert verdict(still) is None  # the input is held
+
+
+def test_constraints_where_a_leaf_reaches_beyond_the_level() -> None:
+    data = around_level(halving()[0], 1.0, 1 / 16)
+    small = around_level(halving()[0], 1.0, 1 / 1024)["evidence"]["local"]["J"]
+    data = edited(edited(data, "claim.ranks", ...), "evidence.ranks", ...)
+    data = edited(data, "levels.local", (1 / 1024).hex())
+    data = edited(edited(data, "evidence.local.J", small), "evidence.root", encode(0.5))
+    data = edited(data, "evidence.tree", raw(uniform([-0.5], [0.5], 3)[0]))  # the leaf [1/4, 3/8] is not outside
+    for bound, rule in (("3/10", None), ("24/100", "keep")):
+        assert verdict(edited(data, "claim", lambda c, b=bound: c | {"keep": [["-", "x", b]]})) == rule
+        assert verdict(edited(data, "claim", lambda c, b=bound: c | {"keep": [["-", ["-", "x"], b]]})) == rule
+
+
+def test_constraints_with_what_is_uncertain() -> None:
+    loop = Loop([["+", "u", "q"]], [affine([[-0.5]])], NEAR, uncertain=[("q", "-1/50", "1/50")])
+    data, *_ = certificate(loop, scaled(-0.5, 0.0, 0.02), within(0.25), (-2.0, 2.0), 6)
+    for bound, rule in (("21/1000", None), ("19/1000", "keep")):
+        loop.keep = [["-", "q", bound]]
+        assert verdict(edited(data, "claim", lambda c: c | {"keep": loop.keep})) == rule
+
+
+def test_constraints_beside_V() -> None:
+    data = around_level(halving()[0], 1.0, 1 / 16)
+    assert verdict(edited(data, "claim", lambda c: c | {"keep": [["-", "x", "3"], ["-", "u", "3"]]})) is None
+    assert verdict(edited(data, "claim", lambda c: c | {"keep": [["-", "x", "1"]]})) == "keep"
+    alone = edited(edited(data, "claim.ranks", ...), "evidence.ranks", ...)
+    assert verdict(alone) is None
+    assert verdict(edited(alone, "claim", lambda c: c | {"keep": [["-", "x", "3/10"]]})) is None
+    assert verdict(edited(alone, "claim", lambda c: c | {"keep": [["-", "x", "1/4"]]})) == "keep"
+    leaves = edited(alone, "levels", {"local": (1 / 1024).hex(), "roa": (1 / 16).hex()})
+    leaves = edited(leaves, "evidence.tree", "AAD//wD//w==")
+    small = edited(leaves, "evidence.local", lambda b: b | {"J": around_level(halving()[0], 1.0, 1 / 1024)["evidence"]["local"]["J"]})  # fmt: skip  # noqa: E501
+    grown = edited(small, "evidence.root", around_level(halving()[0], 1.0, 1 / 16)["evidence"]["root"])
+    assert verdict(grown) is None
+    assert verdict(edited(grown, "claim", lambda c: c | {"keep": [["-", "x", "27/100"]]})) is None
+    assert verdict(edited(grown, "claim", lambda c: c | {"keep": [["-", "x", "249/1000"]]})) == "keep"
+    assert verdict(edited(grown, "claim", lambda c: c | {"keep": [["-", "1/100", "x"]]})) == "keep"
+
+
+# ------------------------------------------------------------------------------------------------------------ periodic
+
+ROUND = Loop([["+", "x", "1/2", "u"]], [affine([[0.0]])], TURNING, angles=("x",))
+SINE = [mapped("sin", 0), affine([[0.0]], of=1)]
+
+
+@pytest.mark.parametrize(
+    ("change", "rule"),
+    [
+        ({"dynamics": [["+", "x", "1/2", "u", ["*", "0", "x"]]]}, None),
+        ({"dynamics": [["+", ["*", "2", "x"], "1/2", "u", ["-", "x"]]]}, None),
+        ({"dynamics": [["+", "x", "1/2", ["*", "0", ["tan", ["*", "2", "x"]]]]]}, "ranks"),  # periodic, but not finite
+        ({"dynamics": [["+", "x", "1/2", ["*", "0", ["sin", ["*", "3", "x"]]]]]}, None),
+        ({"dynamics": [["+", "x", "1/2", ["*", "0", ["sin", ["*", "1/2", "x"]]]]]}, "angles"),
+        ({"dynamics": [["+", ["*", "2", "x"], "1/2"]]}, "angles"),
+        ({"dynamics": [["+", "1/2", "u"]]}, "angles"),
+        ({"dynamics": [["+", ["-", "x"], "u"]]}, "angles"),
+        ({"dynamics": [["+", "x", "1/2", ["*", "0", "x", "x"]]]}, "angles"),
+        ({"dynamics": [["+", "x", "1/2", ["*", "0", ["abs", "x"]]]]}, "angles"),
+        ({"dynamics": [["+", "x", "1/2", ["*", "0", ["clip", "x", "-1", "1"]]]]}, "angles"),
+        ({"dynamics": [["+", "x", "1/2", ["*", "0", ["/", "1", ["+", "9", "x"]]]]]}, "angles"),
+        ({"network": SINE}, None),
+        ({"network": [affine([[3.0]]), mapped("cos", 1), affine([[0.0]], of=2)]}, None),
+        ({"network": [affine([[0.5]]), mapped("cos", 1), affine([[0.0]], of=2)]}, "angles"),
+        ({"network": [mapped("tanh", 0), affine([[0.0]], of=1)]}, "angles"),
+        ({"network": [affine([[1.0]])]}, "angles"),
+        ({"network": [affine([[1.0]])], "squash": "tanh"}, "angles"),
+        ({"target": [["-", "x", "9"]]}, "angles"),
+        ({"target": [*TURNING, ["-", ["sin", ["*", "1/2", "x"]], "2"]]}, "angles"),
+        ({"target": [*TURNING, ["-", ["sin", ["*", "2", "x"]], "2"]]}, None),
+        ({"keep": [["-", "x", "9"]]}, "angles"),
+        ({"keep": [["-", ["cos", "x"], "2"]]}, None),
+        ({"keep": [["-", ["-", "x", "x"], "2"]]}, None),
+    ],
+)
+def test_what_is_periodic(change: dict[str, Any], rule: str | None) -> None:
+    loop = Loop(**{**ROUND.__dict__, **change})
+    assert verdict(certificate(loop, scaled(1.0, 0.5), cosine, (-3.25, 3.25), 6)[0]) == rule
+
+
+def test_rates_of_angles_have_no_winding() -> None:
+    loop = Loop([["+", "1", "u"]], [affine([[0.0]])], TURNING, angles=("x",), sample=("1/2", "1/2"))
+    data = certificate(loop, scaled(1.0, 0.5), cosine, (-3.25, 3.25), 6)[0]
+    assert verdict(data) is None
+    assert verdict(edited(data, "plant.dynamics", [["+", "1", ["*", "0", "x"]]])) is None
+    assert verdict(edited(data, "plant.dynamics", [["+", "1", ["*", "1/99", "x"]]])) == "angles"
+    assert verdict(edited(data, "plant.dynamics", [["+", "1", "x"]])) == "angles"
+
+
+def test_a_tree_must_be_longer_than_a_turn() -> None:
+    tree, _ = uniform([0.0], [1.0], 6)
+    everywhere = document(ROUND, (-3.25, 3.25), tree, [0] * 64, [0] * 64)
+    assert verdict(edited(everywhere, "claim.target", ["-1"])) is None
+    for end in (3.0, 2 * math.pi - 3.25, math.nextafter(2 * math.pi - 3.25, -9)):
+        short = edited(document(ROUND, (-3.25, end), tree, [0] * 64, [0] * 64), "claim.target", ["-1"])
+        assert verdict(short) == "ranks"
+    assert verdict(edited(document(ROUND, (-3.25, -3.25), tree, [0] * 64, [0] * 64), "claim.target", ["-1"])) == "ranks"
+
+
+def test_an_image_wider_than_a_turn_is_everywhere() -> None:
+    loop = Loop([["+", "x", "q"]], [affine([[0.0]])], TURNING, angles=("x",), uncertain=[("q", "-4", "4")])
+    tree, leaves = uniform([-3.25], [3.25], 6)
+    near = [cosine(box) for box in leaves]
+    ranks = [0 if here else 1 for here in near]
+    assert verdict(document(loop, (-3.25, 3.25), tree, ranks, [int(r > 0) for r in ranks])) == "ranks"
+    one = [UNRANKED] * 64
+    one[40] = 1
+    assert verdict(document(loop, (-3.25, 3.25), tree, one, [int(i == 40) for i in range(64)])) == "ranks"
+
+
+def test_the_parts_of_an_interval_of_an_angle_have_all_its_places() -> None:
+    """And lie between the ends; parts that have no more than a turn have no more than the interval, but for a hair."""
+    chance, turn, seams = random.Random(3), 2 * arb.pi(), 0
+    for _ in range(3000):
+        lo = chance.choice([-3.1416, -3.25, 0.0, 7.0, -100.0, chance.uniform(-9, 9)])
+        hi = lo + chance.choice([6.2832, 6.3, 7.0, 12.0, 13.0, chance.uniform(6.2832, 20)])
+        a = chance.choice([lo, hi, chance.uniform(-30, 30)]) + chance.choice([0.0, 1e-9, -1e-9, 2 * math.pi, -0.1])
+        b = a + chance.choice([0.0, 1e-9, 0.2, 3.0, 6.0, 6.29, 9.0, chance.uniform(0, 8)])
+        parts = around(arb(a), arb(b), lo, hi, turn)
+        assert parts and all(lo <= p <= q <= hi for p, q in parts)
+        seams += len(parts) == 2
+        if parts != [(lo, hi)]:
+            assert sum(q - p for p, q in parts) <= b - a + (hi - lo - 2 * math.pi) + 1e-9
+        for x in (a, b, lo, hi, *(chance.uniform(a, b) for _ in range(5))):
+            if a <= x <= b:
+                turns = range(math.floor((lo - x) / 6.28) - 1, math.ceil((hi - x) / 6.28) + 2)
+                near = [x + w * 2 * math.pi for w in turns]
+                assert any(p - 1e-12 <= y <= q + 1e-12 for p, q in parts for y in near)
+    assert seams > 300
+
+
+def test_an_angle_of_many_turns_is_a_place() -> None:
+    turn = 2 * arb.pi()
+    ((p, q),) = around(arb(10**6), arb(10**6) + arb("0.01"), -3.25, 3.25, turn)
+    assert math.isclose(p, math.remainder(10**6, 2 * math.pi), abs_tol=1e-9) and math.isclose(q - p, 0.01, abs_tol=1e-9)
+    assert around(arb(10**30), arb(10**30), -3.25, 3.25, turn) == [(-3.25, 3.25)]  # nobody knows which
+    assert around(arb(0), arb(10) ** 400, -3.25, 3.25, turn) == [(-3.25, 3.25)]
+
+
+@pytest.mark.parametrize("hole", [0, 1, 62, 63])
+def test_a_hole_at_the_seam_is_seen_from_its_other_side(hole: int) -> None:
+    data, ranks, steps = certificate(ROUND, scaled(1.0, 0.5), cosine, (-3.1416, 3.1416), 6)
+    assert verdict(data) is None
+    holed = [*ranks[:hole], UNRANKED, *ranks[hole + 1 :]]
+    assert verdict(reranked(data, holed, [*steps[:hole], 0, *steps[hole + 1 :]])) == "ranks"
+
+
+# -------------------------------------------------------------------------------------------------------------- format
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("claim.ranks", ...),
+        ("claim.target", ...),
+        ("claim.sample", ...),
+        ("claim.rate", (0.0).hex()),
+        ("claim.outer", None),
+        ("claim.start", None),
+        ("claim.sample", ["1/4", "1/2"]),
+        ("claim.keep", None),
+        ("claim.keep", []),
+        ("claim.keep", ["x"] * 65),
+        ("claim.keep", [["network", "pi", 0, "x"]]),
+        ("claim.keep", ["y"]),
+        ("claim.target", []),
+        ("claim.target", "x"),
+        ("claim.target", ["u"]),
+        ("claim.target", [["network", "pi", 0, "x"]]),
+        ("claim.target", ["0"] * 65),
+        ("claim.ranks.angles", ["x", "x"]),
+        ("claim.ranks.angles", ["u"]),
+        ("claim.ranks.angles", ["y"]),
+        ("claim.ranks.angles", [["x"]]),
+        ("claim.ranks.angles", "x"),
+        ("claim.ranks.angles", None),
+        ("claim.ranks.steps", 0),
+        ("claim.ranks.steps", True),
+        ("claim.ranks.steps", "9"),
+        ("claim.ranks.steps", 65_535),
+        ("claim.ranks.steps", -1),
+        ("claim.ranks.more", 1),
+        ("plant.time", "continuous"),
+        ("lyapunov", {"kind": "quadratic", "P": "AAAAAAAA8D8="}),
+        ("levels", {"local": (1.0).hex(), "roa": (1.0).hex()}),
+        ("evidence.kind", "partition-tree"),
+        ("evidence.kind", "trusted-solver"),
+        ("evidence.order", 2),
+        ("evidence.order", 0),
+        ("evidence.T", "AAAAAAAA8D8="),
+        ("evidence.ranks", ...),
+        ("evidence.ranks", None),
+        ("evidence.ranks.lo", "AAAAAAAA8D8"),
+        ("evidence.ranks.lo", "AAAAAAAA8H8="),  # infinity
+        ("evidence.ranks.hi", ""),
+        ("evidence.ranks.tree", ...),
+        ("evidence.ranks.ranks", [0]),
+        ("evidence.ranks.steps", "AA"),
+        ("evidence.ranks.more", ""),
+        ("keep", []),
+    ],
+)
+def test_what_has_no_form(path: str, value: Any) -> None:
+    data = halving(keep=[["-", "x", "9"]])[0]
+    assert verdict(data) is None and verdict(edited(data, path, value)) == "format"
+
+
+def test_keys_of_other_claims() -> None:
+    data = around_level(halving()[0], 1.0, 1 / 16)
+    for path in ("evidence.ranks", "claim.ranks"):
+        assert verdict(edited(data, path, ...)) == "format"
+    assert verdict(edited(data, "claim", lambda c: c | {"target": NEAR})) == "format"
+    assert verdict(edited(data, "plant.time", "continuous")) == "format"
+    trusted = {"kind": "trusted-solver", "solver": "a", "version": "1", "precision": (1.0).hex(), "queries": []}
+    plain = edited(edited(edited(data, "plant.time", "continuous"), "claim.ranks", ...), "evidence", trusted)
+    plain = edited(plain, "plant.dynamics", ["u"])
+    assert rules.judge(dumped(plain)).result == "TRUSTED"
+    assert verdict(edited(plain, "claim", lambda c: c | {"keep": ["-1"]})) == "format"
+    further = {"keep": ["-1"], "outer": {"expression": "x", "level": (1.0).hex()}}
+    found = rules.judge(dumped(edited(plain, "claim", lambda c: c | further)))
+    assert (found.rule, found.at) == ("format", "claim.keep")
+    tube = {"kind": "enlarged", "start": encode(1.0), "keep": ["-1"]}
+    found = rules.judge(dumped(edited(plain, "claim", lambda c: c | tube)))
+    assert (found.rule, found.at) == ("format", "claim.keep")
+
+
+def test_the_command_and_its_words(tmp_path: Path) -> None:
+    data, *_ = certificate(
+        Loop(**{**ROUND.__dict__, "keep": [["-", ["cos", "x"], "2"]]}), scaled(1.0, 0.5), cosine, (-3.25, 3.25), 6
+    )
+    path = tmp_path / "c.json"
+    path.write_bytes(dumped(data))
+    command = [sys.executable, "-I", "-m", "certify.reference", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    claim, said = done.stdout.splitlines()
+    assert done.returncode == 0 and not done.stderr and said.startswith("ACCEPTED sha256=")
+    assert "multiples of 2 pi in x" in claim and "the 1 expressions of keep are negative at every step" in claim
+    done = subprocess.run([*command, "--json"], capture_output=True, text=True, check=False, timeout=60)
+    found = json.loads(done.stdout)
+    assert (found["result"], found["claim"], found["leaves"], found["levels"]) == ("ACCEPTED", "reaches", 64, {})
+    path.write_bytes(dumped(reranked(data, [0] * 64, [0] * 64)))
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 1 and "REJECTED rule=ranks at=ranks leaf 0" in done.stdout
+
+
+def test_limits_count_steps() -> None:
+    data, ranks, steps = halving()
+    short = dumped(data)
+    most = next(n for n in range(10, 60) if rules.judge(short, 2**n).rule != "limits")
+    longer = dumped(reranked(data, [255 * r for r in ranks], [255 * k for k in steps]))
+    assert rules.judge(longer, 2**most).rule == "limits"
+
+
+# -------------------------------------------------------------------------------------------------------------- chance
+
+
+def reaches(x: float, q: Callable[[], float], r: int) -> bool:
+    """True if x+ = -7/10 x + q is in [-1/4, 1/4] after r steps at the latest."""
+    for _ in range(r + 1):
+        if abs(x) <= 0.25 + 1e-12:
+            return True
+        x = -0.7 * x + q()
+    return False
+
+
+def test_accepted_mutants_are_true() -> None:
+    """Ranks and steps at random near those that hold: of what is accepted no trajectory is found that is late."""
+    chance = random.Random(7)
+    loop = Loop([["+", "u", "q"]], [affine([[-0.7]])], NEAR, uncertain=[("q", "-1/50", "1/50")])
+    data, ranks, steps = certificate(loop, scaled(-0.7, 0.0, 0.02), within(0.25), (-2.0, 2.0), 5, 3)
+    _, leaves = uniform([-2.0], [2.0], 5)
+    assert verdict(data) is None
+    found = {True: 0, False: 0}
+    for _ in range(120):
+        made, taken = list(ranks), list(steps)
+        for i in chance.sample(range(32), chance.choice([1, 1, 2, 3])):
+            if chance.random() < 0.5 and ranks[i]:
+                made[i] = max(1, ranks[i] + chance.choice([-2, -1, 1, 2]))
+            taken[i] = min(made[i], max(int(made[i] > 0), taken[i] + chance.choice([-1, 0, 1])))
+        good = verdict(reranked(data, made, taken)) is None
+        found[good] += 1
+        for box, r in zip(leaves, made, strict=True):
+            for _ in range(20 if good else 0):
+                x = chance.choice([*box[0], chance.uniform(*box[0])])
+                assert reaches(x, lambda: chance.choice([-0.02, 0.02]), r)
+    assert min(found.values()) > 10
+
+
+PENDULUM = [["+", "y", ["*", "q", ["cos", "x"]]], ["+", ["*", "2", ["sin", "x"]], ["*", "u", ["+", "1", "q"]], ["*", "x", "y", "1/9"]]]  # fmt: skip  # noqa: E501
+TANH = [affine([[-0.7, 0.2], [0.4, -0.9]], [0.1, -0.3]), mapped("tanh", 1), affine([[-1.5, 0.8]], of=2)]
+
+
+def policy(x: float, y: float) -> float:
+    return -1.5 * math.tanh(-0.7 * x + 0.2 * y + 0.1) + 0.8 * math.tanh(0.4 * x - 0.9 * y - 0.3)
+
+
+def rates(x: float, y: float, u: float, q: float) -> tuple[float, float]:
+    return y + q * math.cos(x), 2 * math.sin(x) + u * (1 + q) + x * y / 9
+
+
+def moved(x: float, y: float, h: float, q: Callable[[], float]) -> tuple[float, float]:
+    """By steps of Runge and Kutta, the input held, with another q in each of four parts of the period."""
+    u, part, values = policy(x, y), h / 40, [q() for _ in range(4)]
+    for k in range(40):
+        now = values[k // 10]
+        a, b = rates(x, y, u, now)
+        c, d = rates(x + part / 2 * a, y + part / 2 * b, u, now)
+        e, f = rates(x + part / 2 * c, y + part / 2 * d, u, now)
+        g, i = rates(x + part * e, y + part * f, u, now)
+        x, y = x + part / 6 * (a + 2 * c + 2 * e + g), y + part / 6 * (b + 2 * d + 2 * f + i)
+    return x, y
+
+
+@pytest.mark.parametrize("order", [0, 1, 2, 3, 5])
+def test_boxes_hold_all_trajectories(order: int) -> None:
+    """Each state is within the error of its form, at the same d, after some steps; order 0 is discrete time."""
+    sample = ("1/20", "1/10") if order else None
+    loop = Loop(PENDULUM, TANH, [["-", "x", "9"]], ("x", "y"), sample, max(order, 1), [("q", "-1/10", "1/5")])
+    c = read(dumped(loop.document([0.5, -0.5], [0.6, -0.4], b"\xff", two_bytes([3]), b"\3")))
+    chance, walk = random.Random(order), Walk(c, max(order, 1))
+    rows = [walk.start(Box(0, [0.5, -0.5], [0.6, -0.4]))]
+    for _ in range(3):
+        rows.append(walk.step(rows[-1], "here"))
+    nearest = 0.0
+    for _ in range(150):
+        d = [chance.choice([-1.0, 1.0, chance.uniform(-1, 1)]) for _ in range(2)]
+        far = chance.choice([-0.1, 0.2])
+
+        def q(far: float = far) -> float:
+            return chance.choice([far, far, chance.uniform(-0.1, 0.2)])
+
+        state = 0.55 + 0.05 * d[0], -0.45 + 0.05 * d[1]
+        for row in rows[1:]:
+            if order:
+                state = moved(*state, chance.choice([0.05, 0.1, chance.uniform(0.05, 0.1)]), q)
+            else:
+                state = rates(*state, policy(*state), q())
+            for i, x in enumerate(state):
+                middle, *slopes = (float(v.mid()) for v in row[i])
+                error = abs(x - middle - slopes[0] * d[0] - slopes[1] * d[1])
+                assert error <= slopes[2 + i] + 1e-9 and not slopes[3 - i]
+                nearest = max(nearest, error / slopes[2 + i])
+    assert nearest > 0.3
