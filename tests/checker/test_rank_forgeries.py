@@ -1,0 +1,67 @@
+"""Attacks on ranks, angles and constraints: no forgery is accepted, and no file keeps a checker busy."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from certify.checker.case import Case
+from certify.checker.ranks import Cover
+from tests.support.rank_forgeries import verdicts
+from tests.support.ranked import Document, Loop, affine, two_bytes
+
+# ------------------------------------------------------------------------------------------------------------- angles
+
+
+def standing(n: int, near: bool = False) -> Document:
+    """n angles that stay, of which one leaf has all, and a target that holds none or, if near, all of them."""
+    names = tuple(f"x{i}" for i in range(n))
+    never = ["-", ["cos", "x0"], "99" if near else "-2"]
+    loop = Loop([["+", name] for name in names], [affine([[0.0] * n])], [never], states=names, angles=names)
+    return loop.document([-3.25] * n, [3.25] * n, b"\xff", two_bytes([1]), b"\1")
+
+
+@pytest.mark.parametrize("n", [1, 13, 15, 64])
+def test_many_angles_that_are_cut_in_two_do_not_take_hours(n: int) -> None:
+    """The boxes of an image count: 2^64 of them would never be done."""
+    assert verdicts(standing(n)) == ("ranks", "ranks")
+    assert verdicts(standing(n, near=True)) == (None, None)
+
+
+def covered(chance: np.random.Generator, n: int, angles: tuple[int, ...]) -> tuple[Cover, Any, Any]:
+    """A root box, and boxes that are in it but for their angles."""
+    lo = chance.choice([-3.1416, -3.25, 0.0, 7.0, -100.0], n)
+    hi = lo + chance.choice([6.28319, 6.3, 7.0, 12.6, 13.0, 40.0], n)
+    ranks = SimpleNamespace(lo=lo, hi=hi, angles=angles, tree=b"\xff", ranks=b"\0\0")
+    centre = chance.uniform(-30, 30, (n, 30))
+    wide = chance.choice([0.0, 1e-9, 0.1, 1.0, 3.0, 6.0, 6.3, 10.0], (n, 30))
+    low, high = centre - wide, centre + wide
+    for i in set(range(n)).difference(angles):
+        low[i], high[i] = np.clip(low[i], lo[i], hi[i]), np.clip(high[i], lo[i], hi[i])
+    return Cover(cast(Case, SimpleNamespace(ranks=ranks))), low, high
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_parts_of_a_box_have_all_its_places(seed: int) -> None:
+    chance, cut = np.random.default_rng(seed), 0
+    for _ in range(40):
+        n = int(chance.integers(1, 5))
+        angles = tuple(int(i) for i in chance.permutation(n)[: chance.integers(0, n + 1)])
+        cover, lo, hi = covered(chance, n, angles)
+        found = [list[tuple[Any, Any]]() for _ in range(lo.shape[1])]
+        for low, high, some in cover.places(lo, hi):
+            for b in some:
+                found[b].append((low[:, b], high[:, b]))
+        for b, parts in enumerate(found):
+            assert all(np.all((cover.lo <= p) & (p <= q) & (q <= cover.hi)) for p, q in parts)
+            cut += len(parts) > 1
+            for x in lo[:, b] + chance.choice([0.0, 1.0, 0.5, 0.2], (5, n)) * (hi - lo)[:, b]:
+                turned = [x[i] + 2 * np.pi * np.arange(-40, 41) * (i in angles) for i in range(n)]
+                assert any(
+                    all(np.any((p[i] - 1e-12 <= y) & (y <= q[i] + 1e-12)) for i, y in enumerate(turned))
+                    for p, q in parts
+                )
+    assert cut > 100
