@@ -11,7 +11,7 @@ import pytest
 from certify.checker.case import Case
 from certify.checker.ranks import Cover
 from tests.support.rank_forgeries import verdicts
-from tests.support.ranked import Document, Loop, affine, two_bytes
+from tests.support.ranked import Document, Loop, affine, mapped, two_bytes
 
 # ------------------------------------------------------------------------------------------------------------- angles
 
@@ -65,3 +65,19 @@ def test_the_parts_of_a_box_have_all_its_places(seed: int) -> None:
                     for p, q in parts
                 )
     assert cut > 100
+
+
+def wound(factors: int, steps: int) -> Document:
+    """An angle times 2^64 so many times, under a sine, in the equations and in the policy's network."""
+    network = [affine([[2.0**1000]], of=k) for k in range(steps)]
+    network += [mapped("sin", steps), affine([[0.0]], of=steps + 1)]
+    far = ["*", "x", *([["**", "2", 64]] * factors)] if factors else "x"
+    loop = Loop([["+", "x", "1/2", ["*", "0", ["sin", far]]]], network, [["-", ["cos", "x"], "99"]], angles=("x",))
+    return loop.document([-3.25], [3.25], b"\xff", two_bytes([0]), b"\0")
+
+
+@pytest.mark.parametrize(("factors", "steps"), [(1, 0), (0, 1), (9000, 0), (0, 250)])
+def test_an_angle_that_winds_very_often_is_refused_at_once(factors: int, steps: int) -> None:
+    """Or else integers have so many digits that their products take hours."""
+    assert verdicts(wound(0, 0)) == (None, None)
+    assert verdicts(wound(factors, steps)) == ("angles", "angles")
