@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from certify.checker import document, words
 from certify.checker.case import Case
 from certify.checker.ranks import Cover
+from certify.reference import rules as reference_rules
+from certify.reference.__main__ import in_words as said
 from tests.support.rank_forgeries import verdicts
-from tests.support.ranked import Document, Loop, affine, mapped, two_bytes
+from tests.support.ranked import Document, Loop, affine, around_level, dumped, mapped, two_bytes
 
 # ------------------------------------------------------------------------------------------------------------- angles
 
@@ -81,3 +85,29 @@ def test_an_angle_that_winds_very_often_is_refused_at_once(factors: int, steps: 
     """Or else integers have so many digits that their products take hours."""
     assert verdicts(wound(0, 0)) == (None, None)
     assert verdicts(wound(factors, steps)) == ("angles", "angles")
+
+
+# -------------------------------------------------------------------------------------------------------------- words
+
+
+def in_words(data: Document) -> tuple[str, str]:
+    """The claim as each program says it."""
+    c = document.certificate(json.loads(dumped(data)), "0" * 64)
+    judged = reference_rules.judge(dumped(data))
+    assert judged.certificate is not None and judged.result == "ACCEPTED"
+    return "\n".join(words.claim(c)), said(judged.certificate)
+
+
+def test_what_is_said_of_places_and_of_instants() -> None:
+    """Trajectories start where an input begins to be held, and a place is no state."""
+    held = Loop(["u"], [affine([[-1.0]])], [["-", ["*", "x", "x"], "1/4"]], sample=("1/2", "1/2"))
+    checker, reference = in_words(held.document([0.5], [0.75], b"\xff", two_bytes([1]), b"\1"))
+    assert "leaf of finite rank (1 of 1 leaves) at a sampling instant is in the target after as many periods" in checker
+    assert "starts at a sampling instant in a box" in reference and "after r periods at the latest" in reference
+    loop = Loop([["+", "x", "u"]], [mapped("sin", 0), affine([[-0.5]], of=1)], None, angles=("x",))
+    tree = bytes([0, 0, 255, 255, 255])
+    data = loop.document([-3.25], [3.25], tree, two_bytes([65535] * 3), bytes(3))
+    checker, reference = in_words(around_level(data, 1.0, 1 / 16))
+    assert "(0 of 3 leaves)" in checker and "and from then on is, up to these multiples, one of those above" in checker
+    assert "until then u stays in its bounds" in checker and "each state but" not in checker
+    assert "is, as a place, one of these" in reference
