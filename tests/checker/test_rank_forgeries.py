@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from fractions import Fraction
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -14,8 +15,10 @@ from certify.checker.case import Case
 from certify.checker.ranks import Cover
 from certify.reference import rules as reference_rules
 from certify.reference.__main__ import in_words as said
-from tests.support.rank_forgeries import verdicts
-from tests.support.ranked import Document, Loop, affine, around_level, dumped, mapped, two_bytes
+from tests.support.marks import slow_after
+from tests.support.rank_forgeries import Draw, Forger, Forgery, by_checker, verdicts
+from tests.support.rank_truth import Truth
+from tests.support.ranked import UNRANKED, Document, Loop, affine, around_level, dumped, mapped, two_bytes, uniform
 
 # ------------------------------------------------------------------------------------------------------------- angles
 
@@ -85,6 +88,67 @@ def test_an_angle_that_winds_very_often_is_refused_at_once(factors: int, steps: 
     """Or else integers have so many digits that their products take hours."""
     assert verdicts(wound(0, 0)) == (None, None)
     assert verdicts(wound(factors, steps)) == ("angles", "angles")
+
+
+# -------------------------------------------------------------------------------------------------------- random loops
+
+SEEDS = (19, 25, 28, 43, 53, 60, 16, 47, 104, 122, 12, 23, 32, 35, 38, 59, 64, 77, 85, 89, 91, 94, 98, 109, 113, 127)
+FAST = 6
+
+
+def is_a_lie(data: Document, times: int = 3) -> str | None:
+    """A sentence on a trajectory that does not do what a document claims; None if none was found."""
+    truth = Truth(data)
+    return next((lie for lie in (truth.lie(np.random.default_rng(k)) for k in range(times)) if lie), None)
+
+
+def refuses(forgery: Forgery) -> bool:
+    """True if both refuse it under a rule that says so. What may be true may be accepted, if it is no lie."""
+    found = verdicts(forgery.data)
+    assert all((rule is None and forgery.maybe) or rule in forgery.rules for rule in found), (forgery.what, found)
+    assert None not in found or is_a_lie(forgery.data) is None, forgery.what
+    return None not in found
+
+
+@pytest.mark.parametrize("seed", slow_after(FAST, SEEDS))
+def test_random_loops_do_what_is_accepted_and_no_forgery_is(seed: int) -> None:
+    made = Draw(seed, (1, 1, 2)).ranked(depths=(5, 6, 6))
+    assert len(made.moving) > 5 and verdicts(made.document) == (None, None)
+    assert is_a_lie(made.document, 10) is None
+    refused = [refuses(forgery) for forgery in Forger(made, seed).all()]
+    assert sum(refused) > 25 and refused.count(False) < 30
+
+
+@pytest.mark.parametrize("seed", slow_after(5, range(200, 280)))
+def test_what_the_checker_accepts_without_any_margin_is_true(seed: int) -> None:
+    """Its own images of leaves, to the last bit, give the ranks."""
+    made = Draw(seed).ranked(0.0)
+    assert by_checker(made.document) is None and is_a_lie(made.document, 6) is None
+
+
+# ----------------------------------------------------------------------------------------------------------- by a hair
+
+
+@pytest.mark.parametrize(("over", "rule"), [("1/1000000000", "ranks"), ("-1/1000000000", None)])
+def test_an_image_that_leaves_the_root_box_or_meets_a_leaf_by_a_billionth(over: str, rule: str | None) -> None:
+    """x+ = (10 + x)/4, and a hair where x is 2: [0, 2] goes to [5/2, 3], and [2, 3] to where x > 299/100."""
+    slope = str(Fraction(1, 4) + Fraction(over) / 2)
+    loop = Loop([["+", "5/2", ["*", slope, "x"], ["*", "0", "u"]]], [affine([[0.0]])], [["-", "299/100", "x"]])
+    met = loop.document([0.0], [4.0], bytes([0, 255, 0, 255, 255]), two_bytes([2, 1, UNRANKED]), b"\1\1\0")
+    out = loop.document([1.0], [3.0], bytes([0, 255, 255]), two_bytes([2, 1]), b"\1\1")
+    assert verdicts(met) == verdicts(out) == (rule, rule)
+
+
+@pytest.mark.parametrize("sign", ["", "-"])
+def test_ranks_that_run_in_a_circle(sign: str) -> None:
+    """x+ = x or -x stays at the same distance for ever."""
+    loop = Loop([["*", f"{sign}1", "x"]], [affine([[0.0]])], [["-", ["*", "x", "x"], "1/16"]])
+    tree, leaves = uniform([-2.0], [2.0], 5)
+    near = [max(map(abs, box[0])) <= 0.25 for box in leaves]
+    for left, right, count in ((1, 1, 1), (1, 2, 1), (9, 8, 1), (9, 9, 9), (255, 254, 254)):
+        ranks = [0 if here else left if box[0][0] < 0 else right for here, box in zip(near, leaves, strict=True)]
+        steps = [min(count, rank) for rank in ranks]
+        assert verdicts(loop.document([-2.0], [2.0], tree, two_bytes(ranks), bytes(steps))) == ("ranks", "ranks")
 
 
 # -------------------------------------------------------------------------------------------------------------- words
