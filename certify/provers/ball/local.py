@@ -264,11 +264,13 @@ class Rule:
         return self.steps.models_on(balls, self.cells, reach)
 
     def _corners(self, level: float) -> list[Corner] | None:
-        """The inequality at the corners of all cells; None where something has no finite model, or may leave its
-        bounds."""
+        """The inequality at the corners of all cells; None where something has no finite model, may leave its
+        bounds, or may violate a constraint."""
         if self.cuts is None:
             return None
-        J, found = ball_around(self.problem, self.T, level), list[Corner]()
+        J, found, keep = ball_around(self.problem, self.T, level), list[Corner](), self.problem.keep
+        if keep and not self.steps.keeps(J, keep, self.cells):
+            return None
         for models in self.models(J, level):
             if not (models.finite and models.admitted):
                 return None
