@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from certify.analysis.options import RoaOptions
 from certify.errors import InputError, OptionError
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.plants import System, constraints_of_values, kept_constraints
+from certify.loop.constraints import not_kept_at_origin
+from certify.loop.plants import System, kept_constraints
+from certify.loop.plants.constraints import in_words
 
 Array = NDArray[np.float64]
 
@@ -85,8 +87,6 @@ def require_kept_at_origin(loop: ClosedLoop) -> None:
     ------
     InputError : it does not, at some corner of the ranges of what is uncertain.
     """
-    from certify.provers.constraints import not_kept_at_origin
-
     found = not_kept_at_origin(loop)
     if found is None:
         return
@@ -101,8 +101,7 @@ def require_kept_at_origin(loop: ClosedLoop) -> None:
 
 def constraints_in_words(system: System) -> dict[str, str]:
     """The inequalities that a claim keeps by name, over the states' values, as in `p - 1.5 < 0`."""
-    stated = replace(system, constraints=kept_constraints(system))
-    return {name: f"{g} < 0" for name, g in constraints_of_values(stated).items()}
+    return in_words(replace(system, constraints=kept_constraints(system)))
 
 
 def ellipsoid_in(system: System, box: Mapping[str, float] | None = None) -> Array:

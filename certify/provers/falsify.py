@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from certify.certificates.claims import Problem
 from certify.effort import UNLIMITED, Effort
+from certify.loop.constraints import Constraints, is_violated_at
 from certify.loop.networks import Gradients
 from certify.loop.plants import System, at_values, corners, mean_rate
 from certify.loop.policies import bounded_by_form
 from certify.loop.rigorous import evaluate_increment, evaluate_policy
-from certify.provers.constraints import Constraints, is_violated_at
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -172,7 +172,7 @@ def confirm(problem: Problem, witness: Witness) -> bool:
         found = evaluate_increment(held, problem.V.P, witness.x, witness.period, problem.rate)
         return bool(np.any(witness.x != 0)) and found >= 0
     if witness.kind == "keep":
-        return is_violated_at(problem, witness.constraint, witness.x, witness.values)
+        return is_violated_at(problem.loop, witness.constraint, witness.x, witness.values)
     for u, (lo, hi) in zip(evaluate_policy(loop, witness.x), loop.system.input_bounds, strict=True):
         if u * lo.denominator < lo.numerator or u * hi.denominator > hi.numerator:
             return True

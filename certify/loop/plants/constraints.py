@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 
 from certify.errors import InputError, OptionError
 from certify.loop.expressions import Expression, Operation, Symbol, constant_of, symbols_of, total
-from certify.loop.plants.deviations import in_deviations
+from certify.loop.plants.deviations import constraints_of_values, in_deviations
 from certify.loop.plants.equations import parse_comparison
 from certify.loop.plants.system import System
 
@@ -116,10 +116,6 @@ def _sums(terms: list[tuple[Expression, ...]]) -> list[Expression]:
     return [total(each) for each in itertools.islice(itertools.product(*terms), _MOST_PARTS + 1)]
 
 
-def in_words(names: Mapping[str, Expression]) -> str:
-    """Inequalities with their names.
-
-    >>> in_words({"wall": Symbol("p") - 1})
-    'wall: p - 1 < 0'
-    """
-    return "; ".join(f"{name}: {g} < 0" for name, g in names.items())
+def in_words(system: System) -> dict[str, str]:
+    """The constraints by name, over the states' values, as in `p - 1.5 < 0`."""
+    return {name: f"{g} < 0" for name, g in constraints_of_values(system).items()}

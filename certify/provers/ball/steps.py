@@ -23,7 +23,7 @@ from certify.provers.ball.ranged import RangedJet, RangedJets
 
 Array = NDArray[np.float64]
 Cell = tuple[Interval, ...]
-_WIDER, _ROUNDED = 1 + 1e-9, 1e-12
+_WIDER = 1 + 1e-9  # share of how far a constraint moves on a ball, for the checker's rounding
 _ATTEMPTS, _FURTHER = 4, 1.25  # at how far the states move in a period, each from the rates of the last
 
 
@@ -69,15 +69,24 @@ class Steps:
         in_cells = [self._in_cell(walk, driven, later) for walk in walks]
         return [list(of_ball) for of_ball in zip(*in_cells, strict=True)]
 
-    def keeps(self, J: Array, constraints: Sequence[Expression], cells: Sequence[Cell]) -> bool:
-        """True if g < 0 on the ball for each g of these, in each cell; where inputs are held at all times of a period,
-        in which quantities may be anywhere."""
-        driven, sample = [self.known.driven(J)], self.known.loop.system.sample
-        walks = [_Walk(self, J[None], driven, cell) for cell in cells]
+    def largest(
+        self, balls: Array, constraints: Sequence[Expression], cells: Sequence[Cell]
+    ) -> tuple[Array, Array] | None:
+        """For each expression g its value (K,) at the middle, and by how much it is larger anywhere on each of several
+        balls (N, n, k), in any cell, (N, K); where inputs are held, at any time of a period, in which quantities may be
+        anywhere. None where one has no finite model."""
+        driven, sample = [self.known.driven(J) for J in balls], self.known.loop.system.sample
+        walks = [_Walk(self, balls, driven, cell) for cell in cells]
         if sample is None:
-            return all(walk.is_negative(constraints) for walk in walks)
-        moved = _within_a_period(walks[0], float(sample[1]))
-        return moved is not None and walks[0].is_negative(constraints, moved[0], fixed=False)
+            found = [walk.of(constraints) for walk in walks]
+        else:
+            moved = _within_a_period(walks[0], float(sample[1]))
+            found = [] if moved is None else [walks[0].of(constraints, moved[0], fixed=False)]
+        if not found:
+            return None
+        middle = np.array([g.c for g in found[0]])
+        ends = np.array([[g.c + _WIDER * (g.away + g.radius) for g in of_cell] for of_cell in found]).max(0).T
+        return (middle, ends - middle) if np.all(np.isfinite(ends)) else None
 
     def _in_cell(self, walk: _Walk, driven: Sequence[Driven], later: _Later | None) -> list[Models]:
         """On each ball."""
@@ -132,15 +141,13 @@ class _Walk:
         values = self._states_by_name(near) | self._held_by_name(fixed)
         return [evaluate(e, values, self.algebra, shared) for e in self.steps.dynamics]
 
-    def is_negative(
-        self, constraints: Sequence[Expression], near: tuple[Array, Array] | None = None, fixed: bool = True
-    ) -> bool:
-        """True if these expressions are negative at these states, as `rates` has them, on all balls."""
+    def of(
+        self, expressions: Sequence[Expression], near: tuple[Array, Array] | None = None, fixed: bool = True
+    ) -> list[RangedJet]:
+        """Expressions at these states, as `rates` has them."""
         shared: dict[Expression, RangedJet] = {}
         values = self._states_by_name(near) | self._held_by_name(fixed)
-        found = [evaluate(g, values, self.algebra, shared) for g in constraints]
-        # a margin of roundings is left to the checker
-        return all(bool(np.all(g.c + _WIDER * (g.away + g.radius) < -_ROUNDED * abs(g.c))) for g in found)
+        return [evaluate(g, values, self.algebra, shared) for g in expressions]
 
     def series(self, order: int, near: tuple[Array, Array] | None = None) -> list[list[RangedJet]]:
         """x_1 to x_order, from these states, for each component."""

@@ -15,10 +15,9 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates.claims import Problem
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import Expression, Symbol
-from certify.loop.plants import corners, kept_constraints
+from certify.loop.expressions import Expression, Operation, Symbol, constant_of
+from certify.loop.plants import System, corners, kept_constraints
 from certify.loop.plants.floating_point import function_of
 from certify.loop.rigorous import ball, evaluate_arb, evaluate_policy, points, precision
 
@@ -34,13 +33,17 @@ _FAR = 4.0  # shares of the largest distance, beyond which a point has gone astr
 
 
 class Constraints:
-    """The constraints of a closed loop in floats."""
+    """The constraints of a closed loop in floats.
+
+    `names` are theirs, and `planes` those that are half-spaces of states: a (n,) and b > 0 of a'x < b.
+    """
 
     def __init__(self, loop: ClosedLoop) -> None:
         self.loop, system = loop, loop.system
         found = kept_constraints(system)
         self.names = tuple(found)
         self.g = function_of(system, tuple(found.values()), [s for s, _ in system.uncertain], "numpy")
+        self.planes = [plane for plane in (_plane(system, g) for g in found.values()) if plane is not None]
         self.values = [[float(q) for q in corner.values()] for corner in corners(system)]
 
     @np.errstate(all="ignore")
@@ -83,10 +86,51 @@ class Constraints:
         return values[0], ((values[1:] - values[0]) / apart.T).T
 
 
-def is_violated_at(problem: Problem, name: str, x: Array, values: Mapping[str, Fraction]) -> bool:
+def _plane(system: System, g: Expression) -> tuple[Array, float] | None:
+    """The half-space g < 0, as a and b of a'x < b; None if g is not linear in the states, or b is not positive."""
+    found = _linear(g)
+    if found is None:
+        return None
+    factors, b = found
+    a = np.array([float(factors.pop(s, Fraction(0))) for s in system.states])
+    return (a, -float(b)) if not factors and b < 0 and np.any(a != 0) else None
+
+
+def _linear(e: Expression) -> tuple[dict[Symbol, Fraction], Fraction] | None:
+    """The factors of symbols in a linear expression, and its value where they are 0; None if it is not linear."""
+    constant = constant_of(e)
+    if constant is not None:
+        return {}, constant
+    match e:
+        case Symbol():
+            return {e: Fraction(1)}, Fraction(0)
+        case Operation(operator="-", operands=(inner,)):
+            return _times(_linear(inner), Fraction(-1))
+        case Operation(operator="*" | "/" as sign, operands=(inner, other)) if k := constant_of(other):
+            return _times(_linear(inner), k if sign == "*" else 1 / k)
+        case Operation(operator="*", operands=(other, inner)) if (k := constant_of(other)) is not None:
+            return _times(_linear(inner), k)
+        case Operation(operator="+", operands=terms):
+            factors, total = dict[Symbol, Fraction](), Fraction(0)
+            for term in map(_linear, terms):
+                if term is None:
+                    return None
+                factors |= {s: factors.get(s, Fraction(0)) + k for s, k in term[0].items()}
+                total += term[1]
+            return factors, total
+    return None
+
+
+def _times(
+    linear: tuple[dict[Symbol, Fraction], Fraction] | None, k: Fraction
+) -> tuple[dict[Symbol, Fraction], Fraction] | None:
+    return None if linear is None else ({s: k * v for s, v in linear[0].items()}, k * linear[1])
+
+
+def is_violated_at(loop: ClosedLoop, name: str, x: Array, values: Mapping[str, Fraction]) -> bool:
     """True if the constraint of this name is certain not to be negative at a binary64 point (n,), by Arb."""
-    g = kept_constraints(problem.loop.system).get(name)
-    return g is not None and bool(_value(problem.loop, g, x, values) >= 0)
+    g = kept_constraints(loop.system).get(name)
+    return g is not None and bool(_value(loop, g, x, values) >= 0)
 
 
 def not_kept_at_origin(loop: ClosedLoop) -> tuple[str, float] | None:
