@@ -264,7 +264,7 @@ class Rule:
         return self.steps.models_on(balls, self.cells, reach)
 
     def kept_on(self, balls: Array) -> tuple[Array, Array] | None:
-        """Of the constraints' g, for several balls, what `Steps.largest` says."""
+        """The constraints' g on several balls, as `Steps.largest` has them."""
         with np.errstate(all="ignore"):
             return self.steps.largest(balls, self.problem.keep, self.cells)
 
