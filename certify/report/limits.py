@@ -12,6 +12,7 @@ from certify.report.words import below, number, symbol
 _LIMITS = {
     "domain": "the domain",
     "inputs": "the input bounds: beyond it the policy asks for more than the actuator gives",
+    "constraint": "a constraint: a larger set holds a state that violates it",
     "witness": "a point where Vdot >= 0",
     "effort": "the effort: more may be provable",
     "time": "the time limit: more may be provable",
@@ -27,7 +28,7 @@ _OF_OUTER = {
     "boxes": "the limit on boxes: more may be provable",
     "requested": "the level that was asked for",
 }
-AT_A_POINT = frozenset({"domain", "vdot", "input"})
+AT_A_POINT = frozenset({"domain", "vdot", "input", "keep"})
 """Kinds of limits that are met at a state, which is named; of others a run knows along which states it was hard."""
 _TOUCHING = Fraction(1, 10**6)  # relative distance from the domain's limit below which a set is said to touch it
 
@@ -50,7 +51,18 @@ def limited_by(result: Mapping[str, Any]) -> str:
             if precision is None:
                 return f"a margin that the engine keeps: {apart}"
             return f"the precision of {solver['solver']} (delta {number(precision)}), which stops {apart}"
-    return limit_in_words(reason, TimingInWords.of_result(result))
+    return _constraint(result) or limit_in_words(reason, TimingInWords.of_result(result))
+
+
+def _constraint(result: Mapping[str, Any]) -> str:
+    """The constraint that limits a level, in words; empty where none does."""
+    name = (result.get("witness") or {}).get("constraint")
+    if str(result["reason"]) != "constraint" or name is None:
+        return ""
+    said = (result.get("constraints") or {}).get(name)
+    held = "sample" in (result.get("claim") or {})
+    which = "from which a period may violate it" if held else "that violates it"
+    return f"the constraint {name}{f': {said}' if said else ''}; a larger set holds a state {which}"
 
 
 def hardest(weights: Mapping[str, float]) -> str:
