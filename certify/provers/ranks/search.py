@@ -15,14 +15,16 @@ from typing import Any
 import numpy as np
 
 from certify.certificates import RankTree
-from certify.certificates.claims import Problem, Ranks
+from certify.certificates.claims import Ranks
 from certify.effort import Effort
+from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression
 from certify.loop.plants import System
 from certify.provers.bounds.arrays import Array, Index
 from certify.provers.execution import Runner
 from certify.provers.ranks.cover import Cover
 from certify.provers.ranks.images import Course, Images
+from certify.provers.ranks.targets import Target
 
 NONE = 65_535
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
@@ -42,7 +44,7 @@ class RankProof:
     ranks, evidence : as the claim and the certificate have them.
     share : of the root box's volume.
     leaves : of finite rank; `boxes` were looked at, in `rounds` rounds.
-    done : no leaf is left whose halves could gain anything.
+    done : no leaf is left whose halves could gain anything, or the box that was wanted is proved.
     """
 
     ranks: Ranks
@@ -52,6 +54,15 @@ class RankProof:
     boxes: int
     rounds: int
     done: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """A box lo <= x <= hi (n,) of places, each of whose leaves is to have a rank of `most` at most."""
+
+    lo: Array
+    hi: Array
+    most: int = NONE - 1
 
 
 class Search:
@@ -134,6 +145,11 @@ class Search:
         lower = ranks < best[nodes]
         best[nodes[lower]], by[nodes[lower]] = ranks[lower], steps[lower]  # of several the last, the lowest, stays
 
+    def has(self, wanted: Wanted) -> bool:
+        """True if the box is proved."""
+        inside, _, met = self.cover.met_by(wanted.lo[:, None], wanted.hi[:, None])
+        return bool(inside[0] and np.all(self.rank[met] <= wanted.most))
+
     def next(self, near: Index) -> tuple[Index, Index]:
         """The leaves to halve next, and their axes."""
         widths = (self.cover.high - self.cover.low) / (self.cover.root[1] - self.cover.root[0])
@@ -161,16 +177,17 @@ def root_box(system: System) -> tuple[Array, Array]:
 
 
 def prove_ranks(
-    problem: Problem,
-    level: float,
+    loop: ClosedLoop,
+    target: Target,
     keep: Sequence[Expression],
     root: tuple[Array, Array],
     effort: Effort,
     runner: Runner,
     report: Callable[[float, int, int], None] | None = None,
     order: int = 2,
+    wanted: Wanted | None = None,
 ) -> RankProof | None:
-    """Prove from which leaves of a box trajectories reach {V <= level}.
+    """Prove from which leaves of a box trajectories reach a target.
 
     Parameters
     ----------
@@ -178,15 +195,16 @@ def prove_ranks(
     root : corners lo and hi (n,) of the box, in deviations; of an angle more than a turn apart.
     report : called after every round with the share that is proved, the boxes looked at, and the leaves that wait.
     order : of the series in time, where inputs are held.
+    wanted : a box on which alone it depends; the search ends once it is proved.
 
     Returns
     -------
     RankProof | None : None if no leaf has a rank.
     """
-    system = problem.loop.system
+    system = loop.system
     lo, hi = root
     named = [i for i, s in enumerate(system.states) if s.name in system.angles]
-    course = Course(problem, level, named, keep, hi - lo, COUNTS, order)
+    course = Course(loop, target, named, keep, hi - lo, COUNTS, order)
     search, rounds, done = Search(course, lo, hi), 0, False
     new = np.zeros(1, dtype=np.int64)
     widths = np.ones(len(lo))
@@ -197,11 +215,11 @@ def prove_ranks(
     with runner.start(course) as bound:
         while True:
             effort.charge(len(new) * course.operations)
-            search.take(new, bound(search.cover.low[:, new], search.cover.high[:, new], 0.0, level))
+            search.take(new, bound(search.cover.low[:, new], search.cover.high[:, new], 0.0, 0.0))
             near, rounds = search.spread(), rounds + 1
             if report is not None:
                 report(search.share, search.boxes, len(search.unknown))
-            done = not len(near)
+            done = not len(near) or (wanted is not None and search.has(wanted))
             if done or effort.over or len(search.cover.leaves) > _MOST_LEAVES:
                 break
             new = search.halve(*search.next(near))
