@@ -173,7 +173,7 @@ class ByRanks:
 
     def extend(self, state: State, effort: Effort) -> State:
         """Add the boxes; a note says why there are none."""
-        from certify.provers.ranks import Sublevel, prove_ranks, root_box
+        from certify.provers.ranks import Question, Sublevel, prove_ranks, root_box
 
         tools, (claim, evidence), trial = self.tools, state.proved, state.contest.best.trial
         system, problem = state.loop.system, trial.task.problem
@@ -185,8 +185,9 @@ class ByRanks:
             tools.tell("ranks")
             share = effort.share(_FOR_RANKS)
             told = None if tools.progress is None else report
-            target, root = Sublevel(problem.V, claim.roa), root_box(system)
-            found = prove_ranks(problem.loop, target, claim.keep, root, share, tools.runner, told, evidence.order)
+            target = Sublevel(problem.V, claim.roa)
+            question = Question(problem.loop, target, claim.keep, root_box(system), evidence.order)
+            found = prove_ranks(question, share, tools.runner, told)
         if found is None:
             return state.noting("no box of the domain is proved to lead into the set")
         return replace(

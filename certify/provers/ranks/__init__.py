@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from certify.provers.ranks.mend import without_leaf
-from certify.provers.ranks.search import RankProof, Wanted, prove_ranks, root_box
+from certify.provers.ranks.prove import Question, RankProof, prove_ranks, root_box
 from certify.provers.ranks.targets import Region, Sublevel
+from certify.provers.ranks.wanted import Wanted
 
-__all__ = ["RankProof", "Region", "Sublevel", "Wanted", "prove_ranks", "root_box", "without_leaf"]
+__all__ = ["Question", "RankProof", "Region", "Sublevel", "Wanted", "prove_ranks", "root_box", "without_leaf"]

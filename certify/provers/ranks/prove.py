@@ -1,0 +1,123 @@
+"""The proof of ranks: a search is run until nothing is left to gain, or its effort is over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from certify.certificates import RankTree
+from certify.certificates.claims import Ranks
+from certify.effort import Effort
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Expression
+from certify.loop.plants import System
+from certify.provers.bounds.arrays import Array
+from certify.provers.execution import Runner
+from certify.provers.ranks.images import Course
+from certify.provers.ranks.search import COUNTS, NONE, Search
+from certify.provers.ranks.targets import Target
+from certify.provers.ranks.wanted import SearchFrom, Wanted
+
+_HALF_TURN = 3.1416  # and a little more
+_SLIVER = 1e-6
+_MOST_LEAVES = 400_000
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """From which leaves of a box do trajectories reach a target?
+
+    Parameters
+    ----------
+    loop, target : the loop, and the set that is to be reached.
+    keep : expressions that stay negative on the way.
+    root : corners lo and hi (n,) of the box, in deviations; of an angle more than a turn apart.
+    order : of the series in time, where inputs are held.
+    """
+
+    loop: ClosedLoop
+    target: Target
+    keep: tuple[Expression, ...]
+    root: tuple[Array, Array]
+    order: int = 2
+
+    @property
+    def course(self) -> Course:
+        """The course of boxes through the loop."""
+        system, (lo, hi) = self.loop.system, self.root
+        named = [i for i, s in enumerate(system.states) if s.name in system.angles]
+        return Course(self.loop, self.target, named, self.keep, hi - lo, COUNTS, self.order)
+
+
+@dataclass(frozen=True, slots=True)
+class RankProof:
+    """Leaves from which the target is reached, with their evidence.
+
+    Parameters
+    ----------
+    ranks, evidence : as the claim and the certificate have them.
+    share : of the root box's volume.
+    leaves : of finite rank; `boxes` were looked at, in `rounds` rounds.
+    done : no leaf is left whose halves could gain anything, or the box that was wanted is proved.
+    """
+
+    ranks: Ranks
+    evidence: RankTree
+    share: float
+    leaves: int
+    boxes: int
+    rounds: int
+    done: bool
+
+
+def root_box(system: System) -> tuple[Array, Array]:
+    """The box of places of a plant, corners (n,): a turn of each angle around 0, of other states the domain but for a
+    sliver along its ends."""
+    ends = np.array([[float(end) for end in pair] for pair in system.domain])
+    inwards = _SLIVER * np.abs(ends).max(1)
+    lo, hi = ends[:, 0] + inwards, ends[:, 1] - inwards
+    angles = np.array([s.name in system.angles for s in system.states])
+    return np.where(angles, -_HALF_TURN, lo), np.where(angles, _HALF_TURN, hi)
+
+
+def prove_ranks(
+    question: Question,
+    effort: Effort,
+    runner: Runner,
+    report: Callable[[float, int, int], None] | None = None,
+    wanted: Wanted | None = None,
+) -> RankProof | None:
+    """Prove from which leaves of a box trajectories reach a target.
+
+    Parameters
+    ----------
+    report : called after every round with the share that is proved, the boxes looked at, and the leaves that wait.
+    wanted : a box on which alone it depends; the search ends once it is proved.
+
+    Returns
+    -------
+    RankProof | None : None if no leaf has a rank.
+    """
+    course = question.course
+    search = Search(course, *question.root) if wanted is None else SearchFrom(course, *question.root, wanted)
+    new, rounds, done = search.begin(), 0, False
+    with runner.start(course) as bound:
+        while True:
+            effort.charge(len(new) * course.operations)
+            search.take(new, bound(search.cover.low[:, new], search.cover.high[:, new], 0.0, 0.0))
+            near, rounds = search.spread(), rounds + 1
+            if report is not None:
+                report(search.share, search.boxes, len(search.unknown))
+            done = search.is_done(near)
+            if done or effort.over or len(search.cover.leaves) > _MOST_LEAVES:
+                break
+            new = search.further(near)
+    search.tighten()
+    tree, most = search.evidence()
+    leaves = int(np.sum(tree.ranks < NONE))
+    if not leaves:
+        return None
+    ranks = Ranks(question.loop.system.angles, most)
+    return RankProof(ranks, tree, search.share, leaves, search.boxes, rounds, done)
