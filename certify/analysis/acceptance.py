@@ -165,7 +165,7 @@ def _wanted(certificate: Certificate) -> str:
 def _leaf_of(answer: Mapping[str, Any]) -> int | None:
     """The number of the leaf that the checker refuses; None if it refuses something else."""
     found = re.fullmatch(r"leaf (\d+)", str(answer.get("at", "")))
-    return int(found[1]) if found and answer.get("rule") in ("ring", "inputs", "flow") else None
+    return int(found[1]) if found and answer.get("rule") in ("ring", "inputs", "flow", "keep") else None
 
 
 def _finer(certificate: Certificate, problem: Problem, answer: Mapping[str, Any]) -> PartitionTree | None:

@@ -80,6 +80,8 @@ class Keywords(TypedDict, total=False):
     disturbances: Mapping[str, Exact | Sequence[Exact]] | None
     input_error: Exact | Mapping[str, Exact] | None
     sample_time: Exact | Sequence[Exact] | None
+    keep: str | Sequence[str] | None
+    avoid: str | Sequence[str] | None
 
 
 def certify_roa(

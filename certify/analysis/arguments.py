@@ -118,6 +118,18 @@ def region(text: str, plant: System, option: str, deviations: bool = False) -> t
     return tuple(found.get(name, (Fraction(0), Fraction(0))) for name in names)
 
 
+def comparisons(texts: Sequence[str], name: str) -> tuple[str, ...]:
+    """Comparisons, of which one text may have several, separated by semicolons.
+
+    >>> comparisons(["p <= 1; v <= 2", "F <= 3"], "keep")
+    ('p <= 1', 'v <= 2', 'F <= 3')
+    """
+    found = [part.strip() for text in texts for part in text.split(";")]
+    if not all(found):
+        raise OptionError(f"`{name}` takes a comparison, such as 'p <= 1.5'; found nothing in {'; '.join(texts)!r}.")
+    return tuple(found)
+
+
 def numbers(text: str, name: str) -> tuple[float, ...]:
     """Numbers separated by commas."""
     try:
@@ -191,6 +203,7 @@ _READERS: Mapping[str, Callable[[Any, str], Any]] = {
     "ranges": _ranges,
     "bounds": lambda text, name: state(text, name) if "=" in text else _exact(text, name),
     "period": _value_or_range,
+    "comparisons": lambda text, name: comparisons([text] if isinstance(text, str) else text, name),
 }
 
 

@@ -6,6 +6,7 @@ A run asks here before it begins; nothing here is part of a proof.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -13,7 +14,10 @@ from numpy.typing import NDArray
 
 from certify.analysis.options import RoaOptions
 from certify.errors import InputError, OptionError
-from certify.loop.plants import System
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.constraints import not_kept_at_origin
+from certify.loop.plants import System, kept_constraints
+from certify.loop.plants.constraints import in_words
 
 Array = NDArray[np.float64]
 
@@ -33,6 +37,7 @@ def require_one_that_knows(system: System, options: RoaOptions) -> None:
             "a set beyond the ellipsoid must be of a plant in continuous time whose input follows the state at once; "
             f"the time of {system.name} goes in steps. Ask for the set without it."
         )
+    _require_no_constraints(system, options)
     if options.engine == "bounds" and not options.enlarges:
         return
     if system.in_steps:
@@ -54,6 +59,49 @@ def require_one_that_knows(system: System, options: RoaOptions) -> None:
         f"`engine` must be bounds where something is uncertain: dReal is asked about exact equations; {found}. Use the "
         "engine bounds, or leave the ranges out."
     )
+
+
+def _require_no_constraints(system: System, options: RoaOptions) -> None:
+    """Refuse what says nothing of constraints, where there are any."""
+    if not system.constraints:
+        return
+    found = f"found {', '.join(system.constraints)} in {system.name}"
+    without = "leave the constraints out (in the plant's file the table [constraints])"
+    if options.enlarges or options.goes_beyond:
+        what, plain = ("a tube", "it") if options.enlarges else ("a set beyond the ellipsoid", "it")
+        raise InputError(
+            f"{what} must be of a plant without constraints: along it nothing is shown of them; {found}. Ask for the "
+            f"set without {plain}, or {without}."
+        )
+    if options.engine != "bounds":
+        raise OptionError(
+            f"`engine` must be bounds where constraints are to be kept: dReal is not asked about them; {found}. Use "
+            f"the engine bounds, or {without}."
+        )
+
+
+def require_kept_at_origin(loop: ClosedLoop) -> None:
+    """Refuse a constraint that does not hold where V is 0.
+
+    Raises
+    ------
+    InputError : it does not, at some corner of the ranges of what is uncertain.
+    """
+    found = not_kept_at_origin(loop)
+    if found is None:
+        return
+    name, value = found
+    g = constraints_in_words(loop.system)[name]
+    at = zip(loop.system.states, loop.system.exact_x_eq(), strict=True)
+    raise InputError(
+        f"the constraint {name}, {g}, must hold where V is 0, at {', '.join(f'{s} = {float(q):g}' for s, q in at)}; "
+        f"its left side is {value:.4g} there, and every set around that point would violate it."
+    )
+
+
+def constraints_in_words(system: System) -> dict[str, str]:
+    """The inequalities that a claim keeps by name, over the states' values, as in `p - 1.5 < 0`."""
+    return in_words(replace(system, constraints=kept_constraints(system)))
 
 
 def ellipsoid_in(system: System, box: Mapping[str, float] | None = None) -> Array:

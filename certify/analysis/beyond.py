@@ -12,7 +12,7 @@ from certify.analysis.options import RoaOptions
 from certify.certificates import Certificate, PartitionTree
 from certify.certificates.claims import Claim, Outer, Problem
 from certify.certificates.ranked import count
-from certify.loop.plants import constraints_of_values
+from certify.loop.plants.constraints import in_words
 from certify.lyapunov import sampled_volume
 from certify.lyapunov.rigorous import evaluate_rise
 
@@ -51,8 +51,7 @@ def rank_facts(certificate: Certificate, rounds: int | None = None) -> RankFacts
 
 def constraints_in_words(certificate: Certificate) -> dict[str, str]:
     """The claim's constraints by name, over the states' values, as in `p - 3/2 < 0`."""
-    stated = replace(certificate.system, constraints=certificate.constraints)
-    return {name: f"{g} < 0" for name, g in constraints_of_values(stated).items()}
+    return in_words(replace(certificate.system, constraints=certificate.constraints))
 
 
 def short_of(problem: Problem, claim: Claim, options: RoaOptions, found: OuterProof | None) -> str:

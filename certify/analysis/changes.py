@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlantChanges:
-    """Changes of a plant: values and ranges of its parameters, its domain, what acts on it, when its input changes.
+    """Changes of a plant: values and ranges of its parameters, its domain, what acts on it, when its input changes,
+    what trajectories have to keep.
 
     The fields are the tables and options of a study; None changes nothing.
     """
@@ -45,6 +46,15 @@ class PlantChanges:
         written="As in 0.02. LO..HI: any sequence of periods between the two. max: the longest period for which the "
         "set that is proved without one is still proved.",
         python="A period, or a pair (lo, hi) for any sequence of periods between the two.")
+    keep: tuple[str, ...] | None = option(None, "loop", "comparisons", metavar="COMPARISON", help=(
+        "A constraint that has to hold along every trajectory, at all times: a comparison of the values of states and "
+        "inputs, with parameters and disturbances."),
+        written="As in 'p <= 1.5' or 'force: abs(F) <= 8', which names it; repeatable.",
+        python="A comparison or several, as text.")
+    avoid: tuple[str, ...] | None = option(None, "loop", "comparisons", metavar="COMPARISON", help=(
+        "States that no trajectory may meet: those at which the comparison holds."),
+        written="As in '(x - 1)**2 + y**2 < 0.25'; repeatable.",
+        python="A comparison or several, as text.")
     # fmt: on
 
     def of(self, plant: System) -> System:
@@ -59,6 +69,10 @@ class PlantChanges:
         plant = plant.with_parameters({name: q for name, q in given.items() if not isinstance(q, tuple)})
         plant = plant.with_ranges({name: ends for name, ends in given.items() if isinstance(ends, tuple)})
         plant = plant.with_domain(self._domain(plant)).with_ranges(self._acting(plant))
+        if self.keep or self.avoid:
+            from certify.loop.plants import with_constraints
+
+            plant = with_constraints(plant, self.keep or (), self.avoid or ())
         if (error := self.input_error) is not None:
             from certify.loop.plants import with_input_errors
 

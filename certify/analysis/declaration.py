@@ -26,6 +26,7 @@ Kind = Literal[
     "ranges",
     "bounds",
     "period",
+    "comparisons",
 ]
 """The form of a value: `certify.analysis.arguments` reads it as text, `certify.analysis.values` as Python's."""
 

@@ -76,9 +76,10 @@ def _uncertain(system: System) -> list[dict[str, str]]:
 
 
 def _witness(witness: Witness) -> dict[str, Any]:
-    held = witness.values if witness.kind == "vdot" else {}  # an input does not depend on them
+    held = {} if witness.kind == "input" else witness.values  # an input does not depend on them
     values = {name: str(q) for name, q in held.items()}
-    return {"x": witness.x.tolist(), "V": witness.level, "kind": witness.kind, "values": values}
+    named = {"constraint": witness.constraint} if witness.constraint else {}
+    return {"x": witness.x.tolist(), "V": witness.level, "kind": witness.kind, "values": values, **named}
 
 
 def _sizes(result: RoaResult) -> dict[str, Any]:

@@ -23,6 +23,8 @@ from certify.lyapunov import leaves_domain, slowest_decay
 from certify.provers.base import Task
 from certify.provers.falsify import Witness, refutes
 
+_BY_KIND = {"vdot": Stop.WITNESS, "input": Stop.INPUTS, "keep": Stop.KEEP}
+
 
 def result_about(result: RoaResult, trial: Trial) -> RoaResult:
     """The result with the candidate that it is about."""
@@ -75,7 +77,9 @@ def refuted_at_once(result: RoaResult, trial: Trial) -> RoaResult | None:
 
 def is_refuted(task: Task, witness: Witness | None) -> bool:
     """True if a witness refutes the claim for the level that the task asks for, exactly."""
-    return witness is not None and task.kind == "asymptotic" and refutes(task.problem, witness, task.target)
+    if witness is None or (task.kind != "asymptotic" and witness.kind != "keep"):
+        return False  # near the origin V need not fall under a practical claim
+    return refutes(task.problem, witness, task.target)
 
 
 def with_witness(result: RoaResult, task: Task, witness: Witness | None) -> RoaResult:
@@ -110,4 +114,4 @@ def limit_of(stop: Stop, task: Task, witness: Witness | None) -> Stop:
     """The limit of a level, from what stopped its proof."""
     if stop is not Stop.REQUESTED or task.exactly:
         return stop
-    return Stop.DOMAIN if witness is None else (Stop.INPUTS if witness.kind == "input" else Stop.WITNESS)
+    return Stop.DOMAIN if witness is None else _BY_KIND[witness.kind]

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -27,13 +27,13 @@ from certify.certificates import SEARCH, decode, encode, loop_sections, remove, 
 from certify.certificates.claims import Problem
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.plants import System
+from certify.loop.plants import System, kept_constraints
 from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import is_positive_definite, leaves_domain
 from certify.lyapunov.function import Quadratic
 from certify.provers.base import SearchState, Task
 from certify.provers.boxes.partition import MOST_SPLITS
-from certify.provers.falsify import Witness, confirm
+from certify.provers.falsify import Kind, Witness, confirm
 
 FORMAT = "certify-search/2"
 _LARGEST = 2**30  # bytes of a file
@@ -121,9 +121,11 @@ class NothingYetError(InputError):
 
 
 def identity(system: System, network: PolicyNetwork, rate: float) -> str:
-    """A hash of the loop, its periods and the rate, which a search is about."""
+    """A hash of the loop, its periods, the rate and the constraints, which a search is about."""
     sample = None if system.sample is None else [str(h) for h in system.sample]
-    said = json.dumps([loop_sections(system, network), sample, float(rate).hex()], sort_keys=True)
+    about = [loop_sections(system, network), sample, float(rate).hex()]
+    kept = {name: str(g) for name, g in kept_constraints(system).items()}
+    said = json.dumps([*about, kept] if kept else about, sort_keys=True)
     return hashlib.sha256(said.encode()).hexdigest()
 
 
@@ -254,7 +256,8 @@ def _stated(witness: Witness | None) -> dict[str, Any] | None:
     values = {name: str(q) for name, q in witness.values.items()}
     period = None if witness.period is None else str(witness.period)
     level = float(witness.level).hex()
-    return {"x": encode(witness.x), "level": level, "kind": witness.kind, "values": values, "period": period}
+    named = {"constraint": witness.constraint} if witness.constraint else {}
+    return {"x": encode(witness.x), "level": level, "kind": witness.kind, "values": values, "period": period, **named}
 
 
 def _read_witness(data: Mapping[str, Any] | None, problem: Problem) -> Witness | None:
@@ -264,12 +267,13 @@ def _read_witness(data: Mapping[str, Any] | None, problem: Problem) -> Witness |
     system, x = problem.loop.system, decode(data["x"], (problem.V.n,))
     values = {name: _rational(q) for name, q in data["values"].items()}
     period = None if data["period"] is None else _rational(data["period"])
-    witness = Witness(x, float.fromhex(data["level"]), data["kind"], values, period)
+    named = str(data.get("constraint", ""))
+    witness = Witness(x, float.fromhex(data["level"]), data["kind"], values, period, named)
     if not (
-        witness.kind in ("vdot", "input")
+        witness.kind in get_args(Kind)
         and np.all(np.isfinite(x))
         and all(system.ranges[name][0] <= q <= system.ranges[name][1] for name, q in values.items())
-        and (period is None) == (system.sample is None or witness.kind == "input")
+        and (period is None) == (system.sample is None or witness.kind != "vdot")
         and (period is None or system.sample is None or system.sample[0] <= period <= system.sample[1])
         and math.isclose(witness.level, float(problem.V(x)), rel_tol=_SAME)
         and confirm(problem, witness)

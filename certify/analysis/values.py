@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from certify.analysis.arguments import comparisons
 from certify.analysis.changes import PlantChanges
 from certify.analysis.declaration import declared
 from certify.analysis.options import RoaOptions
@@ -215,4 +216,7 @@ _READERS: Mapping[str, Callable[[Any, str], Any]] = {
     "ranges": _ranges,
     "bounds": lambda value, name: _state(value, name) if isinstance(value, Mapping) else _exact(value, name),
     "period": _value_or_pair,
+    "comparisons": lambda value, name: comparisons(
+        [text(v, name) for v in ([value] if isinstance(value, str) else _entries(value, name))], name
+    ),
 }

@@ -19,7 +19,7 @@ from certify.certificates.evidence import PartitionTree, RanksAlone, TrustedSolv
 from certify.certificates.formats import SCHEMA
 from certify.errors import InputError
 from certify.loop.expressions import Expression, to_tree
-from certify.loop.plants import System
+from certify.loop.plants import System, kept_constraints
 from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.neural import Neural
@@ -50,7 +50,7 @@ class _Stated(ABC):
     @property
     def constraints(self) -> dict[str, Expression]:
         """The claim's constraints: g of each condition g < 0, by its name in the plant, or else by its number."""
-        named = {g: name for name, g in self.system.uncertain_constraints().items()}
+        named = {g: name for name, g in kept_constraints(self.system).items()}
         return {named.get(g, f"constraint_{k}"): g for k, g in enumerate(self.kept, 1)}
 
     def to_json(self) -> str:

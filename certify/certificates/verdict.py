@@ -74,6 +74,7 @@ class Stop(Enum):
     MARGIN = "margin to the domain"
     WITNESS = "witness"
     INPUTS = "inputs"
+    KEEP = "constraint"
     EFFORT = "effort"
     TIME = "time"
     STALLED = "nothing gained"

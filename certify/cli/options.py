@@ -103,7 +103,7 @@ def _declared(
     found, others = {}, otherwise or {}
     for name, option in declared(kind).items():
         if option.typed and (name in names or not names):
-            of: Any = {"flag": bool, "ranges": list[str]}.get(option.kind, str)
+            of: Any = {"flag": bool, "ranges": list[str], "comparisons": list[str]}.get(option.kind, str)
             default = others.get(name, option.default)
             said = "" if default in (None, False) else f"[default: {_shown(default)}]"
             help_ = " ".join(filter(None, (option.help, option.written, said)))

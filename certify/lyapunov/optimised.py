@@ -8,6 +8,9 @@ state). Each round samples the closed loop, remembers the states that limit the 
 `log det P` in a trust region subject to them: a convex problem of the size of P, in coordinates in which the present
 set is a ball. Nothing is proved here: the engines prove the resulting binary64 matrix.
 
+A state that violates a constraint of the plant has mu = 0: whatever P is, it must lie outside. So an obstacle shapes V,
+and its mirror image with it. A constraint that is a half-space a'x < b is a matrix inequality, a'P^-1 a <= b^2.
+
 The margin alpha is asked for, not only the sign, because a proof needs many boxes where Vdot nearly vanishes.
 """
 
@@ -22,6 +25,7 @@ from numpy.typing import NDArray
 from certify.effort import UNLIMITED, Effort
 from certify.errors import BackendError
 from certify.loop.closed_loop import ClosedLoop
+from certify.loop.constraints import Constraints
 from certify.loop.plants import mean_rate
 from certify.lyapunov.candidates import increment_matrix, slowest_decay, solve_lyapunov
 from certify.lyapunov.level_sets import domain_limit, volume
@@ -30,6 +34,7 @@ from certify.lyapunov.programs import Inequality, smallest_trace
 Array = NDArray[np.float64]
 _RADII = np.linspace(0.1, 1.1, 12)  # of the samples on a ray, where 1 is the edge of the present set
 _FRESH, _NEAR = 400, 300  # new rays of a search: in any direction, and near those that limit the set
+_TOUCHING = 32  # rays from which states are looked for that violate a constraint
 _KEEP = 200  # rays of a search that are remembered for their crossing, and for their worst state
 _ROWS = 500  # states that each margin hands to the solver
 _ROUNDS = 30
@@ -176,13 +181,15 @@ class _Samples:
     """States that limit sublevel sets of the closed loop, remembered from search to search.
 
     x, G(x), (dG/dx) x : (N, n), G being the mean rate of a step, F in continuous time. outside : (N,), the input leaves
-    its bounds at x or G has a pole there. Where the effort has ended, one search does for several.
+    its bounds at x, a constraint is violated, or G has a pole there. Where the effort has ended, one search does for
+    several.
     """
 
     def __init__(self, loop: ClosedLoop, least: float, generator: np.random.Generator, effort: Effort) -> None:
         self.loop, self.least, self.generator, self.effort = loop, least, generator, effort
         self.f, self.step = loop.system.function(), loop.step
         self.bounds = np.array([[float(v) for v in b] for b in loop.system.input_bounds]).T
+        self.constraints = Constraints(loop) if loop.system.constraints else None
         self.x, self.F, self.dF = (np.zeros((0, loop.system.n)) for _ in range(3))
         self.outside = np.zeros(0, dtype=bool)
 
@@ -195,7 +202,14 @@ class _Samples:
             F = mean_rate(self.loop.system, self.f, x, u, self.step)
         outside = ~np.isfinite(F).all(-1)
         F = np.where(outside[..., None], 0.0, F)
-        return F, outside | np.any((u < self.bounds[0]) | (u > self.bounds[1]), axis=-1)
+        outside |= np.any((u < self.bounds[0]) | (u > self.bounds[1]), axis=-1)
+        return F, outside if self.constraints is None else outside | np.any(self.constraints.at(x, u) >= 0, axis=-1)
+
+    def limit(self, P: Array) -> float:
+        """The level at which {x'Px <= level} meets a side of the domain, or a constraint that is a half-space."""
+        found = domain_limit(P, self.loop.system.domain)
+        planes = [] if self.constraints is None else self.constraints.planes
+        return min([found, *(b * b / float(a @ np.linalg.solve(P, a)) for a, b in planes)])
 
     def known(self, P: Array, alpha: float) -> float:
         """The lowest level of a remembered violation of `D + 2 alpha V < 0`, inf if there is none."""
@@ -213,14 +227,14 @@ class _Samples:
 
     def fit(self, P: Array, alpha: float) -> Array:
         """`rescale` from the domain's limit downwards."""
-        return self.rescale(P / domain_limit(P, self.loop.system.domain), alpha, searches=4)
+        return self.rescale(P / self.limit(P), alpha, searches=4)
 
     def rescale(self, P: Array, alpha: float, searches: int = 1) -> Array:
         """P scaled so that {V <= 1} lies in the domain and holds no violation that the searches found."""
         for k in range(searches + 10):
             self.search(P, alpha)
             level = self.known(P, alpha)
-            P = P / min(level, domain_limit(P, self.loop.system.domain), float(_RADII[-1]) ** 2)
+            P = P / min(level, self.limit(P), float(_RADII[-1]) ** 2)
             if not np.all(np.isfinite(P)):  # as where the loop does not rest at the origin
                 raise BackendError("V falls on no sampled set around the origin. Use the candidate 'lyapunov'.")
             if k + 1 >= searches and level > 0.5:  # a lower level leaves the set too coarsely sampled
@@ -260,7 +274,11 @@ class _Samples:
             F, outside = self.field(state)
             bad = ~(_g(P, state, F, alpha, self.step) < 0) | outside
             low, high = np.where(bad, low, middle), np.where(bad, middle, high)
-        self.remember(np.concatenate([x[worst, share[worst].argmax(axis=1)], high[:, None] * rays[crossed]]))
+        found = [x[worst, share[worst].argmax(axis=1)], high[:, None] * rays[crossed]]
+        if self.constraints is not None:  # where they are first violated, which rays may miss
+            T = np.linalg.inv(L).T
+            found.append(self.constraints.touching(T, float(_RADII[-1]) ** 2, _unit(z[:_TOUCHING])) @ T.T)
+        self.remember(np.concatenate(found))
 
     def remember(self, x: Array) -> None:
         """Add states, (N, n)."""
@@ -291,6 +309,9 @@ def _solve(samples: _Samples, P: Array, A: Array, alpha: float, radius: float) -
     for (lo, hi), column in zip(samples.loop.system.domain, inverse.T, strict=True):
         e = column / min(float(-lo), float(hi))
         matrices.append((lambda M: M, np.outer(e, e)))  # (P^-1)_ii <= d_i^2
+    for a, b in [] if samples.constraints is None else samples.constraints.planes:
+        e = inverse @ a / b
+        matrices.append((lambda M: M, np.outer(e, e)))  # a'P^-1 a <= b^2
     held, least = list[Array](), list[Array]()
     for margin in (_SCORED * alpha, alpha):
         level, mu = samples.crossings(P, margin)

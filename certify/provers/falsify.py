@@ -1,4 +1,4 @@
-"""The falsifier: the lowest V at which D' >= 0, or at which the input leaves its bounds.
+"""The falsifier: the lowest V at which D' >= 0, the input leaves its bounds, or a constraint is violated.
 
 D' = D + 2 lambda V, where D is Vdot, or V's increment over a step by time. Violating samples of the ellipsoid are
 improved by descending V along D' = 0, each on its own so that they end in different valleys: a gradient step on D'
@@ -9,7 +9,7 @@ reported witness is shown in Arb; the search itself proves nothing.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Literal
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from certify.certificates.claims import Problem
 from certify.effort import UNLIMITED, Effort
+from certify.loop.constraints import Constraints, is_violated_at
 from certify.loop.networks import Gradients
 from certify.loop.plants import System, at_values, corners, mean_rate
 from certify.loop.policies import bounded_by_form
@@ -29,21 +30,25 @@ Mask = NDArray[np.bool_]
 _RATIO, _LEVELS, _LOWER = 1.4, 60, 13  # a survey: ratio of levels, their number, further steps of 8
 _CALL, _EACH = 3e5, 0.3  # operations of evaluating few states at once; of an operation at one, with its derivative
 _TOGETHER = 15  # levels that are looked at in one batch
+Kind = Literal["vdot", "input", "keep"]
+_STARTS = 256  # points from which each constraint is looked for
 _APART = 1e-7  # share of a state's or an input's size between the points of a difference
 
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """A state `x` (n,) with D' >= 0 (kind `vdot`) or an input out of bounds (`input`); `level` is V(x), rounded.
+    """A state `x` (n,) with D' >= 0 (kind `vdot`), an input out of bounds (`input`), or a `constraint` that is violated
+    (`keep`), by its name; `level` is V(x), rounded.
 
     `values` are those of what is uncertain, at which it is so, and `period` the sampling period; None without one.
     """
 
     x: Array
     level: float
-    kind: Literal["vdot", "input"]
+    kind: Kind
     values: Mapping[str, Fraction] = field(default_factory=dict)
     period: Fraction | None = None
+    constraint: str = ""
 
     def describe(self, system: System, rate: float = 0.0) -> str:
         """The violation in words, of a claim with this rate."""
@@ -51,6 +56,7 @@ class Witness:
         names += "".join(f", {name} = {float(q):.6g}" for name, q in self.values.items())
         names += ", in deviations from x_eq," if system.operating_point() else ""
         what = "the input leaves its bounds" if self.kind == "input" else "Vdot >= 0"
+        what = f"the constraint {self.constraint} is violated" if self.kind == "keep" else what
         at_rate = f" faster than at the rate {rate:g}" if rate else ""
         if self.kind == "vdot" and rate:
             what = f"V does not fall{at_rate}"
@@ -86,11 +92,23 @@ def falsify(
     # Half of the samples on the boundary, where violations usually begin, half spread over the levels.
     radius = np.where(np.arange(samples) % 2 == 0, 1.0, generator.random(samples))
     z = direction * (radius * np.sqrt(limit) * (1 - 1e-9))[:, None]
+    if search.constraints is not None:
+        z = np.concatenate([z, search.constraints.touching(T, limit, z[:_STARTS])])
     best = search.lowest(z)
     if best is None and not effort.over:  # climb D' on the boundary before giving up
         z = search.climb(z[:: max(1, samples // 512)], limit)
         best = search.lowest(z)
     return best
+
+
+def touch(problem: Problem, T: Array, limit: float, seed: int = 0) -> Witness | None:
+    """Search {V <= limit} for the lowest violation of a constraint; None if none was found, or none can be."""
+    if not problem.keep:
+        return None
+    search, n = _Search(problem, T), problem.loop.system.n
+    direction = np.random.default_rng(seed).standard_normal((_STARTS, n))
+    z = direction / np.linalg.norm(direction, axis=1, keepdims=True) * np.sqrt(limit)
+    return search.touched(z, limit)
 
 
 def is_violated(problem: Problem, T: Array, limit: float, samples: int = 4000, seed: int = 0) -> bool:
@@ -153,6 +171,8 @@ def confirm(problem: Problem, witness: Witness) -> bool:
         held = replace(loop, system=at_values(loop.system, witness.values)) if witness.values else loop
         found = evaluate_increment(held, problem.V.P, witness.x, witness.period, problem.rate)
         return bool(np.any(witness.x != 0)) and found >= 0
+    if witness.kind == "keep":
+        return is_violated_at(problem.loop, witness.constraint, witness.x, witness.values)
     for u, (lo, hi) in zip(evaluate_policy(loop, witness.x), loop.system.input_bounds, strict=True):
         if u * lo.denominator < lo.numerator or u * hi.denominator > hi.numerator:
             return True
@@ -179,9 +199,11 @@ class _Search:
         self.worst = self._worst()
         self.lo, self.hi = np.array([[float(end) for end in pair] for pair in system.input_bounds]).T
         self.check_inputs = not bounded_by_form(self.network, system.input_bounds)
+        self.constraints = Constraints(self.loop) if problem.keep else None
+        self.asks_more = self.check_inputs or self.constraints is not None
 
     def violation(self, z: Array) -> tuple[Array, Array]:
-        """(D', how far the worst input lies outside its bounds) at x = T z, shapes (B,)."""
+        """(D', how far the worst input lies outside its bounds, or the largest g of a constraint) at x = T z, (B,)."""
         self._charge(len(z), 1)
         x = z @ self.T.T
         return self._at(x, self._inputs(x)[0])
@@ -194,7 +216,11 @@ class _Search:
     @np.errstate(all="ignore")
     def _at(self, x: Array, u: Array) -> tuple[Array, Array]:
         decrease = [self._decrease(x, u, values, step) for values, step in self.worst]
-        return np.concatenate(decrease).max(0), np.maximum(self.lo - u, u - self.hi).max(-1)
+        beyond = np.maximum(self.lo - u, u - self.hi).max(-1)
+        if self.constraints is not None:
+            worst = self.constraints.at(x, u).max(-1)
+            beyond = np.maximum(beyond, worst) if self.check_inputs else worst
+        return np.concatenate(decrease).max(0), beyond
 
     @np.errstate(all="ignore")
     def _inputs(self, x: Array) -> tuple[Array, Array, Gradients]:
@@ -255,7 +281,7 @@ class _Search:
     def bad(self, z: Array) -> Mask:
         """True (B,) where a condition fails."""
         vdot, excess = self.violation(z)
-        return (vdot >= 0) | (excess > 0) if self.check_inputs else vdot >= 0
+        return (vdot >= 0) | (excess > 0) if self.asks_more else vdot >= 0
 
     @np.errstate(all="ignore")
     def lowest(self, start: Array) -> Witness | None:
@@ -281,16 +307,37 @@ class _Search:
     def _shown(self, z: Array) -> Witness | None:
         """A violation at one of these points (B, n): the binary64 state is what counts, so that a point is pulled
         outwards until the violation is certain there."""
-        kinds: tuple[Literal["vdot", "input"], ...] = ("vdot", "input") if self.check_inputs else ("vdot",)
         for point in z:
             for factor in (1.0, 1 + 1e-12, 1 + 1e-9, 1 + 1e-6):
                 x = self.T @ (factor * point)
-                for kind in kinds:
-                    every = itertools.product(self.periods, self.corners)
-                    for period, values in every if kind == "vdot" else [(None, self.corners[0])]:
-                        witness = Witness(x, float(self.problem.V(x)), kind, values, period)
-                        if confirm(self.problem, witness):
-                            return witness
+                for witness in self._witnesses(x, float(self.problem.V(x))):
+                    if confirm(self.problem, witness):
+                        return witness
+        return None
+
+    def _witnesses(self, x: Array, level: float) -> Iterator[Witness]:
+        """All that may be violated at a state."""
+        for period, values in itertools.product(self.periods, self.corners):
+            yield Witness(x, level, "vdot", values, period)
+        if self.check_inputs:
+            yield Witness(x, level, "input", self.corners[0])
+        for name in () if self.constraints is None else self.constraints.names:
+            for values in self.corners:
+                yield Witness(x, level, "keep", values, constraint=name)
+
+    def touched(self, start: Array, limit: float) -> Witness | None:
+        """The lowest violation of a constraint in {V <= limit}, looked for from points (N, n)."""
+        if self.constraints is None:
+            return None
+        z = self.constraints.touching(self.T, limit, start)
+        x = z @ self.T.T
+        z = z[self.constraints.at(x, self.loop.policy(x)).max(-1) > 0] if len(z) else z
+        for point in self._lowest_few(z, 32):
+            x = self.T @ point
+            every = self._witnesses(x, float(self.problem.V(x)))
+            shown = (one for one in every if one.kind == "keep" and confirm(self.problem, one))
+            if (found := next(shown, None)) is not None:
+                return found
         return None
 
     @np.errstate(all="ignore")
@@ -301,7 +348,7 @@ class _Search:
             vdot, _, by_vdot, by_excess = self._slopes(z)
             square = (z * z).sum(-1, keepdims=True)
             gradient = by_vdot / square - 2 * vdot[:, None] * z / (square * square)
-            gradient = gradient + by_excess if self.check_inputs else gradient
+            gradient = gradient + by_excess if self.asks_more else gradient
             moved = z + step * radius * gradient / (np.linalg.norm(gradient, axis=-1, keepdims=True) + 1e-300)
             z = radius * moved / np.linalg.norm(moved, axis=-1, keepdims=True)
             step *= 0.95
@@ -327,7 +374,7 @@ class _Search:
     def _uphill(self, z: Array) -> Array:
         """Unit directions (B, n), tangent to the sphere, in which the violation grows fastest."""
         vdot, _, gradient, by_excess = self._slopes(z)
-        if self.check_inputs:
+        if self.asks_more:
             gradient = np.where(vdot[:, None] >= 0, gradient, by_excess)
         z = z / np.linalg.norm(z, axis=-1, keepdims=True)
         tangent = gradient - (gradient * z).sum(-1, keepdims=True) * z

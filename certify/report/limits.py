@@ -12,6 +12,7 @@ from certify.report.words import below, number, symbol
 _LIMITS = {
     "domain": "the domain",
     "inputs": "the input bounds: beyond it the policy asks for more than the actuator gives",
+    "constraint": "a constraint: a larger set holds a state that violates it",
     "witness": "a point where Vdot >= 0",
     "effort": "the effort: more may be provable",
     "time": "the time limit: more may be provable",
@@ -27,7 +28,7 @@ _OF_OUTER = {
     "boxes": "the limit on boxes: more may be provable",
     "requested": "the level that was asked for",
 }
-AT_A_POINT = frozenset({"domain", "vdot", "input"})
+AT_A_POINT = frozenset({"domain", "vdot", "input", "keep"})
 """Kinds of limits that are met at a state, which is named; of others a run knows along which states it was hard."""
 _TOUCHING = Fraction(1, 10**6)  # relative distance from the domain's limit below which a set is said to touch it
 

@@ -154,8 +154,8 @@ class _Linearised:
     """The rule around {x'Px <= 1}, x = J d where X = 0.
 
     A row holds what the decay leaves at each corner of the ranges, (n, n) each, between the `roots`, the
-    inverses of those of the decays at X = 0, and how far inputs and states move, who have that `room`, (m + n,): `here`
-    at this X. `slopes` are its derivatives at 0 by the entries of X on and above the diagonal.
+    inverses of those of the decays at X = 0, and how far inputs, states and constraints move, who have that `room`,
+    (m + n + K,): `here` at this X. `slopes` are its derivatives at 0 by the entries of X on and above the diagonal.
     """
 
     rule: Rule
@@ -178,7 +178,10 @@ class _Linearised:
                 return None
             corners = _corners(self.rule, models, ball, P)
             shown = best_at(corners)
-            here = _row(models, corners, ball, shown.multipliers, self.roots) if shown.margin > _FAR else self.here
+            held = _kept(self.rule, ball[None])[0]
+            here = self.here
+            if shown.margin > _FAR:
+                here = np.append(_row(models, corners, ball, shown.multipliers, self.roots), held)
         return replace(self, X=X, here=here) if shown.margin > _FAR and np.all(np.isfinite(here)) else None
 
     def largest(self, trust: float) -> Array | None:
@@ -228,18 +231,26 @@ def _linearised(known: Paths, P: Array, effort: Effort) -> _Linearised | None:
             some = changes[start : start + _TOGETHER]
             effort.charge(len(some) * rule.operations_of_models)
             balls = _balls(J, some)
-            for X, ball, found in zip(some, balls, rule.models_on(balls, 1.0), strict=True):
+            held = _kept(rule, balls)
+            for X, ball, found, kept in zip(some, balls, rule.models_on(balls, 1.0), held, strict=True):
                 corners = _corners(rule, found, ball, P + inverse.T @ X @ inverse)
-                rows.append(_row(found, corners, ball, shown.multipliers, roots))
+                rows.append(np.append(_row(found, corners, ball, shown.multipliers, roots), kept))
     here = rows[0]
     slopes = (np.array(rows[1:]) - here) / _DIFFERENCE
     half = [float(min(-lo, hi)) for lo, hi in known.loop.system.domain]
-    room = np.append(models[0].inputs.room, half)
+    at_rest = rule.kept_on(J[None]) if problem.keep else None
+    room = np.concatenate([models[0].inputs.room, half, [] if at_rest is None else -at_rest[0]])
     return _Linearised(rule, J, roots, changes[0], here, slopes, room) if np.all(np.isfinite(slopes)) else None
 
 
 def _corners(rule: Rule, models: Sequence[Models], J: Array, P: Array) -> list[Corner]:
     return [corner for one in models for corner in corners_of(one, J, P, None, rule.steps.longest)]
+
+
+def _kept(rule: Rule, balls: Array) -> Array:
+    """How far each constraint moves on each ball, (N, K), infinite where one has no finite model."""
+    found = rule.kept_on(balls) if rule.problem.keep else None
+    return np.full((len(balls), len(rule.problem.keep)), math.inf) if found is None else found[1]
 
 
 def _directions(n: int) -> list[Array]:

@@ -30,9 +30,10 @@ from certify.lyapunov import (
 )
 from certify.lyapunov.function import Quadratic
 from certify.provers.base import FEW, Task
-from certify.provers.falsify import Witness, falsify, survey
+from certify.provers.falsify import Witness, falsify, survey, touch
 
 Array = NDArray[np.float64]
+Ended = Literal["domain", "sampled"]
 _BELOW = 1e-9  # relative distance from a limit that is itself out of reach (the domain's open condition)
 _BELOW_WITNESS = 1e-3
 _SMALLEST = 1e-120  # the least level: squares of states and products of bounds must not underflow
@@ -63,7 +64,7 @@ class Trial:
     task: Task
     T: Array
     limit: float
-    limited_by: Literal["domain", "sampled"]
+    limited_by: Ended
     volume: float
     notice: str | None = None
 
@@ -108,12 +109,16 @@ def trial(
     task = Task(problem, kind, level, options.level is not None)
     if options.level is not None and leaves_domain(P, options.level, loop.system.domain):
         return Trial(name, task, T, limit, "domain", volume(P, limit), notice)
+    if kind == "practical" and (met := touch(problem, T, level)) is not None:
+        level = level if task.exactly else met.level * (1 - _BELOW_WITNESS)
+        task = replace(task, target=level, witness=met)
+    within: Ended = "domain" if task.witness is None else "sampled"
     if kind == "practical" and n > FEW:  # a ball decides, and no survey could
-        return Trial(name, task, T, limit, "domain", volume(P, level), notice)
+        return Trial(name, task, T, limit, within, volume(P, level), notice)
     if kind == "practical":
         bands = survey(problem, T, level, effort=effort)
         reach = bands[0].above if bands else 0.0
-        return Trial(name, task, T, limit, "sampled" if reach < level else "domain", volume(P, reach), notice)
+        return Trial(name, task, T, limit, "sampled" if reach < level else within, volume(P, reach), notice)
     witness = falsify(problem, T, level, _MANY_SAMPLES if _only_one(options) else _SAMPLES, 0, effort)
     below = level if witness is None or task.exactly else witness.level * (1 - _BELOW_WITNESS)
     task = Task(problem, kind, below, task.exactly, witness)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from certify.analysis.asked import ellipsoid_in, require_one_that_knows, state_in, values_of
+from certify.analysis.asked import ellipsoid_in, require_kept_at_origin, require_one_that_knows, state_in, values_of
 from certify.analysis.options import RoaOptions
 from certify.analysis.outcome import by_spectrum, not_stable
 from certify.analysis.results import RoaResult
@@ -45,6 +45,7 @@ class Setting:
         with self.tools.timing("candidate"):
             state = _with_claim(state)
             rest, loop = _rest(state.loop, state.options)
+            require_kept_at_origin(loop)
             state = replace(state, loop=loop)
             state = state.with_result(
                 system=loop.system,

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,7 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import with_origin
 from certify.lyapunov import domain_limit, extents, semi_axes, volume
 from certify.lyapunov.function import Quadratic
-from certify.provers.falsify import Witness, confirm
+from certify.provers.falsify import Kind, Witness, confirm
 from certify.report.words import volume_unit
 
 if TYPE_CHECKING:
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 _LEAF = bytes([255])  # of a tree in preorder
 _CERTIFICATE = "certificate.json"
+_OF_WITNESS = ("x", "kind", "values", "constraint")
 
 
 def kept(out: Path, case: Case) -> Row | None:
@@ -193,7 +194,7 @@ def _stated(case: Case, answer: Answer, plant: System) -> Row:
             volume_unit=volume_unit([plant.units.get(s.name, "") for s in plant.states]),
             states=tuple(s.name for s in plant.states),
             units={name: plant.units.get(name, "") for name in (*names, *plant.parameters)},
-            witness=None if witness is None else {name: witness[name] for name in ("x", "kind", "values")},
+            witness=None if witness is None else {name: witness[name] for name in _OF_WITNESS if name in witness},
             boxes=int(data["boxes"]),
             leaves=0 if answer.raw is None else int(data["leaves"]),
             seconds=_optional(data["seconds"]["total"]),
@@ -265,15 +266,15 @@ def _sampled_limit(certificate: Certificate, said: Mapping[str, Any] | None) -> 
     system, x = certificate.system, np.array(said["x"], dtype=np.float64)
     problem = Problem(ClosedLoop(system, certificate.network), Quadratic(certificate.P), certificate.claim.rate)
     values = {str(name): Fraction(text) for name, text in said["values"].items()}
-    if x.shape != (system.n,) or not np.all(np.isfinite(x)) or said["kind"] not in ("vdot", "input"):
+    if x.shape != (system.n,) or not np.all(np.isfinite(x)) or said["kind"] not in get_args(Kind):
         return None
     if not all(name in system.ranges and _is_in(q, system.ranges[name]) for name, q in values.items()):
         return None
     if said["kind"] == "vdot" and set(values) != set(system.ranges):
         return None
-    periods = [None] if system.sample is None or said["kind"] == "input" else list(system.sample)
-    level = float(problem.V(x))
-    shown = (confirm(problem, Witness(x, level, said["kind"], values, period)) for period in periods)
+    periods = [None] if system.sample is None or said["kind"] != "vdot" else list(system.sample)
+    level, named = float(problem.V(x)), str(said.get("constraint", ""))
+    shown = (confirm(problem, Witness(x, level, said["kind"], values, period, named)) for period in periods)
     return level if any(shown) else None
 
 

@@ -18,7 +18,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from certify.analysis.arguments import read_option
+from certify.analysis.arguments import comparisons, read_option
+from certify.analysis.changes import PlantChanges
+from certify.analysis.declaration import declared
 from certify.analysis.inputs import named_plant
 from certify.analysis.options import RoaOptions
 from certify.analysis.studies.case import OPTIONS, PLANT_OPTIONS, TABLES, Case, File, readable_ids
@@ -263,6 +265,9 @@ def _require_readable(file: PlantFile, text: str, table: str, name: str) -> None
         if name in OPTIONS and name != _FILE_OPTION and table == "options":
             _options_with(file, f"options.{name}", **{OPTIONS[name]: read_option(OPTIONS[name], text)})
         elif table != "options" or name in PLANT_OPTIONS:
+            if name in PLANT_OPTIONS and declared(PlantChanges)[name].kind == "comparisons":
+                comparisons([text], name)
+                return
             separator = ":" if table == "domain" and ".." not in text else ".."
             parts = [text.rpartition("=")[2]] if name == "input_error" else text.split(separator)
             if len(parts) > 2:

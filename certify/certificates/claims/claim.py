@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Literal
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression
+from certify.loop.plants import kept_constraints
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.symbolic import Symbolic
@@ -46,6 +47,11 @@ class Problem:
             raise InputError(f"`P` must be a finite matrix of shape ({n}, {n}); found shape {self.V.P.shape}.")
         if not (math.isfinite(self.rate) and self.rate >= 0):
             raise InputError(f"`rate` must be a number of at least 0; found {self.rate}.")
+
+    @property
+    def keep(self) -> tuple[Expression, ...]:
+        """The plant's constraints, g of each inequality g < 0, as a claim states them."""
+        return tuple(kept_constraints(self.loop.system).values())
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from certify.loop.plants.constraints import in_parts, kept_constraints, with_constraints
 from certify.loop.plants.deviations import (
     constraints_of_values,
     domain_of_values,
@@ -33,7 +34,9 @@ __all__ = [
     "get_system",
     "in_deviations",
     "in_floats",
+    "in_parts",
     "input_errors",
+    "kept_constraints",
     "kind_of",
     "linearise",
     "load_system",
@@ -42,6 +45,7 @@ __all__ = [
     "residuals",
     "rests_where",
     "shipped_system",
+    "with_constraints",
     "with_input_errors",
     "with_origin",
 ]

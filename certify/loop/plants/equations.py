@@ -78,13 +78,29 @@ def parse_constraint(
     ------
     InputError : the text is neither one comparison of two expressions nor an expression.
     """
+    sides = parse_comparison(text, names, known, networks)
+    return parse_expression(text, names, known, networks) if sides is None else sides[0] - sides[1]
+
+
+def parse_comparison(
+    text: str,
+    names: Mapping[str, Expression],
+    known: str = "state, input, parameter or disturbance",
+    networks: Mapping[str, Network] | None = None,
+) -> tuple[Expression, Expression] | None:
+    """The smaller and the larger side of a comparison; None where the text is none.
+
+    Raises
+    ------
+    InputError : the text compares more than two expressions, or otherwise than by order.
+    """
     source = " ".join(str(text).split())
     try:
         tree = ast.parse(source, mode="eval").body
     except (SyntaxError, RecursionError, ValueError, MemoryError):
-        tree = None
+        return None
     if not isinstance(tree, ast.Compare) or not source.isascii() or "#" in source:
-        return parse_expression(text, names, known, networks)
+        return None
     if len(tree.ops) != 1 or not isinstance(tree.ops[0], ast.Lt | ast.LtE | ast.Gt | ast.GtE):
         raise InputError(
             f"constraint {source!r}: it must compare two expressions by <=, <, >= or >; write two constraints for a "
@@ -94,7 +110,7 @@ def parse_constraint(
         parse_expression(source[side.col_offset : side.end_col_offset], names, known, networks)
         for side in (tree.left, tree.comparators[0])
     )
-    return left - right if isinstance(tree.ops[0], ast.Lt | ast.LtE) else right - left
+    return (left, right) if isinstance(tree.ops[0], ast.Lt | ast.LtE) else (right, left)
 
 
 def _size(expression: Expression) -> int:

@@ -263,12 +263,25 @@ class Rule:
         reach = np.minimum(np.linalg.norm(balls, axis=2), extents(self.problem.V.P, level) * _WIDER)
         return self.steps.models_on(balls, self.cells, reach)
 
+    def kept_on(self, balls: Array) -> tuple[Array, Array] | None:
+        """Of the constraints' g, for several balls, what `Steps.largest` says."""
+        return self.steps.largest(balls, self.problem.keep, self.cells)
+
+    def _keeps(self, J: Array) -> bool:
+        """True if every constraint holds on the ball."""
+        if not self.problem.keep:
+            return True
+        found = self.kept_on(J[None])
+        return found is not None and bool(np.all(found[1] < -(1 - _ROUNDING) * found[0]))
+
     def _corners(self, level: float) -> list[Corner] | None:
-        """The inequality at the corners of all cells; None where something has no finite model, or may leave its
-        bounds."""
+        """The inequality at the corners of all cells; None where something has no finite model, may leave its
+        bounds, or may violate a constraint."""
         if self.cuts is None:
             return None
         J, found = ball_around(self.problem, self.T, level), list[Corner]()
+        if not self._keeps(J):
+            return None
         for models in self.models(J, level):
             if not (models.finite and models.admitted):
                 return None

@@ -23,6 +23,7 @@ from certify.provers.ball.ranged import RangedJet, RangedJets
 
 Array = NDArray[np.float64]
 Cell = tuple[Interval, ...]
+_WIDER = 1 + 1e-9  # share of how far a constraint moves on a ball, for the checker's rounding
 _ATTEMPTS, _FURTHER = 4, 1.25  # at how far the states move in a period, each from the rates of the last
 
 
@@ -67,6 +68,25 @@ class Steps:
         later = None if sample is None else _later(walks[0], self.order, sample, reach)
         in_cells = [self._in_cell(walk, driven, later) for walk in walks]
         return [list(of_ball) for of_ball in zip(*in_cells, strict=True)]
+
+    def largest(
+        self, balls: Array, constraints: Sequence[Expression], cells: Sequence[Cell]
+    ) -> tuple[Array, Array] | None:
+        """For each expression g its value (K,) at the middle, and by how much it is larger anywhere on each of several
+        balls (N, n, k), in any cell, (N, K); where inputs are held, at any time of a period, in which quantities may be
+        anywhere. None where one has no finite model."""
+        driven, sample = [self.known.driven(J) for J in balls], self.known.loop.system.sample
+        walks = [_Walk(self, balls, driven, cell) for cell in cells]
+        if sample is None:
+            found = [walk.of(constraints) for walk in walks]
+        else:
+            moved = _within_a_period(walks[0], float(sample[1]))
+            found = [] if moved is None else [walks[0].of(constraints, moved[0], fixed=False)]
+        if not found:
+            return None
+        middle = np.array([g.c for g in found[0]])
+        ends = np.array([[g.c + _WIDER * (g.away + g.radius) for g in of_cell] for of_cell in found]).max(0).T
+        return (middle, ends - middle) if np.all(np.isfinite(ends)) else None
 
     def _in_cell(self, walk: _Walk, driven: Sequence[Driven], later: _Later | None) -> list[Models]:
         """On each ball."""
@@ -120,6 +140,14 @@ class _Walk:
         shared: dict[Expression, RangedJet] = {}
         values = self._states_by_name(near) | self._held_by_name(fixed)
         return [evaluate(e, values, self.algebra, shared) for e in self.steps.dynamics]
+
+    def of(
+        self, expressions: Sequence[Expression], near: tuple[Array, Array] | None = None, fixed: bool = True
+    ) -> list[RangedJet]:
+        """Expressions at these states, as `rates` has them."""
+        shared: dict[Expression, RangedJet] = {}
+        values = self._states_by_name(near) | self._held_by_name(fixed)
+        return [evaluate(g, values, self.algebra, shared) for g in expressions]
 
     def series(self, order: int, near: tuple[Array, Array] | None = None) -> list[list[RangedJet]]:
         """x_1 to x_order, from these states, for each component."""

@@ -27,12 +27,14 @@ Values = Mapping[Symbol, Taylor]
 
 class Mean(NamedTuple):
     """`G`: models of the mean of f over the period, a component each; `least` and `most` (n, B): bounds of f from its
-    beginning to the end of the longest; `exists` (B,): the solution does, and these hold for it."""
+    beginning to the end of the longest; `exists` (B,): the solution does, and these hold for it; `during`: all values
+    at any time of the period, where it exists."""
 
     G: list[Taylor]
     least: Array
     most: Array
     exists: Mask
+    during: Values
 
 
 class Flow:
@@ -74,6 +76,7 @@ class Flow:
             np.stack([model.c - r for model, r in zip(f, reach, strict=True)]),
             np.stack([model.c + r for model, r in zip(f, reach, strict=True)]),
             exists,
+            {**around, **held},
         )
 
     def _rate(self, values: Values, models: Models) -> list[Taylor]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,7 +78,7 @@ class BoundsEngine(Engine):
             ring = grown.proof(stop)
         else:
             ring = empty_ring(task.problem, self.T, inner)
-        claim = Practical(roa=ring.outer, local=inner, floor=floor, rate=task.problem.rate)
+        claim = Practical(roa=ring.outer, local=inner, floor=floor, **_beside(task.problem))
         return self.stated(task.problem, ring, claim, {"ring": time.perf_counter() - start})
 
     def _by_leaves(self, task: Task, budget: Budget, report: Report | None) -> Proof:
@@ -113,7 +114,7 @@ class BoundsEngine(Engine):
         if not ring.covered:
             why = f"F and its inputs are not enclosed on all of V <= {ring.inner:.6g}"
             return Proof(None, None, _cut_short(ring) or Stop.SMOOTH, why, boxes=ring.boxes)
-        claim = Practical(roa=ring.outer, local=ring.inner, floor=ring.inner, rate=task.problem.rate)
+        claim = Practical(roa=ring.outer, local=ring.inner, floor=ring.inner, **_beside(task.problem))
         stop = Stop.CLUSTER if ring.stop is Stop.CLUSTER else stop
         return replace(self.stated(task.problem, ring, claim, {}), stop=stop, witness=witness)
 
@@ -146,6 +147,11 @@ class BoundsEngine(Engine):
             direction=ring.direction,
             left=ring.left,
         )
+
+
+def _beside(problem: Problem) -> dict[str, Any]:
+    """The parts of a claim about a problem beside its levels."""
+    return {"rate": problem.rate, "keep": problem.keep}
 
 
 def _cut_short(ring: RingProof) -> Stop | None:
@@ -234,6 +240,6 @@ class _Outwards:
             ring = empty_ring(self.task.problem, self.engine.T, self.inner)
         else:
             ring = self.ring.proof(self.stop)
-        claim = Asymptotic(roa=ring.outer, local=self.inner, rate=self.task.problem.rate)
+        claim = Asymptotic(roa=ring.outer, local=self.inner, **_beside(self.task.problem))
         lost = "" if self.ring is None or self.stop is not Stop.CLUSTER else self.ring.lost
         return replace(self.engine.stated(self.task.problem, ring, claim, dict(self.seconds)), detail=lost)

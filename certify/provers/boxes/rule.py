@@ -23,7 +23,7 @@ import numpy as np
 from certify.certificates.claims import Problem
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, evaluate, nodes
-from certify.loop.plants import System
+from certify.loop.plants import System, kept_constraints
 from certify.loop.policies import bounded_by_form
 from certify.provers.bounds import (
     Flow,
@@ -36,10 +36,13 @@ from certify.provers.bounds import (
 )
 from certify.provers.bounds.arrays import Array, Mask, chosen, product
 from certify.provers.bounds.compiled import loops
+from certify.provers.bounds.flow import Values
 from certify.provers.bounds.loop import played
 from certify.provers.bounds.tape import Tape, recorded
 from certify.provers.bounds.taylor import EPS, TINY, ConstantsLast, V
 from certify.provers.boxes.form import FormBound
+from certify.provers.boxes.kept import ConstraintModels, held_back
+from certify.provers.boxes.lessening import lessened
 
 _SLACK = 1e-9  # relative distance from the inner level at which a box counts as inside
 _ENDS = 1e-11  # relative distance kept from the ends of the domain
@@ -65,7 +68,8 @@ def operations_of_box(loop: ClosedLoop, order: int = 2) -> float:
     system = loop.system
     symbols = system.n + system.m + len(system.uncertain) + (system.sample is not None)
     times = 1 if system.sample is None else 2 + 2 * order**2
-    equations = sum(1 for _ in nodes(*system.uncertain_dynamics())) * times + system.n * (system.n + 3)
+    asked = kept_constraints(system).values() if system.constraints else ()
+    equations = sum(1 for _ in nodes(*system.uncertain_dynamics(), *asked)) * times + system.n * (system.n + 3)
     return operations_of_policy(loop.network) + _EACH * equations * (symbols + 1) ** 2
 
 
@@ -95,6 +99,7 @@ class VdotBound:
         self.order = 1 if self.flow is None else order
         self.step = loop.step
         self.tape: Tape | None = None  # the tape of D, recorded when it is first played
+        self.constraints = ConstraintModels(loop.system, problem.keep) if problem.keep else None
         self.ends = np.array([[float(end) for end in pair] for pair in loop.system.domain]).T[:, :, None]
         self.extent = (np.sqrt(np.diag(np.linalg.inv(self.P))) * (1 + 1e-9))[:, None]  # half-widths of {V <= 1}
 
@@ -140,7 +145,7 @@ class VdotBound:
         x = np.concatenate([product(self.T, centre)[:, None], slopes_x], 1)
         error = 2 * (n + 4) * EPS * product(np.abs(self.T), np.abs(centre) + radius) + TINY
         mid, slopes, wide, share = self.policy(x, error)
-        decrease, kept = self._decrease(x, error, mid, slopes, wide, outer)
+        decrease, kept, during = self._decrease(x, error, mid, slopes, wide, outer)
         if self.rate:
             decrease = decrease + self.V.model(centre, radius, decrease).scaled(2 * self.rate)
         bound, excess = upper_bound(decrease)
@@ -165,14 +170,21 @@ class VdotBound:
             for j, (inside, outside) in enumerate(input_bounds_kept(self.system, mid, slopes, wide)):
                 proved, violated, smooth = proved & inside, violated | outside, smooth & inside
                 score = np.where(inside, score, np.abs(slopes[j]) + share * wide[j])
+        if self.constraints is not None:
+            asked = self.constraints
+            models = asked(x, error, mid, slopes, wide) if during is None else asked.during(during)
+            for held in held_back(models, known, self.V, centre, radius, outer):
+                proved, violated, smooth = proved & held.inside, violated | held.outside, smooth & held.inside
+                score = np.where(held.inside, score, held.score[:n] + share * held.score[n:].sum(0))
         if self.inside and self.step:
             smooth = proved
         return BoxBounds(proved, bound, score, violated, smooth)
 
     def _decrease(
         self, x: Array, error: Array, mid: Array, slopes: Array, wide: Array, outer: float
-    ) -> tuple[Taylor, Mask | None]:
-        """D, and where (B,) the solution stays in the domain over a period in which the input is held, if it is.
+    ) -> tuple[Taylor, Mask | None, Values | None]:
+        """D, where (B,) the solution stays in the domain over a period in which the input is held, if it is, and what
+        all values are in the period.
 
         Symbols: n box coordinates, m input errors, k uncertain quantities, and the period if that is in a range.
         """
@@ -181,14 +193,14 @@ class VdotBound:
                 count = self.system.n + self.system.m + len(self.system.uncertain)
                 self.tape = recorded(count, self._at_rates)
             how = loops(0)  # the policy's own output counts
-            return played(how, self.tape, self.system, x, error, mid, slopes, wide), None
+            return played(how, self.tape, self.system, x, error, mid, slopes, wide), None, None
         states, inputs, quantities = loop_models(self.system, x, error, mid, slopes, wide, self.flow.symbols)
         here = list(states.values())
         models = Models(here[0])
         mean = self.flow(states, inputs, quantities, self.system.n + self.system.m)
         moved = [self.flow.times_period(rate) for rate in mean.G]
         kept = mean.exists & self._in_domain(here, mean.least, mean.most, outer)
-        return self._increment(here, mean.G, moved, models), kept
+        return self._increment(here, mean.G, moved, models), kept, mean.during
 
     def _at_rates(self, values: Sequence[V], algebra: ConstantsLast[V]) -> V:
         """D where the input is not held over time, from states, inputs and uncertain quantities."""
@@ -267,35 +279,3 @@ def input_bounds_kept(system: System, mid: Array, slopes: Array, wide: Array) ->
         outside = (mid[j] - wide[j] > float(high) + slack) | (mid[j] + wide[j] < float(low) - slack)
         kept.append((inside, outside))
     return kept
-
-
-def lessened(bound: Array, decrease: Taylor, gap: Taylor, n: int, most: float = np.inf) -> Array:
-    """The bound (B,) of a model, made tighter where it is not negative by multiples of a gap that is >= 0 in the ring.
-
-    Parameters
-    ----------
-    gap : its model, whose first n symbols are the box coordinates.
-    most : the largest multiplier, which is tried too if it is finite.
-    """
-    scale = gap.r + EPS * sum(gap.norms())
-    tried = np.minimum(_multipliers(decrease.g[:n], gap.g[:n], gap.c), most)
-    if most < np.inf:
-        tried = np.concatenate([tried, np.full_like(tried[:1], most)])
-    for each in tried:
-        still = chosen(~(bound < 0) & (each > 0))
-        if not len(still):
-            continue
-        k = each[still]
-        c = k * gap.c[still]
-        rest = k * scale[still] + EPS * np.abs(c) + TINY
-        added = Taylor(c, k * gap.g.take(still, -1), k * gap.Q.take(still, -1), rest)
-        tighter, _ = upper_bound(decrease.at(still) + added)
-        bound[still] = np.fmin(bound[still], tighter)
-    return bound
-
-
-def _multipliers(a: Array, b: Array, c: Array) -> Array:
-    """The k at which a term of `c k + sum_i |a_i + k b_i|` vanishes, or 0 where it is negative: (n, B), best first."""
-    k = np.maximum(np.nan_to_num(np.where(b != 0, -a / b, 0.0), nan=0.0, posinf=0.0, neginf=0.0), 0.0)
-    value = c * k + np.abs(a[:, None] + k * b[:, None]).sum(0)
-    return np.asarray(np.take_along_axis(k, value.argsort(0, kind="stable"), 0))

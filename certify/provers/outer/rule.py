@@ -33,7 +33,8 @@ from certify.provers.bounds import (
 from certify.provers.bounds.arrays import Array, Index, Mask, chosen, is_whole, joined, product
 from certify.provers.bounds.taylor import EPS, TINY
 from certify.provers.boxes.form import FormBound
-from certify.provers.boxes.rule import input_bounds_kept, lessened
+from certify.provers.boxes.lessening import lessened
+from certify.provers.boxes.rule import input_bounds_kept
 
 _SLACK = 1e-9  # relative distance from c2 at which a box counts as inside
 _ENDS = 1e-11  # relative distance kept from the ends of the domain
