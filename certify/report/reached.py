@@ -47,7 +47,7 @@ def steps_of(result: Mapping[str, Any], count: int) -> str:
 
 def _headline(result: Mapping[str, Any], verdict: str) -> str:
     name, target = result["system"], target_of(result)
-    box = _box(result)
+    box = box_of(result)
     if verdict == "PROVED" and box is None:
         return f"{name}: from the boxes with ranks, {target} after {steps_of(result, result['ranks']['steps'])} at most"
     if verdict == "PROVED":
@@ -83,7 +83,7 @@ def _rows(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "seconds", ", ".join(f"{name} {value:.2g}" for name, value in result["seconds"].items())
 
 
-def _box(result: Mapping[str, Any]) -> str | None:
+def box_of(result: Mapping[str, Any]) -> str | None:
     """The box that was asked about, in words; None if there is none."""
     if result["from"] is None:
         return None
