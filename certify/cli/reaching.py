@@ -42,9 +42,17 @@ def reached(
 
     note, folder = noting(quiet), out if out is not None else Path("out") / policy.stem
     progress, later = None if quiet else ProgressLine(), list[str]()
-    about = {"load_seconds": time.perf_counter() - start, "provenance": {"policy": policy.name, **versions()}}
     try:
-        result = certify_reach(plant, stored.network, folder, options, progress=progress, tell=later.append, **about)
+        result = certify_reach(
+            plant,
+            stored.network,
+            folder,
+            options,
+            load_seconds=time.perf_counter() - start,
+            provenance={"policy": policy.name, **versions()},
+            progress=progress,
+            tell=later.append,
+        )
     finally:
         if progress is not None:
             progress.close()

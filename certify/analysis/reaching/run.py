@@ -10,16 +10,18 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from certify.analysis.acceptance import Clerk, Desk
 from certify.analysis.beyond import constraints_in_words, rank_facts
 from certify.analysis.reaching.options import ReachOptions, target_of
 from certify.analysis.reaching.results import ReachResult
-from certify.analysis.reaching.runs import Simulation, is_refuted
+from certify.analysis.reaching.runs import Simulation, begins, is_refuted
 from certify.analysis.stages.state import Report
 from certify.certificates import (
     RanksAlone,
@@ -42,10 +44,22 @@ from certify.loop.plants import System, kept_constraints
 from certify.loop.policies import PolicyNetwork
 from certify.provers.base import Progress
 from certify.provers.execution import ThreadRunner
-from certify.provers.ranks import Question, RankProof, Region, Wanted, prove_ranks, root_box, without_leaf
+from certify.provers.ranks import (
+    MOST_STEPS,
+    Question,
+    RankProof,
+    Region,
+    Wanted,
+    prove_ranks,
+    root_box,
+    with_order,
+    without_leaf,
+)
 
-_ORDER = 4  # of the series in time, where inputs are held
-_FOR_RUNS, _FOR_SEARCH = 0.05, 0.7  # shares of the effort, the rest being for the check
+Array = NDArray[np.float64]
+_PROBES = 30  # states at which the order of the series in time is chosen
+_FOR_RUNS, _FOR_SEARCH = 0.2, 0.7  # shares of the effort, the rest being for the check
+_DIRECT = 4000  # boxes that are looked at first where runs need few steps
 _MENDED = 20  # leaves that the checker may refuse
 
 
@@ -164,15 +178,17 @@ def _proved(
 ) -> ReachResult:
     """The result of the search, and of the check of what it finds."""
     options, system = result.options, loop.system
-    keep, order = tuple(kept_constraints(system).values()), 1 if system.sample is None else _ORDER
-    question = Question(loop, Region(target, system.states), keep, root_box(system), order)
+    keep, root = tuple(kept_constraints(system).values()), root_box(system)
+    question = Question(loop, Region(target, system.states), keep, root)
+    question = with_order(question, begins(options.begin or tuple(zip(*map(_exactly, root), strict=True)))[:_PROBES].T)
     with tools.timing("ranks"):
-        found = _searched(question, options, effort.share(_FOR_SEARCH), tools)
+        soon = result.runs is not None and (result.runs.longest or MOST_STEPS) < MOST_STEPS
+        found = _searched(question, options, _DIRECT if soon else 0, effort.share(_FOR_SEARCH), tools)
     evidence = None if found is None else _within(found.evidence, options.within)
     if found is None or evidence is None:
         return replace(result, reason="no box of the domain is proved to lead into the region")
     claim = Reaches(target, Ranks(system.angles, _most(evidence)), keep)
-    certificate = ReachCertificate(system, loop.network, claim, RanksAlone(evidence, order), provenance)
+    certificate = ReachCertificate(system, loop.network, claim, RanksAlone(evidence, question.order), provenance)
     certificate, raw, answer = _accepted(certificate, path, options, tools)
     facts, kept = rank_facts(certificate, found.rounds), constraints_in_words(certificate)
     result = replace(result, ranks=facts, boxes=found.boxes, constraints=kept)
@@ -186,8 +202,11 @@ def _proved(
     return replace(result, verdict=Verdict.PROVED, reason="requested", steps=steps)
 
 
-def _searched(question: Question, options: ReachOptions, effort: Effort, tools: _Tools) -> RankProof | None:
-    """Leaves from which the region is reached: those that the box needs, or else all that the effort finds."""
+def _searched(
+    question: Question, options: ReachOptions, direct: int, effort: Effort, tools: _Tools
+) -> RankProof | None:
+    """Leaves from which the region is reached: those that the box needs, or else all that the effort finds; `direct`
+    boxes are looked at in the hope of one jump."""
 
     def report(share: float, boxes: int, waiting: int) -> None:
         if tools.progress is not None:
@@ -197,8 +216,12 @@ def _searched(question: Question, options: ReachOptions, effort: Effort, tools: 
     if options.begin is not None:
         lo, hi = (np.array([float(pair[k]) for pair in options.begin]) for k in (0, 1))
         most = UNPROVED - 1 if options.within is None else options.within
-        wanted = Wanted(np.nextafter(lo, -np.inf), np.nextafter(hi, np.inf), most)
+        wanted = Wanted(np.nextafter(lo, -np.inf), np.nextafter(hi, np.inf), most, direct)
     return prove_ranks(question, effort, ThreadRunner(), report, wanted)
+
+
+def _exactly(corner: Array) -> list[Fraction]:
+    return [Fraction(v) for v in corner.tolist()]
 
 
 def _within(evidence: RankTree, most: int | None) -> RankTree | None:

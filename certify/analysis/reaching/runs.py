@@ -28,7 +28,7 @@ from certify.report.flow import Flow, time_scales
 Array = NDArray[np.float64]
 End = Literal["late", "left", "violates"]
 LONG = 3000  # steps after which a run is given up
-_RANDOM, _GRID, _CORNERS = 400, 21, 10  # states of a box; a grid's points in one state; states that have all corners
+_RANDOM, _GRID, _CORNERS = 100, 51, 8  # states of a box; a grid's points in one state; states that have all corners
 _CLOSE = 1e-9  # a target that is missed by less is not missed, in floats
 _BITS = 400
 
@@ -86,6 +86,7 @@ class Simulation:
         if not effort.over:
             failing += [Run(self._exact(start[i]), "late", most) for i in alive]
         worst = ("violates", "late", "left")
+        longest = None if effort.over else longest
         return Runs(len(start), longest, min(failing, key=lambda run: worst.index(run.end), default=None))
 
     def _ended(self, x: Array, k: int) -> dict[int, tuple[End, int, str]]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,10 +19,12 @@ from certify.provers.execution import Runner
 from certify.provers.ranks.images import Course
 from certify.provers.ranks.search import COUNTS, NONE, Search
 from certify.provers.ranks.targets import Target
-from certify.provers.ranks.wanted import SearchFrom, Wanted
+from certify.provers.ranks.wanted import COUNTS_FROM, SearchFrom, Wanted
 
 _HALF_TURN = 3.1416  # and a little more
 _SLIVER = 1e-6
+_ORDERS = (2, 3, 4, 5, 6, 7, 8)
+_LITTLE, _GAIN = 1e-5, 0.5  # share of the root box that an error may be; a gain that is worth an order
 _MOST_LEAVES = 400_000
 
 
@@ -43,12 +46,31 @@ class Question:
     root: tuple[Array, Array]
     order: int = 2
 
-    @property
-    def course(self) -> Course:
-        """The course of boxes through the loop."""
+    def course(self, counts: Sequence[int]) -> Course:
+        """The course of boxes through the loop, with images after so many steps."""
         system, (lo, hi) = self.loop.system, self.root
         named = [i for i, s in enumerate(system.states) if s.name in system.angles]
-        return Course(self.loop, self.target, named, self.keep, hi - lo, COUNTS, self.order)
+        return Course(self.loop, self.target, named, self.keep, hi - lo, counts, self.order)
+
+
+def with_order(question: Question, x: Array) -> Question:
+    """The question with the lowest order of the series in time that leaves little error at states x (n, N), or with the
+    last one that still gained something; as it is where no input is held."""
+    if question.loop.system.sample is None:
+        return replace(question, order=1)
+    if question.loop.system.calls:
+        return replace(question, order=1)
+    best, least = question, math.inf
+    for order in _ORDERS:
+        asked = replace(question, order=order)
+        found = asked.course((1,))(x, x, 0.0, 0.0)
+        widths = ((found.hi - found.lo)[0] / (question.root[1] - question.root[0])[:, None]).max(0)
+        width = float(np.nanmedian(widths)) if np.any(np.isfinite(widths)) else math.inf
+        if width < _GAIN * least or least == math.inf:
+            best, least = asked, width
+        if least < _LITTLE:
+            break
+    return best
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +122,7 @@ def prove_ranks(
     -------
     RankProof | None : None if no leaf has a rank.
     """
-    course = question.course
+    course = question.course(COUNTS if wanted is None else COUNTS_FROM)
     search = Search(course, *question.root) if wanted is None else SearchFrom(course, *question.root, wanted)
     new, rounds, done = search.begin(), 0, False
     with runner.start(course) as bound:

@@ -15,6 +15,8 @@ from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.ranks.images import Course, Images
 from certify.provers.ranks.search import NONE, Search
 
+COUNTS_FROM = (*range(1, 13), 14, 16, 20, 24)
+MOST_STEPS = COUNTS_FROM[-1]
 _GROWTH = 1.5  # of an image, relative to its leaf, that counts as none
 _COARSE = 0.26  # share of the root box that first leaves are narrower than
 _SHARE = 0.5  # of the leaves that may be halved, the largest ones
@@ -22,11 +24,13 @@ _SHARE = 0.5  # of the leaves that may be halved, the largest ones
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """A box lo <= x <= hi (n,) of places, each of whose leaves is to have a rank of `most` at most."""
+    """A box lo <= x <= hi (n,) of places, each of whose leaves is to have a rank of `most` at most; `direct` says how
+    many boxes are looked at before leaves that do not meet it are, as where few steps suffice."""
 
     lo: Array
     hi: Array
     most: int = NONE - 1
+    direct: int = 0
 
 
 class SearchFrom(Search):
@@ -69,6 +73,11 @@ class SearchFrom(Search):
 
     def further(self, near: Index) -> Index:
         """The needed leaves that have not been seen; if all have, halves of those without a rank."""
+        own = self._met(self.wanted.lo[:, None], self.wanted.hi[:, None])
+        open_ = own[self.rank[own] == NONE]
+        if self.boxes < self.wanted.direct and len(open_):
+            halves = self.halve(open_, self.steep[:, open_].argmax(0))
+            return halves[np.isin(halves, self._met(self.wanted.lo[:, None], self.wanted.hi[:, None]))]
         needed = self._needed()
         new = needed[~self.seen[needed]]
         if len(new):

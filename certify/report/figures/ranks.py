@@ -132,7 +132,7 @@ def reach_maps(certificate: ReachCertificate, accepted: bool, box: tuple[Array, 
 
 def _picture(ground: Ground, pair: Pair, more: str = "") -> Picture:
     """The map of one plane, with the outline of the target on top."""
-    figure, axes = figure_of(4.2, 3.6 if ground.n > 1 else 1.6, right=0.8)
+    figure, axes = figure_of(4.4, 3.6 if ground.n > 1 else 1.6, left=0.86, right=0.8)
     i, j = pair
     lo, hi = ground.ranked.tree.lo, ground.ranked.tree.hi
     _, _, states = _plane(ground.ranked, ground.middle, pair)
