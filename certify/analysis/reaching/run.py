@@ -34,6 +34,7 @@ from certify.certificates import (
 from certify.certificates.claims import UNPROVED, Ranks, Reaches
 from certify.certificates.membership import angles_in
 from certify.certificates.ranked import Ranked, steps_from
+from certify.certificates.tree import LEAF
 from certify.certificates.verdict import Verdict
 from certify.effort import WHOLE, Effort
 from certify.errors import InputError, OptionError, SoundnessError
@@ -181,6 +182,8 @@ def _proved(
     keep, root = tuple(kept_constraints(system).values()), root_box(system)
     question = Question(loop, Region(target, system.states), keep, root)
     question = with_order(question, begins(options.begin or tuple(zip(*map(_exactly, root), strict=True)))[:_PROBES].T)
+    clerk = _clerk(path, options, tools)
+    _require_periodic(question, clerk)
     with tools.timing("ranks"):
         soon = result.runs is not None and (result.runs.longest or MOST_STEPS) < MOST_STEPS
         found = _searched(question, options, _DIRECT if soon else 0, effort.share(_FOR_SEARCH), tools)
@@ -189,7 +192,7 @@ def _proved(
         return replace(result, reason="no box of the domain is proved to lead into the region")
     claim = Reaches(target, Ranks(system.angles, _most(evidence)), keep)
     certificate = ReachCertificate(system, loop.network, claim, RanksAlone(evidence, question.order), provenance)
-    certificate, raw, answer = _accepted(certificate, path, options, tools)
+    certificate, raw, answer = _accepted(certificate, clerk)
     facts, kept = rank_facts(certificate, found.rounds), constraints_in_words(certificate)
     result = replace(result, ranks=facts, boxes=found.boxes, constraints=kept)
     result = replace(result, certificate=path, raw=raw, checker=answer)
@@ -237,9 +240,36 @@ def _most(evidence: RankTree) -> int:
     return max(1, int(evidence.ranks[evidence.ranks < UNPROVED].max(initial=1)))
 
 
-def _accepted(
-    certificate: ReachCertificate, path: Path, options: ReachOptions, tools: _Tools
-) -> tuple[ReachCertificate, bytes, Mapping[str, Any]]:
+def _clerk(path: Path, options: ReachOptions, tools: _Tools) -> Clerk:
+    """Somebody who writes certificates and has them checked."""
+    told, desk = tools.progress or (lambda *_: None), Desk(options.jobs, True, tools.remarks)
+    return Clerk(path, lambda: 0.0, tools.timing, lambda: told("check", None), lambda _: None, desk.checked)
+
+
+def _require_periodic(question: Question, clerk: Clerk) -> None:
+    """Refuse a loop or a region that is not the same after a full turn of an angle, as the checker sees it.
+
+    Raises
+    ------
+    InputError : it is not.
+    """
+    system, (lo, hi), keep = question.loop.system, question.root, question.keep
+    if not system.angles or not isinstance(question.target, Region):
+        return
+    nothing = RankTree(lo, hi, bytes([LEAF]), np.array([UNPROVED], np.uint16), np.zeros(1, np.uint8))
+    claim = Reaches(question.target.expressions, Ranks(system.angles, 1), keep)
+    asked = ReachCertificate(system, question.loop.network, claim, RanksAlone(nothing, question.order))
+    _, answer = clerk.ask(asked)
+    clerk.path.unlink(missing_ok=True)
+    if answer.get("rule") == "angles":
+        raise InputError(
+            f"the loop, the region and the constraints must be the same after a full turn of {', '.join(system.angles)}"
+            f", an angle of {system.name}: {answer['at']}, {answer['detail']}. Write them with sin and cos of it, or "
+            "take the angle out of the plant's `angles`."
+        )
+
+
+def _accepted(certificate: ReachCertificate, clerk: Clerk) -> tuple[ReachCertificate, bytes, Mapping[str, Any]]:
     """The certificate, or one without leaves that the checker refuses, its bytes and the checker's answer.
 
     Raises
@@ -247,11 +277,6 @@ def _accepted(
     InputError : the checker takes none of this size.
     SoundnessError : the checker refuses what cannot be mended so.
     """
-    told = tools.progress or (lambda *_: None)
-    clerk = Clerk(
-        path, lambda: 0.0, tools.timing, lambda: told("check", None), lambda _: None,
-        Desk(options.jobs, True, tools.remarks).checked,
-    )  # fmt: skip
     for _ in range(_MENDED):
         raw, answer = clerk.ask(certificate)
         if answer["result"] == "ACCEPTED":
@@ -262,7 +287,6 @@ def _accepted(
             break
         claim = replace(certificate.claim, ranks=Ranks(certificate.claim.ranks.angles, _most(lower)))
         certificate = replace(certificate, claim=claim, evidence=replace(certificate.evidence, ranks=lower))
-        tools.remarks.append(f"the checker refused {answer['at']}, which is left out with all that leads into it")
     if answer.get("rule") == "limits":
         raise InputError(f"the checkers take no certificate of this size: {answer['detail']}. Try a smaller --effort.")
     raise SoundnessError(f"the checker rejects what the engine proved: {answer}.")
