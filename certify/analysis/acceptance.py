@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import re
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
@@ -15,7 +16,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from certify.certificates import Certificate, PartitionTree, TrustedSolver, write_beside
+from certify.certificates import (
+    Certificate,
+    PartitionTree,
+    ReachCertificate,
+    TrustedSolver,
+    run_checker,
+    write_beside,
+)
 from certify.certificates.claims import Claim, Problem
 from certify.errors import BackendError, InputError, SoundnessError
 from certify.provers.ball.contraction import contraction
@@ -24,6 +32,9 @@ from certify.provers.ranks import without_leaf
 
 _SPLITS, _LOWERINGS = 3, 9  # the most splits and lowerings for leaves that the checker refuses
 _BELOW_LEAVES, _LEVELS = 2, 5  # weaker certificates: below a refused leaf so long, and with a lower level at all
+_LONG = 1_000_000  # bytes of a certificate, from which on several processes check it
+_MOST_JOBS = 64
+_QUICK = 2**27  # operations of the reference, as FORMAT.md counts them: at most some five seconds
 _HIGHER = 1.5  # the next floor, after one that is refused
 
 
@@ -36,6 +47,48 @@ class Accepted:
     data: bytes
     answer: Mapping[str, Any]
     mended: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Desk:
+    """The place where certificates are checked.
+
+    Parameters
+    ----------
+    jobs : processes of the checker; by default one for each core where there is much to do, as with ranks.
+    remarks : takes what a person should know of the check.
+    """
+
+    jobs: int | None
+    ranked: bool
+    remarks: list[str]
+
+    def checked(self, path: Path) -> Mapping[str, Any]:
+        """The checker's answer about a file, patient if the file needs more work than the checker allows otherwise.
+
+        Where the checker accepts and the reference is quick, the reference is asked too: the answer then has its own as
+        `reference`, or is its refusal, and says so.
+        """
+        answer = self._answered(path, patient=False)
+        if (answer.get("rule"), answer.get("at")) == ("limits", "operations"):
+            answer = self._answered(path, patient=True)
+            if answer["result"] != "REJECTED":
+                self.remarks.append("its check takes more than ten minutes: type `certify check --patient` for another")
+        elif answer["result"] == "ACCEPTED":
+            return self._twice(path, answer)
+        return answer
+
+    def _twice(self, path: Path, answer: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The checker's answer with the reference's, or that alone if it refuses; the checker's if it needs long."""
+        second = run_checker(path, program="reference", operations=_QUICK)
+        if (second.get("rule"), second.get("at")) == ("limits", "operations"):
+            return answer
+        return {**answer, "reference": second} if second["result"] == "ACCEPTED" else {**second, "by": "reference"}
+
+    def _answered(self, path: Path, patient: bool) -> Mapping[str, Any]:
+        """The checker's answer; where there are many leaves, several processes share them."""
+        cores = len(os.sched_getaffinity(0)) if self.ranked or path.stat().st_size > _LONG else 1
+        return run_checker(path, jobs=self.jobs or min(cores, _MOST_JOBS), patient=patient)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +158,9 @@ class Clerk:
             if self.cluster is not None and lowerings:
                 mended += f"; boxes were bounded by the workers of {self.cluster}, who may be at fault"
 
-    def ask(self, certificate: Certificate, *, final: bool = False) -> tuple[bytes, Mapping[str, Any]]:
+    def ask(
+        self, certificate: Certificate | ReachCertificate, *, final: bool = False
+    ) -> tuple[bytes, Mapping[str, Any]]:
         """The certificate's bytes and the checker's answer; the file gets its name only if that is not a refusal.
 
         `final` : whether the run ends with this certificate if it is accepted.
@@ -132,7 +187,7 @@ class Clerk:
         return data, answer
 
 
-def _require_about(answer: Mapping[str, Any], data: bytes, certificate: Certificate) -> None:
+def _require_about(answer: Mapping[str, Any], data: bytes, certificate: Certificate | ReachCertificate) -> None:
     """Raise SoundnessError unless an answer is about these bytes and levels."""
     for what, said, meant in (
         ("bytes", answer["certificate_sha256"], hashlib.sha256(data).hexdigest()),
@@ -160,7 +215,7 @@ def _what_is_lower(first: Certificate, certificate: Certificate) -> str:
     return ", ".join(said)
 
 
-def _wanted(certificate: Certificate) -> str:
+def _wanted(certificate: Certificate | ReachCertificate) -> str:
     return "TRUSTED" if isinstance(certificate.evidence, TrustedSolver) else "ACCEPTED"
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from certify.analysis.facts import OuterFacts, RankFacts
 from certify.analysis.options import RoaOptions
-from certify.certificates import Certificate, PartitionTree
+from certify.certificates import Certificate, ReachCertificate, TrustedSolver
 from certify.certificates.claims import Claim, Outer, Problem
 from certify.certificates.ranked import count
 from certify.loop.plants.constraints import in_words
@@ -37,19 +37,18 @@ def outer_facts(problem: Problem, claim: Claim, outer: Outer, found: OuterProof)
     )
 
 
-def rank_facts(certificate: Certificate, rounds: int | None = None) -> RankFacts | None:
+def rank_facts(certificate: Certificate | ReachCertificate, rounds: int | None = None) -> RankFacts | None:
     """The facts on the boxes with ranks of a certificate; None without any."""
     ranks, evidence = certificate.claim.ranks, certificate.evidence
-    if ranks is None or not isinstance(evidence, PartitionTree) or evidence.ranks is None:
+    tree = None if isinstance(evidence, TrustedSolver) else evidence.ranks
+    if ranks is None or tree is None:
         return None
     names = [s.name for s in certificate.system.states]
-    found = count(evidence.ranks, [names.index(name) for name in ranks.angles])
-    return RankFacts(
-        evidence.ranks, ranks.angles, found.leaves, found.proved, found.share, found.volume, found.steps, rounds
-    )
+    found = count(tree, [names.index(name) for name in ranks.angles])
+    return RankFacts(tree, ranks.angles, found.leaves, found.proved, found.share, found.volume, found.steps, rounds)
 
 
-def constraints_in_words(certificate: Certificate) -> dict[str, str]:
+def constraints_in_words(certificate: Certificate | ReachCertificate) -> dict[str, str]:
     """The claim's constraints by name, over the states' values, as in `p - 3/2 < 0`."""
     return in_words(replace(certificate.system, constraints=certificate.constraints))
 

@@ -16,14 +16,15 @@ if TYPE_CHECKING:
         LocalBall,
         OuterTree,
         PartitionTree,
+        RanksAlone,
         RankTree,
         Slab,
         TrustedSolver,
         Waypoint,
     )
     from certify.certificates.limits import require_short, require_within_limits
-    from certify.certificates.model import Certificate, loop_sections
-    from certify.certificates.reading import parse_certificate, read_certificate, read_raw
+    from certify.certificates.model import Certificate, ReachCertificate, loop_sections
+    from certify.certificates.reading import parse_any, parse_certificate, read_certificate, read_raw
     from certify.certificates.tree import leaves, leaves_within
     from certify.certificates.writing import (
         SEARCH,
@@ -44,13 +45,14 @@ _NAMES = {
         "OuterTree",
         "PartitionTree",
         "RankTree",
+        "RanksAlone",
         "Slab",
         "TrustedSolver",
         "Waypoint",
     ),
     "limits": ("require_short", "require_within_limits"),
-    "model": ("Certificate", "loop_sections"),
-    "reading": ("parse_certificate", "read_certificate", "read_raw"),
+    "model": ("Certificate", "ReachCertificate", "loop_sections"),
+    "reading": ("parse_any", "parse_certificate", "read_certificate", "read_raw"),
     "tree": ("leaves", "leaves_within"),
     "writing": ("SEARCH", "earlier_aside", "remove", "set_aside", "sole_writer", "write_atomically", "write_beside"),
 }
@@ -64,6 +66,8 @@ __all__ = [
     "OuterTree",
     "PartitionTree",
     "RankTree",
+    "RanksAlone",
+    "ReachCertificate",
     "Slab",
     "TrustedSolver",
     "Waypoint",
@@ -73,6 +77,7 @@ __all__ = [
     "leaves",
     "leaves_within",
     "loop_sections",
+    "parse_any",
     "parse_certificate",
     "read_certificate",
     "read_raw",

@@ -109,9 +109,9 @@ class RankTree:
     ----------
     lo, hi : (n,) each, the box's corners.
     tree : the partition in preorder, one byte for each node.
-    ranks : (N,), of each leaf in the tree's order: from it {V <= c2} is reached after so many steps at the latest, 0
-        within it, 65,535 where nothing is said.
-    steps : (N,), of each leaf: after so many steps its image lies in leaves of lower ranks, or in {V <= c2}.
+    ranks : (N,), of each leaf in the tree's order: from it the target, {V <= c2} or a region, is reached after so many
+        steps at the latest, 0 within it, 65,535 where nothing is said.
+    steps : (N,), of each leaf: after so many steps its image lies in leaves of lower ranks, or in the target.
 
     Raises
     ------
@@ -163,6 +163,15 @@ class PartitionTree:
 
 
 @dataclass(frozen=True, slots=True)
+class RanksAlone:
+    """Evidence of a claim without V: a tree of `ranks`; `order` is that of the series in time, where the input is held
+    over a period."""
+
+    ranks: RankTree
+    order: int = 1
+
+
+@dataclass(frozen=True, slots=True)
 class TrustedSolver:
     """Evidence that cannot be replayed: what a solver answered. `queries` are pairs (name, answer)."""
 
@@ -172,7 +181,9 @@ class TrustedSolver:
     queries: tuple[tuple[str, str], ...]
 
 
-def evidence_section(evidence: PartitionTree | TrustedSolver) -> dict[str, Any]:
+def evidence_section(evidence: PartitionTree | TrustedSolver | RanksAlone) -> dict[str, Any]:
+    if isinstance(evidence, RanksAlone):
+        return {"kind": "ranks", "order": evidence.order, "ranks": _rank_tree(evidence.ranks)}
     if isinstance(evidence, PartitionTree):
         return {
             "kind": "partition-tree",
@@ -226,6 +237,12 @@ def read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSol
         )
     queries = tuple((str(name), str(answer)) for name, answer in data["queries"])
     return TrustedSolver(str(data["solver"]), str(data["version"]), float.fromhex(data["precision"]), queries)
+
+
+def read_ranks_alone(data: Mapping[str, Any], n: int) -> RanksAlone:
+    if data["kind"] != "ranks":
+        raise ValueError(f"evidence of this claim must be of kind 'ranks'; found {data['kind']!r}")
+    return RanksAlone(_read_rank_tree(data["ranks"], n), int(data["order"]))
 
 
 def _outer_tree(evidence: OuterTree) -> dict[str, Any]:

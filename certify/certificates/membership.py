@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates import Certificate, PartitionTree, parse_certificate, read_raw, run_checker
+from certify.certificates import Certificate, PartitionTree, ReachCertificate, parse_any, read_raw, run_checker
 from certify.certificates.ellipsoids import Box, Ellipsoid, steepest, sublevel_set, tube_start
 from certify.certificates.formats import version_in
 from certify.certificates.located import Containment, Located
@@ -44,11 +44,16 @@ NOTHING_PROVED = Located(Containment.UNDECIDED)
 @dataclass(frozen=True, slots=True)
 class Region:
     """The union of `ellipsoids` and, where a claim has them, of an `outer` set or of `ranked` boxes, in deviations from
-    x_eq."""
+    x_eq; under a claim without V of `ranked` boxes alone."""
 
     ellipsoids: tuple[Ellipsoid, ...]
     outer: Sublevel | None = None
     ranked: Ranked | None = None
+
+    @property
+    def n(self) -> int:
+        """The number of states."""
+        return len(self.ellipsoids[0].P) if self.ranked is None else len(self.ranked.tree.lo)
 
     @property
     def largest(self) -> Ellipsoid:
@@ -62,7 +67,7 @@ class Region:
         """
         points = list(states)
         found = [e.holds(points) for e in self.ellipsoids]
-        inside = [any(each) for each in zip(*found, strict=True)]
+        inside = [any(each) for each in zip(*found, strict=True)] if found else [False] * len(points)
         more = self.ranked if self.outer is None else self.outer
         if more is None:
             return inside
@@ -88,7 +93,7 @@ class Region:
         ------
         InputError : the box has another number of states, or an interval has lo > hi.
         """
-        n = len(self.ellipsoids[0].P)
+        n = self.n
         if len(box) != n or not all(lo <= hi for lo, hi in box):
             raise InputError(f"a box must have {n} intervals lo <= hi; found {_shown(box)}.")
         wide = [i for i, (lo, hi) in enumerate(box) if lo < hi]
@@ -199,7 +204,7 @@ def set_of(raw: bytes, name: str) -> ProvedSet:
     ------
     CertificateFormatError : the bytes are no certificate.
     """
-    read = parse_certificate(raw, name)
+    read = parse_any(raw, name)
     region = region_of(read)
     return ProvedSet(
         region.ellipsoids,
@@ -213,8 +218,10 @@ def set_of(raw: bytes, name: str) -> ProvedSet:
     )
 
 
-def region_of(read: Certificate) -> Region:
+def region_of(read: Certificate | ReachCertificate) -> Region:
     """The region that a certificate is about; whether it is proved is for the checker to say."""
+    if isinstance(read, ReachCertificate):
+        return Region((), ranked=Ranked(read.evidence.ranks, None, angles_in(read.system)))
     claim = read.claim
     starts = () if claim.start is None else (tube_start(claim.start.P, claim.centre),)
     outer = (

@@ -5,16 +5,17 @@ raw bytes.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates.claims import Claim, Outer
+from certify.certificates.claims import Claim, Outer, Ranks, Reaches
 from certify.certificates.encoding import encode, network_section
-from certify.certificates.evidence import PartitionTree, TrustedSolver, evidence_section
+from certify.certificates.evidence import PartitionTree, RanksAlone, TrustedSolver, evidence_section
 from certify.certificates.formats import SCHEMA
 from certify.errors import InputError
 from certify.loop.expressions import Expression, to_tree
@@ -28,9 +29,51 @@ POLICY, N_NAME = "policy", "N"
 """Names of networks in a file."""
 
 
+class _Stated(ABC):
+    """A closed loop with a claim; parameters are already put into the equations, and the checker ignores
+    `provenance`."""
+
+    __slots__ = ()
+    system: System
+    network: PolicyNetwork
+    provenance: Mapping[str, Any]
+
+    @property
+    @abstractmethod
+    def kept(self) -> tuple[Expression, ...]:
+        """The claim's constraints."""
+
+    @abstractmethod
+    def sections(self) -> dict[str, Any]:
+        """The sections of the claim, V, its levels and the evidence, and of networks beside the policy's."""
+
+    @property
+    def constraints(self) -> dict[str, Expression]:
+        """The claim's constraints: g of each condition g < 0, by its name in the plant, or else by its number."""
+        named = {g: name for name, g in kept_constraints(self.system).items()}
+        return {named.get(g, f"constraint_{k}"): g for k, g in enumerate(self.kept, 1)}
+
+    def to_json(self) -> str:
+        """The file's text: sorted by section, one line per section, the same bytes for the same certificate."""
+        own = self.sections()
+        people = _for_people(self.system) | _names_of(list(self.constraints))
+        sections: dict[str, Any] = {
+            "schema": SCHEMA,
+            "claim": own["claim"],
+            "networks": [network_section(POLICY, self.network.network), *own["networks"]],
+            **loop_sections(self.system, self.network),
+            "lyapunov": own["lyapunov"],
+            "levels": own["levels"],
+            "evidence": own["evidence"],
+            "provenance": {k: str(v) for k, v in self.provenance.items()} | people,
+        }
+        lines = [f"{json.dumps(k)}: {json.dumps(v)}" for k, v in sections.items()]
+        return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
 @dataclass(frozen=True, slots=True)
-class Certificate:
-    """A claim with its evidence.
+class Certificate(_Stated):
+    """A claim about the level sets of a Lyapunov function, with its evidence.
 
     Parameters
     ----------
@@ -68,10 +111,9 @@ class Certificate:
         return self.V.P
 
     @property
-    def constraints(self) -> dict[str, Expression]:
-        """The claim's constraints: g of each condition g < 0, by its name in the plant, or else by its number."""
-        named = {g: name for name, g in kept_constraints(self.system).items()}
-        return {named.get(g, f"constraint_{k}"): g for k, g in enumerate(self.claim.keep, 1)}
+    def kept(self) -> tuple[Expression, ...]:
+        """The claim's constraints."""
+        return self.claim.keep
 
     @property
     def kind(self) -> str:
@@ -88,31 +130,67 @@ class Certificate:
         """c2."""
         return self.claim.roa
 
-    def to_json(self) -> str:
-        """The file's text: sorted by section, one line per section, the same bytes for the same certificate."""
-        system, network = self.system, self.network
-        sections: dict[str, Any] = {
-            "schema": SCHEMA,
+    def sections(self) -> dict[str, Any]:
+        """The sections of the claim, V, its levels and the evidence, and of networks beside the policy's."""
+        claim, system = self.claim, self.system
+        return {
             "claim": {
-                "kind": self.claim.kind,
-                "rate": float(self.claim.rate).hex(),
-                "sample": None if system.sample is None else [str(h) for h in system.sample],
-                "outer": None if self.claim.outer is None else _outer(self.claim.outer, system),
+                "kind": claim.kind,
+                "rate": float(claim.rate).hex(),
+                "sample": _sample(system),
+                "outer": None if claim.outer is None else _outer(claim.outer, system),
             }
-            | _start(self.claim)
-            | _ranks(self.claim),
-            "networks": [
-                network_section(POLICY, network.network),
-                *_networks(self.claim.outer),
-            ],
-            **loop_sections(system, network),
+            | _start(claim)
+            | _ranks(claim.ranks)
+            | _keep(claim.keep),
+            "networks": _networks(claim.outer),
             "lyapunov": {"kind": "quadratic", "P": encode(self.V.P)},
-            "levels": {name: float(level).hex() for name, level in self.claim.levels.items()},
+            "levels": {name: float(level).hex() for name, level in claim.levels.items()},
             "evidence": evidence_section(self.evidence),
-            "provenance": {k: str(v) for k, v in self.provenance.items()} | _for_people(system) | _names_of(self),
         }
-        lines = [f"{json.dumps(k)}: {json.dumps(v)}" for k, v in sections.items()]
-        return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+@dataclass(frozen=True, slots=True)
+class ReachCertificate(_Stated):
+    """A claim that a region is reached, with its evidence.
+
+    Parameters
+    ----------
+    system, network : the closed loop; parameters are already put into the equations.
+    claim, evidence : the region, and boxes with ranks.
+    provenance : anything that helps people; the checker ignores it.
+    """
+
+    system: System
+    network: PolicyNetwork
+    claim: Reaches
+    evidence: RanksAlone
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def kept(self) -> tuple[Expression, ...]:
+        """The claim's constraints."""
+        return self.claim.keep
+
+    @property
+    def kind(self) -> str:
+        """The claim's kind."""
+        return self.claim.kind
+
+    def sections(self) -> dict[str, Any]:
+        """The sections of the claim, V, its levels and the evidence, and of networks beside the policy's."""
+        claim = self.claim
+        target = {"target": [to_tree(t) for t in claim.target]}
+        return {
+            "claim": {"kind": claim.kind, "sample": _sample(self.system)}
+            | target
+            | _ranks(claim.ranks)
+            | _keep(claim.keep),
+            "networks": [],
+            "lyapunov": None,
+            "levels": {},
+            "evidence": evidence_section(self.evidence),
+        }
 
 
 def loop_sections(system: System, network: PolicyNetwork) -> dict[str, Any]:
@@ -148,11 +226,18 @@ def _start(claim: Claim) -> dict[str, str]:
     return start if claim.centre is None else {**start, "centre": encode(np.array(claim.centre))}
 
 
-def _ranks(claim: Claim) -> dict[str, Any]:
-    """The ranks and the constraints; nothing where there are none."""
-    ranks = claim.ranks
-    stated = {} if ranks is None else {"ranks": {"angles": list(ranks.angles), "steps": ranks.steps}}
-    return stated | ({"keep": [to_tree(g) for g in claim.keep]} if claim.keep else {})
+def _sample(system: System) -> list[str] | None:
+    return None if system.sample is None else [str(h) for h in system.sample]
+
+
+def _ranks(ranks: Ranks | None) -> dict[str, Any]:
+    """The ranks; nothing where there are none."""
+    return {} if ranks is None else {"ranks": {"angles": list(ranks.angles), "steps": ranks.steps}}
+
+
+def _keep(keep: Sequence[Expression]) -> dict[str, Any]:
+    """The constraints; nothing where there are none."""
+    return {"keep": [to_tree(g) for g in keep]} if keep else {}
 
 
 def _networks(outer: Outer | None) -> list[dict[str, Any]]:
@@ -168,10 +253,9 @@ def _outer(outer: Outer, system: System) -> dict[str, Any]:
     return {"expression": called if isinstance(N, Neural) else to_tree(N.expression), "level": float(outer.level).hex()}
 
 
-def _names_of(certificate: Certificate) -> dict[str, list[str]]:
+def _names_of(constraints: Sequence[str]) -> dict[str, list[str]]:
     """The provenance's entry for names of constraints, in their order; none without constraints."""
-    names = list(certificate.constraints)
-    return {"constraints": names} if names else {}
+    return {"constraints": list(constraints)} if constraints else {}
 
 
 def _for_people(system: System) -> dict[str, dict[str, str]]:

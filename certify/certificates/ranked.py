@@ -1,4 +1,4 @@
-"""The boxes with ranks of a certificate, together with {V <= c2}: which states and boxes of states lie in them.
+"""The boxes with ranks of a certificate, together with {V <= c2} if it has a V: the states and boxes in them.
 
 With angles, states that differ by multiples of 2 pi in them are one place: a state lies in the set if one of its turns
 lies in a leaf of finite rank, or in {V <= c2}. Corners of leaves are binary64 numbers and states rationals, so that
@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 
 import flint
@@ -36,8 +36,8 @@ _BITS = 80  # of V at a turned state, at first
 
 @dataclass(frozen=True, slots=True)
 class Ranked:
-    """The leaves of finite rank of `tree`, and {V <= c2}, the `ellipsoid`; `angles` are the numbers of states in which
-    2 pi more is the same place.
+    """The leaves of finite rank of `tree`, and {V <= c2}, the `ellipsoid`, under a claim with a V; `angles` are the
+    numbers of states in which 2 pi more is the same place.
 
     Raises
     ------
@@ -45,7 +45,7 @@ class Ranked:
     """
 
     tree: RankTree
-    ellipsoid: Ellipsoid
+    ellipsoid: Ellipsoid | None
     angles: tuple[int, ...] = ()
     name: str = field(default="the boxes with ranks", init=False)
     _upper: NDArray[np.int64] = field(init=False, repr=False)
@@ -88,7 +88,8 @@ class Ranked:
                 answer = Containment.UNDECIDED
         if answer is not Containment.CONTAINED:
             return Located(answer)
-        return Located(answer, within=" and ".join(n for n in (self.ellipsoid.name, self.name) if n in used))
+        inner = () if self.ellipsoid is None else (self.ellipsoid.name,)
+        return Located(answer, within=" and ".join(n for n in (*inner, self.name) if n in used))
 
     def ranks_at(self, states: Array) -> Array:
         """The ranks of leaves that hold states (N, n), in floats; NaN outside of the root and where nothing is said.
@@ -168,6 +169,8 @@ class Ranked:
 
     def _covered(self, piece: Piece) -> str | None:
         """The name of {V <= c2} if a bound of V shows that a box lies in it, as it is or turned; else None."""
+        if self.ellipsoid is None:
+            return None
         ends = [(bounds_of(a)[0], bounds_of(b)[1]) for a, b in piece]
         turns = [round(float(a + b) / (4 * math.pi)) if i in self.angles else 0 for i, (a, b) in enumerate(ends)]
         moved = tuple(
@@ -177,23 +180,44 @@ class Ranked:
         return self.ellipsoid.name if self.ellipsoid.covers(moved) else None
 
     def _in_ellipsoid(self, x: Sequence[Fraction]) -> bool:
-        if self.ellipsoid.holds([x])[0]:
-            return True
-        reach = [Fraction(v) for v in extents(self.ellipsoid.P, self.ellipsoid.level).tolist()] if self.angles else []
+        inner = self.ellipsoid
+        if inner is None or inner.holds([x])[0]:
+            return inner is not None
+        reach = [Fraction(v) for v in extents(inner.P, inner.level).tolist()] if self.angles else []
         each = [turns_into(v, -reach[i], reach[i]) if i in self.angles else (0,) for i, v in enumerate(x)]
-        return any(any(turns) and self._is_low(x, turns) for turns in itertools.product(*each))
+        return any(any(turns) and _is_low(inner, x, turns) for turns in itertools.product(*each))
 
-    def _is_low(self, x: Sequence[Fraction], turns: Sequence[int]) -> bool:
-        """True if V of a turned state is at most c2; V is a polynomial of degree 2 in pi, which equals no rational."""
-        bits, level = _BITS, self.ellipsoid.level
-        while True:
-            with precision(bits):
-                at = [ball(v) + 2 * w * flint.arb.pi() for v, w in zip(x, turns, strict=True)]
-                rows = zip(at, self.ellipsoid.P.tolist(), strict=True)
-                value = sum(a * p * b for a, row in rows for p, b in zip(row, at, strict=True))
-                if bool(value <= level) or bool(value > level):
-                    return bool(value <= level)
-            bits *= 2
+
+def steps_from(ranked: Ranked, box: Box) -> int | None:
+    """The least number of steps after which every trajectory from a box of states has been in the target, as the ranks
+    show it; None if they do not show that it ever is."""
+
+    def shown(most: int) -> bool:
+        ranks = np.where(ranked.tree.ranks <= most, ranked.tree.ranks, UNPROVED).astype(np.uint16)
+        known = replace(ranked, tree=replace(ranked.tree, ranks=ranks))
+        return known.locate(box).answer is Containment.CONTAINED
+
+    each = np.unique(ranked.tree.ranks[ranked.tree.ranks != UNPROVED]).tolist()
+    if not each or not shown(each[-1]):
+        return None
+    low, high = 0, len(each) - 1
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (low, middle) if shown(each[middle]) else (middle + 1, high)
+    return int(each[high])
+
+
+def _is_low(inner: Ellipsoid, x: Sequence[Fraction], turns: Sequence[int]) -> bool:
+    """True if V of a turned state is at most c2; V is a polynomial of degree 2 in pi, which equals no rational."""
+    bits, level = _BITS, inner.level
+    while True:
+        with precision(bits):
+            at = [ball(v) + 2 * w * flint.arb.pi() for v, w in zip(x, turns, strict=True)]
+            rows = zip(at, inner.P.tolist(), strict=True)
+            value = sum(a * p * b for a, row in rows for p, b in zip(row, at, strict=True))
+            if bool(value <= level) or bool(value > level):
+                return bool(value <= level)
+        bits *= 2
 
 
 def upper_children(tree: bytes) -> NDArray[np.int64]:

@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates.claims import CLAIMS, Claim, Outer, Ranks
+from certify.certificates.claims import CLAIMS, Claim, Outer, Ranks, Reaches
 from certify.certificates.encoding import decode, network_named, read_network
-from certify.certificates.evidence import read_evidence
+from certify.certificates.evidence import read_evidence, read_ranks_alone
 from certify.certificates.formats import SCHEMA, other_version
-from certify.certificates.model import Certificate
+from certify.certificates.model import Certificate, ReachCertificate
 from certify.errors import CertificateFormatError
-from certify.loop.expressions import Number, Symbol, from_tree
+from certify.loop.expressions import Expression, Number, Symbol, from_tree
 from certify.loop.plants import System
 from certify.loop.plants.system import Interval
 from certify.loop.policies import PolicyNetwork
@@ -77,12 +77,28 @@ def read_certificate(path: Path) -> Certificate:
 
 
 def parse_certificate(raw: bytes, name: str) -> Certificate:
-    """The certificate that the bytes hold. This does not check it.
+    """The certificate with a V that the bytes hold. This does not check it.
 
     Parameters
     ----------
     raw : the file's bytes.
     name : what messages call them.
+
+    Raises
+    ------
+    CertificateFormatError : the bytes are no certificate, or one without V.
+    """
+    found = parse_any(raw, name)
+    if isinstance(found, ReachCertificate):
+        raise CertificateFormatError(
+            f"{name} says that a region is reached, and has no V, of which a certificate for this command must be. "
+            "certify check, certify contains and certify report take it."
+        )
+    return found
+
+
+def parse_any(raw: bytes, name: str) -> Certificate | ReachCertificate:
+    """The certificate that the bytes hold, of any claim. This does not check it.
 
     Raises
     ------
@@ -95,16 +111,21 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
             raise CertificateFormatError(
                 f"{name}: `schema` must be {SCHEMA!r}; found {data['schema']!r:.60}.{f' {known}' if known else ''}"
             )
-        kind = data["claim"]["kind"]
-        if kind not in CLAIMS:
-            raise CertificateFormatError(f"{name}: `claim.kind` must be one of {', '.join(CLAIMS)}; found {kind!r}.")
+        kind, kinds = data["claim"]["kind"], (*CLAIMS, Reaches.kind)
+        if kind not in kinds:
+            raise CertificateFormatError(f"{name}: `claim.kind` must be one of {', '.join(kinds)}; found {kind!r}.")
         n = len(data["plant"]["states"])
         provenance, people = _read_provenance(data["provenance"], data["plant"])
-        system = _read_system(data["plant"], data["claim"]["sample"], people)
-        claim, names = _read_claim(data, system), provenance.pop("constraints", "")
+        system, names = _read_system(data["plant"], data["claim"]["sample"], people), provenance.pop("constraints", "")
+        network = _read_network(data["policy"], data["networks"], n, len(data["plant"]["inputs"]))
+        if kind == Reaches.kind:
+            reaches = _read_reaches(data["claim"], system)
+            evidence = read_ranks_alone(data["evidence"], n)
+            return ReachCertificate(_with_constraints(system, reaches, names), network, reaches, evidence, provenance)
+        claim = _read_claim(data, system)
         return Certificate(
             system=_with_constraints(system, claim, names),
-            network=_read_network(data["policy"], data["networks"], n, len(data["plant"]["inputs"])),
+            network=network,
             V=Quadratic(decode(data["lyapunov"]["P"], (n, n))),
             claim=claim,
             evidence=read_evidence(data["evidence"], n),
@@ -164,7 +185,7 @@ def _read_provenance(data: Any, plant: Mapping[str, Any]) -> tuple[dict[str, str
     return {k: str(v) for k, v in found.items() if not read.get(k)}, read
 
 
-def _with_constraints(system: System, claim: Claim, names: str) -> System:
+def _with_constraints(system: System, claim: Claim | Reaches, names: str) -> System:
     """The plant with the claim's angles, and its constraints by the names that the file has for people, if it has a
     usable one for each."""
     found = re.findall(r"'([A-Za-z_][A-Za-z0-9_]{0,63})'", names)
@@ -180,9 +201,8 @@ def _read_claim(data: Mapping[str, Any], system: System) -> Claim:
     levels: dict[str, Any] = {k: float.fromhex(v) for k, v in data["levels"].items()}
     levels["rate"] = float.fromhex(stated["rate"])
     if "ranks" in stated:
-        levels["ranks"] = Ranks(tuple(map(str, stated["ranks"]["angles"])), int(stated["ranks"]["steps"]))
-    named = {s.name: s for s in (*states, *system.inputs, *(s for s, _ in system.uncertain))}
-    levels["keep"] = tuple(from_tree(g, named) for g in stated.get("keep", ()))
+        levels["ranks"] = _read_ranks(stated["ranks"])
+    levels["keep"] = _read_keep(stated, system)
     if stated["outer"] is not None:  # never with a tube
         return claim(**levels, outer=_read_outer(stated["outer"], data["networks"], states))
     own, tube = {f.name for f in fields(claim)}, dict[str, Any]()
@@ -191,6 +211,21 @@ def _read_claim(data: Mapping[str, Any], system: System) -> Claim:
     if "centre" in own:
         tube["centre"] = tuple(decode(stated["centre"], (n,)).tolist())
     return claim(**levels, **tube)
+
+
+def _read_reaches(stated: Mapping[str, Any], system: System) -> Reaches:
+    named = {s.name: s for s in system.states}
+    target = tuple(from_tree(t, named) for t in stated["target"])
+    return Reaches(target, _read_ranks(stated["ranks"]), _read_keep(stated, system))
+
+
+def _read_ranks(stated: Mapping[str, Any]) -> Ranks:
+    return Ranks(tuple(map(str, stated["angles"])), int(stated["steps"]))
+
+
+def _read_keep(stated: Mapping[str, Any], system: System) -> tuple[Expression, ...]:
+    named = {s.name: s for s in (*system.states, *system.inputs, *(s for s, _ in system.uncertain))}
+    return tuple(from_tree(g, named) for g in stated.get("keep", ()))
 
 
 def _read_outer(data: Mapping[str, Any], networks: Sequence[Mapping[str, Any]], states: tuple[Symbol, ...]) -> Outer:

@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from certify.analysis.arguments import options_of
+from certify.analysis.arguments import options_of, read_option, region
 from certify.analysis.changes import PlantChanges
 from certify.analysis.inputs import plant_of, policy_in
 from certify.cli.certifying import certified
 from certify.cli.importing import import_options, kind_called
-from certify.cli.options import changes_of_a_plant, options_of_a_run, takes
+from certify.cli.options import FIRST, changes_of_a_plant, options_of_a_run, takes
+from certify.cli.reaching import reached
 from certify.cli.shared import Json, PlantName, PolicyArgument, PolicyFile, Quiet, Results, noting, the_policy
+from certify.errors import OptionError
 
 if TYPE_CHECKING:
     from certify.loop.policies.importers import ImportOptions
 
 _KIND = "--kind"  # the kind of another program's policy file: --from is the state
+_CLAIM = "The claim"
 
 
 @takes(
     importing=import_options(_KIND),
-    changes=changes_of_a_plant("parameters", "domain"),
-    typed=options_of_a_run("reach_from", "box", "resume", "effort", "time_limit", required=["reach_from"]),
+    changes=changes_of_a_plant(),
+    typed=options_of_a_run("reach_from", "box", "resume", "effort", "time_limit", "jobs"),
 )
 def reach(
     context: typer.Context,
@@ -34,14 +37,56 @@ def reach(
     system: PlantName = None,
     changes: PlantChanges,
     typed: dict[str, Any],
+    target: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="COMPARISON",
+            help="Prove that this region is reached, in discrete time or with a held input, from which boxes of the "
+            "domain, and in how many steps at most: a comparison of the states' values, such as 'position >= 0.45'; "
+            "repeatable, for a region where all of them hold. --from may then be a box.",
+            rich_help_panel=FIRST,
+        ),
+    ] = None,
+    within: Annotated[
+        int | None,
+        typer.Option(metavar="STEPS", help="With --target: the most steps that it may take.", rich_help_panel=_CLAIM),
+    ] = None,
     out: Results = None,
     as_json: Json = False,
     quiet: Quiet = False,
     importing: ImportOptions,
 ) -> None:
-    """Prove that a state, with what lies around it, converges: a tube around its trajectory into a proved set."""
+    """Prove that a state converges, by a tube around its trajectory, or with --target that a region is reached."""
     start, note, path = time.perf_counter(), noting(quiet), the_policy(context, file, policy)
+    _require_one(target, within, typed)
     with kind_called(_KIND):
         stored = policy_in(path, importing, system, changes, note)
     plant = plant_of(stored, system, changes, note)
-    certified(context, path, stored, plant, options_of(typed, plant, note), out, start, quiet, as_json)
+    if target is None:
+        certified(context, path, stored, plant, options_of(typed, plant, note), out, start, quiet, as_json)
+        return
+    from certify.analysis.reaching import ReachOptions
+
+    asked = typed.pop("reach_from", None)
+    options = ReachOptions(
+        target=tuple(target),
+        begin=None if asked is None else region(asked, plant, "--from"),
+        within=within,
+        **{name: read_option(name, text) for name, text in typed.items()},
+    )
+    reached(path, stored, plant, options, out, start, quiet, as_json)
+
+
+def _require_one(target: list[str] | None, within: int | None, typed: dict[str, Any]) -> None:
+    """Refuse options that do not go together.
+
+    Raises
+    ------
+    OptionError : there is neither a target nor a state, or an option belongs to the other question.
+    """
+    if target is None and "reach_from" not in typed:
+        raise OptionError("`target` or `reach_from` must be given: a region that is to be reached, or a state.")
+    if target is None and within is not None:
+        raise OptionError("`within` needs a `target`: how many steps it may take.")
+    if target is not None and (odd := [name for name in ("box", "resume") if name in typed]):
+        raise OptionError(f"`{odd[0]}` is about a tube; leave it out where a `target` is given.")

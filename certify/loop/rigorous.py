@@ -69,14 +69,35 @@ def evaluate_arb(expression: Expression, values: Mapping[Symbol, flint.arb]) -> 
 def evaluate_policy(loop: ClosedLoop, x: Array) -> Balls:
     """pi(x) at a binary64 point (n,), as Arb balls."""
     with precision():
-        network = loop.network
-        y = _net(network, points(x))
-        shift, offset = _centring(loop)
-        u = [
-            flint.arb(float(s)) * network.squashed(v + d, _NUMBERS) + o
-            for v, d, s, o in zip(y, shift, network.scale, offset, strict=True)
-        ]
-        return list(network.clipped(u, _NUMBERS))
+        return policy_at(loop, points(x))
+
+
+def policy_at(loop: ClosedLoop, x: Balls) -> Balls:
+    """pi at balls around a state, at the precision of the caller."""
+    network, (shift, offset) = loop.network, _centring(loop)
+    u = [
+        flint.arb(float(s)) * network.squashed(v + d, _NUMBERS) + o
+        for v, d, s, o in zip(_net(network, x), shift, network.scale, offset, strict=True)
+    ]
+    return list(network.clipped(u, _NUMBERS))
+
+
+def states_after(loop: ClosedLoop, x: Sequence[Fraction]) -> Iterator[tuple[Balls, Balls]]:
+    """The states and inputs of a loop in steps along the trajectory from a state, at its beginning and after each step,
+    without an end; of several periods over which an input may be held the longest. No numbers where none are enclosed.
+    """
+    sample, state = loop.system.sample, [ball(q) for q in x]
+    while True:
+        states = dict(zip(loop.system.states, state, strict=True))
+        u = policy_at(loop, state)
+        yield state, u
+        inputs = dict(zip(loop.system.inputs, u, strict=True))
+        now = field_at(loop, {**states, **inputs})
+        if sample is None:
+            state = now
+            continue
+        mean = _mean_rate(loop, states, inputs, now, sample[1])
+        state = [v + ball(sample[1]) * g for v, g in zip(state, mean, strict=True)]
 
 
 def centring_with_errors(loop: ClosedLoop) -> tuple[Array, Array, Array, Array]:

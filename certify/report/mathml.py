@@ -38,6 +38,22 @@ def inequality(name: str, expression: Expression) -> Any:
     return Markup(f'<math display="block">{said}{below}</math>')
 
 
+def comparison(expression: Expression) -> Any:
+    """`expression <= 0` as MathML; what is a difference as `a <= b`."""
+    from markupsafe import Markup
+
+    left: Expression
+    right: Expression
+    left, right = expression, Number(0)
+    match expression:
+        case Operation(operator="+", operands=(a, Operation(operator="-", operands=(b,)))):
+            left, right = a, b
+        case Operation(operator="-", operands=(a, b)):
+            left, right = a, b
+    each = f"{_row(multiplied_out(left), SUM)}<mo>&#x2264;</mo>{_row(multiplied_out(right), SUM)}"
+    return Markup(f'<math display="block">{each}</math>')
+
+
 def multiplied_out(expression: Expression) -> Expression:
     """The expression with each part that is a number replaced by that number, and without terms that are 0."""
     found: dict[Expression, Expression] = {}

@@ -12,7 +12,6 @@ import pytest
 
 from certify import certify_roa
 from certify.certificates import RankTree, run_checker
-from certify.certificates.claims import Problem
 from certify.certificates.verdict import Verdict
 from certify.effort import UNIT, Effort
 from certify.errors import OptionError
@@ -22,9 +21,9 @@ from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
 from certify.provers.execution import ThreadRunner
-from certify.provers.ranks import RankProof, prove_ranks, root_box, without_leaf
+from certify.provers.ranks import Question, RankProof, Sublevel, prove_ranks, root_box, without_leaf
 from certify.provers.ranks.cover import Cover
-from certify.provers.ranks.images import Course, Form
+from certify.provers.ranks.images import Form
 from certify.provers.ranks.search import COUNTS, NONE
 from tests.support.loops import box
 from tests.support.ranks import hanging
@@ -63,13 +62,14 @@ def swinging() -> tuple[System, PolicyNetwork]:
     return replace(system, angles=()), network
 
 
-def problem(loop: tuple[System, PolicyNetwork]) -> Problem:
-    return Problem(ClosedLoop(*loop), Quadratic(np.eye(loop[0].n)))
+def question(loop: tuple[System, PolicyNetwork], level: float) -> Question:
+    closed = ClosedLoop(*loop)
+    target = Sublevel(Quadratic(np.eye(loop[0].n)), level)
+    return Question(closed, target, (), root_box(closed))
 
 
 def proved(loop: tuple[System, PolicyNetwork], level: float, effort: float = 0.2, **changes: Any) -> RankProof:
-    root = root_box(ClosedLoop(*loop))
-    found = prove_ranks(problem(loop), level, (), root, Effort(effort * UNIT), ThreadRunner(**changes))
+    found = prove_ranks(question(loop, level), Effort(effort * UNIT), ThreadRunner(**changes))
     assert found is not None
     return found
 
@@ -92,7 +92,7 @@ def leaves_of(tree: RankTree) -> list[tuple[list[float], list[float]]]:
 def test_images_hold_trajectories(loop: tuple[System, PolicyNetwork]) -> None:
     system, _ = loop
     generator, n = np.random.default_rng(3), system.n
-    course = Course(problem(loop), 0.01, [], (), np.full(n, 4.0), COUNTS)
+    course = replace(question(loop, 0.01), root=(np.full(n, -2.0), np.full(n, 2.0))).course(COUNTS)
     centre = generator.uniform(-0.7, 0.7, (n, 200))
     radius = generator.uniform(1e-4, 0.05, (n, 200))
     form = Form(np.concatenate([centre[:, None], np.eye(n)[:, :, None] * radius], 1), np.zeros_like(centre))
@@ -140,8 +140,7 @@ def test_a_target_that_nothing_reaches_gives_no_ranks() -> None:
     x, u = symbols("x u")
     system, network = bistable()
     loop = replace(system, dynamics=(2 * x + u,)), network
-    root = root_box(ClosedLoop(*loop))
-    assert prove_ranks(problem(loop), 1e-9, (), root, Effort(UNIT / 10), ThreadRunner()) is None
+    assert prove_ranks(question(loop, 1e-9), Effort(UNIT / 10), ThreadRunner()) is None
 
 
 def test_ranks_fall_along_trajectories() -> None:

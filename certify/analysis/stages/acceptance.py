@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-from certify.analysis.acceptance import Accepted, Clerk
+from certify.analysis.acceptance import Accepted, Clerk, Desk
 from certify.analysis.beyond import constraints_in_words, outer_facts, rank_facts, short_of
 from certify.analysis.outcome import limit_of, short_of_target, with_levels
 from certify.analysis.results import RoaResult
 from certify.analysis.stages.state import State, Tools
-from certify.certificates import Certificate, TrustedSolver, run_checker
+from certify.certificates import Certificate, TrustedSolver
 from certify.certificates.claims import Claim, Problem
 from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT, Effort
 from certify.errors import BackendError, SoundnessError
 from certify.loop.closed_loop import ClosedLoop
 
-_LONG = 1_000_000  # bytes of a certificate, from which on several processes check it
-_MOST_JOBS = 64
-_QUICK = 2**27  # operations of the reference, as FORMAT.md counts them: at most some five seconds
 _CHECK = 2.0  # the checker's work for a leaf, relative to the operations that bound a box
 
 
@@ -59,53 +53,24 @@ class Acceptance:
 
 @dataclass(frozen=True)
 class _Desk:
-    """The place where certificates are checked."""
+    """The desk of a run, where certificates are written and checked."""
 
     state: State
     tools: Tools
     effort: Effort
 
     def clerk(self) -> Clerk:
-        tools = self.tools
+        tools, claim = self.tools, self.state.claim
+        ranked = claim is not None and claim.ranks is not None
         return Clerk(
             tools.out / "certificate.json",
             lambda: self.effort.left,
             tools.timing,
             partial(tools.tell, "check"),
             tools.show,
-            self._checked,
+            Desk(self.state.options.jobs, ranked, tools.remarks).checked,
             self.state.options.cluster,
         )
-
-    def _checked(self, path: Path) -> Mapping[str, Any]:
-        """The checker's answer about a file, patient if the file needs more work than the checker allows otherwise.
-
-        Where the checker accepts and the reference is quick, the reference is asked too: the answer then has its own as
-        `reference`, or is its refusal, and says so.
-        """
-        answer = self._answered(path, patient=False)
-        if (answer.get("rule"), answer.get("at")) == ("limits", "operations"):
-            answer = self._answered(path, patient=True)
-            if answer["result"] != "REJECTED":
-                self.tools.remarks.append(
-                    "its check takes more than ten minutes: type `certify check --patient` for another"
-                )
-        elif answer["result"] == "ACCEPTED":
-            return self._twice(path, answer)
-        return answer
-
-    def _twice(self, path: Path, answer: Mapping[str, Any]) -> Mapping[str, Any]:
-        """The checker's answer with the reference's, or that alone if it refuses; the checker's if it needs long."""
-        second = run_checker(path, program="reference", operations=_QUICK)
-        if (second.get("rule"), second.get("at")) == ("limits", "operations"):
-            return answer
-        return {**answer, "reference": second} if second["result"] == "ACCEPTED" else {**second, "by": "reference"}
-
-    def _answered(self, path: Path, patient: bool) -> Mapping[str, Any]:
-        """The checker's answer; where there are many leaves, several processes share them."""
-        ranked = self.state.claim is not None and self.state.claim.ranks is not None
-        cores = len(os.sched_getaffinity(0)) if ranked or path.stat().st_size > _LONG else 1
-        return run_checker(path, jobs=self.state.options.jobs or min(cores, _MOST_JOBS), patient=patient)
 
 
 def _with_facts(state: State, accepted: Accepted) -> State:

@@ -173,7 +173,7 @@ class ByRanks:
 
     def extend(self, state: State, effort: Effort) -> State:
         """Add the boxes; a note says why there are none."""
-        from certify.provers.ranks import prove_ranks, root_box
+        from certify.provers.ranks import Question, Sublevel, prove_ranks, root_box
 
         tools, (claim, evidence), trial = self.tools, state.proved, state.contest.best.trial
         problem = trial.task.problem
@@ -186,8 +186,9 @@ class ByRanks:
             least = _FOR_RANKS * tools.whole
             share = effort.part(max(least, effort.left - least), even_if_over=True)
             told = None if tools.progress is None else report
-            order, root = evidence.order, root_box(problem.loop)
-            found = prove_ranks(problem, claim.roa, claim.keep, root, share, tools.runner, told, order)
+            target = Sublevel(problem.V, claim.roa)
+            question = Question(problem.loop, target, claim.keep, root_box(problem.loop), evidence.order)
+            found = prove_ranks(question, share, tools.runner, told)
         if found is None:
             return state.noting("no box of the domain beyond the set is proved to lead into it")
         return replace(

@@ -27,11 +27,13 @@ from certify.certificates.claims.conditions import (
     Vdot,
     conditions,
 )
+from certify.certificates.claims.reaches import MOST_TARGETS, Reaches
 
 __all__ = [
     "CLAIMS",
     "MOST_KEPT",
     "MOST_RANK",
+    "MOST_TARGETS",
     "UNPROVED",
     "Asymptotic",
     "BeforeClip",
@@ -48,6 +50,7 @@ __all__ = [
     "Radicand",
     "Ranks",
     "Reached",
+    "Reaches",
     "Vdot",
     "conditions",
 ]

@@ -3,6 +3,19 @@
 from __future__ import annotations
 
 from certify.provers.ranks.mend import without_leaf
-from certify.provers.ranks.search import RankProof, prove_ranks, root_box
+from certify.provers.ranks.prove import Question, RankProof, prove_ranks, root_box, with_order
+from certify.provers.ranks.targets import Region, Sublevel
+from certify.provers.ranks.wanted import MOST_STEPS, Wanted
 
-__all__ = ["RankProof", "prove_ranks", "root_box", "without_leaf"]
+__all__ = [
+    "MOST_STEPS",
+    "Question",
+    "RankProof",
+    "Region",
+    "Sublevel",
+    "Wanted",
+    "prove_ranks",
+    "root_box",
+    "with_order",
+    "without_leaf",
+]

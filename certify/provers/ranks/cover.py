@@ -8,7 +8,7 @@ import numpy as np
 
 from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.boxes.partition import LEAF
-from certify.provers.ranks.images import TURN
+from certify.provers.ranks.targets import TURN
 
 _SLACK = 1e-12  # of a turn
 

@@ -13,15 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from certify.certificates.claims import Problem
+from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, evaluate
 from certify.loop.policies import bounded_by_form
 from certify.provers.bounds import Flow, Models, Taylor, loop_models, policy_enclosure, upper_bound
 from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.bounds.taylor import EPS, TINY
 from certify.provers.boxes.rule import input_bounds_kept, operations_of_box
+from certify.provers.ranks.targets import Target
 
-TURN = 2 * np.pi
 _WIDER = 1e-7  # share of a box's width, beyond all that two programs' rounding may differ by
 _ENDS = 1e-9  # relative distance kept from ends of the domain
 _WIDEST = 0.15  # share of the root box beyond which an image is of no use
@@ -71,7 +71,7 @@ class Course:
 
     Parameters
     ----------
-    problem, level : the loop, and the target {V <= level}.
+    loop, target : the loop, and the set that is to be reached.
     angles : the states that are angles, by their numbers.
     keep : expressions that have to stay negative.
     root : the widths of the root box, (n,).
@@ -82,16 +82,15 @@ class Course:
 
     def __init__(
         self,
-        problem: Problem,
-        level: float,
+        loop: ClosedLoop,
+        target: Target,
         angles: Sequence[int],
         keep: Sequence[Expression],
         root: Array,
         counts: Sequence[int],
         order: int = 2,
     ) -> None:
-        loop = problem.loop
-        self.system, self.P, self.level, self.keep = loop.system, problem.V.P, level, tuple(keep)
+        self.system, self.target, self.keep = loop.system, target, tuple(keep)
         self.angles, self.root, self.counts = tuple(angles), root, tuple(counts)
         self.straight = [i for i in range(self.system.n) if i not in self.angles]
         self.policy = policy_enclosure(loop, 2 * self.system.n)
@@ -115,7 +114,7 @@ class Course:
             np.full((K, n, batch), np.nan),
             np.zeros((K, batch), dtype=bool),
             self.is_there(form),
-            ~(upper_bound(self.beyond(form).scaled(-1.0))[0] < 0),
+            ~self.target.misses(form.x, form.e, self.angles),
             np.abs(slopes).sum(0) / self.root[:, None],
         )
         left = np.flatnonzero(~found.inside)
@@ -183,24 +182,8 @@ class Course:
         return inside
 
     def is_there(self, form: Form) -> Mask:
-        """True where the states lie in the target, as places."""
-        there: Mask = upper_bound(self.beyond(form))[0] < -_ENDS * self.level
-        return there
-
-    def beyond(self, form: Form) -> Taylor:
-        """V - level of the places that are nearest to 0."""
-        n, x = self.system.n, form.x.copy()
-        for i in self.angles:
-            x[i, 0] -= TURN * np.rint(x[i, 0] / TURN)
-        error = 8 * EPS * (np.abs(form.x).sum(1) + TURN) + TINY
-        g = np.concatenate([x[:, 1:], np.eye(n)[:, :, None] * form.e], 1)
-        zeros = np.zeros((2 * n, 2 * n, x.shape[2]))
-        states = [Taylor(x[i, 0], g[i], zeros, error[i]) for i in range(n)]
-        rows = Models(states[0]).combined(self.P, states)
-        V = states[0] * rows[0]
-        for state, row in zip(states[1:], rows[1:], strict=True):
-            V = V + state * row
-        return V.shifted(-self.level)
+        """True where the states lie in the target."""
+        return self.target.holds(form.x, form.e, self.angles)
 
 
 def _form(models: Sequence[Taylor], n: int) -> Form:

@@ -8,51 +8,20 @@ networks). What has a rank keeps it; so the search may end at any time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from certify.certificates import RankTree
-from certify.certificates.claims import Problem, Ranks
-from certify.effort import Effort
-from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import Expression
 from certify.provers.bounds.arrays import Array, Index
-from certify.provers.execution import Runner
 from certify.provers.ranks.cover import Cover
-from certify.provers.ranks.images import TURN, Course, Images
+from certify.provers.ranks.images import Course, Images
 
 NONE = 65_535
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
-_HALF_TURN = 3.1416  # and a little more
-_SLIVER, _SAMPLES = 1e-6, 64
 _FIRST = 2**12  # leaves of the first tree
-_LARGEST = 0.7  # share of the leaves to be halved that are, the largest ones
-_MOST_LEAVES = 400_000
 _ROUNDS, _GAIN = 6, 1e-4  # relative growth of what is proved, in so many rounds, below which the search ends
-
-
-@dataclass(frozen=True, slots=True)
-class RankProof:
-    """Leaves from which the target is reached, with their evidence.
-
-    Parameters
-    ----------
-    ranks, evidence : as the claim and the certificate have them.
-    share : of the root box's volume.
-    leaves : of finite rank; `boxes` were looked at, in `rounds` rounds.
-    done : no leaf is left whose halves could gain anything.
-    """
-
-    ranks: Ranks
-    evidence: RankTree
-    share: float
-    leaves: int
-    boxes: int
-    rounds: int
-    done: bool
+_LARGEST = 0.7  # share of the leaves to be halved that are, the largest ones
 
 
 class Search:
@@ -64,7 +33,26 @@ class Search:
         self.rank, self.steps = np.full(1, NONE), np.zeros(1, dtype=np.int64)
         self.lo, self.hi = np.full((K, n, 1), np.nan), np.full((K, n, 1), np.nan)
         self.there, self.steep, self.meets = np.zeros((K, 1), dtype=bool), np.zeros((n, 1)), np.zeros(1, dtype=bool)
-        self.boxes = 0
+        self.boxes, self.shares = 0, list[float]()
+
+    def begin(self) -> Index:
+        """The leaves of a first tree, all of one size."""
+        new, widths = np.zeros(1, dtype=np.int64), np.ones(len(self.cover.low))
+        while len(new) < _FIRST:
+            axis = int(widths.argmax())
+            widths[axis] /= 2
+            new = self.halve(new, np.full(len(new), axis))
+        return new
+
+    def is_done(self, near: Index) -> bool:
+        """True if no leaf is left whose halves could gain anything, or the last rounds have gained next to nothing."""
+        self.shares.append(self.share)
+        stalled = len(self.shares) > _ROUNDS and 0 < self.shares[-1] <= (1 + _GAIN) * self.shares[-1 - _ROUNDS]
+        return not len(near) or stalled
+
+    def further(self, near: Index) -> Index:
+        """The leaves to look at next."""
+        return self.halve(*self.next(near))
 
     @property
     def unknown(self) -> Index:
@@ -147,6 +135,13 @@ class Search:
         large = near[volumes >= np.quantile(volumes, 1 - _LARGEST)]
         return large, self.steep[:, large].argmax(0)
 
+    def tighten(self) -> None:
+        """Give all leaves the lowest ranks that their images show: some had a rank before others had a lower one."""
+        leaves = self.cover.leaves
+        again = leaves[(self.rank[leaves] < NONE) & (self.rank[leaves] > 0)]
+        self.rank[again], self.steps[again] = NONE, 0
+        self.spread()
+
     def evidence(self) -> tuple[RankTree, int]:
         """The evidence, and the most steps."""
         tree, leaves = self.cover.preorder()
@@ -154,81 +149,3 @@ class Search:
         lo, hi = (end[:, 0].copy() for end in self.cover.root)
         most = int(rank[rank < NONE].max(initial=1))
         return RankTree(lo, hi, tree, rank.astype(np.uint16), steps.astype(np.uint8)), max(1, most)
-
-
-def turning(loop: ClosedLoop) -> list[int]:
-    """The plant's angles, by their numbers, if the policy is the same after a turn of each of them at samples; else
-    none: a policy that reads an angle itself counts turns."""
-    system = loop.system
-    angles = [i for i, s in enumerate(system.states) if s.name in system.angles]
-    x = np.random.default_rng(0).uniform(-1, 1, (_SAMPLES, system.n))
-    u = loop.policy(x)
-    moved = (loop.policy(x + TURN * np.eye(system.n)[i]) for i in angles)
-    return angles if all(np.allclose(u, v, rtol=1e-9, atol=1e-9) for v in moved) else []
-
-
-def root_box(loop: ClosedLoop) -> tuple[Array, Array]:
-    """The box of places of a plant, corners (n,): a turn of each angle around 0, of other states the domain but for a
-    sliver along its ends."""
-    system, turns = loop.system, turning(loop)
-    ends = np.array([[float(end) for end in pair] for pair in system.domain])
-    inwards = _SLIVER * np.abs(ends).max(1)
-    lo, hi = ends[:, 0] + inwards, ends[:, 1] - inwards
-    angles = np.isin(np.arange(system.n), turns)
-    return np.where(angles, -_HALF_TURN, lo), np.where(angles, _HALF_TURN, hi)
-
-
-def prove_ranks(
-    problem: Problem,
-    level: float,
-    keep: Sequence[Expression],
-    root: tuple[Array, Array],
-    effort: Effort,
-    runner: Runner,
-    report: Callable[[float, int, int], None] | None = None,
-    order: int = 2,
-) -> RankProof | None:
-    """Prove from which leaves of a box trajectories reach {V <= level}.
-
-    Parameters
-    ----------
-    keep : expressions that stay negative on the way.
-    root : corners lo and hi (n,) of the box, in deviations; of an angle more than a turn apart.
-    report : called after every round with the share that is proved, the boxes looked at, and the leaves that wait.
-    order : of the series in time, where inputs are held.
-
-    Returns
-    -------
-    RankProof | None : None if no leaf beyond the set has a rank.
-    """
-    system = problem.loop.system
-    lo, hi = root
-    named = turning(problem.loop)
-    course = Course(problem, level, named, keep, hi - lo, COUNTS, order)
-    search, rounds, done = Search(course, lo, hi), 0, False
-    new = np.zeros(1, dtype=np.int64)
-    widths = np.ones(len(lo))
-    while len(new) < _FIRST:
-        axis = int(widths.argmax())
-        widths[axis] /= 2
-        new = search.halve(new, np.full(len(new), axis))
-    with runner.start(course) as bound:
-        shares = [0.0]
-        while True:
-            effort.charge(len(new) * course.operations)
-            search.take(new, bound(search.cover.low[:, new], search.cover.high[:, new], 0.0, level))
-            near, rounds = search.spread(), rounds + 1
-            shares.append(search.share)
-            if report is not None:
-                report(shares[-1], search.boxes, len(search.unknown))
-            done = not len(near) or (len(shares) > _ROUNDS and 0 < shares[-1] <= (1 + _GAIN) * shares[-1 - _ROUNDS])
-            if done or effort.over or len(search.cover.leaves) > _MOST_LEAVES:
-                break
-            new = search.halve(*search.next(near))
-    tree, most = search.evidence()
-    leaves = int((tree.ranks < NONE).sum())
-    if not np.any(tree.steps):
-        return None
-    return RankProof(
-        Ranks(tuple(system.states[i].name for i in named), most), tree, search.share, leaves, search.boxes, rounds, done
-    )

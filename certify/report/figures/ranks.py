@@ -1,98 +1,222 @@
-"""The map of ranks: the number of steps after which {V <= c2} is reached at the latest, in the planes of the states.
+"""The map of ranks: the number of steps after which the target is reached at the latest, in planes of the states.
 
 The colours are those of the leaves at the middles of a picture's points, in the plane in which all other states are at
-rest. Map and scale are images both, so that dark colours turn them alike.
+rest, or in the middle of a box. Map and scale are images both, so that dark colours turn them alike.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.certificates import ReachCertificate
+from certify.certificates.membership import angles_in
 from certify.certificates.ranked import Ranked
+from certify.loop.plants.floating_point import function_of
 from certify.report.figures.geometry import ellipse
-from certify.report.figures.pairs import Pair
+from certify.report.figures.pairs import MOST, Pair
 from certify.report.figures.scene import Scene
-from certify.report.figures.style import MUTED, PAPER, SET, Picture, add_axes, figure_of, to_svg
-from certify.report.words import symbol
+from certify.report.figures.style import INK, MUTED, PAPER, SET, START, Picture, add_axes, figure_of, to_svg
+from certify.report.flow import Flow, simulate, time_scales
+from certify.report.words import deviation, symbol
 
 Array = NDArray[np.float64]
 _LINE = (PAPER, 3.0), (SET, 1.6)  # an outline that is seen on every colour
+_BOX = (PAPER, 3.0), (START, 2.0)
+_RUNS = (PAPER, 1.4), (INK, 0.6)
 _POINTS = 480  # of a map along each side
+_STARTS, _LONGEST = 6, 4000  # simulated runs, and their steps
 _COLOURS = "viridis_r"  # light is near, and no colour is white
 
 
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """The ranks that maps show.
+
+    Parameters
+    ----------
+    ranked, most : the leaves, and the most steps from one.
+    labels, names : of the states.
+    middle : the state (n,) through which planes go.
+    target, outline : the target's name, and the function that draws its outline in a plane.
+    sampled : the steps are sampling instants.
+    word : "proved", or "claimed".
+    """
+
+    ranked: Ranked
+    most: float
+    labels: Sequence[str]
+    names: Sequence[str]
+    middle: Array
+    target: str
+    outline: Callable[[Any, Pair], None]
+    sampled: bool
+    word: str
+    beside: str = ", all other states at rest"
+
+    @property
+    def n(self) -> int:
+        """The number of states."""
+        return len(self.names)
+
+
 def rank_maps(scene: Scene) -> list[Picture]:
-    """A map for each pair of states, or of the line; none without ranks."""
-    ranked = scene.ranked
-    if ranked is None:
+    """A map of the ranks around {V <= c2} for each pair of states, or of the line; none without ranks."""
+    ranked, claim = scene.ranked, scene.certificate.claim
+    if ranked is None or claim.ranks is None:
         return []
-    if scene.n == 1:
-        return [_picture(scene, ranked, (0, 0))]
-    return [_picture(scene, ranked, pair) for pair in scene.pairs]
+    ground = Ground(
+        ranked,
+        float(claim.ranks.steps),
+        scene.labels,
+        [s.name for s in scene.system.states],
+        np.zeros(scene.n),
+        "{V ≤ c₂}",
+        lambda axes, pair: _level_set(axes, scene, ranked, pair),
+        scene.timing.sample is not None,
+        scene.word,
+    )
+    return [_picture(ground, pair) for pair in (scene.pairs if scene.n > 1 else [(0, 0)])]
 
 
-def _picture(scene: Scene, ranked: Ranked, pair: Pair) -> Picture:
-    """The map of one plane, with the ellipse of {V <= c2} on top."""
-    figure, axes = figure_of(4.2, 3.6 if scene.n > 1 else 1.6, right=0.8)
-    i, j = pair
-    lo, hi = ranked.tree.lo, ranked.tree.hi
-    most = float(scene.certificate.claim.ranks.steps) if scene.certificate.claim.ranks is not None else 1.0
-    values = _ranks(scene, ranked, pair)
-    box = (lo[i], hi[i], lo[j], hi[j]) if scene.n > 1 else (lo[0], hi[0], 0.0, 1.0)
-    show = {"cmap": _COLOURS, "vmin": 0.0, "vmax": most, "origin": "lower", "interpolation": "nearest"}
-    axes.imshow(values, extent=box, aspect="auto", zorder=1, **show)
-    if scene.n > 1:
-        _outline(axes, scene, ranked, pair)
-        axes.set_ylabel(scene.labels[j])
-    else:
-        for end in (-scene.reach[0], scene.reach[0]):
+def reach_maps(certificate: ReachCertificate, accepted: bool, box: tuple[Array, Array] | None = None) -> list[Picture]:
+    """A map of the ranks around a region for each pair of states, or of the line; with `box`, corners (n,), through its
+    middle, and with simulated runs from it.
+    """
+    system = certificate.system
+    ranked = Ranked(certificate.evidence.ranks, None, angles_in(system))
+    middle = np.zeros(system.n) if box is None else 0.5 * (box[0] + box[1])
+    beyond = function_of(system, certificate.claim.target, (), "numpy")
+    path = (
+        None if box is None else _runs(certificate, box, lambda x: beyond(x, np.zeros((*x.shape[:-1], system.m)), ()))
+    )
+
+    def outline(axes: Any, pair: Pair) -> None:
+        a, b, states = _plane(ranked, middle, pair)
+        with np.errstate(all="ignore"):
+            value = beyond(states, np.zeros((*states.shape[:-1], system.m)), ()).max(-1)
+        if system.n > 1:
             for colour, width in _LINE:
-                axes.axvline(end, color=colour, lw=width, zorder=4)
+                axes.contour(a, b, value, levels=[0.0], colors=[colour], linewidths=[width], zorder=4)
+        else:
+            for at in a[1:][np.diff(np.sign(value[0])) != 0]:
+                axes.axvline(at, color=SET, lw=1.6, zorder=4)
+        if box is not None and path is not None and system.n > 1:
+            _drawn_runs(axes, path, pair)
+            _drawn_box(axes, box, pair)
+
+    shown = zip(system.states, system.exact_x_eq(), strict=True)
+    ground = Ground(
+        ranked,
+        float(certificate.claim.ranks.steps),
+        [deviation(s.name, q, system.units.get(s.name, "")) for s, q in shown],
+        [s.name for s in system.states],
+        middle,
+        "the region",
+        outline,
+        system.sample is not None,
+        "proved" if accepted else "claimed",
+        ", all other states at 0"
+        if box is None
+        else ", all other states in the middle of the box that was asked about",
+    )
+    pairs = list(combinations(range(system.n), 2))[:MOST] if system.n > 1 else [(0, 0)]
+    more = " Magenta: that box. Thin lines: simulated runs from it, until they are there." if box is not None else ""
+    return [_picture(ground, pair, more) for pair in pairs]
+
+
+def _picture(ground: Ground, pair: Pair, more: str = "") -> Picture:
+    """The map of one plane, with the outline of the target on top."""
+    figure, axes = figure_of(4.4, 3.6 if ground.n > 1 else 1.6, left=0.86, right=0.8)
+    i, j = pair
+    lo, hi = ground.ranked.tree.lo, ground.ranked.tree.hi
+    _, _, states = _plane(ground.ranked, ground.middle, pair)
+    values = ground.ranked.ranks_at(states.reshape(-1, ground.n)).reshape(states.shape[:-1])
+    box = (lo[i], hi[i], lo[j], hi[j]) if ground.n > 1 else (lo[0], hi[0], 0.0, 1.0)
+    show = {"cmap": _COLOURS, "vmin": 0.0, "vmax": ground.most, "origin": "lower", "interpolation": "nearest"}
+    axes.imshow(values, extent=box, aspect="auto", zorder=1, **show)
+    if ground.n > 1:
+        axes.set_ylabel(ground.labels[j])
+    else:
         axes.set_yticks([])
+    ground.outline(axes, pair)
     axes.set_xlim(*box[:2])
     axes.set_ylim(*box[2:])
-    axes.set_xlabel(scene.labels[i])
-    _scale(figure, axes, most, show)
-    steps = "steps" if scene.timing.sample is None else "sampling instants"
-    other = ", all other states at rest" if scene.n > 2 else ""
-    turned = [symbol(scene.system.states[k].name) for k in ranked.angles]
+    axes.set_xlabel(ground.labels[i])
+    _scale(figure, axes, ground.most, show)
+    steps = "sampling instants" if ground.sampled else "steps"
+    other = ground.beside if ground.n > 2 else ""
+    turned = [symbol(ground.names[k]) for k in ground.ranked.angles]
     place = f" Full turns of {', '.join(turned)} are the same place." if turned else ""
-    unless = "" if scene.word == "proved" else ", if the claim is true"
-    title = "Steps to {V ≤ c₂}, at most"
+    unless = "" if ground.word == "proved" else ", if the claim is true"
+    title = f"Steps to {ground.target}, at most"
     return Picture(
-        title if scene.n <= 2 else f"{title}: {scene.labels[i]}, {scene.labels[j]}",
-        f"Colour: the number of {steps} after which every trajectory from there is in {{V ≤ c₂}}, the blue outline, at "
-        f"the latest{unless}{other}. White: nothing is {scene.word}.{place}",
+        title if ground.n <= 2 else f"{title}: {ground.labels[i]}, {ground.labels[j]}",
+        f"Colour: the number of {steps} after which every trajectory from there is in {ground.target}, the blue "
+        f"outline, at the latest{unless}{other}. White: nothing is {ground.word}.{place}{more}",
         to_svg(figure),
-        simulated=False,
+        simulated=bool(more),
     )
 
 
-def _ranks(scene: Scene, ranked: Ranked, pair: Pair) -> Array:
-    """The ranks at the middles of a map's points, (rows, columns)."""
+def _plane(ranked: Ranked, middle: Array, pair: Pair) -> tuple[Array, Array, Array]:
+    """The middles of a map's points along two states, and the states there, (rows, columns, n)."""
     i, j = pair
     shares = (np.arange(_POINTS) + 0.5) / _POINTS
     a, b = (ranked.tree.lo[k] + shares * (ranked.tree.hi[k] - ranked.tree.lo[k]) for k in pair)
-    rows = len(b) if scene.n > 1 else 1
-    states = np.zeros((rows, _POINTS, scene.n))
+    states = np.tile(middle, (len(b) if len(middle) > 1 else 1, _POINTS, 1))
     states[..., i] = a[None, :]
-    if scene.n > 1:
+    if len(middle) > 1:
         states[..., j] = b[:, None]
-    found = ranked.ranks_at(states.reshape(-1, scene.n))
-    return np.asarray(found.reshape(rows, _POINTS))
+    return a, b, states
 
 
-def _outline(axes: Any, scene: Scene, ranked: Ranked, pair: Pair) -> None:
-    """The section of {V <= c2}, and the same after the turns that are in the picture."""
+def _level_set(axes: Any, scene: Scene, ranked: Ranked, pair: Pair) -> None:
+    """The section of {V <= c2}, and the same after the turns that are in the picture; of one state its ends."""
+    if scene.n == 1:
+        for end in (-scene.reach[0], scene.reach[0]):
+            for colour, width in _LINE:
+                axes.axvline(end, color=colour, lw=width, zorder=4)
+        return
     x, y = ellipse(scene.P, pair, scene.outer)
     turns = [(-1, 0, 1) if k in ranked.angles else (0,) for k in pair]
     for v in turns[0]:
         for w in turns[1]:
             for colour, width in _LINE:
                 axes.plot(x + 2 * np.pi * v, y + 2 * np.pi * w, color=colour, lw=width, zorder=4)
+
+
+def _runs(certificate: ReachCertificate, box: tuple[Array, Array], beyond: Callable[[Array], Array]) -> Array:
+    """Simulated runs from a box, (steps, runs, n); NaN once they are in the region."""
+    flow = Flow.of(certificate.system, certificate.network)
+    step = flow.fitting(time_scales(flow)[0])
+    shares = np.random.default_rng(0).uniform(size=(_STARTS - 2, len(box[0])))
+    starts = np.concatenate([[box[0]], [box[1]], box[0] + shares * (box[1] - box[0])])
+    each = 1 if flow.discrete else flow.steps_between(step)
+    most = min(_LONGEST, certificate.claim.ranks.steps * each)
+    path = simulate(flow, starts, step, most)
+    with np.errstate(all="ignore"):
+        there = np.cumsum(beyond(path).max(-1) <= 0, axis=0) > 1
+    path[there] = np.nan
+    return path
+
+
+def _drawn_runs(axes: Any, path: Array, pair: Pair) -> None:
+    for run in range(path.shape[1]):
+        for colour, width in _RUNS:
+            axes.plot(path[:, run, pair[0]], path[:, run, pair[1]], color=colour, lw=width, zorder=3)
+
+
+def _drawn_box(axes: Any, box: tuple[Array, Array], pair: Pair) -> None:
+    """The box's section, which may be a line."""
+    (a, b), (c, d) = ((box[0][k], box[1][k]) for k in pair)
+    for colour, width in _BOX:
+        axes.plot([a, b, b, a, a], [c, c, d, d, c], color=colour, lw=width, zorder=5)
 
 
 def _scale(figure: Any, axes: Any, most: float, show: dict[str, Any]) -> None:

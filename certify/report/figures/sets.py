@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates import Certificate, PartitionTree, RankTree, Slab
+from certify.certificates import Certificate, PartitionTree, RankTree, ReachCertificate, Slab, TrustedSolver
 from certify.certificates.ellipsoids import sublevel_set
 from certify.certificates.membership import angles_in
 from certify.certificates.ranked import Ranked
@@ -62,9 +62,9 @@ def slabs_of(certificate: Certificate) -> tuple[Slab, ...]:
     return certificate.evidence.tube if isinstance(certificate.evidence, PartitionTree) else ()
 
 
-def tree_of(certificate: Certificate) -> RankTree | None:
+def tree_of(certificate: Certificate | ReachCertificate) -> RankTree | None:
     """The tree of the boxes with ranks; None without any."""
-    return certificate.evidence.ranks if isinstance(certificate.evidence, PartitionTree) else None
+    return None if isinstance(certificate.evidence, TrustedSolver) else certificate.evidence.ranks
 
 
 def ranked_of(certificate: Certificate) -> Ranked | None:

@@ -119,12 +119,14 @@ class Picture:
         return "data:image/svg+xml;base64," + base64.b64encode(self.svg.encode("utf-8")).decode("ascii")
 
 
-def figure_of(width: float, height: float, *, right: float = 0.14, bottom: float = 0.52) -> tuple[Any, Any]:
+def figure_of(
+    width: float, height: float, *, left: float = 0.66, right: float = 0.14, bottom: float = 0.52
+) -> tuple[Any, Any]:
     """A figure with one set of axes; sizes in inches. Margins are fixed: measuring all texts would double the time."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height))
-    return figure, add_axes(figure, 0.66, bottom, width - 0.66 - right, height - bottom - 0.12)
+    return figure, add_axes(figure, left, bottom, width - left - right, height - bottom - 0.12)
 
 
 def add_axes(figure: Any, left: float, bottom: float, width: float, height: float) -> Any:

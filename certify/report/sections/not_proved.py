@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from certify.certificates import Certificate
+from certify.certificates import Certificate, ReachCertificate
 from certify.loop.plants import System, input_errors
 from certify.report.claims import Words
 from certify.report.sections.shared import timing_of
@@ -53,7 +53,26 @@ def not_proved_of(certificate: Certificate, words: Words) -> list[tuple[str, str
     return items
 
 
-def _turns(certificate: Certificate) -> Iterator[tuple[str, str]]:
+def not_reached_of(certificate: ReachCertificate) -> list[tuple[str, str]]:
+    """Heads and texts of the gaps of a claim that a region is reached."""
+    system, timing = certificate.system, timing_of(certificate)
+    return [
+        ("What comes later.", "Once in the region, a trajectory may leave it at once; nothing is said of it any more."),
+        ("Boxes without a rank.", "Of their states nothing is said: they may reach the region too, or not."),
+        (
+            "Fewer steps.",
+            f"The numbers of {'steps' if timing.discrete else 'sampling instants'} are bounds: most trajectories need "
+            "fewer.",
+        ),
+        *_not_of_the_plant(system),
+        *(one for one in _other_times(timing) if "set" not in one[0]),
+        _rounding(system),
+        *_turns(certificate),
+        ("Simulated figures.", "Runs that are drawn are illustrations in floating point."),
+    ]
+
+
+def _turns(certificate: Certificate | ReachCertificate) -> Iterator[tuple[str, str]]:
     """The gap about angles, unless full turns of them are the same place."""
     ranks, said = certificate.claim.ranks, "States are real numbers: an angle of a full turn is not the origin."
     if ranks is None or not ranks.angles:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates import Certificate, TrustedSolver
+from certify.certificates import Certificate, ReachCertificate, TrustedSolver
 from certify.certificates.claims import Outer
 from certify.errors import CertifyError
 from certify.loop.closed_loop import ClosedLoop
@@ -65,7 +65,7 @@ def tables_of(
     return {
         "levels": _levels(certificate, result),
         "size": _sizes(certificate, sets),
-        "ranked": _ranked(certificate),
+        "ranked": ranked_rows(certificate),
         "estimated": _estimated(certificate, result) if drawn else "",
         "geometry": _geometry(certificate),
         "reach": reach,
@@ -73,7 +73,7 @@ def tables_of(
         "sets": "the set reaches" if len(heads) <= 2 else "each set reaches",
         "measure": volume_name(certificate.system.n),
         "evidence": _evidence(certificate, answer if status.accepted else None, sha256, size),
-        "run": _run(result),
+        "run": run_rows(result),
         "candidates": _candidates(certificate, result),
     }
 
@@ -121,7 +121,7 @@ def _sizes(certificate: Certificate, sets: Sequence[Ellipsoid]) -> Rows:
     ]
 
 
-def _ranked(certificate: Certificate) -> Rows:
+def ranked_rows(certificate: Certificate | ReachCertificate, target: str = "{V ≤ c₂}") -> Rows:
     """The boxes with ranks: how many, how large, how far away."""
     found, tree, system = ranks_of(certificate), tree_of(certificate), certificate.system
     if found is None or tree is None:
@@ -136,7 +136,7 @@ def _ranked(certificate: Certificate) -> Rows:
     size = f"{below(found.volume)} {_unit_of(certificate)}".rstrip()
     return [
         ("boxes with ranks", f"{found.proved:,} of {found.leaves:,}"),
-        (f"most {steps} to {{V ≤ c₂}}", f"{found.steps:,}"),
+        (f"most {steps} to {target}", f"{found.steps:,}"),
         (f"{volume_name(system.n)} of these boxes", size),
         ("share of the box that was cut", f"{below(100 * found.share, 4)} %"),
         ("that box", ", ".join(box)),
@@ -175,16 +175,7 @@ def _geometry(certificate: Certificate) -> Rows:
 
 def _evidence(certificate: Certificate, accepted: Mapping[str, Any] | None, sha256: str, size: int | None) -> Rows:
     """The claim's basis: the policy, the file, and the checker's counts if it `accepted`."""
-    network, beyond, slabs = certificate.network, certificate.claim.outer, slabs_of(certificate)
-    rows = [
-        ("policy", f"{network.words}, squash {network.squash}, centre {network.centre}"),
-        *(() if network.clip is None else (("clipped to", _clip(certificate)),)),
-        *((("its layers read", read_in_words(certificate)),) if network.is_moved else ()),
-        ("policy sha256", network.sha256()),
-        ("certificate sha256", sha256),
-    ]
-    if size is not None:
-        rows.append(("certificate size", f"{size:,} bytes"))
+    beyond, slabs, rows = certificate.claim.outer, slabs_of(certificate), file_rows(certificate, sha256, size)
     if beyond is not None:
         rows += _outer_rows(beyond, accepted)
     if slabs:
@@ -200,7 +191,20 @@ def _evidence(certificate: Certificate, accepted: Mapping[str, Any] | None, sha2
     return rows
 
 
-def _run(result: Mapping[str, Any] | None) -> Rows:
+def file_rows(certificate: Certificate | ReachCertificate, sha256: str, size: int | None) -> Rows:
+    """The policy and the file."""
+    network = certificate.network
+    return [
+        ("policy", f"{network.words}, squash {network.squash}, centre {network.centre}"),
+        *(() if network.clip is None else (("clipped to", _clip(certificate)),)),
+        *((("its layers read", read_in_words(certificate)),) if network.is_moved else ()),
+        ("policy sha256", network.sha256()),
+        ("certificate sha256", sha256),
+        *(() if size is None else (("certificate size", f"{size:,} bytes"),)),
+    ]
+
+
+def run_rows(result: Mapping[str, Any] | None) -> Rows:
     """The run's work and times; empty without a run."""
     if result is None:
         return []
@@ -229,7 +233,7 @@ def _candidates(certificate: Certificate, result: Mapping[str, Any] | None) -> l
     ]
 
 
-def _unit_of(certificate: Certificate) -> str:
+def _unit_of(certificate: Certificate | ReachCertificate) -> str:
     """The unit of a volume of states."""
     system = certificate.system
     return volume_unit([system.units.get(s.name, "") for s in system.states])
@@ -277,7 +281,7 @@ def _lengths(certificate: Certificate, sets: Sequence[Ellipsoid]) -> tuple[list[
     return heads, [*axes, *most]
 
 
-def _clip(certificate: Certificate) -> str:
+def _clip(certificate: Certificate | ReachCertificate) -> str:
     """Each input's limits, in its unit."""
     inputs, clip = certificate.system.inputs, certificate.network.clip or ()
     each = zip(inputs, *clip, strict=True)

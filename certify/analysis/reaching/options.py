@@ -1,0 +1,79 @@
+"""The options of a proof that a region is reached, and the region in a plant's own terms."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from certify.certificates.claims import MOST_RANK, MOST_TARGETS
+from certify.certificates.ellipsoids import Box
+from certify.errors import InputError, OptionError
+from certify.loop.expressions import Expression, Number, Symbol, substitute, symbols_of
+from certify.loop.plants import System, in_deviations
+from certify.loop.plants.equations import parse_comparison
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReachOptions:
+    """The options of a run.
+
+    Parameters
+    ----------
+    target : comparisons of the states' values by <= or >=, all of which hold in the region.
+    begin : a box of states, in deviations, about which the verdict is; None for no box in particular.
+    within : the most steps that it may take.
+    effort, time_limit, jobs : as of `certify roa`.
+
+    Raises
+    ------
+    OptionError : a number is not what it must be.
+    """
+
+    target: tuple[str, ...]
+    begin: Box | None = None
+    within: int | None = None
+    effort: float = 1.0
+    time_limit: float | None = None
+    jobs: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.target) <= MOST_TARGETS:
+            raise OptionError(f"`target` must be 1 to {MOST_TARGETS} comparisons; found {len(self.target)}.")
+        if self.within is not None and not 1 <= self.within <= MOST_RANK:
+            raise OptionError(f"`within` must be 1 to {MOST_RANK:,} steps; found {self.within}.")
+
+
+def target_of(system: System, texts: Sequence[str]) -> tuple[Expression, ...]:
+    """The expressions, in deviations from the operating point, that are at most 0 in the region.
+
+    Raises
+    ------
+    OptionError : a text is no comparison by <= or >= of expressions in states and parameters.
+    """
+    return tuple(_expression(system, text) for text in texts)
+
+
+def _expression(system: System, text: str) -> Expression:
+    shown = " ".join(text.split())
+    known = [*system.states, *map(Symbol, system.parameters)]
+    try:
+        sides = parse_comparison(text, {s.name: s for s in known}, "state or parameter")
+    except InputError as error:
+        raise OptionError(f"`target`: {str(error).replace('constraint ', '', 1)}") from error
+    if sides is None or re.search(r"[<>](?!=)", text):
+        raise OptionError(
+            f"`target` takes a comparison by <= or >=, whose ends belong to the region, such as 'position >= 0.45'; "
+            f"found {shown!r}."
+        )
+    (t,) = in_deviations([sides[0] - sides[1]], system.states, system.x_eq)
+    odd = symbols_of(t) & {s for s, _ in system.uncertain}
+    if odd or not symbols_of(t) & set(system.states):
+        names = ", ".join(s.name for s in system.states)
+        raise OptionError(f"`target` must be of states, {names}, and of parameters without a range; found {shown!r}.")
+    return substitute(t, {Symbol(name): Number(q) for name, q in system.parameters.items()})
+
+
+def in_words(texts: Sequence[str]) -> str:
+    """The region as it was written."""
+    return " and ".join(" ".join(text.split()) for text in texts)

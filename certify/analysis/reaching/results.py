@@ -1,0 +1,110 @@
+"""The result of a proof that a region is reached, and its JSON object."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from certify.analysis.facts import RankFacts
+from certify.analysis.reaching.options import ReachOptions, in_words
+from certify.analysis.reaching.runs import Run, Runs
+from certify.certificates.verdict import Verdict
+from certify.loop.plants import System
+from certify.loop.policies import PolicyNetwork
+
+
+@dataclass(frozen=True, slots=True)
+class ReachResult:
+    """The result of a run. `reason` says in words why it ends so.
+
+    Parameters
+    ----------
+    ranks : the boxes that are proved, if any are; `boxes` were looked at.
+    steps : after so many every trajectory from the box `options.begin` has been in the region; None if that is not
+        proved, or no box was named.
+    constraints : those that are kept until then, in words by their names.
+    runs : simulated, from that box.
+    certificate, raw, checker : the file, its bytes, and the checker's answer about them; None where there is none.
+    """
+
+    verdict: Verdict
+    reason: str
+    system: System
+    network: PolicyNetwork
+    options: ReachOptions
+    ranks: RankFacts | None = None
+    steps: int | None = None
+    boxes: int = 0
+    constraints: Mapping[str, str] = field(default_factory=dict)
+    runs: Runs | None = None
+    notice: str | None = None
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    certificate: Path | None = None
+    raw: bytes | None = field(default=None, repr=False)
+    checker: Mapping[str, Any] | None = None
+
+    @property
+    def begin(self) -> dict[str, tuple[Fraction, Fraction]] | None:
+        """The box that was asked about, by the states' values; None if there is none."""
+        box = self.options.begin
+        if box is None:
+            return None
+        each = zip(self.system.states, box, self.system.exact_x_eq(), strict=True)
+        return {s.name: (lo + q, hi + q) for s, (lo, hi), q in each}
+
+    def values(self, x: Sequence[Fraction]) -> dict[str, Fraction]:
+        """A state by the states' values, from its deviations."""
+        each = zip(self.system.states, x, self.system.exact_x_eq(), strict=True)
+        return {s.name: v + q for s, v, q in each}
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON object of `certify reach --target --json`."""
+        system, begin = self.system, self.begin
+        return {
+            "schema": "certify-reach/1",
+            "verdict": self.verdict.value,
+            "reason": self.reason,
+            "claim": {"kind": "reaches"} | ({} if system.sample is None else {"sample": list(map(str, system.sample))}),
+            "target": list(self.options.target),
+            "from": None if begin is None else {name: [str(lo), str(hi)] for name, (lo, hi) in begin.items()},
+            "within": self.options.within,
+            "steps": self.steps,
+            "ranks": None if self.ranks is None else self.ranks.to_dict(),
+            "constraints": dict(self.constraints),
+            "simulated": None if self.runs is None else self._simulated(self.runs),
+            "time": system.time,
+            "system": system.name,
+            "parameters": {name: str(q) for name, q in system.parameters.items()},
+            "uncertain": {name: [str(lo), str(hi)] for name, (lo, hi) in system.ranges.items()},
+            "states": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.states],
+            "policy": {"sha256": self.network.sha256(), "layers": list(self.network.layers)},
+            "boxes": self.boxes,
+            "notice": self.notice,
+            "seconds": dict(self.seconds),
+            "certificate": None if self.certificate is None else str(self.certificate),
+            "certificate_sha256": None if self.checker is None else self.checker.get("certificate_sha256"),
+            "checked": None if self.checker is None else self.checker.get("result"),
+            "reference": None if self.checker is None else self.checker.get("reference", {}).get("result"),
+        }
+
+    def _simulated(self, runs: Runs) -> dict[str, Any]:
+        failing = None if runs.failing is None else self._run(runs.failing)
+        return {"runs": runs.count, "longest": runs.longest, "witness": failing}
+
+    def _run(self, run: Run) -> dict[str, Any]:
+        x = {name: str(q) for name, q in self.values(run.x).items()}
+        named = {"constraint": run.constraint} if run.constraint else {}
+        return {"x": x, "end": run.end, "steps": run.steps, **named}
+
+    def told(self, run: Run) -> str:
+        """The end of a run in words."""
+        state = ", ".join(f"{name} = {float(q):.6g}" for name, q in self.values(run.x).items())
+        if run.end == "violates":
+            return f"from {state} the constraint {run.constraint} is violated after {run.steps:,} steps"
+        where = in_words(self.options.target)
+        if run.end == "left":
+            return f"from {state} the domain is left after {run.steps:,} steps, before {where}"
+        return f"from {state} {where} does not hold in any of the first {run.steps:,} steps"

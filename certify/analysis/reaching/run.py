@@ -1,0 +1,292 @@
+"""`certify_reach`: simulate, refute what can be refuted, prove ranks, and have them accepted.
+
+Nothing is PROVED before the checker, run as a process of its own, has accepted the very bytes that were written.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.analysis.acceptance import Clerk, Desk
+from certify.analysis.beyond import constraints_in_words, rank_facts
+from certify.analysis.reaching.options import ReachOptions, target_of
+from certify.analysis.reaching.results import ReachResult
+from certify.analysis.reaching.runs import Simulation, begins, is_refuted
+from certify.analysis.stages.state import Report
+from certify.certificates import (
+    RanksAlone,
+    RankTree,
+    ReachCertificate,
+    earlier_aside,
+    require_within_limits,
+    sole_writer,
+)
+from certify.certificates.claims import UNPROVED, Ranks, Reaches
+from certify.certificates.membership import angles_in
+from certify.certificates.ranked import Ranked, steps_from
+from certify.certificates.tree import LEAF
+from certify.certificates.verdict import Verdict
+from certify.effort import WHOLE, Effort
+from certify.errors import InputError, OptionError, SoundnessError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.composition import composed
+from certify.loop.expressions import Expression
+from certify.loop.plants import System, kept_constraints
+from certify.loop.policies import PolicyNetwork
+from certify.provers.base import Progress
+from certify.provers.execution import ThreadRunner
+from certify.provers.ranks import (
+    MOST_STEPS,
+    Question,
+    RankProof,
+    Region,
+    Wanted,
+    prove_ranks,
+    root_box,
+    with_order,
+    without_leaf,
+)
+
+Array = NDArray[np.float64]
+_PROBES = 30  # states at which the order of the series in time is chosen
+_FOR_RUNS, _FOR_SEARCH = 0.2, 0.7  # shares of the effort, the rest being for the check
+_DIRECT = 4000  # boxes that are looked at first where runs need few steps
+_MENDED = 20  # leaves that the checker may refuse
+
+
+@dataclass
+class _Tools:
+    """The stopwatch of a run, and those who are told of it."""
+
+    progress: Report | None
+    seconds: dict[str, float] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+
+    @contextmanager
+    def timing(self, stage: str) -> Iterator[None]:
+        """Add the seconds of the block to those of a stage."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begin
+
+
+def certify_reach(
+    system: System,
+    network: PolicyNetwork,
+    out: Path,
+    options: ReachOptions,
+    *,
+    load_seconds: float = 0.0,
+    provenance: Mapping[str, Any] | None = None,
+    progress: Report | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> ReachResult:
+    """Prove from which boxes of a plant's domain every trajectory reaches a region.
+
+    Parameters
+    ----------
+    system, network : the closed loop, in discrete time or with a held input.
+    out : folder for `certificate.json`; it is made if it is not there.
+    load_seconds : time already spent on reading, for the report.
+    provenance : entries for the certificate that the checker ignores.
+    progress : called with the stage and where it stands.
+    tell : told where an earlier run's certificate is kept, if this run ends without one.
+
+    Raises
+    ------
+    InputError : the closed loop or an option cannot be used, or `out` cannot be written or is another run's.
+    SoundnessError : the checker rejects what was proved.
+    """
+    from certify.provers.execution.threads import one_thread
+
+    start, tools = time.perf_counter(), _Tools(progress)
+    system, network = composed(system, network)
+    loop = ClosedLoop(system, network)
+    require_within_limits(system, network)
+    if not system.in_steps:
+        raise OptionError(
+            "`target` needs a loop whose time goes in steps: discrete time, or an input that is held (`sample_time`)."
+        )
+    target = target_of(system, options.target)
+    _require_inside(system, options)
+    limit = options.time_limit
+    effort = Effort(options.effort * WHOLE, None if limit is None else max(0.0, limit - load_seconds))
+    with one_thread(), sole_writer(out), earlier_aside(out, tell or (lambda _: None)):
+        result = ReachResult(Verdict.UNKNOWN, "", system, network, options)
+        result = _simulated(result, loop, target, effort, tools)
+        if not result.reason:
+            result = _proved(result, loop, target, effort, tools, out / "certificate.json", provenance or {})
+    seconds = {"load": load_seconds, **tools.seconds, "total": load_seconds + time.perf_counter() - start}
+    return replace(result, seconds=seconds, notice="; ".join(tools.remarks) or None)
+
+
+def _require_inside(system: System, options: ReachOptions) -> None:
+    """Refuse a box that does not lie in the interior of the domain.
+
+    Raises
+    ------
+    OptionError : it does not, in some state.
+    """
+    each = zip(system.states, options.begin or (), system.domain, system.exact_x_eq(), strict=options.begin is not None)
+    for s, (lo, hi), (least, most), q in each:
+        if s.name not in system.angles and not least < lo <= hi < most:
+            raise OptionError(
+                f"`reach_from` must lie in the interior of the domain, {s.name} between {float(least + q):g} and "
+                f"{float(most + q):g}; found {float(lo + q):g}..{float(hi + q):g}. --domain widens it."
+            )
+
+
+def _simulated(
+    result: ReachResult, loop: ClosedLoop, target: tuple[Expression, ...], effort: Effort, tools: _Tools
+) -> ReachResult:
+    """The result with simulated runs from the box; final if one of them does not get there."""
+    options = result.options
+    if options.begin is None:
+        return result
+    with tools.timing("simulate"):
+        runs = Simulation(loop, target, options.begin).runs(options.within, effort.share(_FOR_RUNS))
+    result = replace(result, runs=runs)
+    if runs.failing is None:
+        return result
+    with tools.timing("refute"):
+        refuted = is_refuted(loop, target, runs.failing, options.within)
+    told = result.told(runs.failing)
+    if refuted:
+        return replace(result, verdict=Verdict.REFUTED, reason=f"{told}, shown in Arb")
+    return replace(result, reason=f"in a simulation, {told}")
+
+
+def _proved(
+    result: ReachResult,
+    loop: ClosedLoop,
+    target: tuple[Expression, ...],
+    effort: Effort,
+    tools: _Tools,
+    path: Path,
+    provenance: Mapping[str, Any],
+) -> ReachResult:
+    """The result of the search, and of the check of what it finds."""
+    options, system = result.options, loop.system
+    keep, root = tuple(kept_constraints(system).values()), root_box(loop)
+    question = Question(loop, Region(target, system.states), keep, root)
+    question = with_order(question, begins(options.begin or tuple(zip(*map(_exactly, root), strict=True)))[:_PROBES].T)
+    clerk = _clerk(path, options, tools)
+    _require_periodic(question, clerk)
+    with tools.timing("ranks"):
+        soon = result.runs is not None and (result.runs.longest or MOST_STEPS) < MOST_STEPS
+        found = _searched(question, options, _DIRECT if soon else 0, effort.share(_FOR_SEARCH), tools)
+    evidence = None if found is None else _within(found.evidence, options.within)
+    if found is None or evidence is None:
+        return replace(result, reason="no box of the domain is proved to lead into the region")
+    claim = Reaches(target, Ranks(found.ranks.angles, _most(evidence)), keep)
+    certificate = ReachCertificate(system, loop.network, claim, RanksAlone(evidence, question.order), provenance)
+    certificate, raw, answer = _accepted(certificate, clerk)
+    facts, kept = rank_facts(certificate, found.rounds), constraints_in_words(certificate)
+    result = replace(result, ranks=facts, boxes=found.boxes, constraints=kept)
+    result = replace(result, certificate=path, raw=raw, checker=answer)
+    if options.begin is None:
+        return replace(result, verdict=Verdict.PROVED, reason="effort" if effort.over or not found.done else "done")
+    steps = steps_from(Ranked(certificate.evidence.ranks, None, angles_in(system)), options.begin)
+    if steps is None:
+        why = "the effort is over" if not found.done else "no leaf is left whose halves could gain anything"
+        return replace(result, reason=f"of the box only a part is proved, or none: {why}")
+    return replace(result, verdict=Verdict.PROVED, reason="requested", steps=steps)
+
+
+def _searched(
+    question: Question, options: ReachOptions, direct: int, effort: Effort, tools: _Tools
+) -> RankProof | None:
+    """Leaves from which the region is reached: those that the box needs, or else all that the effort finds; `direct`
+    boxes are looked at in the hope of one jump."""
+
+    def report(share: float, boxes: int, waiting: int) -> None:
+        if tools.progress is not None:
+            tools.progress("ranks", Progress(0.0, 0.0, boxes, waiting, share, effort.left))
+
+    wanted = None
+    if options.begin is not None:
+        lo, hi = (np.array([float(pair[k]) for pair in options.begin]) for k in (0, 1))
+        most = UNPROVED - 1 if options.within is None else options.within
+        wanted = Wanted(np.nextafter(lo, -np.inf), np.nextafter(hi, np.inf), most, direct)
+    return prove_ranks(question, effort, ThreadRunner(), report, wanted)
+
+
+def _exactly(corner: Array) -> list[Fraction]:
+    return [Fraction(v) for v in corner.tolist()]
+
+
+def _within(evidence: RankTree, most: int | None) -> RankTree | None:
+    """The evidence without leaves of higher ranks than that; None if only leaves in the region are left."""
+    if most is not None:
+        dropped = evidence.ranks > most
+        ranks = np.where(dropped, UNPROVED, evidence.ranks).astype(np.uint16)
+        evidence = replace(evidence, ranks=ranks, steps=np.where(dropped, 0, evidence.steps).astype(np.uint8))
+    return evidence if np.any(evidence.steps) else None
+
+
+def _most(evidence: RankTree) -> int:
+    return max(1, int(evidence.ranks[evidence.ranks < UNPROVED].max(initial=1)))
+
+
+def _clerk(path: Path, options: ReachOptions, tools: _Tools) -> Clerk:
+    """Somebody who writes certificates and has them checked."""
+    told, desk = tools.progress or (lambda *_: None), Desk(options.jobs, True, tools.remarks)
+    return Clerk(path, lambda: 0.0, tools.timing, lambda: told("check", None), lambda _: None, desk.checked)
+
+
+def _require_periodic(question: Question, clerk: Clerk) -> None:
+    """Refuse a loop or a region that is not the same after a full turn of an angle, as the checker sees it.
+
+    Raises
+    ------
+    InputError : it is not.
+    """
+    system, (lo, hi), keep = question.loop.system, question.root, question.keep
+    if not system.angles or not isinstance(question.target, Region):
+        return
+    nothing = RankTree(lo, hi, bytes([LEAF]), np.array([UNPROVED], np.uint16), np.zeros(1, np.uint8))
+    claim = Reaches(question.target.expressions, Ranks(system.angles, 1), keep)
+    asked = ReachCertificate(system, question.loop.network, claim, RanksAlone(nothing, question.order))
+    _, answer = clerk.ask(asked)
+    clerk.path.unlink(missing_ok=True)
+    if answer.get("rule") == "angles":
+        raise InputError(
+            f"the loop, the region and the constraints must be the same after a full turn of {', '.join(system.angles)}"
+            f", an angle of {system.name}: {answer['at']}, {answer['detail']}. Write them with sin and cos of it, or "
+            "take the angle out of the plant's `angles`."
+        )
+
+
+def _accepted(certificate: ReachCertificate, clerk: Clerk) -> tuple[ReachCertificate, bytes, Mapping[str, Any]]:
+    """The certificate, or one without leaves that the checker refuses, its bytes and the checker's answer.
+
+    Raises
+    ------
+    InputError : the checker takes none of this size.
+    SoundnessError : the checker refuses what cannot be mended so.
+    """
+    for _ in range(_MENDED):
+        raw, answer = clerk.ask(certificate)
+        if answer["result"] == "ACCEPTED":
+            return certificate, raw, answer
+        refused = re.fullmatch(r"rank leaf (\d+)", str(answer.get("at", "")))
+        lower = None if refused is None else without_leaf(certificate.evidence.ranks, int(refused[1]))
+        if lower is None:
+            break
+        claim = replace(certificate.claim, ranks=Ranks(certificate.claim.ranks.angles, _most(lower)))
+        certificate = replace(certificate, claim=claim, evidence=replace(certificate.evidence, ranks=lower))
+    if answer.get("rule") == "limits":
+        raise InputError(f"the checkers take no certificate of this size: {answer['detail']}. Try a smaller --effort.")
+    raise SoundnessError(f"the checker rejects what the engine proved: {answer}.")

@@ -1,0 +1,156 @@
+"""Simulated runs from a box, and the proof in Arb that one of them breaks the claim.
+
+Floats look for a state from which a run does not get there in time, or violates a constraint on the way; in Arb balls
+the same run then shows it, or does not. Values of uncertain quantities are the nominal ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import islice, product
+from typing import Literal
+
+import flint
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.certificates.ellipsoids import Box
+from certify.effort import Effort
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Expression, Symbol
+from certify.loop.plants import kept_constraints
+from certify.loop.plants.floating_point import function_of
+from certify.loop.rigorous import ball, evaluate_arb, precision, states_after
+from certify.report.flow import Flow, time_scales
+
+Array = NDArray[np.float64]
+End = Literal["late", "left", "violates"]
+LONG = 3000  # steps after which a run is given up
+_RANDOM, _GRID, _CORNERS = 100, 51, 8  # states of a box; a grid's points in one state; states that have all corners
+_CLOSE = 1e-9  # a target that is missed by less is not missed, in floats
+_BITS = 400
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """The course of a run that does not get there, from the state `x`, deviations as rationals: after so many `steps`
+    it has not been in the target ("late"), it leaves the domain ("left"), or it violates a `constraint`."""
+
+    x: tuple[Fraction, ...]
+    end: End
+    steps: int
+    constraint: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Runs:
+    """Simulated runs from a box: how many, the most steps of one that gets there, and one that does not."""
+
+    count: int
+    longest: int | None
+    failing: Run | None
+
+
+class Simulation:
+    """Runs of a closed loop towards a target, in floats; `begin` is the box from which they start."""
+
+    def __init__(self, loop: ClosedLoop, target: Sequence[Expression], begin: Box) -> None:
+        system = loop.system
+        self.flow, self.begin, self.names = Flow.of(system, loop.network), begin, tuple(kept_constraints(system))
+        quantities = [s for s, _ in system.uncertain]
+        self.nominal = [float(system.parameters.get(s.name, Fraction(0))) for s in quantities]
+        self.beyond = function_of(system, tuple(target), (), "numpy")
+        kept = tuple(kept_constraints(system).values())
+        self.kept = function_of(system, kept, quantities, "numpy") if kept else None
+        self.step = self.flow.fitting(time_scales(self.flow)[0])
+
+    @np.errstate(all="ignore")
+    def runs(self, within: int | None, effort: Effort) -> Runs:
+        """Runs from states of the box; `within` is the number of steps after which the target is to be reached."""
+        x, most = begins(self.begin), LONG if within is None else within
+        start, alive, longest, failing = x, np.arange(len(x)), None, list[Run]()
+        for k in range(most + 1):
+            there = self.beyond(x, self.flow.policy(x), ()).max(-1) <= _CLOSE
+            longest = k if np.any(there) else longest
+            x, alive = x[~there], alive[~there]
+            ended = self._ended(x, k)
+            failing += [Run(self._exact(start[alive[i]]), *end) for i, end in ended.items()]
+            going = ~np.isin(np.arange(len(x)), list(ended))
+            x, alive = x[going], alive[going]
+            if not len(x) or k == most or effort.over:
+                break
+            effort.charge(self._each * self.flow.operations(len(x)))
+            x = self._later(x)
+        if not effort.over:
+            failing += [Run(self._exact(start[i]), "late", most) for i in alive]
+        worst = ("violates", "late", "left")
+        longest = None if effort.over else longest
+        return Runs(len(start), longest, min(failing, key=lambda run: worst.index(run.end), default=None))
+
+    def _ended(self, x: Array, k: int) -> dict[int, tuple[End, int, str]]:
+        """The runs that end at states x (N, n) after k steps, by their numbers, and how."""
+        turning = np.isin(np.arange(x.shape[-1]), self.flow.angles)
+        inside = np.all(((x > self.flow.lo) & (x < self.flow.hi)) | turning, axis=-1)
+        found: dict[int, tuple[End, int, str]] = {int(i): ("left", k, "") for i in np.flatnonzero(~inside)}
+        if self.kept is not None and len(x):
+            g = self.kept(x, self.flow.policy(x), self.nominal)
+            for i in np.flatnonzero((g > 0).any(-1)):
+                found[int(i)] = ("violates", k, self.names[int(g[i].argmax())])
+        return found
+
+    @property
+    def _each(self) -> int:
+        """Steps of the integration in a step of the loop."""
+        return 1 if self.flow.discrete else self.flow.steps_between(self.step)
+
+    def _later(self, x: Array) -> Array:
+        """The states after a step of the loop."""
+        held = None if self.flow.discrete else self.flow.policy(x)
+        for _ in range(self._each):
+            x = self.flow.advance(x, held, self.step)
+        return x
+
+    def _exact(self, x: Array) -> tuple[Fraction, ...]:
+        """A state in the box, which a float may lie beside."""
+        each = zip(x.tolist(), self.begin, strict=True)
+        return tuple(min(max(Fraction(v), lo), hi) for v, (lo, hi) in each)
+
+
+def begins(box: Box) -> Array:
+    """States of a box: its corners, its middle, and some between, (N, n)."""
+    lo, hi = (np.array([float(pair[k]) for pair in box]) for k in (0, 1))
+    wide = np.flatnonzero(hi > lo)
+    found = [0.5 * (lo + hi)]
+    if 0 < len(wide) <= _CORNERS:
+        found += [np.where(np.isin(np.arange(len(lo)), wide[list(map(bool, each))]), hi, lo)
+                  for each in product((0, 1), repeat=len(wide))]  # fmt: skip
+    if len(wide):
+        shares = np.random.default_rng(0).uniform(size=(_RANDOM, len(lo)))
+        found += list(lo + shares * (hi - lo))
+        line = np.linspace(0, 1, _GRID)[:, None] if len(wide) == 1 else np.zeros((0, 1))
+        found += list(lo + line * (hi - lo))
+    inside = np.clip(np.array(found), lo, hi)
+    return np.unique(inside, axis=0)
+
+
+def is_refuted(loop: ClosedLoop, target: Sequence[Expression], run: Run, within: int | None) -> bool:
+    """True if Arb shows that the run breaks the claim: in none of `within` steps is it in the target, or in none until
+    it violates the constraint."""
+    system = loop.system
+    nominal = {s: system.parameters.get(s.name, Fraction(0)) for s, _ in system.uncertain}
+    if not all(lo <= nominal[s] <= hi for s, (lo, hi) in system.uncertain):
+        return False
+    if run.end == "left" or (run.end == "late" and run.steps != within):
+        return False
+    with precision(_BITS):
+        values: dict[Symbol, flint.arb] = {}
+        for x, u in islice(states_after(loop, run.x), run.steps + 1):
+            values = dict(zip((*system.states, *system.inputs), (*x, *u), strict=True))
+            if not any(bool(evaluate_arb(t, values) > 0) for t in target):
+                return False
+        if run.end == "late":
+            return True
+        violated = kept_constraints(system)[run.constraint]
+        return bool(evaluate_arb(violated, {**values, **{s: ball(q) for s, q in nominal.items()}}) > 0)

@@ -1,0 +1,156 @@
+"""The proof of ranks: a search is run until nothing is left to gain, or its effort is over."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from certify.certificates import RankTree
+from certify.certificates.claims import Ranks
+from certify.effort import Effort
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Expression
+from certify.provers.bounds.arrays import Array
+from certify.provers.execution import Runner
+from certify.provers.ranks.images import Course
+from certify.provers.ranks.search import COUNTS, NONE, Search
+from certify.provers.ranks.targets import TURN, Target
+from certify.provers.ranks.wanted import COUNTS_FROM, SearchFrom, Wanted
+
+_HALF_TURN = 3.1416  # and a little more
+_SLIVER, _SAMPLES = 1e-6, 64
+_ORDERS = (2, 3, 4, 5, 6, 7, 8)
+_LITTLE, _GAIN = 1e-5, 0.5  # share of the root box that an error may be; a gain that is worth an order
+_MOST_LEAVES = 400_000
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """From which leaves of a box do trajectories reach a target?
+
+    Parameters
+    ----------
+    loop, target : the loop, and the set that is to be reached.
+    keep : expressions that stay negative on the way.
+    root : corners lo and hi (n,) of the box, in deviations; of an angle more than a turn apart.
+    order : of the series in time, where inputs are held.
+    """
+
+    loop: ClosedLoop
+    target: Target
+    keep: tuple[Expression, ...]
+    root: tuple[Array, Array]
+    order: int = 2
+
+    def course(self, counts: Sequence[int]) -> Course:
+        """The course of boxes through the loop, with images after so many steps."""
+        lo, hi = self.root
+        return Course(self.loop, self.target, turning(self.loop), self.keep, hi - lo, counts, self.order)
+
+
+def with_order(question: Question, x: Array) -> Question:
+    """The question with the lowest order of the series in time that leaves little error at states x (n, N), or with the
+    last one that still gained something; as it is where no input is held."""
+    if question.loop.system.sample is None:
+        return replace(question, order=1)
+    if question.loop.system.calls:
+        return replace(question, order=1)
+    best, least = question, math.inf
+    for order in _ORDERS:
+        asked = replace(question, order=order)
+        found = asked.course((1,))(x, x, 0.0, 0.0)
+        widths = ((found.hi - found.lo)[0] / (question.root[1] - question.root[0])[:, None]).max(0)
+        width = float(np.nanmedian(widths)) if np.any(np.isfinite(widths)) else math.inf
+        if width < _GAIN * least or least == math.inf:
+            best, least = asked, width
+        if least < _LITTLE:
+            break
+    return best
+
+
+@dataclass(frozen=True, slots=True)
+class RankProof:
+    """Leaves from which the target is reached, with their evidence.
+
+    Parameters
+    ----------
+    ranks, evidence : as the claim and the certificate have them.
+    share : of the root box's volume.
+    leaves : of finite rank; `boxes` were looked at, in `rounds` rounds.
+    done : no leaf is left whose halves could gain anything, or the box that was wanted is proved.
+    """
+
+    ranks: Ranks
+    evidence: RankTree
+    share: float
+    leaves: int
+    boxes: int
+    rounds: int
+    done: bool
+
+
+def turning(loop: ClosedLoop) -> list[int]:
+    """The plant's angles, by their numbers, if the policy is the same after a turn of each of them at samples; else
+    none: a policy that reads an angle itself counts turns."""
+    system = loop.system
+    angles = [i for i, s in enumerate(system.states) if s.name in system.angles]
+    x = np.random.default_rng(0).uniform(-1, 1, (_SAMPLES, system.n))
+    u = loop.policy(x)
+    moved = (loop.policy(x + TURN * np.eye(system.n)[i]) for i in angles)
+    return angles if all(np.allclose(u, v, rtol=1e-9, atol=1e-9) for v in moved) else []
+
+
+def root_box(loop: ClosedLoop) -> tuple[Array, Array]:
+    """The box of places of a plant, corners (n,): a turn of each angle around 0, of other states the domain but for a
+    sliver along its ends."""
+    system, turns = loop.system, turning(loop)
+    ends = np.array([[float(end) for end in pair] for pair in system.domain])
+    inwards = _SLIVER * np.abs(ends).max(1)
+    lo, hi = ends[:, 0] + inwards, ends[:, 1] - inwards
+    angles = np.isin(np.arange(system.n), turns)
+    return np.where(angles, -_HALF_TURN, lo), np.where(angles, _HALF_TURN, hi)
+
+
+def prove_ranks(
+    question: Question,
+    effort: Effort,
+    runner: Runner,
+    report: Callable[[float, int, int], None] | None = None,
+    wanted: Wanted | None = None,
+) -> RankProof | None:
+    """Prove from which leaves of a box trajectories reach a target.
+
+    Parameters
+    ----------
+    report : called after every round with the share that is proved, the boxes looked at, and the leaves that wait.
+    wanted : a box on which alone it depends; the search ends once it is proved.
+
+    Returns
+    -------
+    RankProof | None : None if no leaf beyond the target has a rank.
+    """
+    course = question.course(COUNTS if wanted is None else COUNTS_FROM)
+    search = Search(course, *question.root) if wanted is None else SearchFrom(course, *question.root, wanted)
+    new, rounds, done = search.begin(), 0, False
+    with runner.start(course) as bound:
+        while True:
+            effort.charge(len(new) * course.operations)
+            search.take(new, bound(search.cover.low[:, new], search.cover.high[:, new], 0.0, 0.0))
+            near, rounds = search.spread(), rounds + 1
+            if report is not None:
+                report(search.share, search.boxes, len(search.unknown))
+            done = search.is_done(near)
+            if done or effort.over or len(search.cover.leaves) > _MOST_LEAVES:
+                break
+            new = search.further(near)
+    search.tighten()
+    tree, most = search.evidence()
+    leaves = int(np.sum(tree.ranks < NONE))
+    if not np.any(tree.steps):
+        return None
+    system = question.loop.system
+    ranks = Ranks(tuple(system.states[i].name for i in turning(question.loop)), most)
+    return RankProof(ranks, tree, search.share, leaves, search.boxes, rounds, done)

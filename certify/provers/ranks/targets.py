@@ -1,0 +1,98 @@
+"""Targets of ranks: the sets that trajectories are to reach, as the search sees them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from certify.loop.expressions import Expression, Symbol, evaluate
+from certify.lyapunov.function import Quadratic
+from certify.provers.bounds import Models, Taylor, upper_bound
+from certify.provers.bounds.arrays import Array, Mask
+from certify.provers.bounds.taylor import EPS, TINY
+
+TURN = 2 * np.pi
+_ENDS = 1e-9  # relative distance kept from a target's boundary, beyond all that two programs' rounding may differ by
+
+
+class Target(Protocol):
+    """A set of states."""
+
+    def holds(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
+        """True (B,) where states `x[:, 0] + x[:, 1:] d` within e, (n, n + 1, B) and (n, B), certainly lie in the set;
+        `angles` are numbers of states of which 2 pi more is the same place."""
+
+    def misses(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
+        """True (B,) where none of these states lies in the set."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sublevel:
+    """The set {V <= level}, as places."""
+
+    V: Quadratic
+    level: float
+
+    def holds(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
+        """True where V is at most the level."""
+        there: Mask = upper_bound(self._beyond(x, e, angles))[0] < -_ENDS * self.level
+        return there
+
+    def misses(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
+        """True where V is above the level."""
+        away: Mask = upper_bound(self._beyond(x, e, angles).scaled(-1.0))[0] < 0
+        return away
+
+    def _beyond(self, x: Array, e: Array, angles: Sequence[int]) -> Taylor:
+        """V - level of the places that are nearest to 0."""
+        turned = x.copy()
+        for i in angles:
+            turned[i, 0] -= TURN * np.rint(x[i, 0] / TURN)
+        error = 8 * EPS * (np.abs(x).sum(1) + TURN) + TINY
+        states = _models(turned, e, error)
+        rows = Models(states[0]).combined(self.V.P, states)
+        V = states[0] * rows[0]
+        for state, row in zip(states[1:], rows[1:], strict=True):
+            V = V + state * row
+        return V.shifted(-self.level)
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """The set where each of these `expressions` in `states` is at most 0."""
+
+    expressions: tuple[Expression, ...]
+    states: tuple[Symbol, ...]
+
+    def holds(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
+        """True where all are; with angles they are periodic."""
+        there = np.ones(e.shape[1], dtype=bool)
+        for v in self._values(x, e):
+            there &= upper_bound(v)[0] < -_ENDS * (np.abs(v.c) + v.radius())
+        return there
+
+    def misses(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
+        """True where one is positive."""
+        away = np.zeros(e.shape[1], dtype=bool)
+        for v in self._values(x, e):
+            away |= upper_bound(v.scaled(-1.0))[0] < 0
+        return away
+
+    def _values(self, x: Array, e: Array) -> list[Taylor]:
+        """The expressions; none of no states."""
+        if not e.shape[1]:
+            return []
+        models = _models(x, e, 8 * EPS * np.abs(x).sum(1) + TINY)
+        values, known = dict(zip(self.states, models, strict=True)), dict[Expression, Taylor]()
+        return [evaluate(expression, values, Models(models[0]), known) for expression in self.expressions]
+
+
+def _models(x: Array, e: Array, error: Array) -> list[Taylor]:
+    """The states as models in the coordinates of the box and their errors."""
+    n = len(e)
+    g = np.concatenate([x[:, 1:], np.eye(n)[:, :, None] * e], 1)
+    zeros = np.zeros((2 * n, 2 * n, x.shape[2]))
+    return [Taylor(x[i, 0], g[i], zeros, error[i]) for i in range(n)]

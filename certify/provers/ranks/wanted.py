@@ -1,0 +1,138 @@
+"""The search for the ranks of one box: only leaves are looked at that trajectories from it may meet.
+
+A leaf is *needed* if it meets the box, or the image of a needed leaf: of all its images the one that counts is the
+farthest that is not wider than the leaf itself, or else the one that has grown least. Needed leaves without a rank are
+halved; all others wait.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from certify.provers.bounds.arrays import Array, Index, Mask
+from certify.provers.ranks.images import Course, Images
+from certify.provers.ranks.search import NONE, Search
+
+COUNTS_FROM = (*range(1, 13), 14, 16, 20, 24)
+MOST_STEPS = COUNTS_FROM[-1]
+_GROWTH = 1.5  # of an image, relative to its leaf, that counts as none
+_COARSE = 0.26  # share of the root box that first leaves are narrower than
+_SHARE = 0.5  # of the leaves that may be halved, the largest ones
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """A box lo <= x <= hi (n,) of places, each of whose leaves is to have a rank of `most` at most; `direct` says how
+    many boxes are looked at before leaves that do not meet it are, as where few steps suffice."""
+
+    lo: Array
+    hi: Array
+    most: int = NONE - 1
+    direct: int = 0
+
+
+class SearchFrom(Search):
+    """Ranks of the leaves that matter for a box."""
+
+    def __init__(self, course: Course, lo: Array, hi: Array, wanted: Wanted) -> None:
+        super().__init__(course, lo, hi)
+        self.wanted, self.seen = wanted, np.zeros(1, dtype=bool)
+
+    def begin(self) -> Index:
+        """The leaves of a coarse tree that meet the box."""
+        self._refine(_COARSE)
+        return self._met(self.wanted.lo[:, None], self.wanted.hi[:, None])
+
+    def _refine(self, share: float) -> None:
+        """Halve leaves that meet the box until none is wider than a share of the root."""
+        while True:
+            nodes = self._met(self.wanted.lo[:, None], self.wanted.hi[:, None])
+            widths = self._widths(nodes)
+            wide = widths.max(0) > share
+            if not np.any(wide):
+                return
+            self.halve(nodes[wide], widths[:, wide].argmax(0))
+
+    def halve(self, nodes: Index, axes: Index) -> Index:
+        """Halve leaves; their halves are not seen yet."""
+        halves = super().halve(nodes, axes)
+        self.seen = np.append(self.seen, np.zeros(len(halves), dtype=bool))
+        return halves
+
+    def take(self, nodes: Index, found: Images) -> None:
+        """Take in the images of leaves."""
+        super().take(nodes, found)
+        self.seen[nodes] = True
+
+    def is_done(self, near: Index) -> bool:
+        """True if the box is proved."""
+        inside, _, met = self.cover.met_by(self.wanted.lo[:, None], self.wanted.hi[:, None])
+        return bool(inside[0] and np.all(self.rank[met] <= self.wanted.most)) or not inside[0]
+
+    def further(self, near: Index) -> Index:
+        """The needed leaves that have not been seen; if all have, halves of those without a rank."""
+        own = self._met(self.wanted.lo[:, None], self.wanted.hi[:, None])
+        open_ = own[self.rank[own] == NONE]
+        if self.boxes < self.wanted.direct and len(open_):
+            halves = self.halve(open_, self.steep[:, open_].argmax(0))
+            return halves[np.isin(halves, self._met(self.wanted.lo[:, None], self.wanted.hi[:, None]))]
+        needed = self._needed()
+        new = needed[~self.seen[needed]]
+        if len(new):
+            return new
+        waiting = needed[self.rank[needed] == NONE]
+        if not len(waiting):  # the box has ranks that are too high
+            needed = self._met(self.wanted.lo[:, None], self.wanted.hi[:, None])
+            waiting = needed[self.rank[needed] > self.wanted.most]
+            self.rank[waiting], self.steps[waiting] = NONE, 0
+        stuck = waiting[~np.isfinite(self.lo[:, 0, waiting]).any(0)]
+        chosen = np.union1d(stuck, np.intersect1d(waiting, near))
+        chosen = chosen if len(chosen) else waiting
+        volumes = self._widths(chosen).prod(0)
+        large = chosen[volumes >= np.quantile(volumes, 1 - _SHARE)]
+        halves = self.halve(large, self.steep[:, large].argmax(0))
+        needed = self._needed()
+        new = needed[~self.seen[needed]]
+        return new if len(new) else halves
+
+    def _needed(self) -> Index:
+        """All leaves that trajectories from the box may meet on the way, as far as images are known."""
+        known = np.zeros(self.cover.size, dtype=bool)
+        new = self._met(self.wanted.lo[:, None], self.wanted.hi[:, None])
+        while len(new):
+            known[new] = True
+            open_ = new[self.seen[new] & (self.rank[new] == NONE)]
+            k, at = self._course_of(open_)
+            leaves = self._met(self.lo[k, :, at].T, self.hi[k, :, at].T)
+            new = leaves[~known[leaves]]
+        found: Index = np.flatnonzero(known)
+        return found
+
+    def _course_of(self, nodes: Index) -> tuple[Index, Index]:
+        """For each leaf that has an image the number of the one that counts, and the leaf."""
+        if not len(nodes):
+            return nodes, nodes
+        own = self.cover.high[:, nodes] - self.cover.low[:, nodes]
+        with np.errstate(invalid="ignore"):
+            growth = ((self.hi[:, :, nodes] - self.lo[:, :, nodes]) / own).max(1)
+        there: Mask = self.there[:, nodes]
+        growth = np.where(np.isfinite(growth), growth, np.inf)
+        far = np.where(growth <= _GROWTH, np.arange(len(growth))[:, None], -1).max(0)
+        k = np.where(far >= 0, far, growth.argmin(0))
+        use = np.isfinite(growth.min(0)) & ~there.any(0)
+        return k[use], nodes[use]
+
+    def _met(self, lo: Array, hi: Array) -> Index:
+        """The leaves that boxes meet."""
+        _, _, leaves = self.cover.met_by(lo, hi)
+        found: Index = np.unique(leaves)
+        return found
+
+    def _widths(self, nodes: Index) -> Array:
+        """The widths of leaves as shares of the root's, (n, N)."""
+        widths: Array = (self.cover.high[:, nodes] - self.cover.low[:, nodes]) / (
+            self.cover.root[1] - self.cover.root[0]
+        )
+        return widths
