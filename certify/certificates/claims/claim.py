@@ -145,7 +145,7 @@ class Claim:
         return self.local
 
     def _beside(self) -> dict[str, Any]:
-        """What a claim may state beside its levels."""
+        """The parts that a claim may state beside its levels."""
         return {"rate": self.rate, "outer": self.outer, "ranks": self.ranks, "keep": self.keep}
 
     @property
