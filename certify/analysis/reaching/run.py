@@ -59,7 +59,8 @@ from certify.provers.ranks import (
 
 Array = NDArray[np.float64]
 _PROBES = 30  # states at which the order of the series in time is chosen
-_FOR_RUNS, _FOR_SEARCH = 0.2, 0.7  # shares of the effort, the rest being for the check
+_RUNS = 1e10  # operations for simulated runs, a few seconds, which no effort is charged with
+_FOR_SEARCH = 0.7  # share of the effort, the rest being for the check
 _DIRECT = 4000  # boxes that are looked at first where runs need few steps
 _MENDED = 20  # leaves that the checker may refuse
 
@@ -125,7 +126,7 @@ def certify_reach(
     effort = Effort(options.effort * WHOLE, None if limit is None else max(0.0, limit - load_seconds))
     with one_thread(), sole_writer(out), earlier_aside(out, tell or (lambda _: None)):
         result = ReachResult(Verdict.UNKNOWN, "", system, network, options)
-        result = _simulated(result, loop, target, effort, tools)
+        result = _simulated(result, loop, target, tools)
         if not result.reason:
             result = _proved(result, loop, target, effort, tools, out / "certificate.json", provenance or {})
     seconds = {"load": load_seconds, **tools.seconds, "total": load_seconds + time.perf_counter() - start}
@@ -148,15 +149,13 @@ def _require_inside(system: System, options: ReachOptions) -> None:
             )
 
 
-def _simulated(
-    result: ReachResult, loop: ClosedLoop, target: tuple[Expression, ...], effort: Effort, tools: _Tools
-) -> ReachResult:
+def _simulated(result: ReachResult, loop: ClosedLoop, target: tuple[Expression, ...], tools: _Tools) -> ReachResult:
     """The result with simulated runs from the box; final if one of them does not get there."""
     options = result.options
     if options.begin is None:
         return result
     with tools.timing("simulate"):
-        runs = Simulation(loop, target, options.begin).runs(options.within, effort.share(_FOR_RUNS))
+        runs = Simulation(loop, target, options.begin).runs(options.within, Effort(_RUNS))
     result = replace(result, runs=runs)
     if runs.failing is None:
         return result

@@ -30,6 +30,7 @@ End = Literal["late", "left", "violates"]
 LONG = 3000  # steps after which a run is given up
 _RANDOM, _GRID, _CORNERS = 100, 51, 8  # states of a box; a grid's points in one state; states that have all corners
 _CLOSE = 1e-9  # a target that is missed by less is not missed, in floats
+_FINER = 0.1  # of the step with which pictures are drawn
 _BITS = 400
 
 
@@ -64,7 +65,7 @@ class Simulation:
         self.beyond = function_of(system, tuple(target), (), "numpy")
         kept = tuple(kept_constraints(system).values())
         self.kept = function_of(system, kept, quantities, "numpy") if kept else None
-        self.step = self.flow.fitting(time_scales(self.flow)[0])
+        self.step = self.flow.fitting(_FINER * time_scales(self.flow)[0])
 
     @np.errstate(all="ignore")
     def runs(self, within: int | None, effort: Effort) -> Runs:

@@ -96,13 +96,17 @@ class Cover:
             low, high = np.hstack([low, more[0]]), np.hstack([high, more[1]])
         return owner, low, high
 
-    def preorder(self) -> tuple[bytes, Index]:
-        """The tree's bytes, and the leaves in their order there."""
+    def preorder(self, kept: Mask) -> tuple[bytes, Index]:
+        """The tree's bytes, and the leaves in their order there; a node below which no leaf is `kept`, (N,), is a leaf
+        itself."""
         tree, leaves, waiting = bytearray(), list[int](), [0]
-        axes, lefts, rights = self.axis.tolist(), self.left.tolist(), self.right.tolist()
+        axes, lefts, rights, some = self.axis.tolist(), self.left.tolist(), self.right.tolist(), kept.tolist()
+        for node in range(self.size - 1, -1, -1):  # halves have higher numbers
+            if axes[node] >= 0:
+                some[node] = some[lefts[node]] or some[rights[node]]
         while waiting:
             node = waiting.pop()
-            if axes[node] < 0:
+            if axes[node] < 0 or not some[node]:
                 tree.append(LEAF)
                 leaves.append(node)
                 continue

@@ -23,7 +23,7 @@ from certify.provers.ranks.wanted import COUNTS_FROM, SearchFrom, Wanted
 _HALF_TURN = 3.1416  # and a little more
 _SLIVER, _SAMPLES = 1e-6, 64
 _ORDERS = (2, 3, 4, 5, 6, 7, 8)
-_LITTLE, _GAIN = 1e-5, 0.5  # share of the root box that an error may be; a gain that is worth an order
+_LITTLE, _GAIN = 1e-7, 0.5  # share of the root box that an error may be; a gain that is worth an order
 _MOST_LEAVES = 400_000
 
 

@@ -144,8 +144,10 @@ class Search:
 
     def evidence(self) -> tuple[RankTree, int]:
         """The evidence, and the most steps."""
-        tree, leaves = self.cover.preorder()
-        rank, steps = self.rank[leaves], self.steps[leaves]
+        known = (self.cover.axis < 0) & (self.rank < NONE)
+        tree, leaves = self.cover.preorder(known)
+        rank = np.where(known[leaves], self.rank[leaves], NONE)
+        steps = np.where(known[leaves], self.steps[leaves], 0)
         lo, hi = (end[:, 0].copy() for end in self.cover.root)
         most = int(rank[rank < NONE].max(initial=1))
         return RankTree(lo, hi, tree, rank.astype(np.uint16), steps.astype(np.uint8)), max(1, most)

@@ -18,8 +18,8 @@ from certify.provers.ranks.search import NONE, Search
 COUNTS_FROM = (*range(1, 13), 14, 16, 20, 24)
 MOST_STEPS = COUNTS_FROM[-1]
 _GROWTH = 1.5  # of an image, relative to its leaf, that counts as none
-_COARSE = 0.26  # share of the root box that first leaves are narrower than
-_SHARE = 0.5  # of the leaves that may be halved, the largest ones
+_NARROW = 1e-11  # share of the root box below which leaves are not halved
+_SHARE = 0.7  # of the leaves that may be halved, the largest ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,19 +41,9 @@ class SearchFrom(Search):
         self.wanted, self.seen = wanted, np.zeros(1, dtype=bool)
 
     def begin(self) -> Index:
-        """The leaves of a coarse tree that meet the box."""
-        self._refine(_COARSE)
-        return self._met(self.wanted.lo[:, None], self.wanted.hi[:, None])
-
-    def _refine(self, share: float) -> None:
-        """Halve leaves that meet the box until none is wider than a share of the root."""
-        while True:
-            nodes = self._met(self.wanted.lo[:, None], self.wanted.hi[:, None])
-            widths = self._widths(nodes)
-            wide = widths.max(0) > share
-            if not np.any(wide):
-                return
-            self.halve(nodes[wide], widths[:, wide].argmax(0))
+        """The leaves of a first tree, all of one size, that meet the box."""
+        super().begin()
+        return self._own
 
     def halve(self, nodes: Index, axes: Index) -> Index:
         """Halve leaves; their halves are not seen yet."""
@@ -67,40 +57,52 @@ class SearchFrom(Search):
         self.seen[nodes] = True
 
     def is_done(self, near: Index) -> bool:
-        """True if the box is proved."""
+        """True if the box is proved, or cannot be: it leaves the root, or leaves of it cannot be halved any more."""
         inside, _, met = self.cover.met_by(self.wanted.lo[:, None], self.wanted.hi[:, None])
-        return bool(inside[0] and np.all(self.rank[met] <= self.wanted.most)) or not inside[0]
+        narrow = met[self._widths(met).max(0) < _NARROW]
+        proved = np.all(self.rank[met] <= self.wanted.most)
+        return bool(proved or not inside[0] or np.any(self.rank[narrow] > self.wanted.most))
 
     def further(self, near: Index) -> Index:
         """The needed leaves that have not been seen; if all have, halves of those without a rank."""
-        own = self._met(self.wanted.lo[:, None], self.wanted.hi[:, None])
+        own = self._own
         open_ = own[self.rank[own] == NONE]
         if self.boxes < self.wanted.direct and len(open_):
-            halves = self.halve(open_, self.steep[:, open_].argmax(0))
-            return halves[np.isin(halves, self._met(self.wanted.lo[:, None], self.wanted.hi[:, None]))]
+            self.halve(open_, self.steep[:, open_].argmax(0))
+            return self._unseen(self._own)
+        new = self._unseen(self._needed())
+        while not len(new):
+            self._halve_some(near)
+            new = self._unseen(self._needed())
+        return new
+
+    def _halve_some(self, near: Index) -> None:
+        """Halve needed leaves without a rank: those whose images meet one with a rank, or that have none."""
         needed = self._needed()
-        new = needed[~self.seen[needed]]
-        if len(new):
-            return new
         waiting = needed[self.rank[needed] == NONE]
         if not len(waiting):  # the box has ranks that are too high
-            needed = self._met(self.wanted.lo[:, None], self.wanted.hi[:, None])
-            waiting = needed[self.rank[needed] > self.wanted.most]
+            waiting = self._own[self.rank[self._own] > self.wanted.most]
             self.rank[waiting], self.steps[waiting] = NONE, 0
         stuck = waiting[~np.isfinite(self.lo[:, 0, waiting]).any(0)]
         chosen = np.union1d(stuck, np.intersect1d(waiting, near))
         chosen = chosen if len(chosen) else waiting
         volumes = self._widths(chosen).prod(0)
         large = chosen[volumes >= np.quantile(volumes, 1 - _SHARE)]
-        halves = self.halve(large, self.steep[:, large].argmax(0))
-        needed = self._needed()
-        new = needed[~self.seen[needed]]
-        return new if len(new) else halves
+        self.halve(large, self.steep[:, large].argmax(0))
+
+    @property
+    def _own(self) -> Index:
+        """The leaves that meet the box."""
+        return self._met(self.wanted.lo[:, None], self.wanted.hi[:, None])
+
+    def _unseen(self, nodes: Index) -> Index:
+        found: Index = nodes[~self.seen[nodes]]
+        return found
 
     def _needed(self) -> Index:
         """All leaves that trajectories from the box may meet on the way, as far as images are known."""
         known = np.zeros(self.cover.size, dtype=bool)
-        new = self._met(self.wanted.lo[:, None], self.wanted.hi[:, None])
+        new = self._own
         while len(new):
             known[new] = True
             open_ = new[self.seen[new] & (self.rank[new] == NONE)]
