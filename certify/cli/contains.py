@@ -33,7 +33,9 @@ def contains(
     as_json: Json = False,
 ) -> None:
     """Check a certificate and decide exactly whether a state, or every state of a box, lies in the proved set."""
+    from certify.certificates.claims import Reaches
     from certify.certificates.membership import proved_set
+    from certify.certificates.ranked import steps_from
 
     proved = proved_set(certificate, patient)
     box = region(" ".join(states), proved.system, "STATES", deviations)
@@ -46,7 +48,12 @@ def contains(
         "operating_point": {name: str(q) for name, q in proved.system.operating_point().items()},
         **stated(found, box, proved.system),
     }
-    say(json.dumps(data) if as_json else text(found, box, proved.system))
+    said = text(found, box, proved.system)
+    if proved.claim == Reaches.kind and proved.ranked is not None:
+        steps = steps_from(proved.ranked, box)
+        data["steps"] = steps
+        said += "" if steps is None else f"; the region is reached after {steps:,} steps or periods at the latest"
+    say(json.dumps(data) if as_json else said)
     raise typer.Exit(found.answer.exit_status)
 
 

@@ -73,7 +73,7 @@ def asked(system: System, out: Path, *target: str, begin: Box | None = None, wit
 def accepted_by_both(result: ReachResult) -> ReachCertificate:
     assert result.certificate is not None and result.raw is not None
     for program in ("checker", "reference"):
-        assert run_checker(result.certificate, program=program)["result"] == "ACCEPTED"  # type: ignore[arg-type]
+        assert run_checker(result.certificate, program=program)["result"] == "ACCEPTED"
     found = parse_any(result.raw, "certificate")
     assert isinstance(found, ReachCertificate) and found.to_json().encode() == result.raw
     return found

@@ -126,7 +126,11 @@ def reach_maps(certificate: ReachCertificate, accepted: bool, box: tuple[Array, 
         else ", all other states in the middle of the box that was asked about",
     )
     pairs = list(combinations(range(system.n), 2))[:MOST] if system.n > 1 else [(0, 0)]
-    more = " Magenta: that box. Thin lines: simulated runs from it, until they are there." if box is not None else ""
+    more = (
+        " Magenta: the box that was asked about. Thin lines: simulated runs from it, until they are there; between two "
+        "boxes, several steps apart, they may pass states without a rank."
+    )
+    more = more if box is not None else ""
     return [_picture(ground, pair, more) for pair in pairs]
 
 

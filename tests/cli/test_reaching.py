@@ -1,0 +1,111 @@
+"""`certify reach --target`: what it prints, exit statuses, files, and what cannot be asked."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from certify.cli.main import _run
+from certify.loop.policies import Policy, PolicyNetwork, save_policy
+
+PLANT = """
+name = "cart"
+time = "discrete"
+states = ["p", "v"]
+inputs = ["F"]
+[parameters]
+h = 0.1
+[dynamics]
+p = "p + h*v"
+v = "v + h*F"
+[x_eq]
+p = "1"
+v = "0"
+[u_eq]
+F = 0
+[domain]
+p = [-1, 4]
+v = [-3, 3]
+[input_bounds]
+F = [-20, 20]
+"""
+
+
+@pytest.fixture
+def asked(tmp_path: Path) -> list[str]:
+    """A cart in steps that a gain brakes at p = 1, asked to come near from the right."""
+    network = PolicyNetwork.of_layers(
+        (np.array([[-2.0, -3.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none"
+    )
+    save_policy(tmp_path / "cart.pt", Policy(network, "cart", {}))
+    (tmp_path / "cart.toml").write_text(PLANT)
+    return [
+        "reach", "--policy", str(tmp_path / "cart.pt"), "--system", str(tmp_path / "cart.toml"), "--quiet",
+        "--target", "p <= 1.5", "--from", "p=2.5..3,v=0", "--out", str(tmp_path / "out"),
+    ]  # fmt: skip
+
+
+def said(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> tuple[int, dict[str, Any]]:
+    capsys.readouterr()
+    status = _run([*arguments, "--json"], True)
+    return status, json.loads(capsys.readouterr().out)
+
+
+def test_a_box_that_gets_there(asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, data = said(capsys, asked)
+    assert status == 0 and (data["verdict"], data["checked"], data["reference"]) == ("PROVED", "ACCEPTED", "ACCEPTED")
+    assert data["from"] == {"p": ["5/2", "3"], "v": ["0", "0"]} and data["claim"] == {"kind": "reaches"}
+    assert data["simulated"]["longest"] <= data["steps"] <= data["ranks"]["steps"]
+    assert {"verdict", "reason", "ranks", "seconds", "certificate", "checked"} <= data.keys()
+    file = data["certificate"]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "PROVED · ACCEPTED" in page and "p = 2.5..3" in page and f"<b>{data['steps']} steps</b>" in page
+    assert _run(["check", file], False) == 0 and _run(["check", file, "--reference"], False) == 0
+    assert _run(["contains", file, "p=2.5..3", "v=0"], False) == 0
+    assert f"reached after {data['steps']} steps" in capsys.readouterr().out
+    assert _run(["contains", file, "p=3.9", "v=2.9"], False) == 1
+    assert _run(["report", file, "--out", str(tmp_path / "again.html")], False) == 0
+    assert "PROVED · ACCEPTED" in (tmp_path / "again.html").read_text()
+    assert _run(["plot", file, "--out", str(tmp_path / "set.svg")], False) == 2  # there is no V
+
+
+def test_what_is_not_so(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    status, data = said(capsys, [*asked, "--within", "3"])
+    assert status == 1 and data["verdict"] == "REFUTED" and data["simulated"]["witness"]["end"] == "late"
+    status, data = said(capsys, [*asked, "--keep", "fast: v >= -0.5"])
+    assert status == 1 and data["simulated"]["witness"]["constraint"] == "fast" and data["certificate"] is None
+    status, data = said(capsys, [*asked, "--keep", "v >= -2"])
+    assert status == 0 and data["constraints"]
+    status, data = said(capsys, [*asked, "--target", "v >= 0.1"])
+    assert status == 3 and data["verdict"] == "UNKNOWN" and "in a simulation" in data["reason"]
+
+
+def test_text_for_people(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert _run(asked, False) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert text.startswith("PROVED cart: from all of p = 2.5..3, v = 0, p <= 1.5 after")
+    assert "checked ACCEPTED, and by the reference" in text
+
+
+@pytest.mark.parametrize(
+    ("more", "why"),
+    [
+        (["--target", "p < 1"], "--target takes a comparison by <= or >="),
+        (["--box", "p=1"], "--box is about a tube"),
+        (["--within", "0"], "--within must be 1 to"),
+        (["--sample-time", "0.1"], "discrete"),
+    ],
+)
+def test_what_cannot_be_asked(asked: list[str], more: list[str], why: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert _run([*asked, *more], False) == 2
+    assert why in capsys.readouterr().err
+
+
+def test_a_target_or_a_state_is_needed(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    k = asked.index("--target")
+    assert _run(asked[:k], False) == 2
+    assert "--target or --from must be given" in capsys.readouterr().err
