@@ -199,6 +199,8 @@ def _require_about(answer: Mapping[str, Any], data: bytes, certificate: Certific
 
 def _what_is_lower(first: Certificate, certificate: Certificate) -> str:
     said = []
+    if first.claim.ranks is not None and certificate.claim.ranks is None:
+        said.append("the boxes with ranks are left out")
     if first.claim.outer is not None and certificate.claim.outer is None:
         said.append("the set beyond the ellipsoid is left out")
     if first.claim.one_equilibrium and not certificate.claim.one_equilibrium:
@@ -311,7 +313,15 @@ def _local_only(refused: _Refused) -> Certificate | None:
     return refused.with_claim(claim.local_only(claim.local / (2 if claim.inner == claim.roa else 1)))
 
 
+def _without_ranks(refused: _Refused) -> Certificate | None:
+    """The claim without boxes with ranks, if it is refused under their rules, as where the loop has no such angles."""
+    if refused.rule not in ("angles", "ranks"):
+        return None
+    return refused.with_claim(refused.claim.without_ranks(), ranks=None)
+
+
 _CONCESSIONS = (
+    _without_ranks,
     _without_outer,
     _with_higher_floor,
     _without_tube,

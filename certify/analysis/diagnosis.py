@@ -45,6 +45,7 @@ _BENT = 1.0  # bends of the hidden units, as a share of the linear part, that ar
 _TELLING = 1000  # boxes: a limit below it is what ended the search, and says nothing of the policy
 _SAME, _BELOW = 1e-6, 0.99  # relative: rates that are as good as equal; a rate that is safely below another
 _FEW = 3  # states, for which a function beyond the ellipsoid is suggested
+_ALL = 0.995  # share of the box that has ranks: more effort gains little
 _ENDED = (Stop.EFFORT, Stop.BOXES, Stop.LOCAL)
 
 
@@ -112,10 +113,10 @@ def _binding(result: RoaResult) -> tuple[str, str, str | None, str | None, Array
         where = f"the {side} side of the domain in {symbol(name)}, {quantity(end + at, unit)}"
         where += f" ({quantity(abs(end), unit)} from the operating point)" if at else ""
         return where, "domain", name, side, point
-    if witness is not None and result.stop in (Stop.WITNESS, Stop.INPUTS):
+    if witness is not None and result.stop in (Stop.WITNESS, Stop.INPUTS, Stop.KEEP):
         each = zip(system.states, witness.x.tolist(), system.exact_x_eq(), strict=True)
         where = _named(system, {s.name: v + float(at) for s, v, at in each})
-        if witness.kind == "vdot" and witness.values:
+        if witness.kind != "input" and witness.values:
             where += f" with {_named(system, {name: float(q) for name, q in witness.values.items()})}"
         if witness.kind == "input":
             found = _input_out_of_bounds(result, witness.x)
@@ -123,6 +124,9 @@ def _binding(result: RoaResult) -> tuple[str, str, str | None, str | None, Array
                 name, side, value = found
                 bound = quantity(value, system.units.get(name, ""))
                 return f"{symbol(name)} leaves its {side} bound, {bound}, at {where}", "input", name, side, witness.x
+        if witness.kind == "keep":
+            edge = f"{witness.constraint}: {result.constraints.get(witness.constraint, '')}".removesuffix(" < 0")
+            return f"{edge} = 0 near {where}, V = {number(witness.level, 6)}", "keep", None, None, witness.x
         what = (
             "Vdot = 0"
             if result.timing.is_plain and not result.timing.rate
@@ -169,6 +173,8 @@ def _next(
 ) -> Step:
     if (correction := _correction(result, options, asked[0])) is not None:
         return correction
+    if (boxes := _boxes(result, options)) is not None:
+        return boxes
     if result.claim in ("practical", "nearby") and (centre := _centring(*asked)) is not None:
         return Step(
             (("--centre", centre),),
@@ -196,13 +202,17 @@ def _next(
         return step if result.search is None else replace(step, options=(*step.options, ("--resume", "")))
     if options.claim == "asymptotic" and options.only is not None and options.P is None and options.level is None:
         return Step((("--candidate", "auto"),), f"only the candidate {options.only} was tried")
-    knows = not (result.system.ranges or result.system.in_steps)  # a tube says nothing of such things
+    knows = not (
+        result.system.ranges or result.system.in_steps or result.constraints
+    )  # a tube says nothing of such things
     if result.stop is Stop.STALLED and knows and not options.enlarges and _has_tube(result, effort):
         return Step((("--enlarge", ""),), f"a tube leads into this set from one {_LONGER:g} times as long, at least")
     if result.stop is Stop.STALLED:
         worst = ", ".join(symbol(one) for one, _ in _hurting(result, proof)[:3])
         why = f"the bounds are too wide beyond the local set, most of all along {worst}; "
         return Step((), why + "a policy that bends less there helps", flattens=_can_be_flattened(result))
+    if result.stop is Stop.KEEP:
+        return _around_a_constraint(result, options)
     if result.stop in (Stop.WITNESS, Stop.INPUTS):
         return _another_candidate(result, options)
     if result.stop is Stop.REQUESTED and result.levels.roa is not None:
@@ -222,9 +232,39 @@ def _another_candidate(result: RoaResult, options: RoaOptions) -> Step:
     return Step((), "what this V can show is proved; a larger set needs another policy or another kind of V")
 
 
+def _boxes(result: RoaResult, options: RoaOptions) -> Step | None:
+    """The step where boxes of the domain may be proved to lead into the set; None where they may not, or are."""
+    free = options.level is None and options.P is None and not options.resume and options.engine == "bounds"
+    if result.verdict is not Verdict.PROVED or not result.system.in_steps or result.system.n > _FEW or not free:
+        return None
+    if options.ranks:
+        found = result.ranks
+        if found is None or found.covered > _ALL:
+            return None
+        why = f"{number(100 * (1 - found.covered), 2)} % of the box has no rank yet, and its boxes get smaller"
+        return Step((("--effort", _round(4 * options.effort)),), why)
+    return Step((("--ranks", ""),), "boxes of the domain may be proved to lead into this set")
+
+
+def _around_a_constraint(result: RoaResult, options: RoaOptions) -> Step:
+    """The step where a constraint ends the set: a V that is shaped around it, if that was not tried."""
+    shaped = any(one.candidate.startswith("optimised") for one in result.tried)
+    if options.level is not None:
+        return Step((), "leave --level out for the largest level that can be proved")
+    if not shaped and options.P is None:
+        why = "other candidates are shaped around the constraints, this one is not"
+        return Step((("--candidate", "auto" if options.claim == "asymptotic" else "optimised"),), why)
+    tried = max((t.volume for t in result.tried), default=0.0)
+    if tried > _WORTH * (result.volume or 0.0) > 0:
+        return Step((("--effort", _round(4 * options.effort)),), "another candidate reaches further")
+    why = "a larger set needs a looser constraint, or a policy that turns away from it in time"
+    return Step((), f"V is shaped around the constraints already; {why}" if shaped else why)
+
+
 def _may_go_beyond(result: RoaResult, options: RoaOptions) -> bool:
     """True if a function beyond the ellipsoid can be learned, and pays: of few states, in continuous time."""
     plain = result.timing.is_plain and not options.rate and not options.enlarges and options.engine == "bounds"
+    plain = plain and not result.constraints
     free = options.level is None and options.only is None and options.P is None and not options.resume
     return plain and free and not options.goes_beyond and result.system.n <= _FEW and not result.system.ranges
 

@@ -53,7 +53,7 @@ class RoaResult:
     `notice` says what is not as it was asked for. `reach_from` is the state that was asked about, by the states'
     values; if the verdict on it is UNKNOWN by `Stop.PATH`, `certificate` and `levels` are of a proved set without it.
     If the verdict is UNKNOWN by `Stop.BEYOND` they, and `outer`, are of a smaller set than was asked for. `constraints`
-    are those that are proved, in words by their names.
+    are those that trajectories are to keep, in words by their names; with a certificate they are proved.
     `checker` is the checker's answer, None if it was not reached, about `raw`, the certificate's bytes; `solver` has
     dReal's version and every query with its answer, None if it was not asked. `notices` are facts about plant and
     policy known before the run, such as a domain that was cut; `folder` keeps a temporary folder of the certificate

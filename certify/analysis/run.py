@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Report", "RoaOptions", "RoaResult", "certify_roa"]
 # Shares of the effort for candidates and ring, where more is to come:
-_BEFORE_TUBE, _BEFORE_OUTER, _BEFORE_RANKS = 0.5, 0.25, 0.5
+_BEFORE_TUBE, _BEFORE_OUTER = 0.5, 0.25
 
 
 def certify_roa(
@@ -151,7 +151,6 @@ def _through(state: State, tools: Tools) -> State:
     state = Setting(tools).extend(state, tools.effort)
     options = state.options
     share = _BEFORE_TUBE if options.enlarges else _BEFORE_OUTER if options.goes_beyond else 1.0
-    share = _BEFORE_RANKS if options.ranks else share
     search = tools.effort.share(share)
     state = _extended(state, [Candidate(tools), Ring(tools)], search)
     return _extended(state, _stages_after(state, tools), tools.effort)

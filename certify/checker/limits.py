@@ -117,13 +117,13 @@ class Sizes:
         return found + self.of_following()
 
     def on_leaves(self, order: int, symbols: int) -> int:
-        """On as many leaves as are examined at once."""
+        """Numbers on as many leaves as are examined at once."""
         values = (4 * order if self.c.sample else 1) * self.a + 2 * self.n + 8
         held = self.net.held_on_leaves(symbols + self.m + self.z)
         return values * (symbols + 1) ** 2 + 2**14 * (self.n + self.m + self.z) + held
 
     def of_following(self) -> int:
-        """Where leaves are followed by steps."""
+        """Numbers for leaves that are followed by steps."""
         if self.c.ranks is None or isinstance(self.evidence, Trusted):
             return 0
         return 2**4 * len(self.c.ranks.tree) + self.on_leaves(self.evidence.order, self.s + self.n)

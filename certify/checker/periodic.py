@@ -16,9 +16,11 @@ from .case import Case, Failures
 from .expression import Call, Tape, evaluate
 from .networks import Affine, Algebra, Clip, Concat, Map, Observe, Product, Sum
 
+MOST_TURNS = 2**32  # so that no product of many integers takes hours
+
 
 class Winds(Exception):
-    """A number that winds where none may."""
+    """A number that winds where none may, or too often."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,10 @@ class Winding:
 
     turns: tuple[int, ...]
     value: Fraction | None = None
+
+    def __post_init__(self) -> None:
+        if any(abs(k) > MOST_TURNS for k in self.turns):
+            raise Winds
 
     def __add__(self, other: Winding) -> Winding:
         return Winding(tuple(a + b for a, b in zip(self.turns, other.turns, strict=True)))

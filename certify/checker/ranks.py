@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property, reduce
-from itertools import product as every
 from operator import add
 
 import numpy as np
@@ -78,23 +77,30 @@ class Cover:
 
     def meets_low(self, lo: Array, hi: Array, bound: Array) -> Array:
         """True on boxes (n, B), as places, that lie in the root box and meet no leaf of a rank above a bound (B,)."""
-        good = np.ones(len(bound), dtype=bool)
-        for low, high in self.places(lo, hi):
-            good &= self._descend(low, high, bound)
+        good, seen = np.ones(len(bound), dtype=bool), np.zeros(len(bound), dtype=np.int64)
+        for low, high, some in self.places(lo, hi):
+            left = some[good[some]]
+            if not len(left):  # as of all that follow
+                break
+            good[left], seen[left] = self._descend(low[:, left], high[:, left], bound[left], seen[left])
         return good
 
-    def places(self, lo: Array, hi: Array) -> Iterator[tuple[Array, Array]]:
-        """Boxes in the root box whose union has all places of these; where there is nothing to move, the boxes."""
-        pieces = [self._turned(i, lo[i], hi[i]) for i in self.angles]
-        for chosen in every(*pieces):
+    def places(self, lo: Array, hi: Array) -> Iterator[tuple[Array, Array, Array]]:
+        """Boxes in the root box whose union has all places of these, where there is nothing to move the boxes; and the
+        indices of those that are not done yet: where k angles are cut in two there are 2^k, one after the other."""
+        turned = list(self.angles)
+        first, second, cut = self._turned(lo[turned], hi[turned])
+        digit, count = np.cumsum(cut, axis=0) - cut, np.sum(cut, axis=0)
+        for number in range(2 ** int(np.max(count, initial=0))):
+            other = cut & ((number >> digit) & 1 == 1)  # a digit of the box's number says what it has of an angle
             low, high = lo.copy(), hi.copy()
-            for i, (a, b) in zip(self.angles, chosen, strict=True):
-                low[i], high[i] = a, b
-            yield low, high
+            low[turned], high[turned] = (np.where(other, b, a) for a, b in zip(first, second, strict=True))
+            yield low, high, np.flatnonzero(number < 2.0**count)
 
-    def _turned(self, i: int, lo: Array, hi: Array) -> list[tuple[Array, Array]]:
-        """Two intervals in the root's that have all places of one in an angle; they may be the same, or all of it."""
-        least, most = self.lo[i], self.hi[i]
+    def _turned(self, lo: Array, hi: Array) -> tuple[tuple[Array, Array], tuple[Array, Array], Array]:
+        """Two intervals in the root's that have all places of one in an angle, where it is cut in two; elsewhere the
+        first has them, and may be all of the root's."""
+        least, most = (end[list(self.angles)][:, None] for end in (self.lo, self.hi))
         turns = np.rint((0.5 * lo + 0.5 * hi - (0.5 * least + 0.5 * most)) / TURN.value)
         a, b = moved(lo, -turns)[0], moved(hi, -turns)[1]
         one = np.ones_like(a)
@@ -106,23 +112,22 @@ class Cover:
         whole = np.isfinite(a) & np.isfinite(b) & ~known
         first = np.where(whole, least, np.maximum(a, least)), np.where(whole, most, np.minimum(b, most))
         second = np.where(low, after, least), np.where(low, most, before)
-        split = known & (low | high)
-        return [first, (np.where(split, second[0], first[0]), np.where(split, second[1], first[1]))]
+        return first, second, known & (low | high)
 
-    def _descend(self, lo: Array, hi: Array, bound: Array) -> Array:
-        """Descend with all boxes at once; a box that has met too many nodes fails."""
+    def _descend(self, lo: Array, hi: Array, bound: Array, seen: Array) -> tuple[Array, Array]:
+        """Descend with all boxes at once, which have met so many nodes; one that has met too many fails."""
         inside = np.all((lo >= self.lo[:, None]) & (hi <= self.hi[:, None]), axis=0)
-        good, seen = inside.copy(), np.zeros(len(bound), dtype=np.int64)
+        good = inside.copy()
         box, node = np.flatnonzero(inside), np.zeros(int(np.sum(inside)), dtype=np.int64)
         while len(box):
-            seen += np.bincount(box, minlength=len(bound))
+            seen = seen + np.bincount(box, minlength=len(bound))
             good[box[(self.least[node] > bound[box]) | (seen[box] > _MOST_NODES)]] = False
             further = (self.most[node] > bound[box]) & good[box]
             box, node = box[further], node[further]
             axis, split = self.axis[node], self.split[node]
             below, above = lo[axis, box] <= split, hi[axis, box] >= split
             box, node = np.append(box[below], box[above]), np.append(node[below] + 1, self.right[node[above]])
-        return good
+        return good, seen
 
 
 class Steps(Moving):
@@ -222,7 +227,7 @@ class Steps(Moving):
         return hold
 
     def beyond(self, states: list[Taylor]) -> list[Taylor]:
-        """What is at most 0 in the target: V - c2, or expressions."""
+        """V - c2, or the expressions, which are at most 0 in the target."""
         number = constants(states[0])
         if self.c.target is not None:
             return evaluate(self.c.target, number, states)

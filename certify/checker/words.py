@@ -6,7 +6,7 @@ import math
 from fractions import Fraction
 from typing import Any
 
-from .document import Array, Certificate, Partition, Policy
+from .document import MAX_RANK, Array, Certificate, Partition, Policy, Ranks
 from .expression import Tape
 from .networks import Map, Network, Observe, Product, Step, Sum, hashed
 
@@ -61,30 +61,35 @@ def claim(c: Certificate) -> list[str]:
             "one of those above; u stays in its bounds; states outside the domain are not meant, whatever N is there"
         )
     if c.ranks is not None and c.claim != "reaches":
-        lines.append(f"  and every trajectory that {_by_ranks(c)}, and from then on is one of those above")
+        same = ", up to these multiples," if c.ranks.angles else ""
+        rest = f", and from then on is{same} one of those above"
+        lines.append(f"  and every trajectory that {_by_ranks(c, c.ranks, when['start'], rest)}")
     if c.keep is not None:
         until = ", until it is in the target" if c.claim == "reaches" else ""
         kept = ", ".join(f"{expression(tree)} < 0" for tree in c.keep.trees)
         lines.append(
             f"  and along every trajectory of these, {'at every step' if c.discrete else 'at all times'}{until}: {kept}"
         )
-    if c.claim == "reaches":
-        return [f"claim: every trajectory of the closed loop that {_by_ranks(c)}; nothing is claimed of later", *lines]
+    if c.ranks is not None and c.claim == "reaches":
+        said = _by_ranks(c, c.ranks, when["start"], "")
+        return [f"claim: every trajectory of the closed loop that {said}; nothing is claimed of later", *lines]
     said = CLAIMS[c.claim].format(c=c, time=duration(c), when=when)
     return [f"claim: {said}; u stays in its bounds", *lines]
 
 
-def _by_ranks(c: Certificate) -> str:
-    """The statement of chapter ranks."""
-    if c.ranks is None:
-        return ""
+def _by_ranks(c: Certificate, ranks: Ranks, start: str, rest: str) -> str:
+    """The statement of chapter ranks, with what comes after the target."""
     target = f"V <= {c.c2!r}" if c.target is None else "the target"
-    angles = ", ".join(c.states[i] for i in c.ranks.angles)
+    angles = ", ".join(c.states[i] for i in ranks.angles)
     places = f" up to multiples of 2 pi in {angles}" if angles else ""
     others = f"each state but {angles}" if angles else "the state"
+    inside = f"{others} is in the interior of the domain and " if len(ranks.angles) < len(c.states) else ""
+    each = memoryview(ranks.ranks).cast("H")  # of two bytes, whose order does not matter to what is asked
+    count = sum(rank != MAX_RANK for rank in each)
     return (
-        f"starts in a leaf of finite rank is in {target}{places} after as many steps as the rank is, at the latest, "
-        f"{c.ranks.most} at most; until then {others} is in the interior of the domain and u stays in its bounds"
+        f"starts in a leaf of finite rank ({count} of {len(each)} leaves){start} is in {target}{places} after as many "
+        f"{'steps' if c.discrete else 'periods'} as the rank is, at the latest, {ranks.most} at most{rest}; until then "
+        f"{inside}u stays in its bounds"
     )
 
 

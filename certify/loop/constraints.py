@@ -27,6 +27,7 @@ _STEPS, _FULL, _DAMPED = (
     10,
     0.5,
 )  # linearisations, the first of which are followed all the way, others by this share
+_EACH, _OF_G = 3e5, 0.1  # operations of a step, however few points; of all g at one, relative to the loop's
 _APART = 1e-6  # of a difference quotient, as a share of the distance from the origin
 _PUSHES = (1e-9, 1e-6, 1e-3)  # shares of that distance, by which a point is moved into the violation
 _FAR = 4.0  # shares of the largest distance, beyond which a point has gone astray
@@ -43,8 +44,14 @@ class Constraints:
         found = kept_constraints(system)
         self.names = tuple(found)
         self.g = function_of(system, tuple(found.values()), [s for s, _ in system.uncertain], "numpy")
-        self.planes = [plane for plane in (_plane(system, g) for g in found.values()) if plane is not None]
+        planes = [_plane(system, g) for g in found.values()]
+        self.planes, self.is_plane = [p for p in planes if p is not None], [p is not None for p in planes]
         self.values = [[float(q) for q in corner.values()] for corner in corners(system)]
+
+    def operations(self, n: int, start: int, steps: int = _STEPS) -> float:
+        """Operations of `touching` from so many points of n states, about, as an `Effort` counts them."""
+        looks = sum(1 if flat else steps * start for flat in self.is_plane) * (n + 1)
+        return _EACH * steps * len(self.names) + looks * self.loop.operations * (1 + len(self.values) * _OF_G)
 
     @np.errstate(all="ignore")
     def at(self, x: Array, u: Array) -> Array:
@@ -53,13 +60,13 @@ class Constraints:
         return np.asarray(np.where(np.isnan(found), np.inf, found))
 
     @np.errstate(all="ignore")
-    def touching(self, T: Array, limit: float, start: Array) -> Array:
+    def touching(self, T: Array, limit: float, start: Array, steps: int = _STEPS) -> Array:
         """Points z (N, n) of {z'z <= limit} about where each g vanishes nearest to the origin, looked for from several
         points (M, n), x = T z; and points beside them, at which it is violated."""
         found = list[Array]()
         for k in range(len(self.names)):
-            z, most = start, _FAR * limit**0.5
-            for step in range(_STEPS):
+            z, most = start[:1] if self.is_plane[k] else start, _FAR * limit**0.5
+            for step in range(1 if self.is_plane[k] else steps):
                 value, slope = self._linearised(T, z, k)
                 square = (slope * slope).sum(-1, keepdims=True)
                 nearest = slope * ((slope * z).sum(-1, keepdims=True) - value[:, None]) / square

@@ -34,7 +34,7 @@ from certify.lyapunov.programs import Inequality, smallest_trace
 Array = NDArray[np.float64]
 _RADII = np.linspace(0.1, 1.1, 12)  # of the samples on a ray, where 1 is the edge of the present set
 _FRESH, _NEAR = 400, 300  # new rays of a search: in any direction, and near those that limit the set
-_TOUCHING = 32  # rays from which states are looked for that violate a constraint
+_TOUCHING, _LINEARISED = 16, 12  # rays from which states are looked for that violate a constraint, in so many steps
 _KEEP = 200  # rays of a search that are remembered for their crossing, and for their worst state
 _ROWS = 500  # states that each margin hands to the solver
 _ROUNDS = 30
@@ -276,8 +276,9 @@ class _Samples:
             low, high = np.where(bad, low, middle), np.where(bad, middle, high)
         found = [x[worst, share[worst].argmax(axis=1)], high[:, None] * rays[crossed]]
         if self.constraints is not None:  # where they are first violated, which rays may miss
-            T = np.linalg.inv(L).T
-            found.append(self.constraints.touching(T, float(_RADII[-1]) ** 2, _unit(z[:_TOUCHING])) @ T.T)
+            T, most = np.linalg.inv(L).T, float(_RADII[-1]) ** 2
+            self.effort.charge(self.constraints.operations(n, _TOUCHING, _LINEARISED))
+            found.append(self.constraints.touching(T, most, _unit(z[:_TOUCHING]), _LINEARISED) @ T.T)
         self.remember(np.concatenate(found))
 
     def remember(self, x: Array) -> None:

@@ -93,6 +93,7 @@ def falsify(
     radius = np.where(np.arange(samples) % 2 == 0, 1.0, generator.random(samples))
     z = direction * (radius * np.sqrt(limit) * (1 - 1e-9))[:, None]
     if search.constraints is not None:
+        effort.charge(search.constraints.operations(n, _STARTS))
         z = np.concatenate([z, search.constraints.touching(T, limit, z[:_STARTS])])
     best = search.lowest(z)
     if best is None and not effort.over:  # climb D' on the boundary before giving up

@@ -92,16 +92,17 @@ def in_ranks(c: Certificate) -> str:
     """The statement about ranks beside that about V."""
     if c.ranks is None:
         return ""
-    return f"; and {from_leaves(c)} in V <= {c.outer!r}{on_the_way(c)}, and is one of these from then on"
+    place = ", as a place," if c.ranks.angles else ""
+    return f"; and {from_leaves(c)} in V <= {c.outer!r}{on_the_way(c)}, and is{place} one of these from then on"
 
 
 def from_leaves(c: Certificate) -> str:
     """The words for the starts and the time; a state follows where the trajectory is then."""
     most = 0 if c.ranks is None else c.ranks.steps
-    after = "steps" if c.plant.discrete else "periods"
+    after, when = ("steps", "") if c.plant.discrete else ("periods", " at a sampling instant")
     return (
-        f"every trajectory that starts in a box of the certificate's tree of ranks whose rank is r < 65535 is, after r "
-        f"{after} at the latest ({most} at most),"
+        f"every trajectory that starts{when} in a box of the certificate's tree of ranks whose rank is r < 65535 is, "
+        f"after r {after} at the latest ({most} at most),"
     )
 
 

@@ -19,6 +19,7 @@ from .networks import Affine, Clip, Concat, Map, Observe, Product, Sum, paired
 from .refusal import Refused, require
 
 RULE, PERIODIC = "angles", ("sin", "cos")
+MAX_TURNS = 2**32  # integers of many digits would take hours
 
 
 def angles(c: Certificate) -> None:
@@ -65,6 +66,10 @@ class Winding:
 
     turns: tuple[int, ...]
     factor: int | None = None
+
+    def __post_init__(self) -> None:
+        few = all(-MAX_TURNS <= v <= MAX_TURNS for v in self.turns)
+        require(few, RULE, "loop", f"a number winds more than {MAX_TURNS} times")
 
     @property
     def winds(self) -> bool:

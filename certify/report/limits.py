@@ -51,7 +51,18 @@ def limited_by(result: Mapping[str, Any]) -> str:
             if precision is None:
                 return f"a margin that the engine keeps: {apart}"
             return f"the precision of {solver['solver']} (delta {number(precision)}), which stops {apart}"
-    return limit_in_words(reason, TimingInWords.of_result(result))
+    return _constraint(result) or limit_in_words(reason, TimingInWords.of_result(result))
+
+
+def _constraint(result: Mapping[str, Any]) -> str:
+    """The constraint that limits a level, in words; empty where none does."""
+    name = (result.get("witness") or {}).get("constraint")
+    if str(result["reason"]) != "constraint" or name is None:
+        return ""
+    said = (result.get("constraints") or {}).get(name)
+    held = "sample" in (result.get("claim") or {})
+    which = "from which a period may violate it" if held else "that violates it"
+    return f"the constraint {name}{f': {said}' if said else ''}; a larger set holds a state {which}"
 
 
 def hardest(weights: Mapping[str, float]) -> str:

@@ -79,7 +79,7 @@ NAMED = {
     "System": System,
 }
 """Types that the fields name for type checkers alone."""
-WIDER = {"reach_from", "lyapunov", "Q", "R", "hidden", "disturbances", "input_error", "sample_time"}
+WIDER = {"reach_from", "lyapunov", "Q", "R", "hidden", "disturbances", "input_error", "sample_time", "keep", "avoid"}
 """Options that Python takes in more forms than their fields hold."""
 APART = {"P", "ranges"}
 """Options whose forms no rule compares: all that numpy makes an array of; and ranges without the plant's values."""
@@ -138,11 +138,15 @@ TEXTS: dict[str, Any] = {
     "parameters": ["b=0.05..0.2"],
     "input_error": "u=1/1000",
     "sample_time": "0.001..0.002",
+    "keep": ["wall: theta <= 1; abs(u) <= 5"],
+    "avoid": ["theta**2 > 9"],
 }
 VALUES: dict[str, Any] = {
     "ranges": {"b": ("0.05", Fraction(1, 5))},
     "input_error": {"u": Fraction(1, 1000)},
     "sample_time": ("0.001", "0.002"),
+    "keep": ["wall: theta <= 1", "abs(u) <= 5"],
+    "avoid": "theta**2 > 9",
 }
 
 
@@ -162,13 +166,15 @@ def test_a_changed_plant_is_the_same_whichever_way_it_comes(
     for module in ("run", "api"):
         monkeypatch.setattr(f"certify.analysis.{module}.{'run' if module == 'api' else 'certify_roa'}", reached)
     typed = ["--param", "b=0.05..0.2", "--input-error", "u=1/1000", "--sample-time", "0.001..0.002", "--level", "0.1"]
+    typed += ["--keep", "wall: theta <= 1", "--keep", "abs(u) <= 5", "--avoid", "theta**2 > 9"]
     assert _run(["roa", str(SHIPPED), *typed, "--effort", "1/2", "--out", str(tmp_path)], False) == 2
     with pytest.raises(InputError, match="reached"):
         certify_roa(None, SHIPPED, tmp_path, level=0.1, effort=0.5, **VALUES)
     study = tmp_path / "s.toml"
     study.write_text(
         f'policies = "{SHIPPED}"\n[parameters]\nb = "0.05..0.2"\n[options]\ninput_error = "u=1/1000"\n'
-        'sample_time = "0.001..0.002"\nlevel = 0.1\neffort = "1/2"\n'
+        'sample_time = "0.001..0.002"\nlevel = 0.1\neffort = "1/2"\nkeep = "wall: theta <= 1; abs(u) <= 5"\n'
+        'avoid = "theta**2 > 9"\n'
     )
     (case,) = read_study(study).cases()
     _, plant, options = case.loop(tmp_path, lambda _: None)
@@ -178,6 +184,7 @@ def test_a_changed_plant_is_the_same_whichever_way_it_comes(
         "b": (Fraction(1, 20), Fraction(1, 5)),
         "error_u": (Fraction(-1, 1000), Fraction(1, 1000)),
     }
+    assert list(plant.constraints) == ["wall", "keep", "avoid"]
     assert plant.sample == (Fraction(1, 1000), Fraction(1, 500)) and (options.level, options.effort) == (0.1, 0.5)
 
 

@@ -248,7 +248,7 @@ def _corners(rule: Rule, models: Sequence[Models], J: Array, P: Array) -> list[C
 
 
 def _kept(rule: Rule, balls: Array) -> Array:
-    """How far each constraint moves on each ball, (N, K), infinite where one has no finite model."""
+    """The motion of each constraint on each ball, (N, K), infinite where one has no finite model."""
     found = rule.kept_on(balls) if rule.problem.keep else None
     return np.full((len(balls), len(rule.problem.keep)), math.inf) if found is None else found[1]
 

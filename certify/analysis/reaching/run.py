@@ -178,7 +178,7 @@ def _proved(
 ) -> ReachResult:
     """The result of the search, and of the check of what it finds."""
     options, system = result.options, loop.system
-    keep, root = tuple(kept_constraints(system).values()), root_box(system)
+    keep, root = tuple(kept_constraints(system).values()), root_box(loop)
     question = Question(loop, Region(target, system.states), keep, root)
     question = with_order(question, begins(options.begin or tuple(zip(*map(_exactly, root), strict=True)))[:_PROBES].T)
     clerk = _clerk(path, options, tools)
@@ -189,7 +189,7 @@ def _proved(
     evidence = None if found is None else _within(found.evidence, options.within)
     if found is None or evidence is None:
         return replace(result, reason="no box of the domain is proved to lead into the region")
-    claim = Reaches(target, Ranks(system.angles, _most(evidence)), keep)
+    claim = Reaches(target, Ranks(found.ranks.angles, _most(evidence)), keep)
     certificate = ReachCertificate(system, loop.network, claim, RanksAlone(evidence, question.order), provenance)
     certificate, raw, answer = _accepted(certificate, clerk)
     facts, kept = rank_facts(certificate, found.rounds), constraints_in_words(certificate)

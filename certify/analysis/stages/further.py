@@ -23,7 +23,7 @@ from certify.provers.base import Budget, Progress
 
 Array = NDArray[np.float64]
 _FOR_SEARCH = 0.5  # share of the effort that is left, the rest being for the check
-_FOR_RANKS = 0.7  # share of the effort that is left, the rest being for the check
+_FOR_RANKS = 0.35  # share of the whole effort, even if the search has left less
 _FOR_LEARNING = 0.4  # share of the effort that is left, the rest being for the proof and its check
 
 
@@ -176,20 +176,21 @@ class ByRanks:
         from certify.provers.ranks import Question, Sublevel, prove_ranks, root_box
 
         tools, (claim, evidence), trial = self.tools, state.proved, state.contest.best.trial
-        system, problem = state.loop.system, trial.task.problem
+        problem = trial.task.problem
 
         def report(share: float, boxes: int, waiting: int) -> None:
             tools.report(Progress(claim.roa, claim.roa, boxes, waiting, share, None), "ranks")
 
         with tools.timing("ranks"):
             tools.tell("ranks")
-            share = effort.share(_FOR_RANKS)
+            least = _FOR_RANKS * tools.whole
+            share = effort.part(max(least, effort.left - least), even_if_over=True)
             told = None if tools.progress is None else report
             target = Sublevel(problem.V, claim.roa)
-            question = Question(problem.loop, target, claim.keep, root_box(system), evidence.order)
+            question = Question(problem.loop, target, claim.keep, root_box(problem.loop), evidence.order)
             found = prove_ranks(question, share, tools.runner, told)
         if found is None:
-            return state.noting("no box of the domain is proved to lead into the set")
+            return state.noting("no box of the domain beyond the set is proved to lead into it")
         return replace(
             state,
             rounds=found.rounds,

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from certify.analysis.asked import ellipsoid_in, require_kept_at_origin, require_one_that_knows, state_in, values_of
+from certify.analysis.asked import (
+    constraints_in_words,
+    ellipsoid_in,
+    require_kept_at_origin,
+    require_one_that_knows,
+    state_in,
+    values_of,
+)
 from certify.analysis.options import RoaOptions
 from certify.analysis.outcome import by_spectrum, not_stable
 from certify.analysis.results import RoaResult
@@ -51,6 +58,7 @@ class Setting:
                 system=loop.system,
                 network=loop.network,
                 claim=state.kind,
+                constraints=constraints_in_words(loop.system),
                 reach_from=None if centre is None else values_of(loop.system, centre),
             )
             return _by_spectrum(state, rest)

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 
 from certify.errors import InputError, OptionError
-from certify.loop.expressions import Expression, Operation, Symbol, constant_of, symbols_of, total
+from certify.loop.expressions import Expression, Number, Operation, Symbol, constant_of, symbols_of, total
 from certify.loop.plants.deviations import constraints_of_values, in_deviations
 from certify.loop.plants.equations import parse_comparison
 from certify.loop.plants.system import System
@@ -32,14 +32,22 @@ def with_constraints(system: System, keep: Iterable[str], avoid: Iterable[str]) 
     """
     found = dict(system.constraints)
     for option, texts in (("keep", keep), ("avoid", avoid)):
-        for count, text in enumerate(texts, 1):
+        for text in texts:
             name, smaller, larger = _read(system, option, text)
-            g = smaller - larger if option == "keep" else larger - smaller
-            name = name or (option if option not in found else f"{option}_{count}")
+            if option == "avoid":
+                smaller, larger = larger, smaller
+            g = smaller if larger is Number(0) else smaller - larger
+            name = name or _unused(option, found)
             if name in found:
                 raise OptionError(f"`{option}` {text!r}: {system.name} has a constraint {name} already; name another.")
             (found[name],) = in_deviations([g], system.states, system.x_eq)
     return replace(system, constraints=found)
+
+
+def _unused(name: str, found: Collection[str]) -> str:
+    """The name, or if there is one, the name with the first number, from 2 on, that is not there."""
+    others = (f"{name}{number}" for number in itertools.count(2))
+    return next(one for one in itertools.chain([name], others) if one not in found)
 
 
 def _read(system: System, option: str, text: str) -> tuple[str, Expression, Expression]:

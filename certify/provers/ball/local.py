@@ -264,10 +264,11 @@ class Rule:
         return self.steps.models_on(balls, self.cells, reach)
 
     def kept_on(self, balls: Array) -> tuple[Array, Array] | None:
-        """Of the constraints' g, for several balls, what `Steps.largest` says."""
-        return self.steps.largest(balls, self.problem.keep, self.cells)
+        """The constraints' g on several balls, as `Steps.largest` has them."""
+        with np.errstate(all="ignore"):
+            return self.steps.largest(balls, self.problem.keep, self.cells)
 
-    def _keeps(self, J: Array) -> bool:
+    def keeps(self, J: Array) -> bool:
         """True if every constraint holds on the ball."""
         if not self.problem.keep:
             return True
@@ -280,7 +281,7 @@ class Rule:
         if self.cuts is None:
             return None
         J, found = ball_around(self.problem, self.T, level), list[Corner]()
-        if not self._keeps(J):
+        if not self.keeps(J):
             return None
         for models in self.models(J, level):
             if not (models.finite and models.admitted):

@@ -35,7 +35,7 @@ class Images(NamedTuple):
     ----------
     lo, hi : (K, n, B); NaN where there is none that is of use.
     there : (K, B), the image lies in the target.
-    inside : (B,), the box itself does.
+    inside, meets : (B,), the box itself does; it may have states there.
     steep : (n, B), by how much each axis of the box widens its first image that reaches far, relative to the root.
     """
 
@@ -43,6 +43,7 @@ class Images(NamedTuple):
     hi: Array
     there: Mask
     inside: Mask
+    meets: Mask
     steep: Array
 
 
@@ -113,6 +114,7 @@ class Course:
             np.full((K, n, batch), np.nan),
             np.zeros((K, batch), dtype=bool),
             self.is_there(form),
+            ~self.target.misses(form.x, form.e, self.angles),
             np.abs(slopes).sum(0) / self.root[:, None],
         )
         left = np.flatnonzero(~found.inside)

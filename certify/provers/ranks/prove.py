@@ -13,16 +13,15 @@ from certify.certificates.claims import Ranks
 from certify.effort import Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression
-from certify.loop.plants import System
 from certify.provers.bounds.arrays import Array
 from certify.provers.execution import Runner
 from certify.provers.ranks.images import Course
 from certify.provers.ranks.search import COUNTS, NONE, Search
-from certify.provers.ranks.targets import Target
+from certify.provers.ranks.targets import TURN, Target
 from certify.provers.ranks.wanted import COUNTS_FROM, SearchFrom, Wanted
 
 _HALF_TURN = 3.1416  # and a little more
-_SLIVER = 1e-6
+_SLIVER, _SAMPLES = 1e-6, 64
 _ORDERS = (2, 3, 4, 5, 6, 7, 8)
 _LITTLE, _GAIN = 1e-7, 0.5  # share of the root box that an error may be; a gain that is worth an order
 _MOST_LEAVES = 400_000
@@ -48,9 +47,8 @@ class Question:
 
     def course(self, counts: Sequence[int]) -> Course:
         """The course of boxes through the loop, with images after so many steps."""
-        system, (lo, hi) = self.loop.system, self.root
-        named = [i for i, s in enumerate(system.states) if s.name in system.angles]
-        return Course(self.loop, self.target, named, self.keep, hi - lo, counts, self.order)
+        lo, hi = self.root
+        return Course(self.loop, self.target, turning(self.loop), self.keep, hi - lo, counts, self.order)
 
 
 def with_order(question: Question, x: Array) -> Question:
@@ -94,13 +92,25 @@ class RankProof:
     done: bool
 
 
-def root_box(system: System) -> tuple[Array, Array]:
+def turning(loop: ClosedLoop) -> list[int]:
+    """The plant's angles, by their numbers, if the policy is the same after a turn of each of them at samples; else
+    none: a policy that reads an angle itself counts turns."""
+    system = loop.system
+    angles = [i for i, s in enumerate(system.states) if s.name in system.angles]
+    x = np.random.default_rng(0).uniform(-1, 1, (_SAMPLES, system.n))
+    u = loop.policy(x)
+    moved = (loop.policy(x + TURN * np.eye(system.n)[i]) for i in angles)
+    return angles if all(np.allclose(u, v, rtol=1e-9, atol=1e-9) for v in moved) else []
+
+
+def root_box(loop: ClosedLoop) -> tuple[Array, Array]:
     """The box of places of a plant, corners (n,): a turn of each angle around 0, of other states the domain but for a
     sliver along its ends."""
+    system, turns = loop.system, turning(loop)
     ends = np.array([[float(end) for end in pair] for pair in system.domain])
     inwards = _SLIVER * np.abs(ends).max(1)
     lo, hi = ends[:, 0] + inwards, ends[:, 1] - inwards
-    angles = np.array([s.name in system.angles for s in system.states])
+    angles = np.isin(np.arange(system.n), turns)
     return np.where(angles, -_HALF_TURN, lo), np.where(angles, _HALF_TURN, hi)
 
 
@@ -120,7 +130,7 @@ def prove_ranks(
 
     Returns
     -------
-    RankProof | None : None if no leaf has a rank.
+    RankProof | None : None if no leaf beyond the target has a rank.
     """
     course = question.course(COUNTS if wanted is None else COUNTS_FROM)
     search = Search(course, *question.root) if wanted is None else SearchFrom(course, *question.root, wanted)
@@ -139,7 +149,8 @@ def prove_ranks(
     search.tighten()
     tree, most = search.evidence()
     leaves = int(np.sum(tree.ranks < NONE))
-    if not leaves:
+    if not np.any(tree.steps):
         return None
-    ranks = Ranks(question.loop.system.angles, most)
+    system = question.loop.system
+    ranks = Ranks(tuple(system.states[i].name for i in turning(question.loop)), most)
     return RankProof(ranks, tree, search.share, leaves, search.boxes, rounds, done)

@@ -20,6 +20,7 @@ from certify.provers.ranks.images import Course, Images
 NONE = 65_535
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 _FIRST = 2**12  # leaves of the first tree
+_ROUNDS, _GAIN = 6, 1e-4  # relative growth of what is proved, in so many rounds, below which the search ends
 _LARGEST = 0.7  # share of the leaves to be halved that are, the largest ones
 
 
@@ -31,8 +32,8 @@ class Search:
         K, n = len(course.counts), len(lo)
         self.rank, self.steps = np.full(1, NONE), np.zeros(1, dtype=np.int64)
         self.lo, self.hi = np.full((K, n, 1), np.nan), np.full((K, n, 1), np.nan)
-        self.there, self.steep = np.zeros((K, 1), dtype=bool), np.zeros((n, 1))
-        self.boxes = 0
+        self.there, self.steep, self.meets = np.zeros((K, 1), dtype=bool), np.zeros((n, 1)), np.zeros(1, dtype=bool)
+        self.boxes, self.shares = 0, list[float]()
 
     def begin(self) -> Index:
         """The leaves of a first tree, all of one size."""
@@ -44,8 +45,10 @@ class Search:
         return new
 
     def is_done(self, near: Index) -> bool:
-        """True if no leaf is left whose halves could gain anything."""
-        return not len(near)
+        """True if no leaf is left whose halves could gain anything, or the last rounds have gained next to nothing."""
+        self.shares.append(self.share)
+        stalled = len(self.shares) > _ROUNDS and 0 < self.shares[-1] <= (1 + _GAIN) * self.shares[-1 - _ROUNDS]
+        return not len(near) or stalled
 
     def further(self, near: Index) -> Index:
         """The leaves to look at next."""
@@ -75,18 +78,23 @@ class Search:
 
         self.rank, self.steps = longer(self.rank, NONE), longer(self.steps, 0)
         self.lo, self.hi = longer(self.lo, np.nan), longer(self.hi, np.nan)
-        self.there, self.steep = longer(self.there, False), longer(self.steep, 0.0)
+        self.there, self.steep, self.meets = (
+            longer(self.there, False),
+            longer(self.steep, 0.0),
+            longer(self.meets, False),
+        )
         return halves
 
     def take(self, nodes: Index, found: Images) -> None:
         """Take in the images of leaves."""
         self.lo[..., nodes], self.hi[..., nodes] = found.lo, found.hi
-        self.there[:, nodes], self.steep[:, nodes] = found.there, found.steep
+        self.there[:, nodes], self.steep[:, nodes], self.meets[nodes] = found.there, found.steep, found.meets
         self.rank[nodes[found.inside]] = 0
         self.boxes += len(nodes)
 
     def spread(self) -> Index:
-        """Give ranks to all leaves that have one by now; those without whose images meet some leaf with a rank."""
+        """Give ranks to all leaves that have one by now; those without that may meet the target, or whose images meet
+        some leaf with a rank."""
         unknown, counts = self.unknown, np.array(self.course.counts)
         k, at = np.nonzero(np.isfinite(self.lo[:, 0, unknown]))
         node, there = unknown[at], self.there[k, unknown[at]]
@@ -109,7 +117,7 @@ class Search:
                 break
             self.rank[new], self.steps[new] = best[new], by[new]
         some = np.logical_or.reduceat(self.rank[leaf] < NONE, starts) if len(starts) else np.zeros(0, dtype=bool)
-        near: Index = np.unique(owners[some])
+        near: Index = np.unique(np.append(owners[some], unknown[self.meets[unknown]]))
         waiting: Index = near[self.rank[near] == NONE]
         return waiting
 

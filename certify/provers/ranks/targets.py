@@ -25,6 +25,9 @@ class Target(Protocol):
         """True (B,) where states `x[:, 0] + x[:, 1:] d` within e, (n, n + 1, B) and (n, B), certainly lie in the set;
         `angles` are numbers of states of which 2 pi more is the same place."""
 
+    def misses(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
+        """True (B,) where none of these states lies in the set."""
+
 
 @dataclass(frozen=True, slots=True)
 class Sublevel:
@@ -35,6 +38,16 @@ class Sublevel:
 
     def holds(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
         """True where V is at most the level."""
+        there: Mask = upper_bound(self._beyond(x, e, angles))[0] < -_ENDS * self.level
+        return there
+
+    def misses(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
+        """True where V is above the level."""
+        away: Mask = upper_bound(self._beyond(x, e, angles).scaled(-1.0))[0] < 0
+        return away
+
+    def _beyond(self, x: Array, e: Array, angles: Sequence[int]) -> Taylor:
+        """V - level of the places that are nearest to 0."""
         turned = x.copy()
         for i in angles:
             turned[i, 0] -= TURN * np.rint(x[i, 0] / TURN)
@@ -44,8 +57,7 @@ class Sublevel:
         V = states[0] * rows[0]
         for state, row in zip(states[1:], rows[1:], strict=True):
             V = V + state * row
-        there: Mask = upper_bound(V.shifted(-self.level))[0] < -_ENDS * self.level
-        return there
+        return V.shifted(-self.level)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,14 +70,24 @@ class Region:
     def holds(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
         """True where all are; with angles they are periodic."""
         there = np.ones(e.shape[1], dtype=bool)
-        if not len(there):
-            return there
-        models = _models(x, e, 8 * EPS * np.abs(x).sum(1) + TINY)
-        values, known = dict(zip(self.states, models, strict=True)), dict[Expression, Taylor]()
-        for expression in self.expressions:
-            v = evaluate(expression, values, Models(models[0]), known)
+        for v in self._values(x, e):
             there &= upper_bound(v)[0] < -_ENDS * (np.abs(v.c) + v.radius())
         return there
+
+    def misses(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
+        """True where one is positive."""
+        away = np.zeros(e.shape[1], dtype=bool)
+        for v in self._values(x, e):
+            away |= upper_bound(v.scaled(-1.0))[0] < 0
+        return away
+
+    def _values(self, x: Array, e: Array) -> list[Taylor]:
+        """The expressions; none of no states."""
+        if not e.shape[1]:
+            return []
+        models = _models(x, e, 8 * EPS * np.abs(x).sum(1) + TINY)
+        values, known = dict(zip(self.states, models, strict=True)), dict[Expression, Taylor]()
+        return [evaluate(expression, values, Models(models[0]), known) for expression in self.expressions]
 
 
 def _models(x: Array, e: Array, error: Array) -> list[Taylor]:

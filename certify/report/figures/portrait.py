@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.report.figures.edges import draw_edges, keys_of_edges
 from certify.report.figures.geometry import ellipse, shadow, shadows, thin
 from certify.report.figures.pairs import Pair
 from certify.report.figures.scene import Scene
@@ -169,6 +170,7 @@ def keys(scene: Scene, runs: Runs, region: Region | None, growing: bool) -> tupl
         found.append(Key(inner + (": section" if scene.n > 2 else ""), INNER, 1.4, fill=INNER_FILL))
     if growing:
         found.append(Key(f"{scene.falling} ≥ 0 on a grid*", GROWTH, 1.0, fill=GROWTH_FILL))
+    found += keys_of_edges(scene)
     found += [Key(text, colour, 1.4, style) for _, colour, style, text in _kinds(scene, runs)]
     if region is not None:
         found.append(Key("boundary of the simulated region*", REGION, 1.4, "--"))
@@ -204,10 +206,8 @@ def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region |
     change = scene.growth(x)
     section = ellipse(scene.P, pair, scene.outer)
     axes.fill(*section, color=SET_FILL, lw=0, zorder=1)
-    outline = scene.outline(pair)
-    if outline is not None:
-        axes.contourf(*outline, levels=[-np.inf, 0], colors=[START_FILL], zorder=0.5)
-        axes.contour(*outline, levels=[0.0], colors=[START], linewidths=1.8 if scene.n == 2 else 1.5, zorder=4)
+    _draw_outline(axes, scene, pair)
+    draw_edges(axes, scene, pair)
     growing = (change >= 0) & np.any(x != 0, axis=-1) & _shows_sign(scene)
     if np.any(growing):
         axes.contourf(a, b, change, levels=[0, np.inf], colors=[GROWTH_FILL], zorder=0)
@@ -262,6 +262,14 @@ def _unbroken(path: Array, angles: Sequence[int]) -> list[Array]:
         return [path]
     turns = np.any(np.abs(np.diff(path[:, list(angles)], axis=0)) > np.pi, axis=1)
     return np.split(path, np.flatnonzero(turns) + 1)
+
+
+def _draw_outline(axes: Any, scene: Scene, pair: Pair) -> None:
+    """The outer set and its boundary, if there is one."""
+    outline = scene.outline(pair)
+    if outline is not None:
+        axes.contourf(*outline, levels=[-np.inf, 0], colors=[START_FILL], zorder=0.5)
+        axes.contour(*outline, levels=[0.0], colors=[START], linewidths=1.8 if scene.n == 2 else 1.5, zorder=4)
 
 
 def _moments(band: Band) -> Array:

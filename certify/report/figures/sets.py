@@ -83,7 +83,9 @@ def ranked_of(certificate: Certificate) -> Ranked | None:
 def system_of(certificate: Certificate) -> System:
     """The plant as pictures simulate it: with its angles only where the claim takes full turns for the same place."""
     system = certificate.system
-    return system if certificate.claim.ranks is not None else replace(system, angles=())
+    if certificate.claim.ranks is not None or not system.angles:
+        return system
+    return replace(system, angles=())
 
 
 @dataclass(frozen=True, slots=True)

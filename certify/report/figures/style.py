@@ -19,12 +19,13 @@ INNER, INNER_FILL = "#14795a", "#bfe5d6"
 START, START_FILL = "#a3297a", "#f4dfec"
 GROWTH, GROWTH_FILL = "#b03a48", "#f3d9db"
 SIMULATED, LEAVING, UNSETTLED, REGION = "#8a94a0", "#c9813a", "#8466ad", "#7a4c12"
+EDGE, EDGE_FILL = "#4d4d4d", "#dedede"
 PAPER, LEAF_EDGE = "#ffffff", "#8fb0d3"
 _DARK = {
     INK: "#e4e8ec", MUTED: "#a4adb8", SET: "#7db8f0", SET_FILL: "#1d3a57", INNER: "#5ccaa3", INNER_FILL: "#1c4d3f",
     START: "#ee8fc9", START_FILL: "#472a3e", GROWTH: "#f08c99", GROWTH_FILL: "#4b2830",
     SIMULATED: "#87919c", LEAVING: "#e3a35f", UNSETTLED: "#bda2e4", REGION: "#e8c48a", PAPER: "#161b20",
-    LEAF_EDGE: "#41668c",
+    LEAF_EDGE: "#41668c", EDGE: "#c4c4c4", EDGE_FILL: "#3b3f44",
 }  # fmt: skip
 RASTER_FROM = 3000  # leaves, from which on they are drawn as an image
 _FONTS = "system-ui, -apple-system, &quot;Segoe UI&quot;, Helvetica, Arial, &quot;DejaVu Sans&quot;, sans-serif"

@@ -1,0 +1,214 @@
+"""The search for ranks: images hold trajectories, only leaves that lead to the set get a rank, checkers accept it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from certify import certify_roa
+from certify.certificates import RankTree, run_checker
+from certify.certificates.verdict import Verdict
+from certify.effort import UNIT, Effort
+from certify.errors import OptionError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Number, symbols
+from certify.loop.plants import System
+from certify.loop.policies import PolicyNetwork
+from certify.lyapunov.function import Quadratic
+from certify.provers.execution import ThreadRunner
+from certify.provers.ranks import Question, RankProof, Sublevel, prove_ranks, root_box, without_leaf
+from certify.provers.ranks.cover import Cover
+from certify.provers.ranks.images import Form
+from certify.provers.ranks.search import COUNTS, NONE
+from tests.support.loops import box
+from tests.support.ranks import hanging
+
+PERIOD = Fraction(1, 10)
+
+
+def bistable(time: str = "discrete") -> tuple[System, PolicyNetwork]:
+    """Trajectories with |x| < 1 end at 0, others leave; a policy that gives nothing."""
+    x, u = symbols("x u")
+    pulled = x * x * x - x + u
+    discrete = time == "discrete"
+    system = System(
+        name="bistable",
+        states=(x,),
+        inputs=(u,),
+        parameters={},
+        dynamics=(x + pulled / 5,) if discrete else (pulled,),
+        u_eq=(Number(0),),
+        domain=box(2),
+        input_bounds=box(1),
+        time="discrete" if discrete else "continuous",
+        sample=None if discrete else (PERIOD / 2, PERIOD),
+    )
+    weights, zeros = (np.zeros((1, 1)),), (np.zeros(1),)
+    return system, PolicyNetwork.of_layers(weights, zeros, np.ones(1), np.zeros(1), "identity", "none")
+
+
+def swinging() -> tuple[System, PolicyNetwork]:
+    """The hanging pendulum under a small tanh network."""
+    system, _ = hanging()
+    generator = np.random.default_rng(5)
+    weights = (generator.normal(size=(8, 2)) / 2, generator.normal(size=(1, 8)) / 4)
+    biases = (generator.normal(size=8) / 2, np.zeros(1))
+    network = PolicyNetwork.of_layers(weights, biases, np.ones(1), np.zeros(1), "tanh", "output")
+    return replace(system, angles=()), network
+
+
+def question(loop: tuple[System, PolicyNetwork], level: float) -> Question:
+    closed = ClosedLoop(*loop)
+    target = Sublevel(Quadratic(np.eye(loop[0].n)), level)
+    return Question(closed, target, (), root_box(closed))
+
+
+def proved(loop: tuple[System, PolicyNetwork], level: float, effort: float = 0.2, **changes: Any) -> RankProof:
+    found = prove_ranks(question(loop, level), Effort(effort * UNIT), ThreadRunner(**changes))
+    assert found is not None
+    return found
+
+
+def leaves_of(tree: RankTree) -> list[tuple[list[float], list[float]]]:
+    """The corners of the leaves, in preorder."""
+    waiting, found = [(tree.lo.tolist(), tree.hi.tolist())], []
+    for axis in tree.tree:
+        lo, hi = waiting.pop()
+        if axis == 255:
+            found.append((lo, hi))
+            continue
+        left, right = list(hi), list(lo)
+        left[axis] = right[axis] = 0.5 * lo[axis] + 0.5 * hi[axis]
+        waiting += [(right, hi), (lo, left)]
+    return found
+
+
+@pytest.mark.parametrize("loop", [bistable(), bistable("held"), hanging(), swinging()])
+def test_images_hold_trajectories(loop: tuple[System, PolicyNetwork]) -> None:
+    system, _ = loop
+    generator, n = np.random.default_rng(3), system.n
+    course = replace(question(loop, 0.01), root=(np.full(n, -2.0), np.full(n, 2.0))).course(COUNTS)
+    centre = generator.uniform(-0.7, 0.7, (n, 200))
+    radius = generator.uniform(1e-4, 0.05, (n, 200))
+    form = Form(np.concatenate([centre[:, None], np.eye(n)[:, :, None] * radius], 1), np.zeros_like(centre))
+    d = np.sign(generator.normal(size=(n, 200))) * generator.random((n, 200)) ** 0.2
+    x, f = (centre + radius * d).T, system.function()
+    for _ in range(12):
+        form, kept = course.step(form)
+        if system.sample is None:
+            x = f(x, ClosedLoop(*loop).policy(x))
+        else:
+            h = float(PERIOD) * generator.uniform(0.5, 1.0, (200, 1))
+            x = held(f, x, ClosedLoop(*loop).policy(x), h)
+        lo, hi = form.box
+        assert np.all(kept)
+        assert np.all((lo <= x.T + 1e-12) & (hi + 1e-12 >= x.T))
+        away = np.abs(x.T - form.x[:, 0] - (form.x[:, 1:] * d).sum(1))
+        assert np.all(away <= form.e + 1e-12)
+
+
+def held(f: Any, x: np.ndarray, u: np.ndarray, h: np.ndarray, steps: int = 50) -> np.ndarray:
+    """The solution after the periods h, by the classical method of Runge and Kutta."""
+    h = h / steps
+    for _ in range(steps):
+        a = f(x, u)
+        b = f(x + h / 2 * a, u)
+        c = f(x + h / 2 * b, u)
+        x = x + h / 6 * (a + 2 * b + 2 * c + f(x + h * c, u))
+    return x
+
+
+@pytest.mark.parametrize("time", ["discrete", "held"])
+def test_nothing_beyond_the_basin_has_a_rank(time: str) -> None:
+    found = proved(bistable(time), 0.01)
+    ends = [
+        (lo[0], hi[0])
+        for (lo, hi), rank in zip(leaves_of(found.evidence), found.evidence.ranks, strict=True)
+        if rank < NONE
+    ]
+    assert max(max(abs(lo), abs(hi)) for lo, hi in ends) < 1
+    assert max(hi for _, hi in ends) > 0.99
+    assert min(lo for lo, _ in ends) < -0.99
+
+
+def test_a_target_that_nothing_reaches_gives_no_ranks() -> None:
+    x, u = symbols("x u")
+    system, network = bistable()
+    loop = replace(system, dynamics=(2 * x + u,)), network
+    assert prove_ranks(question(loop, 1e-9), Effort(UNIT / 10), ThreadRunner()) is None
+
+
+def test_ranks_fall_along_trajectories() -> None:
+    """Simulated from the corners and middles of leaves: in the target after as many steps as the rank is."""
+    loop = hanging()
+    found = proved(loop, 0.05)
+    tree, f = found.evidence, loop[0].function()
+    leaves = [leaf for leaf, rank in zip(leaves_of(tree), tree.ranks, strict=True) if 0 < rank < NONE]
+    ranks = np.array([rank for rank in tree.ranks if 0 < rank < NONE])
+    corners = np.array(leaves).transpose(1, 0, 2)
+    for share in (0.0, 0.5, 1.0):
+        x = corners[0] + share * (corners[1] - corners[0])
+        late = np.ones(len(x), dtype=bool)
+        for step in range(1, int(ranks.max()) + 1):
+            x = f(x, np.zeros((len(x), 1)))
+            place = np.column_stack([x[:, 0] - 2 * np.pi * np.rint(x[:, 0] / (2 * np.pi)), x[:, 1]])
+            late &= ~((place**2).sum(1) <= 0.05 * (1 + 1e-9))
+            assert not np.any(late & (ranks == step))
+    assert found.share > 0.9
+
+
+def test_any_number_of_threads_finds_the_same() -> None:
+    one, two = (proved(hanging(), 0.05, threads=threads) for threads in (1, 2))
+    assert (one.evidence.tree, one.share) == (two.evidence.tree, two.share)
+    assert np.array_equal(one.evidence.ranks, two.evidence.ranks)
+    assert np.array_equal(one.evidence.steps, two.evidence.steps)
+
+
+def test_more_effort_proves_more() -> None:
+    assert proved(hanging(), 0.05, 0.02).share < proved(hanging(), 0.05, 0.6).share
+
+
+def test_without_a_leaf_higher_ranks_go() -> None:
+    tree = RankTree(
+        np.zeros(1), np.ones(1), b"\x00\x00\xff\xff\xff", np.array([0, 3, 5], np.uint16), np.array([0, 3, 2], np.uint8)
+    )
+    left = without_leaf(tree, 2)
+    assert left is not None
+    assert left.ranks.tolist() == [0, 3, NONE]
+    assert left.steps.tolist() == [0, 3, 0]
+    assert without_leaf(tree, 1) is None
+
+
+def test_boxes_across_a_seam_meet_leaves_on_both_sides() -> None:
+    cover = Cover(np.array([-3.1416]), np.array([3.1416]), [0])
+    halves = cover.halve(np.array([0]), np.array([0]))
+    cover.halve(halves, np.array([0, 0]))
+    lo, hi = np.array([[3.0, 3.0 + 4 * np.pi, -0.1, 0.0]]), np.array([[3.3, 3.3 + 4 * np.pi, 7.0, 0.1]])
+    inside, box_of, leaf = cover.met_by(lo, hi)
+    met = [sorted(set(cover.low[0, leaf[box_of == k]].round(2))) for k in range(4)]
+    assert np.all(inside)
+    assert met == [[-3.14, 1.57], [-3.14, 1.57], [-3.14, -1.57, 0.0, 1.57], [-1.57, 0.0]]
+
+
+@pytest.mark.parametrize("loop", [bistable(), bistable("held"), hanging()])
+def test_a_run_with_ranks_is_accepted(loop: tuple[System, PolicyNetwork], tmp_path: Path) -> None:
+    result = certify_roa(*loop, out=tmp_path, ranks=True, effort=0.004, level=0.05)
+    assert result.verdict is Verdict.PROVED
+    assert result.ranks is not None
+    assert result.ranks.volume > result.volume
+    for program in ("checker", "reference")[: 2 if loop[0].n == 1 else 1]:
+        answer = run_checker(tmp_path / "certificate.json", program=program, patient=True)
+        assert answer["result"] == "ACCEPTED", answer
+
+
+def test_ranks_need_steps(tmp_path: Path) -> None:
+    system, network = bistable("held")
+    with pytest.raises(OptionError, match="time goes in steps"):
+        certify_roa(replace(system, sample=None), network, out=tmp_path, ranks=True)
+    with pytest.raises(OptionError, match="without a tube"):
+        certify_roa(system, network, out=tmp_path, ranks=True, enlarge=True)
