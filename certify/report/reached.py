@@ -55,8 +55,8 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
     within = "" if result["within"] is None else f" within {steps_of(result, result['within'])}"
     where = "any box" if box is None else f"all of {box}"
     if verdict == "REFUTED":
-        return f"{name}: not from {where} {target}{within}"
-    return f"{name}: from {where} {target}{within} is NOT proved"
+        return f"{name}: {target}{within}: not from {where}"
+    return f"{name}: {target}{within} is NOT proved from {where}"
 
 
 def _rows(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
