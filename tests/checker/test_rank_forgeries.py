@@ -15,9 +15,10 @@ from certify.checker.case import Case
 from certify.checker.ranks import Cover
 from certify.reference import rules as reference_rules
 from certify.reference.__main__ import in_words as said
+from tests.support import ranks as made
 from tests.support.marks import slow_after
 from tests.support.rank_forgeries import Draw, Forger, Forgery, by_checker, verdicts
-from tests.support.rank_truth import Truth
+from tests.support.rank_truth import Truth, numbers
 from tests.support.ranked import UNRANKED, Document, Loop, affine, around_level, dumped, mapped, two_bytes, uniform
 
 # ------------------------------------------------------------------------------------------------------------- angles
@@ -112,18 +113,18 @@ def refuses(forgery: Forgery) -> bool:
 
 @pytest.mark.parametrize("seed", slow_after(FAST, SEEDS))
 def test_random_loops_do_what_is_accepted_and_no_forgery_is(seed: int) -> None:
-    made = Draw(seed, (1, 1, 2)).ranked(depths=(5, 6, 6))
-    assert len(made.moving) > 5 and verdicts(made.document) == (None, None)
-    assert is_a_lie(made.document, 10) is None
-    refused = [refuses(forgery) for forgery in Forger(made, seed).all()]
+    drawn = Draw(seed, (1, 1, 2)).ranked(depths=(5, 6, 6))
+    assert len(drawn.moving) > 5 and verdicts(drawn.document) == (None, None)
+    assert is_a_lie(drawn.document, 10) is None
+    refused = [refuses(forgery) for forgery in Forger(drawn, seed).all()]
     assert sum(refused) > 25 and refused.count(False) < 30
 
 
 @pytest.mark.parametrize("seed", slow_after(5, range(200, 280)))
 def test_what_the_checker_accepts_without_any_margin_is_true(seed: int) -> None:
     """Its own images of leaves, to the last bit, give the ranks."""
-    made = Draw(seed).ranked(0.0)
-    assert by_checker(made.document) is None and is_a_lie(made.document, 6) is None
+    drawn = Draw(seed).ranked(0.0)
+    assert by_checker(drawn.document) is None and is_a_lie(drawn.document, 6) is None
 
 
 # ----------------------------------------------------------------------------------------------------------- by a hair
@@ -137,6 +138,20 @@ def test_an_image_that_leaves_the_root_box_or_meets_a_leaf_by_a_billionth(over: 
     met = loop.document([0.0], [4.0], bytes([0, 255, 0, 255, 255]), two_bytes([2, 1, UNRANKED]), b"\1\1\0")
     out = loop.document([1.0], [3.0], bytes([0, 255, 255]), two_bytes([2, 1]), b"\1\1")
     assert verdicts(met) == verdicts(out) == (rule, rule)
+
+
+@pytest.mark.parametrize("name", ["linear", "hanging"])
+def test_an_obstacle_that_an_ellipsoid_grazes(name: str) -> None:
+    """The largest a'x where V <= c2 is sqrt(c2 a'P^-1 a), to the last digit that floats have."""
+    data = json.loads(made.base(name).to_json())
+    states, level = data["plant"]["states"], float.fromhex(data["levels"]["roa"])
+    P = numbers(data["lyapunov"]["P"]).reshape(2, 2)
+    for a in ([1, 0], [0, -1], [1, 2], [-3, 1]):
+        largest = Fraction(float(np.sqrt(level * (a @ np.linalg.solve(P, a)))))
+        along = ["+", *(["*", str(k), state] for k, state in zip(a, states, strict=True))]
+        for more, rule in ((Fraction(-1, 10**6), "keep"), (largest / 100, None)):
+            keep = data["claim"] | {"keep": ["-1", ["-", along, str(largest + more)]]}
+            assert verdicts(data | {"claim": keep}) == (rule, rule)
 
 
 @pytest.mark.parametrize("sign", ["", "-"])
