@@ -50,6 +50,8 @@ def comparison(expression: Expression) -> Any:
             left, right = a, b
         case Operation(operator="-", operands=(a, b)):
             left, right = a, b
+        case Operation(operator="+", operands=(a, Number(value=q))):
+            left, right = a, Number(-q)
     each = f"{_row(multiplied_out(left), SUM)}<mo>&#x2264;</mo>{_row(multiplied_out(right), SUM)}"
     return Markup(f'<math display="block">{each}</math>')
 

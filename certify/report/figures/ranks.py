@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates import ReachCertificate
+from certify.certificates import RankTree, ReachCertificate, leaves_within
+from certify.certificates.claims import UNPROVED
 from certify.certificates.membership import angles_in
 from certify.certificates.ranked import Ranked
 from certify.loop.plants.floating_point import function_of
@@ -43,6 +44,7 @@ class Ground:
     ranked, most : the leaves, and the most steps from one.
     labels, names : of the states.
     middle : the state (n,) through which planes go.
+    lo, hi : corners (n,) of the pictures.
     target, outline : the target's name, and the function that draws its outline in a plane.
     sampled : the steps are sampling instants.
     word : "proved", or "claimed".
@@ -53,6 +55,8 @@ class Ground:
     labels: Sequence[str]
     names: Sequence[str]
     middle: Array
+    lo: Array
+    hi: Array
     target: str
     outline: Callable[[Any, Pair], None]
     sampled: bool
@@ -76,6 +80,8 @@ def rank_maps(scene: Scene) -> list[Picture]:
         scene.labels,
         [s.name for s in scene.system.states],
         np.zeros(scene.n),
+        ranked.tree.lo,
+        ranked.tree.hi,
         "{V ≤ c₂}",
         lambda axes, pair: _level_set(axes, scene, ranked, pair),
         scene.timing.sample is not None,
@@ -96,8 +102,10 @@ def reach_maps(certificate: ReachCertificate, accepted: bool, box: tuple[Array, 
         None if box is None else _runs(certificate, box, lambda x: beyond(x, np.zeros((*x.shape[:-1], system.m)), ()))
     )
 
+    lo, hi = (ranked.tree.lo, ranked.tree.hi) if box is None or path is None else _view(ranked.tree, box, path)
+
     def outline(axes: Any, pair: Pair) -> None:
-        a, b, states = _plane(ranked, middle, pair)
+        a, b, states = _plane(lo, hi, middle, pair)
         with np.errstate(all="ignore"):
             value = beyond(states, np.zeros((*states.shape[:-1], system.m)), ()).max(-1)
         if system.n > 1:
@@ -117,6 +125,8 @@ def reach_maps(certificate: ReachCertificate, accepted: bool, box: tuple[Array, 
         [deviation(s.name, q, system.units.get(s.name, "")) for s, q in shown],
         [s.name for s in system.states],
         middle,
+        lo,
+        hi,
         "the region",
         outline,
         system.sample is not None,
@@ -138,8 +148,8 @@ def _picture(ground: Ground, pair: Pair, more: str = "") -> Picture:
     """The map of one plane, with the outline of the target on top."""
     figure, axes = figure_of(4.4, 3.6 if ground.n > 1 else 1.6, left=0.86, right=0.8)
     i, j = pair
-    lo, hi = ground.ranked.tree.lo, ground.ranked.tree.hi
-    _, _, states = _plane(ground.ranked, ground.middle, pair)
+    lo, hi = ground.lo, ground.hi
+    _, _, states = _plane(lo, hi, ground.middle, pair)
     values = ground.ranked.ranks_at(states.reshape(-1, ground.n)).reshape(states.shape[:-1])
     box = (lo[i], hi[i], lo[j], hi[j]) if ground.n > 1 else (lo[0], hi[0], 0.0, 1.0)
     show = {"cmap": _COLOURS, "vmin": 0.0, "vmax": ground.most, "origin": "lower", "interpolation": "nearest"}
@@ -168,11 +178,21 @@ def _picture(ground: Ground, pair: Pair, more: str = "") -> Picture:
     )
 
 
-def _plane(ranked: Ranked, middle: Array, pair: Pair) -> tuple[Array, Array, Array]:
+def _view(tree: RankTree, box: tuple[Array, Array], path: Array) -> tuple[Array, Array]:
+    """The part of the root box that has leaves with a rank, and simulated runs, with some room."""
+    lower, upper = leaves_within(tree.tree, tree.lo, tree.hi)
+    known = tree.ranks != UNPROVED
+    lo = np.min([box[0], lower[known].min(0), np.nanmin(path, (0, 1))], axis=0)
+    hi = np.max([box[1], upper[known].max(0), np.nanmax(path, (0, 1))], axis=0)
+    room = 0.2 * (hi - lo)
+    return np.maximum(lo - room, tree.lo), np.minimum(hi + room, tree.hi)
+
+
+def _plane(lo: Array, hi: Array, middle: Array, pair: Pair) -> tuple[Array, Array, Array]:
     """The middles of a map's points along two states, and the states there, (rows, columns, n)."""
     i, j = pair
     shares = (np.arange(_POINTS) + 0.5) / _POINTS
-    a, b = (ranked.tree.lo[k] + shares * (ranked.tree.hi[k] - ranked.tree.lo[k]) for k in pair)
+    a, b = (lo[k] + shares * (hi[k] - lo[k]) for k in pair)
     states = np.tile(middle, (len(b) if len(middle) > 1 else 1, _POINTS, 1))
     states[..., i] = a[None, :]
     if len(middle) > 1:
