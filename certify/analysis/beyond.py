@@ -18,6 +18,7 @@ from certify.lyapunov.rigorous import evaluate_rise
 
 if TYPE_CHECKING:
     from certify.provers.outer import OuterProof
+    from certify.provers.ranks import RankProof
 
 
 def outer_facts(problem: Problem, claim: Claim, outer: Outer, found: OuterProof) -> OuterFacts:
@@ -37,7 +38,7 @@ def outer_facts(problem: Problem, claim: Claim, outer: Outer, found: OuterProof)
     )
 
 
-def rank_facts(certificate: Certificate | ReachCertificate, rounds: int | None = None) -> RankFacts | None:
+def rank_facts(certificate: Certificate | ReachCertificate, search: RankProof | None = None) -> RankFacts | None:
     """The facts on the boxes with ranks of a certificate; None without any."""
     ranks, evidence = certificate.claim.ranks, certificate.evidence
     tree = None if isinstance(evidence, TrustedSolver) else evidence.ranks
@@ -45,7 +46,8 @@ def rank_facts(certificate: Certificate | ReachCertificate, rounds: int | None =
         return None
     names = [s.name for s in certificate.system.states]
     found = count(tree, [names.index(name) for name in ranks.angles])
-    return RankFacts(tree, ranks.angles, found.leaves, found.proved, found.share, found.volume, found.steps, rounds)
+    facts = RankFacts(tree, ranks.angles, found.leaves, found.proved, found.share, found.volume, found.steps)
+    return facts if search is None else replace(facts, rounds=search.rounds, done=search.done)
 
 
 def constraints_in_words(certificate: Certificate | ReachCertificate) -> dict[str, str]:

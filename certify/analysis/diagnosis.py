@@ -239,7 +239,7 @@ def _boxes(result: RoaResult, options: RoaOptions) -> Step | None:
         return None
     if options.ranks:
         found = result.ranks
-        if found is None or found.covered > _ALL:
+        if found is None or found.done or found.covered > _ALL:
             return None
         why = f"{number(100 * (1 - found.covered), 2)} % of the box has no rank yet, and its boxes get smaller"
         return Step((("--effort", _round(4 * options.effort)),), why)

@@ -141,6 +141,7 @@ class RankFacts:
         down.
     steps : the most steps from one of them.
     rounds : of the search; None if it was not counted.
+    done : more effort would gain next to nothing.
     """
 
     tree: RankTree
@@ -151,6 +152,7 @@ class RankFacts:
     volume: float
     steps: int
     rounds: int | None = None
+    done: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: the numbers, and the corners of the box that was cut."""

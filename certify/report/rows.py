@@ -246,7 +246,7 @@ def _ranks(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     unit = volume_unit(units)
     rows.append((f"their {volume_name(len(names))}", f"{below(ranks['volume'])} {unit}".rstrip()))
     if ranks.get("rounds"):
-        rows.append(("their work", f"{ranks['rounds']:,} rounds"))
+        rows.append(("their work", f"{ranks['rounds']:,} round{'s' * (ranks['rounds'] > 1)}"))
     return rows
 
 

@@ -181,7 +181,7 @@ def result(name: str) -> RoaResult:
     found = certify_roa(replace(plant[0], constraints={}, angles=()), plant[1], level=level)
     raw = certificate.to_json().encode()
     return replace(
-        found, ranks=rank_facts(certificate, 7), constraints=constraints_in_words(certificate), raw=raw,
+        found, ranks=replace(rank_facts(certificate), rounds=7), constraints=constraints_in_words(certificate), raw=raw,
         checker=answer_to(certificate, raw),
     )  # fmt: skip
 

@@ -192,7 +192,7 @@ def _proved(
     claim = Reaches(target, Ranks(found.ranks.angles, _most(evidence)), keep)
     certificate = ReachCertificate(system, loop.network, claim, RanksAlone(evidence, question.order), provenance)
     certificate, raw, answer = _accepted(certificate, clerk)
-    facts, kept = rank_facts(certificate, found.rounds), constraints_in_words(certificate)
+    facts, kept = rank_facts(certificate, found), constraints_in_words(certificate)
     result = replace(result, ranks=facts, boxes=found.boxes, constraints=kept)
     result = replace(result, certificate=path, raw=raw, checker=answer)
     if options.begin is None:

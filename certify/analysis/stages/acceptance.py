@@ -81,7 +81,7 @@ def _with_facts(state: State, accepted: Accepted) -> State:
     if claim.start is None:
         result = replace(result, tube=None)
     constraints = constraints_in_words(accepted.certificate)
-    result = replace(result, ranks=rank_facts(accepted.certificate, state.rounds), constraints=constraints)
+    result = replace(result, ranks=rank_facts(accepted.certificate, state.ranked), constraints=constraints)
     if state.beyond is not None:
         if claim.outer is not None:
             result = replace(result, outer=outer_facts(problem, claim, claim.outer, state.beyond))

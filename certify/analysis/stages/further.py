@@ -193,7 +193,7 @@ class ByRanks:
             return state.noting("no box of the domain beyond the set is proved to lead into it")
         return replace(
             state,
-            rounds=found.rounds,
+            ranked=found,
             claim=replace(claim, ranks=found.ranks),
             evidence=replace(evidence, ranks=found.evidence),
         )

@@ -25,6 +25,7 @@ from certify.provers.execution import Runner
 
 if TYPE_CHECKING:
     from certify.provers.outer import OuterProof
+    from certify.provers.ranks import RankProof
 
 StageName = Literal["candidate", "ring", "tube", "learn", "outer", "ranks", "check"]
 Report = Callable[[StageName, Progress | None], None]
@@ -45,7 +46,7 @@ class State:
     race, proof : the candidates, and what the prover says of the best.
     claim, evidence : what is to be certified.
     beyond : the set of another function around the ellipsoid.
-    rounds : of the search for ranks.
+    ranked : boxes with ranks, as the search found them.
     missed : why no tube holds `centre`.
     accepted : the certificate that the checker accepts.
     done : the result is final.
@@ -62,7 +63,7 @@ class State:
     claim: Claim | None = None
     evidence: PartitionTree | TrustedSolver | None = None
     beyond: OuterProof | None = None
-    rounds: int | None = None
+    ranked: RankProof | None = None
     missed: str = ""
     accepted: Accepted | None = None
     done: bool = False

@@ -94,7 +94,7 @@ class Search:
 
     def spread(self) -> Index:
         """Give ranks to all leaves that have one by now; those without that may meet the target, or whose images meet
-        some leaf with a rank."""
+        some leaf with a rank, or lie in the root box with a part only."""
         unknown, counts = self.unknown, np.array(self.course.counts)
         k, at = np.nonzero(np.isfinite(self.lo[:, 0, unknown]))
         node, there = unknown[at], self.there[k, unknown[at]]
@@ -117,7 +117,9 @@ class Search:
                 break
             self.rank[new], self.steps[new] = best[new], by[new]
         some = np.logical_or.reduceat(self.rank[leaf] < NONE, starts) if len(starts) else np.zeros(0, dtype=bool)
-        near: Index = np.unique(np.append(owners[some], unknown[self.meets[unknown]]))
+        (low, high), first = self.cover.root, k == 0
+        sticks = first & ~inside & ((high > self.lo[k, :, node].T) & (low < self.hi[k, :, node].T)).all(0)
+        near: Index = np.unique(np.concatenate([owners[some], unknown[self.meets[unknown]], node[sticks]]))
         waiting: Index = near[self.rank[near] == NONE]
         return waiting
 
