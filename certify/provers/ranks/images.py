@@ -25,7 +25,7 @@ from certify.provers.ranks.targets import Target
 _WIDER = 1e-7  # share of a box's width, beyond all that two programs' rounding may differ by
 _ENDS = 1e-9  # relative distance kept from ends of the domain
 _WIDEST = 0.15  # share of the root box beyond which an image is of no use
-_MORE = 2.0  # operations of a step of a box, relative to those of a box's bound, whose symbols are fewer
+_MORE = 1.5  # operations of a step of a box, relative to those of a box's bound, whose symbols are fewer
 
 
 class Images(NamedTuple):
@@ -36,6 +36,7 @@ class Images(NamedTuple):
     lo, hi : (K, n, B); NaN where there is none that is of use.
     there : (K, B), the image lies in the target.
     inside, meets : (B,), the box itself does; it may have states there.
+    taken : (B,), the steps that were followed.
     steep : (n, B), by how much each axis of the box widens its first image that reaches far, relative to the root.
     """
 
@@ -44,6 +45,7 @@ class Images(NamedTuple):
     there: Mask
     inside: Mask
     meets: Mask
+    taken: Array
     steep: Array
 
 
@@ -99,7 +101,7 @@ class Course:
         sample = self.system.sample
         self.flow = None if sample is None else Flow(self.dynamics, sample, order)
         self.ends = np.array([[float(end) for end in pair] for pair in self.system.domain]).T[:, :, None]
-        self.operations = _MORE * self.counts[-1] * operations_of_box(loop, order)
+        self.operations = _MORE * operations_of_box(loop, order)  # of a step
 
     @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
     def __call__(self, lo: Array, hi: Array, inner: float, outer: float) -> Images:
@@ -115,6 +117,7 @@ class Course:
             np.zeros((K, batch), dtype=bool),
             self.is_there(form),
             ~self.target.misses(form.x, form.e, self.angles),
+            np.zeros(batch),
             np.abs(slopes).sum(0) / self.root[:, None],
         )
         left = np.flatnonzero(~found.inside)
@@ -123,6 +126,7 @@ class Course:
             if not len(left):
                 break
             form, kept = self.step(form)
+            found.taken[left] += 1
             below, above = form.box
             width = ((above - below) / self.root[:, None]).max(0)
             good = kept & (width < _WIDEST)

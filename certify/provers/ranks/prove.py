@@ -25,6 +25,7 @@ _SLIVER, _SAMPLES = 1e-6, 64
 _ORDERS = (2, 3, 4, 5, 6, 7, 8)
 _LITTLE, _GAIN = 1e-7, 0.5  # share of the root box that an error may be; a gain that is worth an order
 _MOST_LEAVES = 400_000
+_AT_FIRST = 0.1  # share of the effort for the first tree
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,11 +135,12 @@ def prove_ranks(
     """
     course = question.course(COUNTS if wanted is None else COUNTS_FROM)
     search = Search(course, *question.root) if wanted is None else SearchFrom(course, *question.root, wanted)
-    new, rounds, done = search.begin(), 0, False
+    new, rounds, done = search.begin(_AT_FIRST * effort.left / (course.counts[-1] * course.operations)), 0, False
     with runner.start(course) as bound:
         while True:
-            effort.charge(len(new) * course.operations)
-            search.take(new, bound(search.cover.low[:, new], search.cover.high[:, new], 0.0, 0.0))
+            found = bound(search.cover.low[:, new], search.cover.high[:, new], 0.0, 0.0)
+            effort.charge(float(found.taken.sum()) * course.operations)
+            search.take(new, found)
             near, rounds = search.spread(), rounds + 1
             if report is not None:
                 report(search.share, search.boxes, len(search.unknown))

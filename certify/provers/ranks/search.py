@@ -19,7 +19,7 @@ from certify.provers.ranks.images import Course, Images
 
 NONE = 65_535
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
-_FIRST = 2**12  # leaves of the first tree
+_FIRST = 2**10  # leaves of the first tree
 _ROUNDS, _GAIN = 6, 1e-4  # relative growth of what is proved, in so many rounds, below which the search ends
 _LARGEST = 0.7  # share of the leaves to be halved that are, the largest ones
 
@@ -35,10 +35,10 @@ class Search:
         self.there, self.steep, self.meets = np.zeros((K, 1), dtype=bool), np.zeros((n, 1)), np.zeros(1, dtype=bool)
         self.boxes, self.shares = 0, list[float]()
 
-    def begin(self) -> Index:
-        """The leaves of a first tree, all of one size."""
+    def begin(self, most: float) -> Index:
+        """The leaves of a first tree, all of one size, so many at most."""
         new, widths = np.zeros(1, dtype=np.int64), np.ones(len(self.cover.low))
-        while len(new) < _FIRST:
+        while 2 * len(new) <= min(most, _FIRST):
             axis = int(widths.argmax())
             widths[axis] /= 2
             new = self.halve(new, np.full(len(new), axis))

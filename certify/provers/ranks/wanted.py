@@ -40,8 +40,8 @@ class SearchFrom(Search):
         super().__init__(course, lo, hi)
         self.wanted, self.seen = wanted, np.zeros(1, dtype=bool)
 
-    def begin(self) -> Index:
-        """The leaves of a first tree, all of one size, that meet the box."""
+    def begin(self, most: float) -> Index:
+        """The leaves of a coarse tree that meet the box, however many."""
         super().begin()
         return self._own
 
