@@ -7,6 +7,7 @@ halved; all others wait.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,8 +42,8 @@ class SearchFrom(Search):
         self.wanted, self.seen = wanted, np.zeros(1, dtype=bool)
 
     def begin(self, most: float) -> Index:
-        """The leaves of a coarse tree that meet the box, however many."""
-        super().begin()
+        """The leaves of a first tree, all of one size, that meet the box: the others cost nothing."""
+        super().begin(math.inf)
         return self._own
 
     def halve(self, nodes: Index, axes: Index) -> Index:
