@@ -240,7 +240,7 @@ def test_whatever_the_checker_refuses_a_run_ends_with_what_it_accepts(
 
 def test_what_cannot_be_mended_is_a_soundness_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "certify.analysis.stages.acceptance.run_checker",
+        "certify.analysis.acceptance.run_checker",
         lambda *_, **__: {"result": "REJECTED", "rule": "hash", "at": "policy"},
     )
     with pytest.raises(SoundnessError, match=r"rejects what the engine proved.*unchecked\.json reproduces"):
@@ -310,7 +310,7 @@ def test_an_answer_about_other_bytes_is_no_proof(tmp_path: Path, monkeypatch: py
     """Another run's certificate is accepted instead of this one's."""
     other = certify_roa(*scalar_tanh(), tmp_path / "other", RoaOptions(level=1.0)).certificate
     assert other is not None
-    monkeypatch.setattr("certify.analysis.stages.acceptance.run_checker", lambda *_, **__: run_checker(other))
+    monkeypatch.setattr("certify.analysis.acceptance.run_checker", lambda *_, **__: run_checker(other))
     with pytest.raises(SoundnessError, match="other bytes"):
         certify_roa(*scalar_tanh(), tmp_path / "mine", RoaOptions(level=2.0))
     assert not (tmp_path / "mine" / "certificate.json").exists()
@@ -335,7 +335,7 @@ def test_what_the_reference_refuses_is_mended_or_left_out(tmp_path: Path, monkey
         level = float.fromhex(json.loads(path.read_bytes())["levels"]["roa"])
         return {"result": "REJECTED", "rule": "ring", "at": "leaf 0", "detail": f"{level}"}
 
-    monkeypatch.setattr("certify.analysis.stages.acceptance.run_checker", refusing)
+    monkeypatch.setattr("certify.analysis.acceptance.run_checker", refusing)
     with pytest.raises(SoundnessError, match=r"rejects what the engine proved.*reference"):
         certify_roa(*scalar_tanh(), tmp_path)
     assert len(told) > 3 and told[1] > told[0]  # the first leaf was split
@@ -349,13 +349,13 @@ def test_a_reference_s_answer_about_something_else_is_no_proof(
         answer = run_checker(path, program, **given)
         return answer if program == "checker" else {**answer, wrong: {}}
 
-    monkeypatch.setattr("certify.analysis.stages.acceptance.run_checker", other)
+    monkeypatch.setattr("certify.analysis.acceptance.run_checker", other)
     with pytest.raises(SoundnessError, match="is about other"):
         certify_roa(*scalar_tanh(), tmp_path)
 
 
 def test_a_reference_that_needs_long_is_not_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("certify.analysis.stages.acceptance._QUICK", 2)
+    monkeypatch.setattr("certify.analysis.acceptance._QUICK", 2)
     result = certify_roa(*scalar_tanh(), tmp_path)
     assert result.verdict is Verdict.PROVED and result.to_dict()["reference"] is None
     assert "ACCEPTED BY BOTH" not in dict(rows_of(result.to_dict(), True))["checker"]

@@ -385,7 +385,7 @@ PLACES = {  # where Ctrl-C comes, and on which call: from the first candidate to
     "a local proof": ("certify.provers.boxes.engine.prove_local", 1),
     "a heat": ("certify.provers.boxes.rule.VdotBound.__call__", 1),
     "the search": ("certify.provers.boxes.rule.VdotBound.__call__", 3),
-    "the first check": ("certify.analysis.stages.acceptance.run_checker", 1),
+    "the first check": ("certify.analysis.acceptance.run_checker", 1),
     "the end": ("certify.analysis.stages.acceptance.limit_of", 1),
 }
 

@@ -410,7 +410,7 @@ def test_an_interrupt_leaves_a_search_and_nothing_half_written(
     if where == "ring":
         monkeypatch.setattr(VdotBound, "__call__", interrupt)
     else:
-        monkeypatch.setattr("certify.analysis.stages.acceptance.run_checker", interrupt)
+        monkeypatch.setattr("certify.analysis.acceptance.run_checker", interrupt)
     status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o")
     assert status == 130 and out == "" and "interrupted" in err and "--resume" in err
     assert [path.name for path in (tmp_path / "o").iterdir()] == ["search.json"]

@@ -152,7 +152,7 @@ def checked_here(monkeypatch: pytest.MonkeyPatch) -> None:
             checker.main(["--json", "--", str(path)])
         return dict(json.loads(said.getvalue()))
 
-    monkeypatch.setattr("certify.analysis.stages.acceptance.run_checker", run)
+    monkeypatch.setattr("certify.analysis.acceptance.run_checker", run)
 
 
 def proved(text: str, folder: Path, claim: Any = "auto") -> bool:

@@ -59,7 +59,7 @@ def loop(name: str, **changes: Any) -> ClosedLoop:
 @pytest.fixture
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """The checker alone is asked, until the reference reads other functions than tanh."""
-    monkeypatch.setattr("certify.analysis.stages.acceptance._Desk._twice", lambda _, path, answer: answer)
+    monkeypatch.setattr("certify.analysis.acceptance.Desk._twice", lambda _, path, answer: answer)
 
 
 # --------------------------------------------------------------------------------------------------------------- boxes
