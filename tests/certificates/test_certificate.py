@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from certify.analysis.run import RoaOptions, certify_roa
 from certify.analysis import acceptance as roa
+from certify.analysis.run import RoaOptions, certify_roa
 from certify.certificates import limits, read_certificate, run_checker
 from certify.certificates.verdict import Verdict
 from certify.checker import ball as checker_ball
