@@ -14,6 +14,8 @@ import numpy as np
 from certify.errors import InputError
 from certify.loop.files.arrays import Numbers
 from certify.loop.policies.importers.steps import (
+    CUBE,
+    SQUARE,
     Activate,
     Affine,
     Branches,
@@ -131,6 +133,19 @@ def product(one: Chain, other: Chain) -> Chain:
         if same and more == gate:
             return (*short, Activate(name))
     return joined("product", one, other)
+
+
+def powered(chain: Chain, exponent: Any, what: str) -> Chain:
+    """`h^2` or `h^3`.
+
+    Raises
+    ------
+    InputError : the exponent is neither 2 nor 3.
+    """
+    said = real(exponent, what)
+    if said.size != 1 or said.item() not in (2, 3):
+        raise InputError(f"the exponent of {what} must be 2 or 3; found {said.ravel()[:4].tolist()}.")
+    return (*chain, SQUARE if said.item() == 2 else CUBE)
 
 
 def clipped(chain: Chain, lo: Any | None, hi: Any | None, what: str) -> Chain:

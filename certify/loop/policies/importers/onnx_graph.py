@@ -18,6 +18,7 @@ from certify.loop.files.arrays import Numbers
 from certify.loop.policies.importers import graph
 from certify.loop.policies.importers.graph import Chain
 from certify.loop.policies.importers.onnx_weights import load_weights
+from certify.loop.policies.importers.onnx_written import written_out
 from certify.loop.policies.importers.options import WITH_TANH, WITHOUT_NORMALISATION
 from certify.loop.policies.importers.reading import Observations, Reading, Values
 from certify.loop.policies.importers.steps import Affine
@@ -25,11 +26,11 @@ from certify.loop.policies.importers.steps import Affine
 _ACTIVATIONS = ("Tanh", "Elu", "Sigmoid", "Gelu", "Softplus", "Mish", "Softsign", "LeakyRelu", "Selu", "Celu")
 _OPERATIONS = {
     "Gemm", "MatMul", "Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", *_ACTIVATIONS,
-    "Identity", "Cast", "Flatten", "Reshape", "Constant", "Concat", "LayerNormalization",
+    "Identity", "Cast", "Flatten", "Reshape", "Constant", "Concat", "LayerNormalization", "Pow",
 }  # fmt: skip
 _KNOWN = (
     f"Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu, {', '.join(_ACTIVATIONS)}, "
-    "LayerNormalization, Concat, Identity, Flatten and Constant"
+    "LayerNormalization, Pow, Concat, Identity, Flatten and Constant"
 )
 _NORMALISATIONS = {
     "BatchNormalization",
@@ -38,6 +39,7 @@ _NORMALISATIONS = {
     "ReduceMean",
 }
 _SELU = {"gamma": float(np.float32(1.05070102214813)), "alpha": float(np.float32(1.67326319217681))}  # of the standard
+_TAKES_INTEGERS = ("Reshape", "Pow")
 _STANDARD = ("", "ai.onnx")
 _FLAGS = {
     "Gemm": {"alpha", "beta", "transA", "transB"},
@@ -66,6 +68,7 @@ _ELEMENTWISE = {
     "Log",
     "Identity",
     "Cast",
+    "Pow",
 }
 
 
@@ -189,6 +192,7 @@ def _doubled(model: Any) -> Any:
 
     copied = onnx.ModelProto()
     copied.CopyFrom(model)
+    written_out(copied.graph)
     attributes = [(node.op_type, a) for node in copied.graph.node for a in node.attribute]
     held = (a.t for kind, a in attributes if kind == "Constant" and a.name == "value")
     for tensor in (*copied.graph.initializer, *held):
@@ -255,7 +259,7 @@ def _walk(graph_: Any, name: str, output: str, what: str) -> Chain:
         given = [None if not i else chains[i] if i in chains else constants.get(i) for i in node.input]
         if any(i and v is None for i, v in zip(node.input, given, strict=True)):
             raise InputError(f"{at} in {what} reads a value that nothing before it makes.")
-        if node.op_type != "Reshape" and any(isinstance(v, np.ndarray) and v.dtype.kind != "f" for v in given):
+        if node.op_type not in _TAKES_INTEGERS and any(isinstance(v, np.ndarray) and v.dtype.kind != "f" for v in given):
             raise InputError(f"{at} in {what} must be of floating-point numbers (float32 or float64).")
         if node.op_type in ("Identity", "Cast") and len(given) == 1 and isinstance(given[0], np.ndarray):
             if node.op_type == "Cast":
@@ -297,6 +301,8 @@ def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain
             return graph.scaled(chain, others[0], at)
         case "Div", 0, 2:
             return graph.scaled(chain, others[0], at, divide=True)
+        case "Pow", 0, 2:
+            return graph.powered(chain, others[0], at)
         case "Neg", 0, 1:
             return graph.negated(chain)
         case _, 0, 1 if kind in _ACTIVATIONS:
@@ -364,16 +370,17 @@ _ALPHAS = {"LeakyRelu": float(np.float32(0.01)), "Elu": 1.0, "Celu": 1.0}  # whe
 
 
 def _activated(chain: Chain, kind: str, flags: dict[str, Any], at: str) -> Chain:
-    """An activation of the chain, but not the Gelu that is an approximation."""
+    """An activation of the chain."""
     if kind in _ALPHAS:
         alpha = float(flags["alpha"].f) if "alpha" in flags else _ALPHAS[kind]
         name = "leaky_relu" if kind == "LeakyRelu" else kind.lower()
         return graph.mapped(chain, name, *([] if alpha == 1 and kind == "Elu" else [alpha]))
     if kind == "Selu":
         return graph.mapped(chain, "selu", *(float(flags[k].f) if k in flags else v for k, v in _SELU.items()))
-    if "approximate" in flags and flags["approximate"].s != b"none":
-        raise InputError(f"{at} must be the exact one, without `approximate`.")
-    return graph.mapped(chain, kind.lower())
+    approximate = flags["approximate"].s if "approximate" in flags else b"none"
+    if approximate not in (b"none", b"tanh"):
+        raise InputError(f"{at} must be the exact one or its tanh form; found approximate {approximate!r}.")
+    return graph.mapped(chain, "gelu-tanh" if approximate == b"tanh" else kind.lower())
 
 
 def _require_real(flags: dict[str, Any], at: str) -> None:

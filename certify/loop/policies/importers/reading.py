@@ -107,6 +107,7 @@ _FORMULAS: Mapping[str, Callable[[Values], Values]] = {
     "hardsigmoid": lambda v: np.clip(v + 3, 0, 6) / 6,
     "hardswish": lambda v: v * (np.clip(v + 3, 0, 6) / 6),
     "logsigmoid": lambda v: -np.logaddexp(0, -v),
+    "gelu-tanh": lambda v: 0.5 * v * (1 + np.tanh(0.7978845608028654 * (v + 0.044715 * v * v * v))),
 }
 """The activations that are made of others, as they are written elsewhere."""
 

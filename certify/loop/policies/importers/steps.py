@@ -6,6 +6,7 @@ number that the file's bytes encode; a step is a function in real arithmetic.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal, TypeVar
@@ -121,7 +122,12 @@ class Branches:
 
 
 Step = Affine | Diagonal | Normalise | Tanh | Activate | Clip | InverseRoot | Branches
+SQUARE = Branches("product", ((), ()))
+"""`y_i = h_i^2`."""
+CUBE = Branches("product", ((), (SQUARE,)))
+"""`y_i = h_i^3`."""
 _SELU = Fraction(1.0507009873554804934193349852946), Fraction(1.6732632423543772848170429916717)
+_GELU_TANH = Fraction(math.sqrt(2 / math.pi)), Fraction(0.044715)  # torch's numbers
 
 
 def activated(function: str, *numbers: Fraction) -> tuple[Step, ...]:
@@ -158,12 +164,14 @@ def activated(function: str, *numbers: Fraction) -> tuple[Step, ...]:
             return (Diagonal((one,), (3 * one,)), Clip((none,), (6 * one,)), _scaled(one / 6))
         case "hardswish", ():
             return (Branches("product", ((), activated("hardsigmoid"))),)
+        case "gelu-tanh", ():
+            return (Branches("product", ((), _tanh_gate())),)
         case "logsigmoid", ():
             return (_scaled(-one), Activate("softplus"), _scaled(-one))
     raise InputError(f"the activation must be one of {', '.join(IMPORTED)}; found {function}.")
 
 
-COMPOSED = ("leaky_relu", "selu", "celu", "hardtanh", "relu6", "hardsigmoid", "hardswish", "logsigmoid")
+COMPOSED = ("leaky_relu", "selu", "celu", "hardtanh", "relu6", "hardsigmoid", "hardswish", "logsigmoid", "gelu-tanh")
 """Activations that are made of others."""
 IMPORTED = (*ACTIVATIONS, *COMPOSED)
 """The names of all activations that are read."""
@@ -182,6 +190,13 @@ def layer_normalised(width: int, epsilon: Fraction) -> tuple[Step, ...]:
     centred = Affine(width * np.eye(width) - 1, np.zeros(width)), Diagonal((share,), (none,))
     mean = Affine(np.ones((1, width)), np.zeros(1)), Diagonal((share,), (epsilon,))
     return (*centred, Branches("product", ((), (Branches("product", ((), ())), *mean, InverseRoot()))))
+
+
+def _tanh_gate() -> tuple[Step, ...]:
+    """`(1 + tanh(k h (1 + c h^2))) / 2`, which multiplies h in the tanh form of GELU."""
+    k, c = _GELU_TANH
+    half = Fraction(1, 2)
+    return Branches("product", ((), (SQUARE, Diagonal((k * c,), (k,))))), Tanh(), Diagonal((half,), (half,))
 
 
 def _scaled(by: Fraction) -> Diagonal:
