@@ -42,8 +42,8 @@ class ImportOptions:
     kind : the kind of file, or `auto`.
     prefix : in a state_dict, the keys of the policy's layers up to their numbers, such as `actor.pi_net.fcs`.
     activation : between the layers of a state_dict, by its name: tanh, relu, elu (alpha 1), sigmoid, silu, gelu (the
-        exact one), gelu-tanh (its tanh form), softplus (beta 1), mish, softsign, leaky_relu (slope 0.01), selu, celu (alpha 1), hardtanh, relu6,
-        hardsigmoid or logsigmoid.
+        exact one), gelu-tanh (its tanh form), softplus (beta 1), mish, softsign, leaky_relu (slope 0.01), selu, celu
+        (alpha 1), hardtanh, relu6, hardsigmoid, hardswish or logsigmoid.
     squash : what follows the last layer of a state_dict: `identity`, `tanh`, or `relu-tanh` for relu(tanh(.)).
     states : what the network reads, in its order: states of the plant, or expressions of them such as `cos(theta)`.
     normaliser : a file with the observations' normaliser, or `none`.

@@ -72,7 +72,7 @@ class Reading:
     @property
     def m(self) -> int:
         """Number of actions."""
-        return _gives(self.steps, self.n)
+        return gives(self.steps, self.n)
 
 
 def _reads(steps: Sequence[Step]) -> int | None:
@@ -87,13 +87,13 @@ def _reads(steps: Sequence[Step]) -> int | None:
     return None
 
 
-def _gives(steps: Sequence[Step], width: int) -> int:
+def gives(steps: Sequence[Step], width: int) -> int:
     """The number of entries that a chain makes of so many."""
     for step in steps:
         if isinstance(step, Affine):
             width = int(step.weight.shape[0])
         if isinstance(step, Branches):
-            ends = [_gives(chain, width) for chain in step.of]
+            ends = [gives(chain, width) for chain in step.of]
             width = sum(ends) if step.kind == "concat" else max(ends)
     return width
 

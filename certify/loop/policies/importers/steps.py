@@ -122,10 +122,14 @@ class Branches:
 
 
 Step = Affine | Diagonal | Normalise | Tanh | Activate | Clip | InverseRoot | Branches
+MOST_NORMALISED = 4096
+"""The most numbers of which a normalisation is read."""
 SQUARE = Branches("product", ((), ()))
 """`y_i = h_i^2`."""
 CUBE = Branches("product", ((), (SQUARE,)))
 """`y_i = h_i^3`."""
+ABSOLUTE = Branches("sum", ((Activate("relu"),), (Diagonal((Fraction(-1),), (Fraction(0),)), Activate("relu"))))
+"""`y_i = |h_i|`."""
 _SELU = Fraction(1.0507009873554804934193349852946), Fraction(1.6732632423543772848170429916717)
 _GELU_TANH = Fraction(math.sqrt(2 / math.pi)), Fraction(0.044715)  # torch's numbers
 
@@ -160,6 +164,8 @@ def activated(function: str, *numbers: Fraction) -> tuple[Step, ...]:
             return (Clip((-one,), (one,)),)
         case "relu6", ():
             return (Clip((none,), (6 * one,)),)
+        case "hardsigmoid", (alpha, beta):
+            return (Diagonal((alpha,), (beta,)), Clip((none,), (one,)))
         case "hardsigmoid", ():
             return (Diagonal((one,), (3 * one,)), Clip((none,), (6 * one,)), _scaled(one / 6))
         case "hardswish", ():
@@ -177,6 +183,23 @@ IMPORTED = (*ACTIVATIONS, *COMPOSED)
 """The names of all activations that are read."""
 
 
+def mean_of(width: int) -> tuple[Step, ...]:
+    """The mean of so many numbers, which is one number."""
+    return Affine(np.ones((1, width)), np.zeros(1)), Diagonal((Fraction(1, width),), (Fraction(0),))
+
+
+def centred(width: int) -> tuple[Step, ...]:
+    """So many numbers less their mean.
+
+    Raises
+    ------
+    InputError : there are more than the import takes.
+    """
+    if not 0 < width <= MOST_NORMALISED:
+        raise InputError(f"a normalisation must be of at most {MOST_NORMALISED} numbers; found {width}.")
+    return Affine(width * np.eye(width) - 1, np.zeros(width)), Diagonal((Fraction(1, width),), (Fraction(0),))
+
+
 def layer_normalised(width: int, epsilon: Fraction) -> tuple[Step, ...]:
     """`c / sqrt(mean of c^2 + epsilon)` of so many numbers, c being these less their mean.
 
@@ -186,10 +209,9 @@ def layer_normalised(width: int, epsilon: Fraction) -> tuple[Step, ...]:
     """
     if epsilon <= 0:
         raise InputError(f"the epsilon of a layer normalisation must be positive; found {float(epsilon)}.")
-    none, share = Fraction(0), Fraction(1, width)
-    centred = Affine(width * np.eye(width) - 1, np.zeros(width)), Diagonal((share,), (none,))
-    mean = Affine(np.ones((1, width)), np.zeros(1)), Diagonal((share,), (epsilon,))
-    return (*centred, Branches("product", ((), (Branches("product", ((), ())), *mean, InverseRoot()))))
+    total, share = mean_of(width)
+    mean = total, share, Diagonal((Fraction(1),), (epsilon,))
+    return (*centred(width), Branches("product", ((), (SQUARE, *mean, InverseRoot()))))
 
 
 def _tanh_gate() -> tuple[Step, ...]:
