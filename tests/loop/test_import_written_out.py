@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from onnx import TensorProto, helper, numpy_helper
 from certify import RoaOptions, Verdict, certify_roa
 from certify.errors import InputError
 from certify.loop.policies.importers import Imported, ImportOptions, import_policy
-from certify.loop.policies.importers.memory import import_module
+from certify.loop.policies.importers.memory import import_module, import_state_dict
 from tests.support.foreign import plant
 
 nn: Any = torch.nn
@@ -195,6 +196,95 @@ def test_another_quotient_of_torchscript_is_refused() -> None:
         import_module(nn.Sequential(nn.Linear(2, 6), Quotient(), nn.Linear(6, 1)), plant(), SAID)
 
 
+# -------------------------------------------------------------------------------------------------------- state_dicts
+
+
+LAYERS = replace(SAID, activation="gelu-tanh", squash="identity")
+ORDERS: dict[Any, tuple[int, int]] = {"layer-before": (0, 1), "layer-after": (1, 0)}
+
+
+def stack(norm: str, eps: float = 1e-5, width: int = 6) -> Any:
+    """Two hidden layers with normalisations, whose gains and biases are no trivial ones."""
+    torch.manual_seed(1)
+    parts: list[Any] = []
+    for reads in (2, width):
+        pair = nn.LayerNorm(width, eps=eps), nn.GELU(approximate="tanh")
+        nn.init.normal_(pair[0].weight)
+        nn.init.normal_(pair[0].bias)
+        parts += [nn.Linear(reads, width), *(pair[k] for k in ORDERS[norm])]
+    return nn.Sequential(*parts, nn.Linear(width, 1)).double()
+
+
+@pytest.mark.parametrize("norm", ORDERS)
+@pytest.mark.parametrize("eps", [None, 0.125])
+def test_layer_norm_of_a_state_dict(norm: Any, eps: float | None) -> None:
+    module = stack(norm, 1e-5 if eps is None else eps)
+    said = replace(LAYERS, norm=norm, norm_epsilon=None if eps is None else Fraction(eps))
+    imported = import_state_dict(module.state_dict(), plant(), said)
+    with torch.no_grad():
+        close(imported.policy.network(X, (Fraction(0),)), module(torch.tensor(X)))
+    assert not imported.not_read and imported.policy.network.sha256() == (
+        import_module(module, plant(), SAID).policy.network.sha256()
+    )
+
+
+def test_numbers_that_show_no_activation_fit_both_places() -> None:
+    numbers_ = {"0": 0, "1": 1, "3": 2, "4": 3, "6": 4}
+    state = {f"net.{numbers_[k[0]]}{k[1:]}": v for k, v in stack("layer-before").state_dict().items()}
+    found = [import_state_dict(state, plant(), replace(LAYERS, norm=norm)) for norm in ORDERS]
+    assert found[0].policy.network.sha256() != found[1].policy.network.sha256()
+    with torch.no_grad():
+        close(found[0].policy.network(X, (Fraction(0),)), stack("layer-before")(torch.tensor(X)))
+
+
+def changed(**more: Any) -> dict[str, Any]:
+    state = dict(stack("layer-before").state_dict())
+    for name, value in more.items():
+        key = name.replace("_", ".")
+        if value is None:
+            del state[key]
+        else:
+            state[key] = value
+    return state
+
+
+FLAT: dict[str, tuple[str, dict[str, Any], Any]] = {
+    "nothing said": (r"1 must be affine.*--norm layer-before", changed(), None),
+    "another place": (r"--norm layer-after does not fit the numbers 0, 1 and 3", changed(), "layer-after"),
+    "no bias": ("must have a weight and a bias", changed(**{"1_bias": None}), "layer-before"),
+    "another width": ("must have a weight and a bias", changed(**{"1_bias": torch.zeros(5)}), "layer-before"),
+    "two in a row": ("one normalisation between two layers",
+                     changed(**{"2_weight": torch.ones(6), "2_bias": torch.ones(6)}), "layer-before"),
+    "behind the last layer": ("one normalisation between two layers",
+                              changed(**{"7_weight": torch.ones(1), "7_bias": torch.ones(1)}), "layer-before"),
+    "a running mean": ("belongs to one of another kind", changed(**{"1_running_mean": torch.ones(6)}), "layer-before"),
+    "a convolution": ("0 must be affine", changed(**{"0_weight": torch.ones(6, 2, 1)}), "layer-before"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FLAT)
+def test_normalisations_that_are_not_clear_are_refused(name: str) -> None:
+    message, state, norm = FLAT[name]
+    state = {f"{k.replace('running.mean', 'running_mean')}": v for k, v in state.items()}
+    with pytest.raises(InputError, match=message):
+        import_state_dict(state, plant(), replace(LAYERS, norm=norm, prefix=""))
+
+
+def test_a_norm_that_is_not_there_is_refused() -> None:
+    module = nn.Sequential(nn.Linear(2, 3), nn.Tanh(), nn.Linear(3, 1))
+    with pytest.raises(InputError, match="--norm must be left out"):
+        import_state_dict(module.state_dict(), plant(), replace(LAYERS, norm="layer-before"))
+    with pytest.raises(InputError, match="--norm must be left out"):
+        import_module(module, plant(), replace(SAID, norm="layer-before"))
+    with pytest.raises(InputError, match="go with --norm"):
+        replace(LAYERS, norm_epsilon=Fraction(1))
+    with pytest.raises(InputError, match="must be positive"):
+        replace(LAYERS, norm="layer-after", norm_epsilon=Fraction(0))
+
+
+# ---------------------------------------------------------------------------------------------------------- the proof
+
+
 def small(function: Any, *norm: Any) -> Any:
     """A policy for the pendulum that is odd, so that it commands nothing at rest."""
     module = nn.Sequential(nn.Linear(2, 4), *norm, function, nn.Linear(4, 1), nn.Tanh()).double()
@@ -217,6 +307,10 @@ PROVED = {
 
 @pytest.mark.parametrize("name", PROVED)
 def test_a_small_policy_is_proved(name: str, tmp_path: Path) -> None:
-    said = {"states": ("theta", "theta_dot"), "normaliser": "none", "action_scale": (6,)}
+    said: dict[str, Any] = {"states": ("theta", "theta_dot"), "normaliser": "none", "action_scale": (6,)}
     options = RoaOptions(candidate="lyapunov", effort=0.2)
-    assert certify_roa("pendulum", PROVED[name], tmp_path, options, importing=said).verdict is Verdict.PROVED
+    given = PROVED[name]
+    if name == "layer norm":
+        said |= {"norm": "layer-before", "norm_epsilon": 1e-5, "activation": "tanh", "squash": "tanh"}
+        given = given.state_dict()
+    assert certify_roa("pendulum", given, tmp_path, options, importing=said).verdict is Verdict.PROVED
