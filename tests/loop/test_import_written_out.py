@@ -16,6 +16,7 @@ from certify import RoaOptions, Verdict, certify_roa
 from certify.errors import InputError
 from certify.loop.policies.importers import Imported, ImportOptions, import_policy
 from certify.loop.policies.importers.memory import import_module, import_state_dict
+from certify.loop.policies.importers.steps import layer_normalised
 from tests.support.foreign import plant
 
 nn: Any = torch.nn
@@ -153,6 +154,43 @@ def test_an_observation_is_normalised_by_the_graphs_own_width(tmp_path: Path) ->
         found = import_policy(tmp_path / "policy.onnx", plant(), SAID).policy.network(X, (Fraction(0),))
         h = nn.functional.layer_norm(torch.tensor(X), (2,), eps=0.25).numpy()
         close(found, (h @ held["W"] + held["B"]) @ held["U"])
+
+
+EXPORTED = {
+    "layer norm": nn.LayerNorm(6),
+    "gelu": nn.GELU(approximate="tanh"),
+    "softsign": nn.Softsign(),
+    "hardswish": nn.Hardswish(),
+    "hardsigmoid": nn.Hardsigmoid(),
+}
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
+@pytest.mark.parametrize("opset", [11, 20])
+@pytest.mark.parametrize("name", EXPORTED)
+def test_what_torch_exports(name: str, opset: int, tmp_path: Path) -> None:
+    """Graphs as torch's exporter writes them, in an old set of operators and in a new one."""
+    torch.manual_seed(0)
+    module = nn.Sequential(nn.Linear(2, 6), EXPORTED[name], nn.Linear(6, 1))
+    said: dict[str, Any] = {
+        "dynamo": False,
+        "opset_version": opset,
+        "input_names": ["o"],
+        "dynamic_axes": {"o": {0: "b"}},
+    }
+    torch.onnx.export(module, (torch.zeros(1, 2),), str(tmp_path / "m.onnx"), **said)
+    imported = import_policy(tmp_path / "m.onnx", plant(), SAID)
+    assert imported.difference.in_double < 1e-13
+    with torch.no_grad():
+        wanted = module.double()(torch.tensor(X)).numpy()
+        module.float()
+    assert np.allclose(imported.policy.network(X, (Fraction(0),)), wanted, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("width", [0, 2**40])
+def test_a_width_that_no_policy_has_is_refused(width: int) -> None:
+    with pytest.raises(InputError, match="at most 4096 numbers"):
+        layer_normalised(width, Fraction(1, 8))
 
 
 # ------------------------------------------------------------------------------------------------------------- modules

@@ -209,9 +209,9 @@ def layer_normalised(width: int, epsilon: Fraction) -> tuple[Step, ...]:
     """
     if epsilon <= 0:
         raise InputError(f"the epsilon of a layer normalisation must be positive; found {float(epsilon)}.")
-    total, share = mean_of(width)
-    mean = total, share, Diagonal((Fraction(1),), (epsilon,))
-    return (*centred(width), Branches("product", ((), (SQUARE, *mean, InverseRoot()))))
+    apart = centred(width)
+    mean = *mean_of(width), Diagonal((Fraction(1),), (epsilon,))
+    return (*apart, Branches("product", ((), (SQUARE, *mean, InverseRoot()))))
 
 
 def _tanh_gate() -> tuple[Step, ...]:
