@@ -90,6 +90,7 @@ _OF_IMPORTING: Mapping[str, Callable[[Any, str], Any]] = {
     "action_scale": _rationals,
     "action_offset": _rationals,
     "epsilon": exact,
+    "norm_epsilon": exact,
     "normaliser": lambda value, where: "none" if value == "none" else Path(path_in(value, where)),
     "clip": _clip,
 }

@@ -25,6 +25,8 @@ _HELP = {
     "states": "What the network reads, in its order: states, or expressions as in 'cos(theta),sin(theta),theta_dot'.",
     "prefix": "Keys of a state_dict's layers up to their numbers, as in actor.pi_net.fcs.",
     "activation": "Between the layers of a state_dict: tanh, relu, elu, silu, gelu and others; docs/import.md has all.",
+    "norm": "Layer normalisation between the layers of a state_dict: layer-before or layer-after the activation.",
+    "norm_epsilon": "What it adds to the variance; 1e-5 if nothing is said.",
     "squash": "After the last layer of a state_dict: identity, tanh or relu-tanh.",
     "normaliser": "File of the observations' normaliser (VecNormalize, rsl_rl), or none.",
     "epsilon": "What rsl_rl's normaliser adds to the standard deviation; 0.01 if nothing is said.",
@@ -75,9 +77,13 @@ def _parsed(texts: Mapping[str, Any]) -> ImportOptions:
         text = texts.get(name)
         return None if text is None else tuple(exact(part.strip(), option) for part in text.split(","))
 
-    states, normaliser, epsilon = texts.get("states"), texts.get("normaliser"), rationals("epsilon", "--epsilon")
-    if epsilon is not None and len(epsilon) != 1:
-        raise InputError(f"--epsilon takes one number; found {texts['epsilon']!r}.")
+    def rational(name: str, option: str) -> Fraction | None:
+        found = rationals(name, option)
+        if found is not None and len(found) != 1:
+            raise InputError(f"{option} takes one number; found {texts[name]!r}.")
+        return None if found is None else found[0]
+
+    states, normaliser = texts.get("states"), texts.get("normaliser")
     return ImportOptions(
         kind=texts.get("kind", "auto"),
         prefix=texts.get("prefix"),
@@ -85,7 +91,9 @@ def _parsed(texts: Mapping[str, Any]) -> ImportOptions:
         squash=texts.get("squash"),
         states=None if states is None else tuple(_parts(states)),
         normaliser=None if normaliser is None else "none" if normaliser == "none" else Path(normaliser),
-        epsilon=None if epsilon is None else epsilon[0],
+        epsilon=rational("epsilon", "--epsilon"),
+        norm=texts.get("norm"),
+        norm_epsilon=rational("norm_epsilon", "--norm-epsilon"),
         action_scale=rationals("action_scale", "--action-scale"),
         action_offset=rationals("action_offset", "--action-offset"),
         clip=_clip(texts.get("clip")),

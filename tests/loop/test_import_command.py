@@ -248,3 +248,14 @@ def test_bounds_for_another_number_of_states_are_refused(run: Run) -> None:
     save_policy("own.pt", Policy(network, "chain", valid=np.array([[-1.0, 1.0]] * 3)))
     status, _, err = run("roa", "--policy", "own.pt", "--system", "plant.toml", "--out", "o")
     assert status == 2 and "3 states" in err
+
+
+def test_layer_norm_is_an_option(run: Run) -> None:
+    layers = torch.nn.Linear(2, 4), torch.nn.LayerNorm(4, eps=0.01), torch.nn.Tanh(), torch.nn.Linear(4, 1)
+    torch.save(torch.nn.Sequential(*layers).state_dict(), "norm.pt")
+    given = "import", "norm.pt", "--out", "p.pt", "--system", "plant.toml", *SAID
+    assert run(*given)[0] == 2 and "--norm layer-before" in run(*given)[2]
+    status, out, _ = run(*given, "--norm", "layer-before", "--norm-epsilon", "0.01")
+    assert status == 0 and "with layer normalisation" in out
+    status, _, err = run(*given, "--norm", "layer-before", "--norm-epsilon", "1,2")
+    assert status == 2 and "--norm-epsilon takes one number" in err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,7 @@ FUNCTIONS = {
     "Hardsigmoid": nn.Hardsigmoid(),
     "LogSigmoid": nn.LogSigmoid(),
     "GELU": nn.GELU(),
+    "GELU of tanh": nn.GELU(approximate="tanh"),
     "Tanh": nn.Tanh(),
 }
 
@@ -91,7 +93,8 @@ def test_state_dicts_of_every_activation(name: str) -> None:
     }  # fmt: skip
     found = import_state_dict(tensors, PLANT, replace(SAID, activation=name, squash="identity"))
     known = {"relu6": "relu6", "leaky_relu": "leaky_relu", "logsigmoid": "logsigmoid"}
-    phi = getattr(nn.functional, known.get(name, name))
+    tanh_form = partial(nn.functional.gelu, approximate="tanh")
+    phi = tanh_form if name == "gelu-tanh" else getattr(nn.functional, known.get(name, name))
     h = torch.tensor(STATES)
     for k in (0, 2, 4):
         h = nn.functional.linear(phi(h) if k else h, *(torch.tensor(tensors[f"{k}.{p}"]) for p in ("weight", "bias")))

@@ -160,7 +160,7 @@ REFUSED = {
     "a function that redefines tanh": (function(model(chain(*MLP))), "standard operators"),
     "no set of operators": (no_operator_set(model(chain(*MLP))), "evaluator of the onnx package"),
     "a tensor twice": (twice(model(chain(*MLP))), "once"),
-    "a quotient": (model([*chain(*TWO)[:1], node("Tanh", "h0", out="v"), node("Div", "h0", "v", out="u")]), "join one"),
+    "a quotient": (model([*chain(*TWO)[:1], node("Tanh", "h0", out="v"), node("Div", "h0", "v", out="u")]), "divides"),
     "integers": (model(chain(*MLP), {**CONSTANTS, "W1": np.ones((2, 6), np.int64)}), "floating-point"),
     "nan": (model(chain(*MLP), {**CONSTANTS, "B1": B1 * np.nan}), "finite"),
     "a zero": (model(chain(("Div", "*", "zero"), *MLP)), "divides by 0"),

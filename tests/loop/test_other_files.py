@@ -141,7 +141,7 @@ def test_normalisations_are_refused_by_name(norm: torch.nn.Module, tmp_path: Pat
 
 def test_layer_norm_in_a_state_dict_is_named(tmp_path: Path) -> None:
     state = Normalised(torch.nn.LayerNorm(32)).state_dict()
-    with pytest.raises(InputError, match=r"net\.1 must be affine.*LayerNorm is read of a module"):
+    with pytest.raises(InputError, match=r"net\.1 must be affine.*LayerNorm is read .*--norm layer-before"):
         import_policy(saved(tmp_path, state), plant(), LAYERS)
 
 

@@ -14,15 +14,21 @@ import numpy as np
 from certify.errors import InputError
 from certify.loop.files.arrays import Numbers
 from certify.loop.policies.importers.steps import (
+    ABSOLUTE,
+    CUBE,
+    SQUARE,
     Activate,
     Affine,
     Branches,
     Clip,
     Diagonal,
+    InverseRoot,
     Step,
     Tanh,
     activated,
+    centred,
     exactly,
+    mean_of,
 )
 from certify.loop.policies.importers.steps import layer_normalised as layer_normalised_steps
 
@@ -131,6 +137,85 @@ def product(one: Chain, other: Chain) -> Chain:
         if same and more == gate:
             return (*short, Activate(name))
     return joined("product", one, other)
+
+
+def powered(chain: Chain, exponent: Any, what: str) -> Chain:
+    """`h^2` or `h^3`.
+
+    Raises
+    ------
+    InputError : the exponent is neither 2 nor 3.
+    """
+    said = real(exponent, what)
+    if said.size != 1 or said.item() not in (2, 3):
+        raise InputError(f"the exponent of {what} must be 2 or 3; found {said.ravel()[:4].tolist()}.")
+    return (*chain, SQUARE if said.item() == 2 else CUBE)
+
+
+def magnitude(chain: Chain) -> Chain:
+    """`|h|`."""
+    return (*chain, ABSOLUTE)
+
+
+def averaged(chain: Chain, width: int) -> Chain:
+    """The mean of the `width` numbers of a row."""
+    return (*chain, *mean_of(width))
+
+
+def subtracted(one: Chain, other: Chain) -> Chain:
+    """The difference of two values; `h - mean of h` is that of every number and the one mean."""
+    width = _averages(_behind(one, other))
+    return (*one, *centred(width)) if width is not None else joined("sum", one, negated(other))
+
+
+def divided(one: Chain, other: Chain, what: str) -> Chain:
+    """`h / (|h| + 1)`, the only quotient of two values that is read.
+
+    Raises
+    ------
+    InputError : it is another quotient.
+    """
+    more = _behind(one, other)
+    if len(more) == 2 and more[0] is ABSOLUTE and more[1] == Diagonal((Fraction(1),), (Fraction(1),)):
+        return mapped(one, "softsign")
+    raise InputError(
+        f"{what} divides two values that depend on the observation; read are h / (1 + |h|), which is softsign, and "
+        f"{_NORMALISED}."
+    )
+
+
+def divided_by_root(one: Chain, under: Chain, what: str) -> Chain:
+    """`h / sqrt(mean of h^2 + epsilon)`, as layer normalisation is written out.
+
+    Raises
+    ------
+    InputError : it is another quotient, or epsilon is not positive.
+    """
+    match _behind(one, under):
+        case [Branches() as square, Affine() as total, Diagonal() as share, Diagonal((scale,), (epsilon,)) as last] if (
+            square == SQUARE and _averages((total, share)) and scale == 1 and epsilon > 0
+        ):
+            return (*one, Branches("product", ((), (square, total, share, last, InverseRoot()))))
+    raise InputError(f"{what} divides by a square root; read is {_NORMALISED}, with a positive epsilon.")
+
+
+_NORMALISED = "h / sqrt(mean of h^2 + epsilon), which is layer normalisation written out"
+
+
+def _behind(one: Chain, other: Chain) -> Chain:
+    """The steps of `other` after those of `one`; none if it does not begin with them."""
+    begins = len(other) >= len(one) and all(a is b for a, b in zip(one, other, strict=False))
+    return other[len(one) :] if begins else ()
+
+
+def _averages(steps: Chain) -> int | None:
+    """The number of entries of which these steps are the mean; None if they are another function."""
+    match steps:
+        case (Affine(weight, bias), Diagonal() as share):
+            rows, width = weight.shape
+            one = rows == 1 and bool(np.all(weight == 1)) and not np.any(bias)
+            return width if one and share == mean_of(width)[1] else None
+    return None
 
 
 def clipped(chain: Chain, lo: Any | None, hi: Any | None, what: str) -> Chain:

@@ -225,6 +225,7 @@ def _require_answers(kind: Content, reading: Reading, options: ImportOptions, pl
         raise InputError(f"the file does not fully define the policy; these options are required: {'; '.join(wanted)}.")
     for option, value, belongs in (
         ("--activation", options.activation, layers_only),
+        ("--norm", options.norm, layers_only),
         ("--squash", options.squash, layers_only or kind == "two-stage"),
         ("--prefix", options.prefix, layers_only),
         ("--normaliser", options.normaliser, kind != "two-stage"),

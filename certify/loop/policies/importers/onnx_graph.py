@@ -8,6 +8,7 @@ width that a value has already, which is removed before the graph runs.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,26 +19,30 @@ from certify.loop.files.arrays import Numbers
 from certify.loop.policies.importers import graph
 from certify.loop.policies.importers.graph import Chain
 from certify.loop.policies.importers.onnx_weights import load_weights
+from certify.loop.policies.importers.onnx_written import written_out
 from certify.loop.policies.importers.options import WITH_TANH, WITHOUT_NORMALISATION
-from certify.loop.policies.importers.reading import Observations, Reading, Values
-from certify.loop.policies.importers.steps import Affine
+from certify.loop.policies.importers.reading import Observations, Reading, Values, gives
+from certify.loop.policies.importers.steps import MOST_NORMALISED, Affine
 
 _ACTIVATIONS = ("Tanh", "Elu", "Sigmoid", "Gelu", "Softplus", "Mish", "Softsign", "LeakyRelu", "Selu", "Celu")
 _OPERATIONS = {
     "Gemm", "MatMul", "Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", *_ACTIVATIONS,
-    "Identity", "Cast", "Flatten", "Reshape", "Constant", "Concat", "LayerNormalization",
+    "Identity", "Cast", "Flatten", "Reshape", "Constant", "Concat", "LayerNormalization", "Pow",
+    "Abs", "HardSigmoid", "HardSwish", "ReduceMean", "Sqrt",
 }  # fmt: skip
 _KNOWN = (
     f"Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu, {', '.join(_ACTIVATIONS)}, "
-    "LayerNormalization, Concat, Identity, Flatten and Constant"
+    "HardSigmoid, HardSwish, Abs, Pow, LayerNormalization, ReduceMean and Sqrt as parts of one, Concat, Identity, "
+    "Flatten and Constant"
 )
 _NORMALISATIONS = {
     "BatchNormalization",
     "InstanceNormalization",
     "GroupNormalization",
-    "ReduceMean",
 }
 _SELU = {"gamma": float(np.float32(1.05070102214813)), "alpha": float(np.float32(1.67326319217681))}  # of the standard
+_HARD_SIGMOID = {"alpha": float(np.float32(0.2)), "beta": 0.5}
+_TAKES_INTEGERS = ("Reshape", "Pow", "ReduceMean")
 _STANDARD = ("", "ai.onnx")
 _FLAGS = {
     "Gemm": {"alpha", "beta", "transA", "transB"},
@@ -48,6 +53,8 @@ _FLAGS = {
     "Elu": {"alpha"},
     "LeakyRelu": {"alpha"},
     "Celu": {"alpha"},
+    "HardSigmoid": {"alpha", "beta"},
+    "ReduceMean": {"axes", "keepdims", "noop_with_empty_axes"},
     "Selu": {"alpha", "gamma"},
     "Concat": {"axis"},
     "Gelu": {"approximate"},
@@ -66,6 +73,11 @@ _ELEMENTWISE = {
     "Log",
     "Identity",
     "Cast",
+    "Pow",
+    "Abs",
+    "Sqrt",
+    "HardSigmoid",
+    "HardSwish",
 }
 
 
@@ -189,6 +201,7 @@ def _doubled(model: Any) -> Any:
 
     copied = onnx.ModelProto()
     copied.CopyFrom(model)
+    written_out(copied.graph)
     attributes = [(node.op_type, a) for node in copied.graph.node for a in node.attribute]
     held = (a.t for kind, a in attributes if kind == "Constant" and a.name == "value")
     for tensor in (*copied.graph.initializer, *held):
@@ -229,7 +242,8 @@ def _walk(graph_: Any, name: str, output: str, what: str) -> Chain:
         if tensor.name in constants:
             raise InputError(f"{what} must name each tensor once; {tensor.name} stands there twice.")
         constants[tensor.name] = _constant(tensor, what)
-    chains: dict[str, Chain] = {name: ()}
+    chains: dict[str, Chain | _Root] = {name: ()}
+    wide = _given_width(graph_, name)
     for node in graph_.node:
         at = f"{node.op_type} {node.name}".strip()
         if node.domain not in _STANDARD or len(node.output) != 1:
@@ -237,8 +251,7 @@ def _walk(graph_: Any, name: str, output: str, what: str) -> Chain:
         if node.output[0] in chains or node.output[0] in constants:
             raise InputError(f"{what} must name each value once; {node.output[0]} stands there twice.")
         if node.op_type in _NORMALISATIONS:
-            part = " (a part of LayerNorm, as exporters write it)" if node.op_type == "ReduceMean" else ""
-            raise InputError(f"{at} in {what}{part} is not read. {WITHOUT_NORMALISATION}")
+            raise InputError(f"{at} in {what} is not read. {WITHOUT_NORMALISATION}")
         if node.op_type not in _OPERATIONS:
             raise InputError(f"{at} in {what} is not read: the operations are {_KNOWN}. {WITH_TANH}")
         flags = {a.name: a for a in node.attribute}
@@ -255,21 +268,57 @@ def _walk(graph_: Any, name: str, output: str, what: str) -> Chain:
         given = [None if not i else chains[i] if i in chains else constants.get(i) for i in node.input]
         if any(i and v is None for i, v in zip(node.input, given, strict=True)):
             raise InputError(f"{at} in {what} reads a value that nothing before it makes.")
-        if node.op_type != "Reshape" and any(isinstance(v, np.ndarray) and v.dtype.kind != "f" for v in given):
+        integers = [v for v in given if isinstance(v, np.ndarray) and v.dtype.kind != "f"]
+        if integers and node.op_type not in _TAKES_INTEGERS:
             raise InputError(f"{at} in {what} must be of floating-point numbers (float32 or float64).")
         if node.op_type in ("Identity", "Cast") and len(given) == 1 and isinstance(given[0], np.ndarray):
             if node.op_type == "Cast":
                 _require_real(flags, f"{at} in {what}")
             constants[node.output[0]] = given[0]
             continue
+        if node.op_type == "ReduceMean":
+            chains[node.output[0]] = _averaged(given, flags, wide, f"{at} in {what}")
+            continue
         chains[node.output[0]] = _apply(node.op_type, given, flags, f"{at} in {what}")
     if output not in chains:
         raise InputError(f"the output of {what} does not depend on its input.")
-    return chains[output]
+    found = chains[output]
+    if isinstance(found, _Root):
+        raise InputError(f"the output of {what} must be no square root.")
+    return found
 
 
-def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain:
-    found = [k for k, value in enumerate(given) if isinstance(value, tuple)]
+@dataclass(frozen=True, slots=True)
+class _Root:
+    """The square root of a value, by which another may be divided."""
+
+    under: Chain
+
+
+def _given_width(graph_: Any, name: str) -> int:
+    """The width of the graph's input; 0 if the graph leaves it open."""
+    (dims,) = (value.type.tensor_type.shape.dim for value in graph_.input if value.name == name)
+    return max(0, int(dims[-1].dim_value)) if len(dims) else 0
+
+
+def _averaged(given: list[Any], flags: dict[str, Any], wide: int, at: str) -> Chain:
+    """The mean of a row, whose axis is an attribute or, from opset 18 on, a second input."""
+    said = list(flags["axes"].ints) if "axes" in flags else np.ravel(given[1]).tolist() if given[1:] else []
+    kept = flags["keepdims"].i if "keepdims" in flags else 1
+    if not given or not isinstance(given[0], tuple) or said not in ([1], [-1]) or kept != 1:
+        raise InputError(f"{at} (a part of LayerNorm, as exporters write it) must be over axis 1, with keepdims 1.")
+    width = gives(given[0], wide)
+    if not 0 < width <= MOST_NORMALISED:
+        raise InputError(f"{at} must be of 1 to {MOST_NORMALISED} numbers, by a layer or by the shape of the input.")
+    return graph.averaged(given[0], width)
+
+
+def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain | _Root:
+    if kind == "Sqrt" and len(given) == 1 and isinstance(given[0], tuple):
+        return _Root(given[0])
+    found = [k for k, value in enumerate(given) if isinstance(value, tuple | _Root)]
+    if any(isinstance(value, _Root) for value in given) or (len(found) == 2 and kind == "Div"):
+        return _divided(kind, given, at)
     if len(found) == len(given) == 2 and kind == "Mul":
         return graph.product(*given)
     if len(found) == len(given) > 1 and kind in ("Add", "Sub", "Concat"):
@@ -297,11 +346,15 @@ def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain
             return graph.scaled(chain, others[0], at)
         case "Div", 0, 2:
             return graph.scaled(chain, others[0], at, divide=True)
+        case "Pow", 0, 2:
+            return graph.powered(chain, others[0], at)
         case "Neg", 0, 1:
             return graph.negated(chain)
         case _, 0, 1 if kind in _ACTIVATIONS:
             return _activated(chain, kind, flags, at)
-        case "HardSwish" | "LayerNormalization", 0, _:
+        case "Abs", 0, 1:
+            return graph.magnitude(chain)
+        case "HardSwish" | "HardSigmoid" | "LayerNormalization", 0, _:
             return _composed(kind, chain, given, flags, at)
         case "Cast", 0, 1:
             _require_real(flags, at)
@@ -318,6 +371,16 @@ def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain
             bounds = [*given[1:], None, None]
             return graph.clipped(chain, bounds[0], bounds[1], at)
     raise InputError(f"{at} is not read: the operations are {_KNOWN}, with the observation in the usual place.")
+
+
+def _divided(kind: str, given: list[Any], at: str) -> Chain:
+    """A quotient of two values, or by the square root of one."""
+    match kind, given:
+        case "Div", [tuple() as one, _Root() as root]:
+            return graph.divided_by_root(one, root.under, at)
+        case "Div", [tuple() as one, tuple() as other]:
+            return graph.divided(one, other, at)
+    raise InputError(f"{at} reads a square root, which may only divide a value, as in layer normalisation.")
 
 
 def _gemm(chain: Chain, given: list[Any], flags: dict[str, Any], at: str) -> Chain:
@@ -342,6 +405,9 @@ def _composed(kind: str, chain: Chain, given: list[Any], flags: dict[str, Any], 
     """Operations that are made of several steps."""
     if kind == "HardSwish" and len(given) == 1:
         return graph.mapped(chain, "hardswish")
+    if kind == "HardSigmoid" and len(given) == 1:
+        said = (float(flags[k].f) if k in flags else v for k, v in _HARD_SIGMOID.items())
+        return graph.mapped(chain, "hardsigmoid", *said)
     axis = flags["axis"].i if "axis" in flags else -1
     if kind != "LayerNormalization" or len(given) not in (2, 3) or axis not in (1, -1):
         raise InputError(f"{at} is not read: it must normalise the numbers of a row, along axis 1.")
@@ -357,23 +423,24 @@ def _joined(kind: str, chains: list[Chain], flags: dict[str, Any], at: str) -> C
             raise InputError(f"{at} must put the numbers of a row one behind the other, along axis 1.")
         return graph.joined("concat", *chains)
     one, other = chains
-    return graph.joined("sum", one, graph.negated(other) if kind == "Sub" else other)
+    return graph.subtracted(one, other) if kind == "Sub" else graph.joined("sum", one, other)
 
 
 _ALPHAS = {"LeakyRelu": float(np.float32(0.01)), "Elu": 1.0, "Celu": 1.0}  # where nothing is said
 
 
 def _activated(chain: Chain, kind: str, flags: dict[str, Any], at: str) -> Chain:
-    """An activation of the chain, but not the Gelu that is an approximation."""
+    """An activation of the chain."""
     if kind in _ALPHAS:
         alpha = float(flags["alpha"].f) if "alpha" in flags else _ALPHAS[kind]
         name = "leaky_relu" if kind == "LeakyRelu" else kind.lower()
         return graph.mapped(chain, name, *([] if alpha == 1 and kind == "Elu" else [alpha]))
     if kind == "Selu":
         return graph.mapped(chain, "selu", *(float(flags[k].f) if k in flags else v for k, v in _SELU.items()))
-    if "approximate" in flags and flags["approximate"].s != b"none":
-        raise InputError(f"{at} must be the exact one, without `approximate`.")
-    return graph.mapped(chain, kind.lower())
+    approximate = flags["approximate"].s if "approximate" in flags else b"none"
+    if approximate not in (b"none", b"tanh"):
+        raise InputError(f"{at} must be the exact one or its tanh form; found approximate {approximate!r}.")
+    return graph.mapped(chain, "gelu-tanh" if approximate == b"tanh" else kind.lower())
 
 
 def _require_real(flags: dict[str, Any], at: str) -> None:

@@ -16,6 +16,7 @@ from certify.loop.policies.network import Centre
 
 Kind = Literal["auto", "state-dict", "torchscript", "onnx", "sb3", "safetensors", "two-stage"]
 Output = Literal["identity", "tanh", "relu-tanh"]
+Norm = Literal["layer-before", "layer-after"]
 Observes = Literal["absolute", "deviation"]
 KNOWN_ACTIVATIONS = f"{', '.join(IMPORTED[:-1])} and {IMPORTED[-1]}"
 """The activations that are proved, in words."""
@@ -26,8 +27,8 @@ WITH_TANH = (
 )
 """The next step where a policy has another activation."""
 WITHOUT_NORMALISATION = (
-    "LayerNorm is read of a module, of TorchScript, and of ONNX as LayerNormalization (from opset 17 on); for another "
-    "normalisation between layers train the policy again without it. "
+    "LayerNorm is read of a module, of TorchScript, of ONNX, and of a policy's state_dict with --norm layer-before or "
+    "layer-after (the activation); for another normalisation between layers train the policy again without it. "
     "BatchNorm alone is affine in evaluation and can be folded into the layer before it."
 )
 """The next step where a policy has a normalisation between its layers."""
@@ -42,8 +43,11 @@ class ImportOptions:
     kind : the kind of file, or `auto`.
     prefix : in a state_dict, the keys of the policy's layers up to their numbers, such as `actor.pi_net.fcs`.
     activation : between the layers of a state_dict, by its name: tanh, relu, elu (alpha 1), sigmoid, silu, gelu (the
-        exact one), softplus (beta 1), mish, softsign, leaky_relu (slope 0.01), selu, celu (alpha 1), hardtanh, relu6,
-        hardsigmoid or logsigmoid.
+        exact one), gelu-tanh (its tanh form), softplus (beta 1), mish, softsign, leaky_relu (slope 0.01), selu, celu
+        (alpha 1), hardtanh, relu6, hardsigmoid, hardswish or logsigmoid.
+    norm : the layer normalisation between the layers of a state_dict, `layer-before` or `layer-after` the activation;
+        None if there is none.
+    norm_epsilon : the number that it adds to the variance; 1e-5 by default.
     squash : what follows the last layer of a state_dict: `identity`, `tanh`, or `relu-tanh` for relu(tanh(.)).
     states : what the network reads, in its order: states of the plant, or expressions of them such as `cos(theta)`.
     normaliser : a file with the observations' normaliser, or `none`.
@@ -74,10 +78,13 @@ class ImportOptions:
     observes: Observes | None = None
     ignore: tuple[str, ...] | None = None
     output: str | None = None
+    norm: Norm | None = None
+    norm_epsilon: Fraction | None = None
 
     def __post_init__(self) -> None:
         for option, value, known in (
             ("--from", self.kind, get_args(Kind)),
+            ("--norm", self.norm, get_args(Norm)),
             ("--squash", self.squash, get_args(Output)),
             ("--centre", self.centre, get_args(Centre)),
             ("--observes", self.observes, get_args(Observes)),
@@ -92,6 +99,11 @@ class ImportOptions:
             raise InputError("--action-scale must not be 0.")
         if self.epsilon is not None and self.epsilon < 0:
             raise InputError(f"--epsilon must not be negative; found {float(self.epsilon)}.")
+        if self.norm_epsilon is not None and (self.norm is None or self.norm_epsilon <= 0):
+            raise InputError(
+                f"--norm-epsilon must be positive, and go with --norm; found {float(self.norm_epsilon)}, and "
+                f"{'no --norm' if self.norm is None else self.norm}."
+            )
 
     @property
     def given(self) -> dict[str, Any]:
@@ -105,7 +117,7 @@ _OPTIONS = {
     "kind": "--from", "prefix": "--prefix", "activation": "--activation", "squash": "--squash", "states": "--states",
     "normaliser": "--normaliser", "epsilon": "--epsilon", "action_scale": "--action-scale",
     "action_offset": "--action-offset", "clip": "--clip", "centre": "--centre", "observes": "--observes",
-    "ignore": "--ignore", "output": "--output",
+    "ignore": "--ignore", "output": "--output", "norm": "--norm", "norm_epsilon": "--norm-epsilon",
 }  # fmt: skip
 
 

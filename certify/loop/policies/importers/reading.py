@@ -13,7 +13,16 @@ from numpy.typing import NDArray
 from certify.errors import InputError
 from certify.loop.activations import ACTIVATIONS
 from certify.loop.policies.importers.options import Output
-from certify.loop.policies.importers.steps import Affine, Branches, Diagonal, Normalise, Step, activated
+from certify.loop.policies.importers.steps import (
+    Affine,
+    Branches,
+    Diagonal,
+    Normalise,
+    Step,
+    activated,
+    exactly,
+    layer_normalised,
+)
 from certify.loop.policies.network import Array
 
 Observations = NDArray[np.floating[Any]]
@@ -72,7 +81,7 @@ class Reading:
     @property
     def m(self) -> int:
         """Number of actions."""
-        return _gives(self.steps, self.n)
+        return gives(self.steps, self.n)
 
 
 def _reads(steps: Sequence[Step]) -> int | None:
@@ -87,13 +96,13 @@ def _reads(steps: Sequence[Step]) -> int | None:
     return None
 
 
-def _gives(steps: Sequence[Step], width: int) -> int:
+def gives(steps: Sequence[Step], width: int) -> int:
     """The number of entries that a chain makes of so many."""
     for step in steps:
         if isinstance(step, Affine):
             width = int(step.weight.shape[0])
         if isinstance(step, Branches):
-            ends = [_gives(chain, width) for chain in step.of]
+            ends = [gives(chain, width) for chain in step.of]
             width = sum(ends) if step.kind == "concat" else max(ends)
     return width
 
@@ -107,12 +116,46 @@ _FORMULAS: Mapping[str, Callable[[Values], Values]] = {
     "hardsigmoid": lambda v: np.clip(v + 3, 0, 6) / 6,
     "hardswish": lambda v: v * (np.clip(v + 3, 0, 6) / 6),
     "logsigmoid": lambda v: -np.logaddexp(0, -v),
+    "gelu-tanh": lambda v: 0.5 * v * (1 + np.tanh(0.7978845608028654 * (v + 0.044715 * v * v * v))),
 }
 """The activations that are made of others, as they are written elsewhere."""
 
 
-def perceptron(layers: Sequence[Affine], squash: Output = "identity", activation: str = "tanh") -> Evaluate:
-    """The layers with an activation between them, and `squash` behind them, in numpy."""
+@dataclass(frozen=True, slots=True)
+class LayerNorm:
+    """A layer normalisation between two layers, before the activation or after it, with its gain and bias (n,)."""
+
+    gain: Array
+    bias: Array
+    epsilon: Fraction
+    before: bool
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """It as exact steps."""
+        nothing, one = (Fraction(0),), (Fraction(1),)
+        tail = Diagonal(exactly(self.gain), nothing), Diagonal(one, exactly(self.bias))
+        return (*layer_normalised(self.gain.size, self.epsilon), *tail)
+
+    def __call__(self, v: Values) -> Values:
+        """Its values of rows of numbers, in their precision."""
+        apart = v - np.mean(v, axis=-1, keepdims=True)
+        root = np.sqrt(np.mean(apart * apart, axis=-1, keepdims=True) + v.dtype.type(self.epsilon))
+        found: Values = apart / root * self.gain.astype(v.dtype) + self.bias.astype(v.dtype)
+        return found
+
+
+Norms = Mapping[int, LayerNorm]
+"""Normalisations by the number of the layer that they stand before."""
+
+
+def perceptron(
+    layers: Sequence[Affine],
+    squash: Output = "identity",
+    activation: str = "tanh",
+    norms: Norms | None = None,
+) -> Evaluate:
+    """The layers with an activation, and maybe a normalisation, between them, and `squash` behind them, in numpy."""
     phi = _FORMULAS[activation] if activation in _FORMULAS else ACTIVATIONS[activation]
     ends: dict[Output, Callable[[Values], Values]] = {
         "identity": lambda y: y,
@@ -124,16 +167,30 @@ def perceptron(layers: Sequence[Affine], squash: Output = "identity", activation
         kind = np.float64 if double else np.float32
         h = x.astype(kind)
         for k, layer in enumerate(layers):
-            h = (phi(h) if k else h) @ layer.weight.T.astype(kind) + layer.bias.astype(kind)
+            for function in _between(k, phi, norms):
+                h = function(h)
+            h = h @ layer.weight.T.astype(kind) + layer.bias.astype(kind)
         return ends[squash](h)
 
     return evaluate
 
 
-def between(layers: Sequence[Affine], activation: str = "tanh") -> tuple[Step, ...]:
-    """The layers as steps, with an activation between them."""
-    function = activated(activation)
-    return tuple(step for k, layer in enumerate(layers) for step in ((*function, layer) if k else (layer,)))
+def _between(k: int, phi: Callable[[Values], Values], norms: Norms | None) -> tuple[Callable[[Values], Values], ...]:
+    """The functions before layer `k`, in order."""
+    norm = (norms or {}).get(k)
+    return () if not k else (phi,) if norm is None else (norm, phi) if norm.before else (phi, norm)
+
+
+def between(layers: Sequence[Affine], activation: str = "tanh", norms: Norms | None = None) -> tuple[Step, ...]:
+    """The layers as steps, with an activation, and maybe a normalisation, between them."""
+    function, steps = activated(activation), list[Step]()
+    for k, layer in enumerate(layers):
+        norm = (norms or {}).get(k)
+        if k:
+            normalised = () if norm is None else norm.steps
+            steps += (*normalised, *function) if norm is not None and norm.before else (*function, *normalised)
+        steps.append(layer)
+    return tuple(steps)
 
 
 def widths(layers: Sequence[Affine]) -> str:

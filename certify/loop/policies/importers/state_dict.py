@@ -7,7 +7,7 @@ after the last one, nor the treatment of observations and actions: each is asked
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 
 import numpy as np
@@ -16,7 +16,15 @@ from certify.errors import InputError
 from certify.loop.files.arrays import Numbers
 from certify.loop.policies.importers.normalisers import normaliser_root, rsl_normaliser
 from certify.loop.policies.importers.options import WITHOUT_NORMALISATION, ImportOptions, Output
-from certify.loop.policies.importers.reading import Observations, Reading, Values, between, perceptron, widths
+from certify.loop.policies.importers.reading import (
+    LayerNorm,
+    Observations,
+    Reading,
+    Values,
+    between,
+    perceptron,
+    widths,
+)
 from certify.loop.policies.importers.steps import Affine, Clip, Step, Tanh, linear
 from certify.loop.policies.importers.unread import unread
 
@@ -28,6 +36,7 @@ _ENDS: dict[Output, tuple[Step, ...]] = {
     "tanh": (Tanh(),),
     "relu-tanh": (Tanh(), Clip((Fraction(0),), (None,))),
 }
+_EPSILON = Fraction(1e-5)  # torch's number
 _NORMALISATION = f"A normalisation layer has such a one. {WITHOUT_NORMALISATION}"
 Layers = list[Affine]
 
@@ -95,7 +104,8 @@ def read_state_dict(
         not proved, or another tensor could belong to the policy.
     """
     prefix = options.prefix if options.prefix is not None else _only(tensors, n, m)
-    layers = _layers(tensors, prefix)
+    norms = {} if options.norm is None else _norms(tensors, prefix, options)
+    layers = _layers(tensors, prefix, list(norms))
     if (layers[0].weight.shape[1], layers[-1].weight.shape[0]) != (n, m):
         raise InputError(
             f"the policy must read {n} states and command {m} inputs; {prefix} is {widths(layers)}. "
@@ -108,14 +118,18 @@ def read_state_dict(
         known |= dict.fromkeys((f"{at}_var", f"{at}count"), "of the normaliser that is read")
     if beside is not None:
         known |= dict.fromkeys(_own(tensors, beside), "the Lyapunov network that is imported beside it")
-    activation = options.activation or "tanh"
+    activation, placed = options.activation or "tanh", dict(norms.values())
+    assumed = f"{activation} between the layers is what --activation says, {squash} behind them what --squash says"
+    if options.norm is not None:
+        epsilon = float(options.norm_epsilon or _EPSILON)
+        assumed += f", layer normalisation {options.norm[6:]} the activation, with epsilon {epsilon}, what --norm says"
     return Reading(
-        words=f"state_dict {prefix} {widths(layers)}",
-        steps=(*between(layers, activation), *_ENDS[squash]),
-        evaluate=perceptron(layers, squash, activation),
+        words=f"state_dict {prefix} {widths(layers)}{' with layer normalisation' if norms else ''}",
+        steps=(*between(layers, activation, placed), *_ENDS[squash]),
+        evaluate=perceptron(layers, squash, activation, placed),
         normaliser=rsl_normaliser(tensors, options.epsilon),
         double=_is_double(tensors, prefix),
-        assumed=f"{activation} between the layers is what --activation says, {squash} behind them what --squash says",
+        assumed=assumed,
         unread=unread(tensors, read, prefix, m, options.ignore, known),
     )
 
@@ -203,9 +217,53 @@ def _only(tensors: Mapping[str, Numbers], n: int, m: int) -> str:
     )
 
 
-def _layers(tensors: Mapping[str, Numbers], prefix: str) -> Layers:
+def _norms(tensors: Mapping[str, Numbers], prefix: str, options: ImportOptions) -> dict[int, tuple[int, LayerNorm]]:
+    """The normalisations between the layers by their own numbers: the place of the layer behind, and what they are.
+
+    Raises
+    ------
+    InputError : there is none, one does not stand between two layers of its width, or their numbers show another place
+        of it than `--norm`.
+    """
+    root, numbers, found = _dot(prefix), _numbers(tensors, prefix), dict[int, tuple[int, LayerNorm]]()
+    flat = [k for k in numbers if tensors[f"{root}{k}.weight"].ndim == 1]
+    affine = [k for k in numbers if k not in flat]
+    for k in flat:
+        weight, bias = tensors[f"{root}{k}.weight"], tensors.get(f"{root}{k}.bias")
+        before, behind = [j for j in affine if j < k], [j for j in affine if j > k]
+        place = len(before)
+        if not before or not behind or place in (known for known, _ in found.values()):
+            raise InputError(f"--norm needs one normalisation between two layers; {root}{k} stands elsewhere.")
+        width = tensors[f"{root}{before[-1]}.weight"].shape[:1]
+        if bias is None or not weight.shape == bias.shape == width or weight.dtype.kind != "f":
+            raise InputError(
+                f"a layer normalisation must have a weight and a bias of shape {width}, like the layer before it; "
+                f"{root}{k} has {weight.shape} and {'no bias' if bias is None else bias.shape}."
+            )
+        shown = (k == before[-1] + 1) - (k + 1 == behind[0])  # 0 where the activation has no number of its own
+        if shown == (-1 if options.norm == "layer-before" else 1):
+            raise InputError(
+                f"--norm {options.norm} does not fit the numbers {before[-1]}, {k} and {behind[0]} of the layers "
+                f"around {root}{k}, where the activation stands {'behind' if shown > 0 else 'before'} it."
+            )
+        made = LayerNorm(
+            weight.astype(np.float64),
+            bias.astype(np.float64),
+            options.norm_epsilon or _EPSILON,
+            options.norm == "layer-before",
+        )
+        found[k] = place, made
+    if not found:
+        raise InputError(f"--norm must be left out: no layer of {prefix or 'the file'} has a weight of one dimension.")
+    return found
+
+
+def _layers(tensors: Mapping[str, Numbers], prefix: str, besides: Sequence[int] = ()) -> Layers:
+    """The affine layers in their order, but not the numbers `besides`."""
     root, layers = _dot(prefix), []
     for k in _numbers(tensors, prefix):
+        if k in besides:
+            continue
         weight, bias = tensors[f"{root}{k}.weight"], tensors.get(f"{root}{k}.bias")
         if weight.ndim != 2 or weight.dtype.kind != "f":
             raise InputError(

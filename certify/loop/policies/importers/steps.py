@@ -6,6 +6,7 @@ number that the file's bytes encode; a step is a function in real arithmetic.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal, TypeVar
@@ -121,7 +122,16 @@ class Branches:
 
 
 Step = Affine | Diagonal | Normalise | Tanh | Activate | Clip | InverseRoot | Branches
+MOST_NORMALISED = 4096
+"""The most numbers of which a normalisation is read."""
+SQUARE = Branches("product", ((), ()))
+"""`y_i = h_i^2`."""
+CUBE = Branches("product", ((), (SQUARE,)))
+"""`y_i = h_i^3`."""
+ABSOLUTE = Branches("sum", ((Activate("relu"),), (Diagonal((Fraction(-1),), (Fraction(0),)), Activate("relu"))))
+"""`y_i = |h_i|`."""
 _SELU = Fraction(1.0507009873554804934193349852946), Fraction(1.6732632423543772848170429916717)
+_GELU_TANH = Fraction(math.sqrt(2 / math.pi)), Fraction(0.044715)  # torch's numbers
 
 
 def activated(function: str, *numbers: Fraction) -> tuple[Step, ...]:
@@ -154,19 +164,40 @@ def activated(function: str, *numbers: Fraction) -> tuple[Step, ...]:
             return (Clip((-one,), (one,)),)
         case "relu6", ():
             return (Clip((none,), (6 * one,)),)
+        case "hardsigmoid", (alpha, beta):
+            return (Diagonal((alpha,), (beta,)), Clip((none,), (one,)))
         case "hardsigmoid", ():
             return (Diagonal((one,), (3 * one,)), Clip((none,), (6 * one,)), _scaled(one / 6))
         case "hardswish", ():
             return (Branches("product", ((), activated("hardsigmoid"))),)
+        case "gelu-tanh", ():
+            return (Branches("product", ((), _tanh_gate())),)
         case "logsigmoid", ():
             return (_scaled(-one), Activate("softplus"), _scaled(-one))
     raise InputError(f"the activation must be one of {', '.join(IMPORTED)}; found {function}.")
 
 
-COMPOSED = ("leaky_relu", "selu", "celu", "hardtanh", "relu6", "hardsigmoid", "hardswish", "logsigmoid")
+COMPOSED = ("leaky_relu", "selu", "celu", "hardtanh", "relu6", "hardsigmoid", "hardswish", "logsigmoid", "gelu-tanh")
 """Activations that are made of others."""
 IMPORTED = (*ACTIVATIONS, *COMPOSED)
 """The names of all activations that are read."""
+
+
+def mean_of(width: int) -> tuple[Step, ...]:
+    """The mean of so many numbers, which is one number."""
+    return Affine(np.ones((1, width)), np.zeros(1)), Diagonal((Fraction(1, width),), (Fraction(0),))
+
+
+def centred(width: int) -> tuple[Step, ...]:
+    """So many numbers less their mean.
+
+    Raises
+    ------
+    InputError : there are more than the import takes.
+    """
+    if not 0 < width <= MOST_NORMALISED:
+        raise InputError(f"a normalisation must be of at most {MOST_NORMALISED} numbers; found {width}.")
+    return Affine(width * np.eye(width) - 1, np.zeros(width)), Diagonal((Fraction(1, width),), (Fraction(0),))
 
 
 def layer_normalised(width: int, epsilon: Fraction) -> tuple[Step, ...]:
@@ -178,10 +209,16 @@ def layer_normalised(width: int, epsilon: Fraction) -> tuple[Step, ...]:
     """
     if epsilon <= 0:
         raise InputError(f"the epsilon of a layer normalisation must be positive; found {float(epsilon)}.")
-    none, share = Fraction(0), Fraction(1, width)
-    centred = Affine(width * np.eye(width) - 1, np.zeros(width)), Diagonal((share,), (none,))
-    mean = Affine(np.ones((1, width)), np.zeros(1)), Diagonal((share,), (epsilon,))
-    return (*centred, Branches("product", ((), (Branches("product", ((), ())), *mean, InverseRoot()))))
+    apart = centred(width)
+    mean = *mean_of(width), Diagonal((Fraction(1),), (epsilon,))
+    return (*apart, Branches("product", ((), (SQUARE, *mean, InverseRoot()))))
+
+
+def _tanh_gate() -> tuple[Step, ...]:
+    """`(1 + tanh(k h (1 + c h^2))) / 2`, which multiplies h in the tanh form of GELU."""
+    k, c = _GELU_TANH
+    half = Fraction(1, 2)
+    return Branches("product", ((), (SQUARE, Diagonal((k * c,), (k,))))), Tanh(), Diagonal((half,), (half,))
 
 
 def _scaled(by: Fraction) -> Diagonal:

@@ -29,10 +29,12 @@ _MAX_DEPTH = 40
 _MAX_TEXT = 2**20
 _KNOWN = (
     "linear, addmm, matmul, add, sub, rsub, mul, div, neg, cat, clamp, hardtanh, relu, tanh, elu, sigmoid, silu, gelu, "
-    "softplus, mish, leaky_relu, selu, celu, relu6, hardsigmoid, hardswish, log_sigmoid and layer_norm"
+    "softplus, mish, leaky_relu, selu, celu, relu6, hardsigmoid, hardswish, log_sigmoid, pow, abs, "
+    "h / (1 + abs(h)) and layer_norm"
 )
 _ACTIVATIONS: dict[str, tuple[float, ...]] = {  # with what a program may write behind the value
     **{"tanh": (), "sigmoid": (), "silu": (), "gelu": (), "mish": (), "elu": (1.0, 1.0, 1.0), "softplus": (1.0, 20.0)},
+    "gelu-tanh": (),
     **dict.fromkeys(("selu", "relu6", "hardsigmoid", "hardswish", "log_sigmoid"), ()),
 }
 _NORMALISATIONS = ("batch_norm", "group_norm", "instance_norm", "rms_norm")
@@ -263,8 +265,11 @@ def _operation(program: _Program, name: str, given: list[Any], node: ast.Call) -
     if program.count[0] > _MAX_OPERATIONS:
         raise InputError(f"{program.file.what} must have at most {_MAX_OPERATIONS} operations; it has more.")
     for word in node.keywords:
+        said = word.value.value if isinstance(word.value, ast.Constant) else None
+        if name == "gelu" and word.arg == "approximate" and said in ("none", "tanh"):
+            name = "gelu" if said == "none" else "gelu-tanh"
         # alpha is written out even where it is 1, and then changes nothing
-        if word.arg != "alpha" or not isinstance(word.value, ast.Constant) or word.value.value != 1:
+        elif word.arg != "alpha" or said != 1:
             raise InputError(f"{at} has {word.arg}, which is not read.")
     if name in ("t", "numpy_T") and len(given) == 1 and _is_array(given[0]) and given[0].ndim == 2:
         return given[0].T
@@ -272,8 +277,11 @@ def _operation(program: _Program, name: str, given: list[Any], node: ast.Call) -
         return _Value(graph.joined("concat", *(v.chain for v in given[0])), name, tuple(given[0]))
     if name in ("add", "sub") and len(given) == 2 and _are_values(given):
         one, other = (v.chain for v in given)
-        chain = graph.joined("sum", one, graph.negated(other) if name == "sub" else other)
+        chain = graph.subtracted(one, other) if name == "sub" else graph.joined("sum", one, other)
         return _Value(chain, name, tuple(given))
+    if name == "div" and len(given) == 2 and _are_values(given):
+        one, other = (v.chain for v in given)
+        return _Value(graph.divided(one, other, at), name, tuple(given))
     if name == "mul" and len(given) == 2 and _are_values(given):
         return _Value(graph.product(*(v.chain for v in given)), name, tuple(given))
     if name == "layer_norm":
@@ -324,6 +332,10 @@ def _step(name: str, place: int, count: int, chain: Chain, given: tuple[Any, ...
             return graph.scaled(chain, given[0], at, divide=True)
         case "neg", 0, 1:
             return graph.negated(chain)
+        case "abs", 0, 1:
+            return graph.magnitude(chain)
+        case "pow", 0, 2:
+            return graph.powered(chain, given[0], at)
         case "leaky_relu" | "celu", 0, 1 | 2:
             return graph.mapped(chain, name, *given)
         case "elu", 0, 2 | 3 | 4 if given[1:] == (1.0, 1.0)[: len(given) - 1] and given[0] != 1:
@@ -357,6 +369,9 @@ def _run(name: str, given: list[Any], double: bool) -> Any:
         "mul": torch.mul,
         "div": torch.div,
         "neg": torch.neg,
+        "abs": torch.abs,
+        "pow": torch.pow,
+        "gelu-tanh": lambda h: torch.nn.functional.gelu(h, approximate="tanh"),
         "tanh": torch.tanh,
         "sigmoid": torch.sigmoid,
         **{name: getattr(torch.nn.functional, name) for name in ("silu", "gelu", "mish")},
