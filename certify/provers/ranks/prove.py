@@ -24,7 +24,8 @@ _HALF_TURN = 3.1416  # and a little more
 _SLIVER, _SAMPLES = 1e-6, 64
 _ORDERS = (2, 3, 4, 5, 6, 7, 8)
 _LITTLE, _GAIN = 1e-7, 0.5  # share of the root box that an error may be; a gain that is worth an order
-_MOST_LEAVES = 400_000
+_MOST_LEAVES, _MOST_PAIRS = 400_000, 10_000_000  # of an image and a leaf that it meets, in one round
+_OF_A_PAIR, _OF_A_LEAF = 500.0, 50_000.0  # operations, beside those of the steps
 _AT_FIRST = 0.1  # share of the effort for the first tree
 
 
@@ -142,10 +143,11 @@ def prove_ranks(
             effort.charge(float(found.taken.sum()) * course.operations)
             search.take(new, found)
             near, rounds = search.spread(), rounds + 1
+            effort.charge(_OF_A_PAIR * search.pairs + _OF_A_LEAF * len(new))
             if report is not None:
                 report(search.share, search.boxes, len(search.unknown))
             done = search.is_done(near)
-            if done or effort.over or len(search.cover.leaves) > _MOST_LEAVES:
+            if done or effort.over or len(search.cover.leaves) > _MOST_LEAVES or search.pairs > _MOST_PAIRS:
                 break
             new = search.further(near)
     search.tighten()

@@ -33,7 +33,7 @@ class Search:
         self.rank, self.steps = np.full(1, NONE), np.zeros(1, dtype=np.int64)
         self.lo, self.hi = np.full((K, n, 1), np.nan), np.full((K, n, 1), np.nan)
         self.there, self.steep, self.meets = np.zeros((K, 1), dtype=bool), np.zeros((n, 1)), np.zeros(1, dtype=bool)
-        self.boxes, self.shares = 0, list[float]()
+        self.boxes, self.pairs, self.shares = 0, 0, list[float]()
 
     def begin(self, most: float) -> Index:
         """The leaves of a first tree, all of one size, so many at most."""
@@ -105,6 +105,7 @@ class Search:
         kept = inside[pair]
         order = np.argsort(pair[kept], kind="stable")
         pair, leaf = pair[kept][order], leaf[kept][order]
+        self.pairs = len(pair)
         starts = np.flatnonzero(np.diff(pair, prepend=-1))
         owners = node[pair[starts]]
         steps = counts[k[pair[starts]]]
