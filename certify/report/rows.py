@@ -34,7 +34,7 @@ from certify.report.words import (
     volume_unit,
 )
 
-_STAGES = ("load", "candidate", "local", "ring", "tube", "learn", "outer", "write", "check")
+_STAGES = ("load", "candidate", "local", "ring", "tube", "learn", "outer", "ranks", "write", "check")
 _LONG = 200  # characters of an expression, beyond which it is not shown
 
 

@@ -157,6 +157,7 @@ def test_options_by_name_are_those_of_the_options() -> None:
         "cluster": "nowhere",
         "resume": "yes",
         "enlarge": "yes",
+        "ranks": "yes",
         "box": {"theta": -1.0},
         "reach_from": {"theta": float("nan")},
         "P": [[1.0, 2.0], [0.0, 1.0]],
