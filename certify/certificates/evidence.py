@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.certificates.claims.claim import UNPROVED
 from certify.certificates.encoding import decode, encode
 from certify.certificates.tree import LEAF
 from certify.errors import InputError
@@ -131,6 +132,22 @@ class RankTree:
                 f"a tree of ranks must have two corners of one length, and a rank and steps for each of its {found} "
                 f"leaves; found {self.lo.shape}, {self.hi.shape}, {len(self.ranks)} and {len(self.steps)}."
             )
+
+    @property
+    def proved(self) -> NDArray[np.bool_]:
+        """True for each leaf that has a rank, (N,)."""
+        proved: NDArray[np.bool_] = self.ranks != UNPROVED
+        return proved
+
+    @property
+    def most(self) -> int:
+        """The highest rank; 0 if there is none."""
+        return int(self.ranks[self.proved].max(initial=0))
+
+    def without(self, dropped: NDArray[np.bool_]) -> RankTree:
+        """The same without the ranks of some leaves, (N,)."""
+        ranks = np.where(dropped, UNPROVED, self.ranks).astype(np.uint16)
+        return replace(self, ranks=ranks, steps=np.where(dropped, 0, self.steps).astype(np.uint8))
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,6 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates.claims import UNPROVED
 from certify.certificates.ellipsoids import Box, Ellipsoid
 from certify.certificates.evidence import RankTree
 from certify.certificates.located import Containment, Located
@@ -55,7 +54,7 @@ class Ranked:
         object.__setattr__(self, "_upper", upper_children(self.tree.tree))
         leaf = np.frombuffer(self.tree.tree, np.uint8) == LEAF
         proved = np.zeros(len(leaf), dtype=np.bool_)
-        proved[leaf] = self.tree.ranks != UNPROVED
+        proved[leaf] = self.tree.proved
         object.__setattr__(self, "_proved", proved)
 
     def holds(self, states: Iterable[Sequence[Fraction | float]]) -> list[bool]:
@@ -193,11 +192,10 @@ def steps_from(ranked: Ranked, box: Box) -> int | None:
     show it; None if they do not show that it ever is."""
 
     def shown(most: int) -> bool:
-        ranks = np.where(ranked.tree.ranks <= most, ranked.tree.ranks, UNPROVED).astype(np.uint16)
-        known = replace(ranked, tree=replace(ranked.tree, ranks=ranks))
+        known = replace(ranked, tree=ranked.tree.without(ranked.tree.ranks > most))
         return known.locate(box).answer is Containment.CONTAINED
 
-    each = np.unique(ranked.tree.ranks[ranked.tree.ranks != UNPROVED]).tolist()
+    each = np.unique(ranked.tree.ranks[ranked.tree.proved]).tolist()
     if not each or not shown(each[-1]):
         return None
     low, high = 0, len(each) - 1
@@ -261,9 +259,7 @@ def count(tree: RankTree, angles: Sequence[int] = ()) -> Count:
     ------
     CertificateFormatError : the tree's bytes are not exactly one tree.
     """
-    finite = tree.ranks[tree.ranks != UNPROVED]
-    most = int(finite.max()) if len(finite) else 0
-    return Count(len(tree.ranks), len(finite), *proved_volume(tree, angles), most)
+    return Count(len(tree.ranks), int(tree.proved.sum()), *proved_volume(tree, angles), tree.most)
 
 
 def proved_volume(tree: RankTree, angles: Sequence[int] = ()) -> tuple[float, float]:
@@ -276,7 +272,7 @@ def proved_volume(tree: RankTree, angles: Sequence[int] = ()) -> tuple[float, fl
     CertificateFormatError : the tree's bytes are not exactly one tree.
     """
     lower, upper = leaves_within(tree.tree, tree.lo, tree.hi)
-    most, proved = tree.hi.copy(), tree.ranks != UNPROVED
+    most, proved = tree.hi.copy(), tree.proved
     for i in angles:
         most[i] = min(most[i], math.nextafter(tree.lo[i] + 2 * math.pi, -math.inf))  # 2 math.pi is below 2 pi
     size, whole = np.ones(len(lower)), 1.0

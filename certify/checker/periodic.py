@@ -69,10 +69,8 @@ class Windings(Algebra[list[Winding]]):
     def affine(self, step: Affine, v: list[Winding]) -> list[Winding]:
         nothing = Winding((0,) * len(v[0].turns))
         turning = [(i, x) for i, x in enumerate(v) if any(x.turns)]
-        return [
-            reduce(add, (x.times(Fraction(row[i])) for i, x in turning), nothing)
-            for row in step.weight[:, : len(v)].tolist()
-        ]
+        rows = step.weight.tolist()
+        return [reduce(add, (x.times(Fraction(row[i])) for i, x in turning), nothing) for row in rows]
 
     def map(self, step: Map, v: list[Winding]) -> list[Winding]:
         return [x.function(step.function) for x in v]

@@ -12,6 +12,7 @@ import pytest
 
 from certify import certify_roa
 from certify.certificates import RankTree, run_checker
+from certify.certificates.claims import UNPROVED
 from certify.certificates.verdict import Verdict
 from certify.effort import UNIT, Effort
 from certify.errors import OptionError
@@ -24,7 +25,7 @@ from certify.provers.execution import ThreadRunner
 from certify.provers.ranks import Question, RankProof, Sublevel, prove_ranks, root_box, without_leaf
 from certify.provers.ranks.cover import Cover
 from certify.provers.ranks.images import Form
-from certify.provers.ranks.search import COUNTS, NONE
+from certify.provers.ranks.search import COUNTS
 from tests.support.loops import box
 from tests.support.ranks import hanging
 
@@ -129,7 +130,7 @@ def test_nothing_beyond_the_basin_has_a_rank(time: str) -> None:
     ends = [
         (lo[0], hi[0])
         for (lo, hi), rank in zip(leaves_of(found.evidence), found.evidence.ranks, strict=True)
-        if rank < NONE
+        if rank < UNPROVED
     ]
     assert max(max(abs(lo), abs(hi)) for lo, hi in ends) < 1
     assert max(hi for _, hi in ends) > 0.99
@@ -148,8 +149,8 @@ def test_ranks_fall_along_trajectories() -> None:
     loop = hanging()
     found = proved(loop, 0.05)
     tree, f = found.evidence, loop[0].function()
-    leaves = [leaf for leaf, rank in zip(leaves_of(tree), tree.ranks, strict=True) if 0 < rank < NONE]
-    ranks = np.array([rank for rank in tree.ranks if 0 < rank < NONE])
+    leaves = [leaf for leaf, rank in zip(leaves_of(tree), tree.ranks, strict=True) if 0 < rank < UNPROVED]
+    ranks = np.array([rank for rank in tree.ranks if 0 < rank < UNPROVED])
     corners = np.array(leaves).transpose(1, 0, 2)
     for share in (0.0, 0.5, 1.0):
         x = corners[0] + share * (corners[1] - corners[0])
@@ -179,7 +180,7 @@ def test_without_a_leaf_higher_ranks_go() -> None:
     )
     left = without_leaf(tree, 2)
     assert left is not None
-    assert left.ranks.tolist() == [0, 3, NONE]
+    assert left.ranks.tolist() == [0, 3, UNPROVED]
     assert left.steps.tolist() == [0, 3, 0]
     assert without_leaf(tree, 1) is None
 

@@ -32,6 +32,7 @@ from tests.support.ranked import (
     Loop,
     affine,
     dumped,
+    least_ranks,
     mapped,
     meets,
     raw,
@@ -199,17 +200,7 @@ def solved(
             return None if box is None else ()
         return meets(every, [(a - hair, b + hair) for a, b in box], lo, hi, angles)
 
-    leading = [[met(box) for box in row] for row in after]
-    ranks, steps, changed = [0 if here else UNRANKED for here in there], [0] * len(every), True
-    while changed:
-        changed = False
-        for i, row in enumerate(leading):
-            for k, some in enumerate(row, 1):
-                if some is None or any(ranks[j] == UNRANKED for j in some):
-                    continue
-                rank = k + max((ranks[j] for j in some), default=0)
-                if rank < ranks[i]:
-                    ranks[i], steps[i], changed = rank, k, True
+    ranks, steps = least_ranks(there, [[met(box) for box in row] for row in after])
     return replace(blank, ranks=ranks, steps=steps)
 
 

@@ -167,7 +167,6 @@ def ranked(
     """The least ranks, and their steps, that images of leaves in floats allow; UNRANKED where there are none."""
     n = len(leaves[0])
     lo, hi = [min(box[i][0] for box in leaves) for i in range(n)], [max(box[i][1] for box in leaves) for i in range(n)]
-    ranks, steps = [0 if in_target(box) else UNRANKED for box in leaves], [0] * len(leaves)
     after = list[list[Sequence[int] | None]]()  # for each leaf and number of steps the leaves that it meets
     for box in leaves:
         met = list[Sequence[int] | None]()
@@ -175,7 +174,13 @@ def ranked(
             now = [(a - HAIR, b + HAIR) for a, b in image(box, k)]
             met.append(() if in_target(now) else meets(leaves, now, lo, hi, angles))
         after.append(met)
-    changed = True
+    return least_ranks([in_target(box) for box in leaves], after)
+
+
+def least_ranks(there: Sequence[bool], after: Sequence[Sequence[Sequence[int] | None]]) -> tuple[list[int], list[int]]:
+    """The least ranks of leaves, and their steps: 0 for those that are in the target; `after` has for each leaf and
+    number of steps the leaves that it meets, None where it must not be followed."""
+    ranks, steps, changed = [0 if here else UNRANKED for here in there], [0] * len(there), True
     while changed:
         changed = False
         for i, met in enumerate(after):

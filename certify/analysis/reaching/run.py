@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
@@ -22,7 +22,7 @@ from certify.analysis.beyond import constraints_in_words, rank_facts
 from certify.analysis.reaching.options import ReachOptions, target_of
 from certify.analysis.reaching.results import ReachResult
 from certify.analysis.reaching.runs import Simulation, begins, is_refuted
-from certify.analysis.stages.state import Report
+from certify.analysis.stages.state import Report, timed
 from certify.certificates import (
     RanksAlone,
     RankTree,
@@ -73,14 +73,9 @@ class _Tools:
     seconds: dict[str, float] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
 
-    @contextmanager
-    def timing(self, stage: str) -> Iterator[None]:
+    def timing(self, stage: str) -> AbstractContextManager[None]:
         """Add the seconds of the block to those of a stage."""
-        begin = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begin
+        return timed(self.seconds, stage)
 
 
 def certify_reach(
@@ -189,7 +184,7 @@ def _proved(
     evidence = None if found is None else _within(found.evidence, options.within)
     if found is None or evidence is None:
         return replace(result, reason="no box of the domain is proved to lead into the region")
-    claim = Reaches(target, Ranks(found.ranks.angles, _most(evidence)), keep)
+    claim = Reaches(target, Ranks(found.ranks.angles, max(1, evidence.most)), keep)
     certificate = ReachCertificate(system, loop.network, claim, RanksAlone(evidence, question.order), provenance)
     certificate, raw, answer = _accepted(certificate, clerk)
     facts, kept = rank_facts(certificate, found), constraints_in_words(certificate)
@@ -229,14 +224,8 @@ def _exactly(corner: Array) -> list[Fraction]:
 def _within(evidence: RankTree, most: int | None) -> RankTree | None:
     """The evidence without leaves of higher ranks than that; None if only leaves in the region are left."""
     if most is not None:
-        dropped = evidence.ranks > most
-        ranks = np.where(dropped, UNPROVED, evidence.ranks).astype(np.uint16)
-        evidence = replace(evidence, ranks=ranks, steps=np.where(dropped, 0, evidence.steps).astype(np.uint8))
+        evidence = evidence.without(evidence.ranks > most)
     return evidence if np.any(evidence.steps) else None
-
-
-def _most(evidence: RankTree) -> int:
-    return max(1, int(evidence.ranks[evidence.ranks < UNPROVED].max(initial=1)))
 
 
 def _clerk(path: Path, options: ReachOptions, tools: _Tools) -> Clerk:
@@ -284,7 +273,7 @@ def _accepted(certificate: ReachCertificate, clerk: Clerk) -> tuple[ReachCertifi
         lower = None if refused is None else without_leaf(certificate.evidence.ranks, int(refused[1]))
         if lower is None:
             break
-        claim = replace(certificate.claim, ranks=Ranks(certificate.claim.ranks.angles, _most(lower)))
+        claim = replace(certificate.claim, ranks=Ranks(certificate.claim.ranks.angles, max(1, lower.most)))
         certificate = replace(certificate, claim=claim, evidence=replace(certificate.evidence, ranks=lower))
     if answer.get("rule") == "limits":
         raise InputError(f"the checkers take no certificate of this size: {answer['detail']}. Try a smaller --effort.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
@@ -105,6 +105,16 @@ class State:
         return replace(self, result=result, done=True)
 
 
+@contextmanager
+def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    """Add the seconds of the block to those of a stage."""
+    begin = time.perf_counter()
+    try:
+        yield
+    finally:
+        seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - begin
+
+
 @dataclass
 class Tools:
     """The hands of a run: where it writes and computes, what it reports, and its stopwatch.
@@ -132,14 +142,9 @@ class Tools:
     def __post_init__(self) -> None:
         self.whole, self.start = self.effort.left, time.perf_counter()
 
-    @contextmanager
-    def timing(self, stage: str) -> Iterator[None]:
+    def timing(self, stage: str) -> AbstractContextManager[None]:
         """Add the seconds of the block to those of a stage."""
-        begin = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begin
+        return timed(self.seconds, stage)
 
     def timings(self) -> dict[str, float]:
         """Seconds of all stages, and in all."""

@@ -40,6 +40,12 @@ class Cover:
         """The corners of the root box, (n, 1)."""
         return self.low[:, :1], self.high[:, :1]
 
+    def widths(self, nodes: Index) -> Array:
+        """The widths of nodes as shares of the root's, (n, N)."""
+        least, most = self.root
+        widths: Array = (self.high[:, nodes] - self.low[:, nodes]) / (most - least)
+        return widths
+
     def halve(self, nodes: Index, axes: Index) -> Index:
         """Split leaves at the middles of these axes; the numbers of their halves."""
         middle = 0.5 * self.low[axes, nodes] + 0.5 * self.high[axes, nodes]

@@ -16,7 +16,7 @@ from certify.loop.expressions import Expression
 from certify.provers.bounds.arrays import Array
 from certify.provers.execution import Runner
 from certify.provers.ranks.images import Course
-from certify.provers.ranks.search import COUNTS, NONE, Search
+from certify.provers.ranks.search import COUNTS, Search
 from certify.provers.ranks.targets import TURN, Target
 from certify.provers.ranks.wanted import COUNTS_FROM, SearchFrom, Wanted
 
@@ -56,9 +56,8 @@ class Question:
 def with_order(question: Question, x: Array) -> Question:
     """The question with the lowest order of the series in time that leaves little error at states x (n, N), or with the
     last one that still gained something; as it is where no input is held."""
-    if question.loop.system.sample is None:
-        return replace(question, order=1)
-    if question.loop.system.calls:
+    system = question.loop.system
+    if system.sample is None or system.calls:
         return replace(question, order=1)
     best, least = question, math.inf
     for order in _ORDERS:
@@ -151,10 +150,8 @@ def prove_ranks(
                 break
             new = search.further(near)
     search.tighten()
-    tree, most = search.evidence()
-    leaves = int(np.sum(tree.ranks < NONE))
+    tree, states = search.evidence(), question.loop.system.states
     if not np.any(tree.steps):
         return None
-    system = question.loop.system
-    ranks = Ranks(tuple(system.states[i].name for i in turning(question.loop)), most)
-    return RankProof(ranks, tree, search.share, leaves, search.boxes, rounds, done)
+    ranks = Ranks(tuple(states[i].name for i in course.angles), tree.most)
+    return RankProof(ranks, tree, search.share, int(tree.proved.sum()), search.boxes, rounds, done)

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from certify.certificates import RankTree
+from certify.certificates.claims import UNPROVED
 from certify.provers.bounds.arrays import Array, Index
 from certify.provers.ranks.cover import Cover
 from certify.provers.ranks.images import Course, Images
 
-NONE = 65_535
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 _FIRST = 2**10  # leaves of the first tree
 _ROUNDS, _GAIN = 6, 1e-4  # relative growth of what is proved, in so many rounds, below which the search ends
@@ -30,7 +30,7 @@ class Search:
     def __init__(self, course: Course, lo: Array, hi: Array) -> None:
         self.course, self.cover = course, Cover(lo, hi, course.angles)
         K, n = len(course.counts), len(lo)
-        self.rank, self.steps = np.full(1, NONE), np.zeros(1, dtype=np.int64)
+        self.rank, self.steps = np.full(1, UNPROVED), np.zeros(1, dtype=np.int64)
         self.lo, self.hi = np.full((K, n, 1), np.nan), np.full((K, n, 1), np.nan)
         self.there, self.steep, self.meets = np.zeros((K, 1), dtype=bool), np.zeros((n, 1)), np.zeros(1, dtype=bool)
         self.boxes, self.pairs, self.shares = 0, 0, list[float]()
@@ -58,15 +58,14 @@ class Search:
     def unknown(self) -> Index:
         """Leaves without a rank."""
         leaves = self.cover.leaves
-        unknown: Index = leaves[self.rank[leaves] == NONE]
+        unknown: Index = leaves[self.rank[leaves] == UNPROVED]
         return unknown
 
     @property
     def share(self) -> float:
         """The share of the root box's volume in leaves with a rank."""
         leaves = self.cover.leaves
-        widths = (self.cover.high - self.cover.low) / (self.cover.root[1] - self.cover.root[0])
-        return float(widths[:, leaves[self.rank[leaves] < NONE]].prod(0).sum())
+        return float(self.cover.widths(leaves[self.rank[leaves] < UNPROVED]).prod(0).sum())
 
     def halve(self, nodes: Index, axes: Index) -> Index:
         """Halve leaves; their halves, of which nothing is known yet."""
@@ -76,7 +75,7 @@ class Search:
         def longer(v: Any, fill: float) -> Any:
             return np.concatenate([v, np.full((*v.shape[:-1], new), fill, dtype=v.dtype)], -1)
 
-        self.rank, self.steps = longer(self.rank, NONE), longer(self.steps, 0)
+        self.rank, self.steps = longer(self.rank, UNPROVED), longer(self.steps, 0)
         self.lo, self.hi = longer(self.lo, np.nan), longer(self.hi, np.nan)
         self.there, self.steep, self.meets = (
             longer(self.there, False),
@@ -98,7 +97,7 @@ class Search:
         unknown, counts = self.unknown, np.array(self.course.counts)
         k, at = np.nonzero(np.isfinite(self.lo[:, 0, unknown]))
         node, there = unknown[at], self.there[k, unknown[at]]
-        best, by = np.full(self.cover.size, NONE), np.zeros(self.cover.size, dtype=np.int64)
+        best, by = np.full(self.cover.size, UNPROVED), np.zeros(self.cover.size, dtype=np.int64)
         self._better(best, by, node[there], counts[k[there]], counts[k[there]])
         node, k = node[~there], k[~there]
         inside, pair, leaf = self.cover.met_by(self.lo[k, :, node].T, self.hi[k, :, node].T)
@@ -111,17 +110,17 @@ class Search:
         steps = counts[k[pair[starts]]]
         while True:
             highest = np.maximum.reduceat(self.rank[leaf], starts) if len(starts) else np.zeros(0, dtype=np.int64)
-            known = (highest < NONE) & (highest + steps < NONE)
+            known = (highest < UNPROVED) & (highest + steps < UNPROVED)
             self._better(best, by, owners[known], highest[known] + steps[known], steps[known])
             new = unknown[(best[unknown] < self.rank[unknown])]
             if not len(new):
                 break
             self.rank[new], self.steps[new] = best[new], by[new]
-        some = np.logical_or.reduceat(self.rank[leaf] < NONE, starts) if len(starts) else np.zeros(0, dtype=bool)
+        some = np.logical_or.reduceat(self.rank[leaf] < UNPROVED, starts) if len(starts) else np.zeros(0, dtype=bool)
         (low, high), first = self.cover.root, k == 0
         sticks = first & ~inside & ((high > self.lo[k, :, node].T) & (low < self.hi[k, :, node].T)).all(0)
         near: Index = np.unique(np.concatenate([owners[some], unknown[self.meets[unknown]], node[sticks]]))
-        waiting: Index = near[self.rank[near] == NONE]
+        waiting: Index = near[self.rank[near] == UNPROVED]
         return waiting
 
     def _better(self, best: Index, by: Index, nodes: Index, ranks: Index, steps: Index) -> None:
@@ -133,24 +132,22 @@ class Search:
 
     def next(self, near: Index) -> tuple[Index, Index]:
         """The leaves to halve next, and their axes."""
-        widths = (self.cover.high - self.cover.low) / (self.cover.root[1] - self.cover.root[0])
-        volumes = widths[:, near].prod(0)
+        volumes = self.cover.widths(near).prod(0)
         large = near[volumes >= np.quantile(volumes, 1 - _LARGEST)]
         return large, self.steep[:, large].argmax(0)
 
     def tighten(self) -> None:
         """Give all leaves the lowest ranks that their images show: some had a rank before others had a lower one."""
         leaves = self.cover.leaves
-        again = leaves[(self.rank[leaves] < NONE) & (self.rank[leaves] > 0)]
-        self.rank[again], self.steps[again] = NONE, 0
+        again = leaves[(self.rank[leaves] < UNPROVED) & (self.rank[leaves] > 0)]
+        self.rank[again], self.steps[again] = UNPROVED, 0
         self.spread()
 
-    def evidence(self) -> tuple[RankTree, int]:
-        """The evidence, and the most steps."""
-        known = (self.cover.axis < 0) & (self.rank < NONE)
+    def evidence(self) -> RankTree:
+        """The evidence: the tree as far as it has ranks."""
+        known = (self.cover.axis < 0) & (self.rank < UNPROVED)
         tree, leaves = self.cover.preorder(known)
-        rank = np.where(known[leaves], self.rank[leaves], NONE)
+        rank = np.where(known[leaves], self.rank[leaves], UNPROVED)
         steps = np.where(known[leaves], self.steps[leaves], 0)
         lo, hi = (end[:, 0].copy() for end in self.cover.root)
-        most = int(rank[rank < NONE].max(initial=1))
-        return RankTree(lo, hi, tree, rank.astype(np.uint16), steps.astype(np.uint8)), max(1, most)
+        return RankTree(lo, hi, tree, rank.astype(np.uint16), steps.astype(np.uint8))

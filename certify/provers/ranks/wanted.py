@@ -12,9 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from certify.certificates.claims import UNPROVED
 from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.ranks.images import Course, Images
-from certify.provers.ranks.search import NONE, Search
+from certify.provers.ranks.search import Search
 
 COUNTS_FROM = (*range(1, 13), 14, 16, 20, 24)
 MOST_STEPS = COUNTS_FROM[-1]
@@ -30,7 +31,7 @@ class Wanted:
 
     lo: Array
     hi: Array
-    most: int = NONE - 1
+    most: int = UNPROVED - 1
     direct: int = 0
 
 
@@ -60,14 +61,14 @@ class SearchFrom(Search):
     def is_done(self, near: Index) -> bool:
         """True if the box is proved, or cannot be: it leaves the root, or leaves of it cannot be halved any more."""
         inside, _, met = self.cover.met_by(self.wanted.lo[:, None], self.wanted.hi[:, None])
-        narrow = met[self._widths(met).max(0) < _NARROW]
+        narrow = met[self.cover.widths(met).max(0) < _NARROW]
         proved = np.all(self.rank[met] <= self.wanted.most)
         return bool(proved or not inside[0] or np.any(self.rank[narrow] > self.wanted.most))
 
     def further(self, near: Index) -> Index:
         """The needed leaves that have not been seen; if all have, halves of those without a rank."""
         own = self._own
-        open_ = own[self.rank[own] == NONE]
+        open_ = own[self.rank[own] == UNPROVED]
         if self.boxes < self.wanted.direct and len(open_):
             self.halve(open_, self.steep[:, open_].argmax(0))
             return self._unseen(self._own)
@@ -80,14 +81,14 @@ class SearchFrom(Search):
     def _halve_some(self, near: Index) -> None:
         """Halve needed leaves without a rank: those whose images meet one with a rank, or that have none."""
         needed = self._needed()
-        waiting = needed[self.rank[needed] == NONE]
+        waiting = needed[self.rank[needed] == UNPROVED]
         if not len(waiting):  # the box has ranks that are too high
             waiting = self._own[self.rank[self._own] > self.wanted.most]
-            self.rank[waiting], self.steps[waiting] = NONE, 0
+            self.rank[waiting], self.steps[waiting] = UNPROVED, 0
         stuck = waiting[~np.isfinite(self.lo[:, 0, waiting]).any(0)]
         chosen = np.union1d(stuck, np.intersect1d(waiting, near))
         chosen = chosen if len(chosen) else waiting
-        volumes = self._widths(chosen).prod(0)
+        volumes = self.cover.widths(chosen).prod(0)
         large = chosen[volumes >= np.quantile(volumes, 1 - _SHARE)]
         self.halve(large, self.steep[:, large].argmax(0))
 
@@ -106,7 +107,7 @@ class SearchFrom(Search):
         new = self._own
         while len(new):
             known[new] = True
-            open_ = new[self.seen[new] & (self.rank[new] == NONE)]
+            open_ = new[self.seen[new] & (self.rank[new] == UNPROVED)]
             k, at = self._course_of(open_)
             leaves = self._met(self.lo[k, :, at].T, self.hi[k, :, at].T)
             new = leaves[~known[leaves]]
@@ -132,10 +133,3 @@ class SearchFrom(Search):
         _, _, leaves = self.cover.met_by(lo, hi)
         found: Index = np.unique(leaves)
         return found
-
-    def _widths(self, nodes: Index) -> Array:
-        """The widths of leaves as shares of the root's, (n, N)."""
-        widths: Array = (self.cover.high[:, nodes] - self.cover.low[:, nodes]) / (
-            self.cover.root[1] - self.cover.root[0]
-        )
-        return widths

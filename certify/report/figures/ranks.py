@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates import RankTree, ReachCertificate, leaves_within
-from certify.certificates.claims import UNPROVED
 from certify.certificates.membership import angles_in
 from certify.certificates.ranked import Ranked
 from certify.loop.plants.floating_point import function_of
@@ -181,7 +180,7 @@ def _picture(ground: Ground, pair: Pair, more: str = "") -> Picture:
 def _view(tree: RankTree, box: tuple[Array, Array], path: Array) -> tuple[Array, Array]:
     """The part of the root box that has leaves with a rank, and simulated runs, with some room."""
     lower, upper = leaves_within(tree.tree, tree.lo, tree.hi)
-    known = tree.ranks != UNPROVED
+    known = tree.proved
     lo = np.min([box[0], lower[known].min(0), np.nanmin(path, (0, 1))], axis=0)
     hi = np.max([box[1], upper[known].max(0), np.nanmax(path, (0, 1))], axis=0)
     room = 0.2 * (hi - lo)
