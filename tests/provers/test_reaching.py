@@ -237,3 +237,9 @@ def _continuous() -> System:
         domain=box(4),
         input_bounds=box(1),
     )
+
+
+def test_a_box_in_the_region_is_there_at_once(tmp_path: Path) -> None:
+    result = asked(halving(), tmp_path, "x <= 2", "x >= -2", begin=((Fraction(1), Fraction(3, 2)),))
+    assert (result.verdict, result.steps) == ("PROVED", 0)
+    accepted_by_both(result)

@@ -222,10 +222,10 @@ def _exactly(corner: Array) -> list[Fraction]:
 
 
 def _within(evidence: RankTree, most: int | None) -> RankTree | None:
-    """The evidence without leaves of higher ranks than that; None if only leaves in the region are left."""
+    """The evidence without leaves of higher ranks than that; None if none is left."""
     if most is not None:
         evidence = evidence.without(evidence.ranks > most)
-    return evidence if np.any(evidence.steps) else None
+    return evidence if np.any(evidence.proved) else None
 
 
 def _clerk(path: Path, options: ReachOptions, tools: _Tools) -> Clerk:

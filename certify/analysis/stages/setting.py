@@ -45,7 +45,7 @@ class Setting:
             ellipsoid_in(system, options.box)
         if options.ranks and not (system.time == "discrete" or system.sample is not None):
             raise OptionError(
-                "`ranks` needs a loop whose time goes in steps: discrete time, or a held input (`sample`)."
+                "`ranks` needs a loop whose time goes in steps: discrete time, or a held input (`sample_time`)."
             )
         centre = None if options.reach_from is None else state_in(system, options.reach_from)
         state = replace(state, centre=centre)

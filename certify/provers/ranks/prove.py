@@ -131,7 +131,7 @@ def prove_ranks(
 
     Returns
     -------
-    RankProof | None : None if no leaf beyond the target has a rank.
+    RankProof | None : None if no leaf beyond the target has a rank, and no leaf of a box that was wanted.
     """
     course = question.course(COUNTS if wanted is None else COUNTS_FROM)
     search = Search(course, *question.root) if wanted is None else SearchFrom(course, *question.root, wanted)
@@ -151,7 +151,7 @@ def prove_ranks(
             new = search.further(near)
     search.tighten()
     tree, states = search.evidence(), question.loop.system.states
-    if not np.any(tree.steps):
+    if not np.any(tree.steps if wanted is None else tree.proved):
         return None
-    ranks = Ranks(tuple(states[i].name for i in course.angles), tree.most)
+    ranks = Ranks(tuple(states[i].name for i in course.angles), max(1, tree.most))
     return RankProof(ranks, tree, search.share, int(tree.proved.sum()), search.boxes, rounds, done)
