@@ -1,4 +1,4 @@
-"""Boxes with ranks, angles, constraints and the claim `reaches` in the reference: true claims, and many false ones.
+"""Boxes with ranks, constraints and the claim `reaches` in the reference, angles in both: true claims, many false ones.
 
 Every certificate is JSON by hand, and its ranks are found in floats (`tests.support.ranked`).
 """
@@ -25,6 +25,8 @@ from certify.reference.evidence import Ranked
 from certify.reference.leaves import Box
 from certify.reference.ranks import Cover, Walk, around
 from certify.reference.refusal import Refused
+from tests.support.rank_forgeries import by_reference as verdict
+from tests.support.rank_forgeries import verdicts
 from tests.support.ranked import (
     UNRANKED,
     Document,
@@ -46,12 +48,6 @@ from tests.support.ranked import (
 HALF = [affine([[-0.5]])]  # u = -x/2
 NEAR: list[Any] = [["-", ["**", "x", 2], "1/16"]]  # |x| <= 1/4
 TURNING: list[Any] = [["-", "9/10", ["cos", "x"]]]
-
-
-def verdict(data: Document) -> str | None:
-    """None if it is accepted, else the rule."""
-    found = rules.judge(dumped(data))
-    return None if found.result == "ACCEPTED" else found.rule
 
 
 def certificate(
@@ -465,19 +461,19 @@ def test_constraints_with_what_is_uncertain() -> None:
 def test_constraints_beside_V() -> None:
     data = around_level(halving()[0], 1.0, 1 / 16)
     assert verdict(edited(data, "claim", lambda c: c | {"keep": [["-", "x", "3"], ["-", "u", "3"]]})) is None
-    assert verdict(edited(data, "claim", lambda c: c | {"keep": [["-", "x", "1"]]})) == "keep"
+    assert verdicts(edited(data, "claim", lambda c: c | {"keep": [["-", "x", "1"]]})) == ("keep", "keep")
     alone = edited(edited(data, "claim.ranks", ...), "evidence.ranks", ...)
-    assert verdict(alone) is None
-    assert verdict(edited(alone, "claim", lambda c: c | {"keep": [["-", "x", "3/10"]]})) is None
-    assert verdict(edited(alone, "claim", lambda c: c | {"keep": [["-", "x", "1/4"]]})) == "keep"
+    assert verdicts(alone) == (None, None)
+    assert verdicts(edited(alone, "claim", lambda c: c | {"keep": [["-", "x", "3/10"]]})) == (None, None)
+    assert verdicts(edited(alone, "claim", lambda c: c | {"keep": [["-", "x", "1/4"]]})) == ("keep", "keep")
     leaves = edited(alone, "levels", {"local": (1 / 1024).hex(), "roa": (1 / 16).hex()})
     leaves = edited(leaves, "evidence.tree", "AAD//wD//w==")
     small = edited(leaves, "evidence.local", lambda b: b | {"J": around_level(halving()[0], 1.0, 1 / 1024)["evidence"]["local"]["J"]})  # fmt: skip  # noqa: E501
     grown = edited(small, "evidence.root", around_level(halving()[0], 1.0, 1 / 16)["evidence"]["root"])
-    assert verdict(grown) is None
-    assert verdict(edited(grown, "claim", lambda c: c | {"keep": [["-", "x", "27/100"]]})) is None
-    assert verdict(edited(grown, "claim", lambda c: c | {"keep": [["-", "x", "249/1000"]]})) == "keep"
-    assert verdict(edited(grown, "claim", lambda c: c | {"keep": [["-", "1/100", "x"]]})) == "keep"
+    assert verdicts(grown) == (None, None)
+    assert verdicts(edited(grown, "claim", lambda c: c | {"keep": [["-", "x", "27/100"]]})) == (None, None)
+    assert verdicts(edited(grown, "claim", lambda c: c | {"keep": [["-", "x", "249/1000"]]})) == ("keep", "keep")
+    assert verdicts(edited(grown, "claim", lambda c: c | {"keep": [["-", "1/100", "x"]]})) == ("keep", "keep")
 
 
 # ------------------------------------------------------------------------------------------------------------ periodic
@@ -517,16 +513,16 @@ SINE = [mapped("sin", 0), affine([[0.0]], of=1)]
 )
 def test_what_is_periodic(change: dict[str, Any], rule: str | None) -> None:
     loop = Loop(**{**ROUND.__dict__, **change})
-    assert verdict(certificate(loop, scaled(1.0, 0.5), cosine, (-3.25, 3.25), 6)[0]) == rule
+    assert verdicts(certificate(loop, scaled(1.0, 0.5), cosine, (-3.25, 3.25), 6)[0]) == (rule, rule)
 
 
 def test_rates_of_angles_have_no_winding() -> None:
     loop = Loop([["+", "1", "u"]], [affine([[0.0]])], TURNING, angles=("x",), sample=("1/2", "1/2"))
     data = certificate(loop, scaled(1.0, 0.5), cosine, (-3.25, 3.25), 6)[0]
-    assert verdict(data) is None
-    assert verdict(edited(data, "plant.dynamics", [["+", "1", ["*", "0", "x"]]])) is None
-    assert verdict(edited(data, "plant.dynamics", [["+", "1", ["*", "1/99", "x"]]])) == "angles"
-    assert verdict(edited(data, "plant.dynamics", [["+", "1", "x"]])) == "angles"
+    assert verdicts(data) == (None, None)
+    assert verdicts(edited(data, "plant.dynamics", [["+", "1", ["*", "0", "x"]]])) == (None, None)
+    assert verdicts(edited(data, "plant.dynamics", [["+", "1", ["*", "1/99", "x"]]])) == ("angles", "angles")
+    assert verdicts(edited(data, "plant.dynamics", [["+", "1", "x"]])) == ("angles", "angles")
 
 
 def test_a_tree_must_be_longer_than_a_turn() -> None:
