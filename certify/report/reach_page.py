@@ -103,7 +103,7 @@ def _claim(certificate: ReachCertificate) -> dict[str, Any]:
     return {
         "target": [comparison(t) for t in claim.target],
         "constraints": [inequality(name, g) for name, g in certificate.constraints.items()],
-        "steps": f"{claim.ranks.steps:,} {steps}",
+        "steps": f"{claim.ranks.steps:,} {steps if claim.ranks.steps > 1 else steps[:-1]}",
         "boxes": BOXES,
         "turned": angles,
         "inside": inside,
