@@ -10,7 +10,7 @@ from itertools import product
 
 from flint import fmpq_mat
 
-from .document import Array, Certificate, Intervals, LocalBall, Outer, OuterTree, Partition, Ranks, Slab, Trusted
+from .document import Array, Certificate, Data, Intervals, LocalBall, Outer, OuterTree, Partition, Ranks, Slab, Trusted
 from .exact import exactly, gershgorin_lower, inverse_diagonal
 from .near import near
 from .network import Folded, fold
@@ -46,6 +46,13 @@ class Case:
         if self.c.ranks is None:
             raise TypeError("this rule is about ranks")
         return self.c.ranks
+
+    @property
+    def data(self) -> Data:
+        """The measurements, of a certificate that has them."""
+        if self.c.data is None:
+            raise TypeError("this rule is about data")
+        return self.c.data
 
     @property
     def local(self) -> LocalBall:

@@ -23,6 +23,7 @@ MAX_STATES, MAX_SLABS = 64, 10**4
 MAX_ORDER = 8  # of a series in time
 MAX_CELLS, MAX_CUTS = 4096, 64  # of the box of uncertain quantities in all, and of one range
 MAX_CONSTRAINTS, MAX_RANK = 64, 2**16 - 1  # that rank is none
+MAX_TRANSITIONS, MAX_ROUNDS = 2**16, 64  # of data
 CLAIMS = ("asymptotic", "practical", "nearby", "enlarged", "reached", "reaches")
 PRACTICAL = ("practical", "nearby")
 WITH_TUBE = ("enlarged", "reached")
@@ -152,6 +153,31 @@ class Ranks:
 
 
 @dataclass(frozen=True)
+class Data:
+    """Measurements on which ranges of parameters rest, and multipliers that show it.
+
+    A run has states (T + 1, n), within `noise` of the true ones, and the inputs (T, m) that are held in between, for a
+    time in `period`, or for a step where that is None; measured is `origin` + x. `rounds` have multipliers (2, K, T, n)
+    of all transitions; a transition is followed in so many `pieces`, with a series in time of an `order`.
+    """
+
+    sha256: str  # of the file that they come from
+    parameters: tuple[str, ...]
+    priors: Intervals
+    period: tuple[Fraction, Fraction] | None
+    origin: tuple[Fraction, ...]
+    noise: tuple[Fraction, ...]
+    runs: tuple[tuple[Array, Array], ...]
+    order: int
+    pieces: int
+    rounds: tuple[Array, ...]
+
+    @property
+    def transitions(self) -> int:
+        return sum(len(inputs) for _, inputs in self.runs)
+
+
+@dataclass(frozen=True)
 class Ranked:
     """Evidence by ranks alone, of a claim without V; the order of the series in time on leaves."""
 
@@ -200,6 +226,7 @@ class Certificate:
     ranks: Ranks | None = None  # of the leaves from which trajectories reach the target
     target: Tape | None = None  # whose outputs are at most 0 there; None if the target is {V <= c2}
     keep: Tape | None = None  # whose outputs stay negative
+    data: Data | None = None  # with which the uncertain parameters are consistent
 
     @property
     def practical(self) -> bool:
@@ -276,7 +303,7 @@ def _attracting(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: V
     """The rest of a certificate with V."""
     n, networks, kind = len(stated["states"]), {net.name: net for net in stated["networks"]}, claim.raw["kind"]
     stated_of = {"enlarged": " start", "reached": " start centre"}
-    may_be = claim.maybe("ranks") + claim.maybe("keep")
+    may_be = "".join(map(claim.maybe, ("ranks", "keep", "data")))
     _, rate, sample, beyond, *more = claim.keys(f"kind rate sample outer{stated_of.get(kind, may_be)}")
     of_tube, others = (more, []) if kind in WITH_TUBE else ([], more)
     optional = dict(zip(may_be.split(), others, strict=True)) if kind not in WITH_TUBE else {}
@@ -302,7 +329,7 @@ def _attracting(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: V
         _most_order(stated, periods),
         outer is not None,
         plain and fall == 0 and outer is None and not optional,
-        ranks is not None,
+        "".join(f" {name}" for name in ("ranks", "data") if name in optional),
     )
     return Certificate(
         kind,
@@ -317,7 +344,43 @@ def _attracting(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: V
         outer=outer,
         ranks=_ranks(ranks, evidence.entry("ranks"), n, stated, periods) if ranks else None,
         keep=None if keep is None else _constraints(keep, _names(stated)),
+        data=_data(optional["data"], evidence.entry("data"), stated) if "data" in optional else None,
     )
+
+
+def _data(claim: Value, evidence: Value, stated: Mapping[str, Any]) -> Data:
+    n, m, discrete = len(stated["states"]), len(stated["inputs"]), stated["discrete"]
+    claim.must(not stated["dynamics"].calls, "missing where the equations call a network")
+    sha256, priors, period, origin, noise, runs = claim.keys("sha256 parameters period origin noise runs")
+    quantities = priors.listed(_quantity, 1, len(stated["uncertain"]))
+    names = tuple(name for name, _ in quantities)
+    priors.must({*names} <= {*stated["uncertain"]} and len({*names}) == len(names), "different uncertain quantities")
+    times = _sample(period)
+    period.must((times is None) is discrete and (times is None or times[0] > 0), "null in discrete time, else positive")
+    measured = runs.listed(lambda run: _run(run, n, m), 1, MAX_TRANSITIONS)
+    count = sum(len(inputs) for _, inputs in measured)
+    runs.must(count <= MAX_TRANSITIONS, f"of {MAX_TRANSITIONS} transitions at most")
+    errors = noise.listed(Value.rational, n)
+    noise.must(min(errors) >= 0, "at least 0")
+    order, pieces, rounds = evidence.keys("order pieces rounds")
+    return Data(
+        sha256.text("[0-9a-f]{64}", "64 hexadecimal digits"),
+        names,
+        tuple(pair for _, pair in quantities),
+        times,
+        origin.listed(Value.rational, n),
+        errors,
+        measured,
+        order.integer(1, 1 if discrete else MAX_ORDER),
+        pieces.integer(1, 1 if discrete else MAX_CUTS),
+        rounds.listed(lambda multipliers: multipliers.array(2, len(names), count, n), 1, MAX_ROUNDS),
+    )
+
+
+def _run(value: Value, n: int, m: int) -> tuple[Array, Array]:
+    steps, states, inputs = value.keys("steps states inputs")
+    count = steps.integer(1, MAX_TRANSITIONS)
+    return states.array(count + 1, n), inputs.array(count, m)
 
 
 def _most_order(stated: Mapping[str, Any], periods: tuple[Fraction, Fraction] | None) -> int:
@@ -471,10 +534,10 @@ def check_hash(policy: Policy, stated: Any) -> None:
 
 
 def _evidence(
-    value: Value, n: int, k: int, claim: str, most: int, outer: bool, plain: bool, ranked: bool
+    value: Value, n: int, k: int, claim: str, most: int, outer: bool, plain: bool, others: str
 ) -> Partition | Trusted:
     """k quantities are uncertain; series in time have an order of at most `most`; `outer` says that a function is
-    stated, `plain` that none is, nor a rate, of a loop without steps, `ranked` that there are ranks."""
+    stated, `plain` that none is, nor a rate, of a loop without steps; `others` are keys that the claim has too."""
     kinds = (
         "partition-tree",
         *(("trusted-solver",) if plain and not k and claim not in (*WITH_TUBE, "nearby") else ()),
@@ -482,7 +545,7 @@ def _evidence(
     known = isinstance(value.raw, dict) and value.raw.get("kind") in kinds
     value.must(known, f"an object of kind {' or '.join(kinds)}")
     if value.raw["kind"] == "partition-tree":
-        keys = f"kind T root tree order cells local contraction tube outer{' ranks' if ranked else ''}"
+        keys = f"kind T root tree order cells local contraction tube outer{others}"
         _, T, root, tree, order, cells, local, contraction, tube, beyond, *_ = value.keys(keys)
         cuts = cells.listed(lambda cut: cut.integer(1, MAX_CUTS), k)
         cells.must(math.prod(cuts) <= MAX_CELLS, f"{MAX_CELLS} parts in all")

@@ -10,16 +10,20 @@ mean.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import reduce
 from operator import add
 from typing import Any
 
+import numpy as np
+
 from .expression import Tape, evaluate
 from .functions import FUNCTIONS
+from .taylor import Taylor
 
 Constant = Callable[[Fraction], Any]
+_ATTEMPTS = 4  # at the a-priori enclosure
 
 
 @dataclass(frozen=True)
@@ -96,3 +100,22 @@ def later(
             rising = x + h * rising
         found.append(rising)
     return found
+
+
+def enclosed(
+    f: Callable[[list[Taylor]], list[Taylor]], states: list[Taylor], longest: float
+) -> tuple[list[Taylor], list[Taylor]]:
+    """Models of the states during a period of at most that length, and f of them; NaN where none of a few attempts is
+    an enclosure (Moore 1966)."""
+    way = np.zeros((len(states), len(states[0].c)))
+    for attempt in range(2 + _ATTEMPTS):
+        during = [replace(x, r=x.r + own) for x, own in zip(states, way, strict=True)]
+        F = f(during)
+        if attempt == 1 + _ATTEMPTS:
+            break
+        most = np.array([(v.size * longest).top for v in F])
+        good = np.all(most < way, axis=0)
+        if np.all(good):
+            break
+        way = np.where(good, way, 1.25 * most if attempt < _ATTEMPTS else np.nan)
+    return during, F

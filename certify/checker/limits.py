@@ -99,7 +99,7 @@ class Sizes:
 
     def numbers(self) -> int:
         """Held at once."""
-        found = 4 * self.net.entries
+        found = 4 * self.net.entries + self.of_measured()
         if not isinstance(self.evidence, Partition):
             return found + self.of_following()
         order = max(self.evidence.order, self.evidence.local.order if self.evidence.local else 1)
@@ -128,6 +128,14 @@ class Sizes:
             return 0
         return 2**4 * len(self.c.ranks.tree) + self.on_leaves(self.evidence.order, self.s + self.n)
 
+    def of_measured(self) -> int:
+        """Numbers for transitions that are followed."""
+        data = self.c.data
+        if data is None:
+            return 0
+        symbols = self.n + len(data.parameters)
+        return self.c.dynamics.size * 4 * data.order * (symbols + 1) ** 2 + 8 * data.transitions * self.n * symbols
+
     # --------------------------------------------------------------------------------------------------------- work
 
     def work(self) -> int:
@@ -136,7 +144,7 @@ class Sizes:
         found += self.inverse(self.bits(self.c.P)) if self.c.target is None else 0
         if not self.c.practical and self.c.target is None:
             found += 2**12 * self.net.entries + 2**19 * Net(_called(self.c.dynamics)).entries
-        found += self.of_ranks()
+        found += self.of_ranks() + self.of_data()
         if not isinstance(self.evidence, Partition):
             return found
         seen = min(2 * self.bits(self.evidence.T) + self.bits(self.c.P) + 16, 2**16 // self.n)
@@ -194,6 +202,18 @@ class Sizes:
         leaves = len(ranks.steps)
         of_all = self.of_leaves(leaves + sum(ranks.steps), self.evidence.order, self.s + self.n)
         return 2**9 * len(ranks.tree) + 2**17 * leaves + of_all
+
+    def of_data(self) -> int:
+        """Transitions, and sums of them, in all rounds."""
+        data = self.c.data
+        if data is None:
+            return 0
+        k, followed, a = len(data.parameters), len(data.rounds) * data.transitions, self.c.dynamics.size
+        times = 2 * data.order**3 + 8 if data.period else 1
+        models = data.pieces * (a * times + 4 * self.n)
+        return self.boxes(followed, models, a * (data.order + 1), self.n + k, 0) + 2**6 * k * followed * self.n * (
+            self.n + k + 2**6
+        )
 
     @property
     def ball(self) -> int:

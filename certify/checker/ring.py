@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import reduce
 from operator import add
@@ -20,7 +20,6 @@ from .processes import Batch
 from .taylor import Taylor, affine, combination, pairs, upper_bound
 
 _BATCH_NUMBERS = 800_000  # in the largest array of a batch: more would not stay in a cache
-_ATTEMPTS = 4  # at the a-priori enclosure
 
 
 @dataclass(frozen=True)
@@ -65,31 +64,15 @@ class Moving(Boxes):
             G = [f + -x for f, x in zip(F, states, strict=True)] if self.c.discrete else F
             return Motion(G, states, [*inputs, *ranges], nothing)
         loose = [*inputs, *(_between(v) for v in ranges)]
-        during, F = self.way(states, loose)
+        from .flow import enclosed, later
+
+        during, F = enclosed(lambda x: self.f(x, loose), states, self.case.longest)
         h = self.number(self.c.sample, self.symbols - 1, batch)
         G = [self.of_mean(f) for f in self.f(during if self.order == 1 else states, [*inputs, *ranges])]
         if self.order > 1:
-            from .flow import later
-
             rising = later(self.c.dynamics, self.constant(batch), states, during, loose, h, self.order, _itself)
             G = [x + h * more for x, more in zip(G, rising, strict=True)]
         return Motion(G, during, loose, self.hull(states, F))
-
-    def way(self, states: list[Taylor], held: list[Taylor]) -> tuple[list[Taylor], list[Taylor]]:
-        """Enclose the states during a period, and f of them; NaN where none of a few attempts is an enclosure."""
-        h, way = self.case.longest, np.zeros((self.n, len(held[0].c)))
-        for attempt in range(1 + _ATTEMPTS):
-            during = [replace(x, r=x.r + own) for x, own in zip(states, way, strict=True)]
-            F = self.f(during, held)
-            most = np.array([(f.size * h).top for f in F])
-            good = np.all(most < way, axis=0)
-            if np.all(good):
-                break
-            way = np.where(good, way, 1.25 * most if attempt < _ATTEMPTS else np.nan)
-        else:
-            during = [replace(x, r=x.r + own) for x, own in zip(states, way, strict=True)]
-            F = self.f(during, held)
-        return during, F
 
     def hull(self, states: list[Taylor], F: list[Taylor]) -> Array:
         """Between what the states lie that start at |x_i| <= `widest` and move as fast as F for a period at most."""

@@ -129,7 +129,7 @@ READ = {"format": 1, "hash": 1}  # rules of document.py, which have held
 RULES = (
     *READ,
     *dict.fromkeys(name for table in (STATED, ON_THE_BALL, OF_THE_TREE, ON_LEAVES) for name, _ in table),
-    *("tube", "contraction", "outer", "faces", "angles", "ranks"),  # of features: their modules have the tables
+    *("data", "tube", "contraction", "outer", "faces", "angles", "ranks"),  # of features: their modules have the tables
 )
 
 
@@ -186,6 +186,10 @@ def check(c: Certificate, jobs: int = 1, patient: bool = False) -> Tally:
     with np.errstate(all="ignore"):  # overflow becomes infinity or NaN, and every test then fails
         tally, case = Tally(), Case(c, jobs, patient)
         tally.hold([(name, rule) for name, rule in STATED if not spared.get(name)], case)
+        if c.data is not None:
+            from . import data
+
+            tally.hold(data.OF_DATA, case)
         if replayed:
             _examine(tally, case)
         if c.ranks is not None:

@@ -6,7 +6,7 @@ import math
 from fractions import Fraction
 from typing import Any
 
-from .document import MAX_RANK, Array, Certificate, Partition, Policy, Ranks
+from .document import MAX_RANK, Array, Certificate, Data, Partition, Policy, Ranks
 from .expression import Tape
 from .networks import Map, Network, Observe, Product, Step, Sum, hashed
 
@@ -70,6 +70,8 @@ def claim(c: Certificate) -> list[str]:
         lines.append(
             f"  and along every trajectory of these, {'at every step' if c.discrete else 'at all times'}{until}: {kept}"
         )
+    if c.data is not None:
+        lines.append(f"  {_consistent(c, c.data)}")
     if c.ranks is not None and c.claim == "reaches":
         said = _by_ranks(c, c.ranks, when["start"], "")
         return [f"claim: every trajectory of the closed loop that {said}; nothing is claimed of later", *lines]
@@ -91,6 +93,27 @@ def _by_ranks(c: Certificate, ranks: Ranks, start: str, rest: str) -> str:
         f"{'steps' if c.discrete else 'periods'} as the rank is, at the latest, {ranks.most} at most{rest}; until then "
         f"{inside}u stays in its bounds"
     )
+
+
+def _consistent(c: Certificate, data: Data) -> str:
+    """The statement of chapter data."""
+    priors = ", ".join(
+        f"{name} in {_interval(pair)}" for name, pair in zip(data.parameters, data.priors, strict=True)
+    )
+    noise = ", ".join(f"{name} within {_number(w)}" for name, w in zip(c.states, data.noise, strict=True))
+    moved = [f"{name} + {_number(q)}" for name, q in zip(c.states, data.origin, strict=True) if q]
+    of = f"; measured are {', '.join(moved)}" if moved else ""
+    lasting = "" if data.period is None else f" of {_lasting(data.period)} units of time, with the input held"
+    return (
+        f"and so for every plant with constant {priors} that is consistent with {data.transitions} measured transitions"
+        f"{lasting}, in {len(data.runs)} runs ({noise}{of}; from a file with sha256 {data.sha256}): their parameters "
+        "lie in the ranges above; of other plants nothing is claimed"
+    )
+
+
+def _lasting(period: tuple[Fraction, Fraction]) -> str:
+    lo, hi = period
+    return _number(lo) if lo == hi else f"some time in {_interval(period)}"
 
 
 def _falls(c: Certificate) -> str:
