@@ -39,7 +39,7 @@ _TOUCHING, _LINEARISED = 16, 12  # rays from which states are looked for that vi
 _KEEP = 200  # rays of a search that are remembered for their crossing, and for their worst state
 _ROWS = 500  # states that each margin hands to the solver
 _ROUNDS = 30
-DECAYS = (0.2, 0.02)
+DECAYS, OF_CORNERS = (0.2, 0.02), (0.05, 0.02)  # the latter where ranges take their own part of the margin
 _REPEATS, _WORTH = 12, 1.05  # of the whole search, and growth of the volume that is worth another
 _SMALL = 0.01  # growth of the log of the volume, or trust radius, at which to stop
 _STEP = 1e-4  # relative, of the difference quotient along a ray
@@ -123,12 +123,13 @@ def optimise_repeatedly(
     ------
     BackendError : of the first round.
     """
-    P, _ = _optimise(loop, start, DECAYS, 0, effort, known)
+    decays = OF_CORNERS if loop.system.ranges else DECAYS
+    P, _ = _optimise(loop, start, decays, 0, effort, known)
     for seed in range(1, _REPEATS):
         if effort.over:
             break
         try:
-            P, growth = _optimise(loop, P, DECAYS, seed, effort, known)
+            P, growth = _optimise(loop, P, decays, seed, effort, known)
         except BackendError:  # no larger one
             break
         if growth < _WORTH:
@@ -200,7 +201,7 @@ class _Samples:
 
     def field(self, x: Array) -> tuple[Array, NDArray[np.bool_]]:
         """G and `outside` at x, shapes (..., n) and (...)."""
-        self.effort.charge(_CALL + self.corners.count * x.size / self.loop.system.n * self.loop.operations)
+        self.effort.charge(_CALL + x.size / self.loop.system.n * self.corners.operations)
         # One matrix product for all states: numpy would make one for each leading index.
         u = self.loop.policy(x.reshape(-1, x.shape[-1])).reshape(*x.shape[:-1], self.loop.system.m)
         with np.errstate(all="ignore"):
