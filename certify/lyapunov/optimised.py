@@ -39,7 +39,7 @@ _TOUCHING, _LINEARISED = 16, 12  # rays from which states are looked for that vi
 _KEEP = 200  # rays of a search that are remembered for their crossing, and for their worst state
 _ROWS = 500  # states that each margin hands to the solver
 _ROUNDS = 30
-DECAYS, OF_CORNERS = (0.2, 0.02), (0.05, 0.02)  # the latter where ranges take their own part of the margin
+DECAYS, FURTHER = (0.2, 0.02), (0.05,)  # the latter for rounds after the first where ranges take part of the margin
 _REPEATS, _WORTH = 12, 1.05  # of the whole search, and growth of the volume that is worth another
 _SMALL = 0.01  # growth of the log of the volume, or trust radius, at which to stop
 _STEP = 1e-4  # relative, of the difference quotient along a ray
@@ -123,8 +123,8 @@ def optimise_repeatedly(
     ------
     BackendError : of the first round.
     """
-    decays = OF_CORNERS if loop.system.ranges else DECAYS
-    P, _ = _optimise(loop, start, decays, 0, effort, known)
+    P, _ = _optimise(loop, start, DECAYS, 0, effort, known)
+    decays = FURTHER if loop.system.ranges else DECAYS
     for seed in range(1, _REPEATS):
         if effort.over:
             break
