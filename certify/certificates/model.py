@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates.claims import Claim, Outer, Ranks, Reaches
+from certify.certificates.data import DataBounds, data_claim, data_evidence
 from certify.certificates.encoding import encode, network_section
 from certify.certificates.evidence import PartitionTree, RanksAlone, TrustedSolver, evidence_section
 from certify.certificates.formats import SCHEMA
@@ -81,6 +82,7 @@ class Certificate(_Stated):
     V : the Lyapunov function.
     claim : the claim about them, with its levels.
     provenance : anything that helps people; the checker ignores it.
+    data : the evidence that the plant's measurements bound its parameters; None if ranges are assumed.
 
     Raises
     ------
@@ -94,6 +96,7 @@ class Certificate(_Stated):
     claim: Claim
     evidence: PartitionTree | TrustedSolver
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    data: DataBounds | None = None
 
     def __post_init__(self) -> None:
         if self.network.is_moved and (self.claim.at_rest or self.network.centre != "none"):
@@ -133,6 +136,7 @@ class Certificate(_Stated):
     def sections(self) -> dict[str, Any]:
         """The sections of the claim, V, its levels and the evidence, and of networks beside the policy's."""
         claim, system = self.claim, self.system
+        claimed, shown = self._of_data()
         return {
             "claim": {
                 "kind": claim.kind,
@@ -142,12 +146,19 @@ class Certificate(_Stated):
             }
             | _start(claim)
             | _ranks(claim.ranks)
-            | _keep(claim.keep),
+            | _keep(claim.keep)
+            | claimed,
             "networks": _networks(claim.outer),
             "lyapunov": {"kind": "quadratic", "P": encode(self.V.P)},
             "levels": {name: float(level).hex() for name, level in claim.levels.items()},
-            "evidence": evidence_section(self.evidence),
+            "evidence": evidence_section(self.evidence) | shown,
         }
+
+    def _of_data(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The entries `data` of the claim and of the evidence; nothing without data."""
+        if self.data is None or self.system.measurements is None:
+            return {}, {}
+        return {"data": data_claim(self.system.measurements, self.system)}, {"data": data_evidence(self.data)}
 
 
 @dataclass(frozen=True, slots=True)

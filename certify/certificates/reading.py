@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates.claims import CLAIMS, Claim, Outer, Ranks, Reaches
+from certify.certificates.data import read_data_bounds, read_measurements
 from certify.certificates.encoding import decode, network_named, read_network
 from certify.certificates.evidence import read_evidence, read_ranks_alone
 from certify.certificates.formats import SCHEMA, other_version
@@ -122,14 +123,18 @@ def parse_any(raw: bytes, name: str) -> Certificate | ReachCertificate:
             reaches = _read_reaches(data["claim"], system)
             evidence = read_ranks_alone(data["evidence"], n)
             return ReachCertificate(_with_constraints(system, reaches, names), network, reaches, evidence, provenance)
-        claim = _read_claim(data, system)
+        claim, measured, bounds = _read_claim(data, system), None, None
+        if "data" in data["claim"]:
+            measured = read_measurements(data["claim"]["data"], n, system.m)
+            bounds = read_data_bounds(data["evidence"]["data"], measured)
         return Certificate(
-            system=_with_constraints(system, claim, names),
+            system=replace(_with_constraints(system, claim, names), measurements=measured),
             network=network,
             V=Quadratic(decode(data["lyapunov"]["P"], (n, n))),
             claim=claim,
             evidence=read_evidence(data["evidence"], n),
             provenance=provenance,
+            data=bounds,
         )
     except CertificateFormatError:
         raise

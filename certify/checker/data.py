@@ -8,13 +8,15 @@ makes better models: rounds do this one after the other.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 
+from .boxes import LEAF, is_whole
 from .case import Case, Failures
-from .document import Array, Data, Intervals
+from .document import Array, Data, Intervals, Round
 from .expression import evaluate
 from .flow import enclosed, later
 from .near import Above, Near, all_near, combined, near, size
@@ -39,7 +41,8 @@ class Flows:
     def __init__(self, case: Case, data: Data) -> None:
         self.case, self.c, self.data = case, case.c, data
         self.n, self.k = len(case.c.states), len(data.parameters)
-        self.symbols = self.n + self.k
+        lo, hi = data.period or (0, 0)
+        self.symbols = self.n + self.k + int(lo < hi)  # the last is that of the period
         self.noise = all_near(data.noise)
         begins = np.concatenate([np.full(len(inputs), run) for run, (_, inputs) in enumerate(data.runs)])
         self.begin = np.arange(len(begins)) + begins  # the number of the measurement at which a transition begins
@@ -49,29 +52,24 @@ class Flows:
     def rows(self, box: Intervals, chosen: Array) -> Rows:
         """What some transitions say, by their numbers, of parameters in a box."""
         found = [self._rows(box, chosen[first : first + self._batch]) for first in range(0, len(chosen), self._batch)]
-        alphas, slopes, slacks = zip(*found, strict=True)
-        return Rows(
-            Near(*(np.concatenate(part, axis=1) for part in zip(*alphas, strict=True))),
-            np.concatenate(slopes, axis=-1),
-            Above(np.concatenate(slacks, axis=1)),
-        )
+        alpha, wrong, slopes, slack = (np.concatenate(part, axis=-1) for part in zip(*found, strict=True))
+        return Rows(Near(alpha, Above(wrong)), slopes, Above(slack))
 
     @property
     def _batch(self) -> int:
         values = self.c.dynamics.size * (self.data.order + 1)
         return int(max(1, min(256, _BATCH_NUMBERS // (self.symbols**2 * (values + 4)))))
 
-    def _rows(self, box: Intervals, chosen: Array) -> tuple[tuple[Array, Array], Array, Array]:
-        begin, (i, j) = self.begin[chosen], pairs(self.symbols)
-        alphas, slopes, slacks = [], [], []
+    def _rows(self, box: Intervals, chosen: Array) -> tuple[Array, ...]:
+        """alpha, its errors, slopes and slack of a batch of transitions."""
+        begin, (i, j), own, none = self.begin[chosen], pairs(self.symbols), self.n + self.k, np.zeros(len(chosen))
+        found = []
         for s, model in enumerate(self.end(box, chosen)):
             squares, value = Near(model.q[i == j]), self.measured(s, begin + 1)
             centre, wrong = combined((1.0, Near(model.c)), (0.5, squares.sum()), (-1.0, value))
-            alphas.append((centre, (wrong + np.zeros_like(centre)).top))
-            slopes.append(model.g)
-            slacks.append((size(squares.value).sum() * 0.5 + size(model.q[i != j]).sum() + model.r).top)
-        values, errors = (np.stack(part) for part in zip(*alphas, strict=True))
-        return (values, Above(errors)), np.stack(slopes), np.stack(slacks)
+            slack = size(squares.value).sum() * 0.5 + size(model.q[i != j]).sum() + size(model.g[own:]).sum() + model.r
+            found.append((centre, wrong.top + none, model.g[:own], slack.top + none))
+        return tuple(np.stack(part) for part in zip(*found, strict=True))
 
     def measured(self, state: int, number: Array) -> Near:
         """Measurements of a state, in deviations."""
@@ -108,7 +106,7 @@ class Flows:
         if self.data.period is None:
             return evaluate(self.c.dynamics, number, [*x, *held])
         lo, hi = (end / pieces for end in self.data.period)
-        h = self._number((lo, hi), None, batch)
+        h = self._number((lo, hi), self.symbols - 1 if lo < hi else None, batch)
         longest = float(near(hi).ends[1])
         for _ in range(pieces):
             during, _ = enclosed(lambda v: evaluate(self.c.dynamics, number, [*v, *held]), x, longest)
@@ -137,32 +135,84 @@ class Flows:
         return (-total).wider(reach).ends
 
 
+    def after(self, box: Intervals, weights: Array, chosen: Array) -> Intervals:
+        """The box that weights (2, K, T, n) of some transitions leave of a box; lo > hi where that is nothing."""
+        rows, found = self.rows(box, chosen), []
+        for k, (lo, hi) in enumerate(box):
+            middle, reach = (lo + hi) / 2, (hi - lo) / 2
+            below, above = (self.bounds(rows, chosen, weights[side, k, chosen], k) for side in (0, 1))
+            least = middle + reach * Fraction(below[0]) if -1 < below[0] < np.inf else lo  # not where it is NaN
+            most = middle + reach * Fraction(above[1]) if -np.inf < above[1] < 1 else hi
+            found.append((least, most))
+        return tuple(found)
+
+
 def _turned(x: Above) -> Above:
     """The same with its two axes exchanged."""
     return Above(x.v.T, x.k)
 
 
-def in_box(case: Case) -> Failures:
-    """`data`: the box that the measurements leave of the priors lies in the claim's ranges."""
+def narrowed(flows: Flows, box: Intervals, rounds: Sequence[Round]) -> tuple[Intervals | None, int]:
+    """The last of the boxes that rounds state, or None if that has nothing, and the number of rounds that show what
+    they state: all, or those before the first that does not."""
+    for number, stated in enumerate(rounds):
+        chosen = np.flatnonzero(np.any(stated.weights != 0, axis=(0, 1, 3)))
+        if not (len(chosen) and all(map(_holds, stated.box, flows.after(box, stated.weights, chosen)))):
+            return box, number
+        if any(lo > hi for lo, hi in stated.box):
+            return None, len(rounds)
+        box = stated.box
+    return box, len(rounds)
+
+
+def _holds(outer: tuple[Fraction, Fraction], inner: tuple[Fraction, Fraction]) -> bool:
+    return outer[0] <= inner[0] and inner[1] <= outer[1]
+
+
+def is_whole_tree(case: Case) -> Failures:
+    """`data`: the bytes are a partition of the priors, with rounds for each leaf."""
     data = case.data
-    flows, box, count = Flows(case, data), list(data.priors), 0
-    for number, multipliers in enumerate(data.rounds):
-        chosen = np.flatnonzero(np.any(multipliers != 0, axis=(0, 1, 3)))
-        rows = flows.rows(tuple(box), chosen)
-        for k, ends in enumerate(multipliers[:, :, chosen].swapaxes(0, 1)):
-            lo, hi = box[k]
-            middle, reach = (lo + hi) / 2, (hi - lo) / 2
-            least, most = flows.bounds(rows, chosen, ends[0], k)[0], flows.bounds(rows, chosen, ends[1], k)[1]
-            lo = middle + reach * Fraction(least) if least > -1 else lo  # not where it is NaN
-            hi = middle + reach * Fraction(most) if most < 1 else hi
-            if lo > hi:
-                yield f"round {number}", f"no {data.parameters[k]} is consistent with the measurements"
-            box[k], count = (lo, hi), count + 2
-    ranges = dict(zip(case.c.uncertain, case.c.ranges, strict=True))
-    for name, (lo, hi) in zip(data.parameters, box, strict=True):
-        if not (ranges[name][0] <= lo and hi <= ranges[name][1]):
-            yield name, "its range must hold all that the measurements are shown to leave of the prior"
-    return count
+    leaves = yield from is_whole(data.tree, range(len(data.parameters)), "data, ")
+    if leaves != len(data.leaves):
+        yield "evidence.data.leaves", f"there must be rounds for each of {leaves} leaves"
+    return leaves
 
 
-OF_DATA = (("data", in_box),)
+def in_ranges(case: Case) -> Failures:
+    """`data`: what the measurements leave of the priors lies in the claim's ranges."""
+    data, flows, left = case.data, Flows(case, case.data), list[Intervals]()
+    for leaf, (box, rounds) in enumerate(zip(_leaves(data), data.leaves, strict=True)):
+        part, shown = narrowed(flows, box, rounds)
+        if shown < len(rounds):
+            yield f"leaf {leaf}, round {shown}", "the measurements may leave more than the box"
+        left += [] if part is None else [part]
+    whole: Intervals | None = None
+    if left:
+        hull = tuple((min(lo for lo, _ in pairs), max(hi for _, hi in pairs)) for pairs in zip(*left, strict=True))
+        whole, shown = narrowed(flows, hull, data.rounds)
+        if shown < len(data.rounds):
+            yield f"round {shown}", "the measurements may leave more than the box"
+    if whole is None:
+        yield "claim.data", "no parameter is consistent with the measurements: nothing is claimed"
+    else:
+        ranges = dict(zip(case.c.uncertain, case.c.ranges, strict=True))
+        for name, pair in zip(data.parameters, whole, strict=True):
+            if not _holds(ranges[name], pair):
+                yield name, "its range must hold all that the measurements leave of the prior"
+    return sum(map(len, data.leaves)) + len(data.rounds)
+
+
+def _leaves(data: Data) -> Iterator[Intervals]:
+    """The parts of the box of priors, in the tree's order; halves meet in the middle."""
+    waiting = [data.priors]
+    for axis in data.tree:
+        box = waiting.pop()
+        if axis == LEAF:
+            yield box
+            continue
+        lo, hi = box[axis]
+        middle = (lo + hi) / 2
+        waiting += [tuple(end if k == axis else pair for k, pair in enumerate(box)) for end in ((middle, hi), (lo, middle))]
+
+
+OF_DATA = (("data", is_whole_tree), ("data", in_ranges))

@@ -23,7 +23,7 @@ MAX_STATES, MAX_SLABS = 64, 10**4
 MAX_ORDER = 8  # of a series in time
 MAX_CELLS, MAX_CUTS = 4096, 64  # of the box of uncertain quantities in all, and of one range
 MAX_CONSTRAINTS, MAX_RANK = 64, 2**16 - 1  # that rank is none
-MAX_TRANSITIONS, MAX_ROUNDS = 2**16, 64  # of data
+MAX_TRANSITIONS, MAX_ROUNDS, MAX_PARTS = 2**16, 64, 4096  # of data; rounds of a part of the priors
 CLAIMS = ("asymptotic", "practical", "nearby", "enlarged", "reached", "reaches")
 PRACTICAL = ("practical", "nearby")
 WITH_TUBE = ("enlarged", "reached")
@@ -153,12 +153,21 @@ class Ranks:
 
 
 @dataclass(frozen=True)
+class Round:
+    """What weights (2, K, T, n) of all transitions leave of a box of parameters lies in another."""
+
+    box: Intervals
+    weights: Array
+
+
+@dataclass(frozen=True)
 class Data:
     """Measurements on which ranges of parameters rest, and multipliers that show it.
 
     A run has states (T + 1, n), within `noise` of the true ones, and the inputs (T, m) that are held in between, for a
-    time in `period`, or for a step where that is None; measured is `origin` + x. `rounds` have multipliers (2, K, T, n)
-    of all transitions; a transition is followed in so many `pieces`, with a series in time of an `order`.
+    time in `period`, or for a step where that is None; measured is `origin` + x. A transition is followed in so many
+    `pieces`, with a series in time of an `order`. The priors are partitioned by a tree; each of its `leaves` has
+    rounds, and so has what these leave of the priors.
     """
 
     sha256: str  # of the file that they come from
@@ -170,7 +179,9 @@ class Data:
     runs: tuple[tuple[Array, Array], ...]
     order: int
     pieces: int
-    rounds: tuple[Array, ...]
+    tree: bytes
+    leaves: tuple[tuple[Round, ...], ...]
+    rounds: tuple[Round, ...]
 
     @property
     def transitions(self) -> int:
@@ -362,7 +373,11 @@ def _data(claim: Value, evidence: Value, stated: Mapping[str, Any]) -> Data:
     runs.must(count <= MAX_TRANSITIONS, f"of {MAX_TRANSITIONS} transitions at most")
     errors = noise.listed(Value.rational, n)
     noise.must(min(errors) >= 0, "at least 0")
-    order, pieces, rounds = evidence.keys("order pieces rounds")
+    order, pieces, tree, leaves, rounds = evidence.keys("order pieces tree leaves rounds")
+
+    def read_rounds(value: Value) -> tuple[Round, ...]:
+        return value.listed(lambda each: _round(each, len(names), count, n), 0, MAX_ROUNDS)
+
     return Data(
         sha256.text("[0-9a-f]{64}", "64 hexadecimal digits"),
         names,
@@ -373,8 +388,16 @@ def _data(claim: Value, evidence: Value, stated: Mapping[str, Any]) -> Data:
         measured,
         order.integer(1, 1 if discrete else MAX_ORDER),
         pieces.integer(1, 1 if discrete else MAX_CUTS),
-        rounds.listed(lambda multipliers: multipliers.array(2, len(names), count, n), 1, MAX_ROUNDS),
+        tree.octets(),
+        leaves.listed(read_rounds, 1, MAX_PARTS),
+        read_rounds(rounds),
     )
+
+
+def _round(value: Value, K: int, T: int, n: int) -> Round:
+    box, weights = value.keys("box weights")
+    lo, hi = box.array(2, K).tolist()
+    return Round(tuple(zip(map(Fraction, lo), map(Fraction, hi), strict=True)), weights.array(2, K, T, n))
 
 
 def _run(value: Value, n: int, m: int) -> tuple[Array, Array]:

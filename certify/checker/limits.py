@@ -208,7 +208,8 @@ class Sizes:
         data = self.c.data
         if data is None:
             return 0
-        k, followed, a = len(data.parameters), len(data.rounds) * data.transitions, self.c.dynamics.size
+        rounds = len(data.rounds) + sum(map(len, data.leaves))
+        k, followed, a = len(data.parameters), rounds * data.transitions, self.c.dynamics.size
         times = 2 * data.order**3 + 8 if data.period else 1
         models = data.pieces * (a * times + 4 * self.n)
         return self.boxes(followed, models, a * (data.order + 1), self.n + k, 0) + 2**6 * k * followed * self.n * (

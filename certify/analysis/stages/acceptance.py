@@ -44,7 +44,8 @@ class Acceptance:
         """
         problem = state.contest.best.trial.task.problem
         system, network = state.loop.system, state.loop.network
-        certificate = Certificate(system, network, problem.V, state.claim, state.evidence, self.tools.provenance)  # type: ignore[arg-type]
+        parts = system, network, problem.V, state.claim, state.evidence, self.tools.provenance, state.data
+        certificate = Certificate(*parts)  # type: ignore[arg-type]
         clerk = _Desk(state, self.tools, effort).clerk()
         accepted = clerk.accepted(certificate, problem)
         state = replace(state, accepted=accepted).noting(accepted.mended)

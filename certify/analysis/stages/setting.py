@@ -23,6 +23,7 @@ from certify.effort import Effort
 from certify.errors import InputError, OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.equilibrium import Rest, find_rest, seen_from
+from certify.loop.plants import Measurements
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,9 @@ class Setting:
             )
         centre = None if options.reach_from is None else state_in(system, options.reach_from)
         state = replace(state, centre=centre)
+        if system.measurements is not None:
+            with self.tools.timing("data"):
+                state = _identified(state, system.measurements)
         with self.tools.timing("candidate"):
             state = _with_claim(state)
             rest, loop = _rest(state.loop, state.options)
@@ -68,6 +72,28 @@ def setting_of(loop: ClosedLoop, options: RoaOptions) -> State:
     """The state before the first stage."""
     unknown = RoaResult(Verdict.UNKNOWN, Stop.REQUESTED, loop.system, loop.network, engine=options.engine)
     return State(loop, options, unknown)
+
+
+def _identified(state: State, measurements: Measurements) -> State:
+    """The plant with the measurements alone that its ranges rest on, and evidence that they do.
+
+    Raises
+    ------
+    InputError : a range does not hold all that the measurements leave, or no plant is consistent with them.
+    """
+    from certify.provers.data import identify
+
+    system = state.loop.system
+    found = identify(system, measurements)
+    for name, (lo, hi) in found.ranges.items():
+        least, most = system.ranges[name]
+        if not least <= lo <= hi <= most:
+            raise InputError(
+                f"the range of {name} must hold all that the data leave, [{float(lo):.9g}, {float(hi):.9g}]; found "
+                f"[{float(least):.9g}, {float(most):.9g}]. `certify identify` writes a plant with such ranges."
+            )
+    loop = ClosedLoop(replace(system, measurements=found.measurements), state.loop.network)
+    return replace(state, loop=loop, data=found.bounds)
 
 
 def _with_claim(state: State) -> State:

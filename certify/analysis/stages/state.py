@@ -16,6 +16,7 @@ from certify.analysis.results import RoaResult
 from certify.analysis.saved_search import Keeper
 from certify.analysis.selection import Race
 from certify.certificates import PartitionTree, TrustedSolver
+from certify.certificates.data import DataBounds
 from certify.certificates.claims import Claim
 from certify.certificates.claims.claim import Kind
 from certify.effort import Effort
@@ -45,6 +46,7 @@ class State:
     notes : remarks for a person, in order; none is ever taken away.
     race, proof : the candidates, and what the prover says of the best.
     claim, evidence : what is to be certified.
+    data : evidence that measurements bound the plant's parameters; None where ranges are assumed.
     beyond : the set of another function around the ellipsoid.
     ranked : boxes with ranks, as the search found them.
     missed : why no tube holds `centre`.
@@ -62,6 +64,7 @@ class State:
     proof: Proof | None = None
     claim: Claim | None = None
     evidence: PartitionTree | TrustedSolver | None = None
+    data: DataBounds | None = None
     beyond: OuterProof | None = None
     ranked: RankProof | None = None
     missed: str = ""

@@ -12,6 +12,7 @@ from certify.loop.plants.deviations import (
 )
 from certify.loop.plants.floating_point import mean_rate
 from certify.loop.plants.linear import Controllability, Matrix, controllability, in_floats, linearise
+from certify.loop.plants.measurements import Measurements, Run
 from certify.loop.plants.operating_point import require_equilibrium, residuals, rests_where
 from certify.loop.plants.registry import available_systems, chosen_system, get_system, shipped_system
 from certify.loop.plants.system import System, exact
@@ -21,6 +22,8 @@ from certify.loop.plants.uncertainty import at_values, corners, input_errors, ki
 __all__ = [
     "Controllability",
     "Matrix",
+    "Measurements",
+    "Run",
     "System",
     "at_values",
     "available_systems",

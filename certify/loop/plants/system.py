@@ -33,6 +33,7 @@ from certify.loop.expressions import (
 from certify.loop.expressions.numerical import Module
 from certify.loop.plants.calls import Call
 from certify.loop.plants.floating_point import function_of
+from certify.loop.plants.measurements import Measurements
 from certify.loop.plants.validation import validate
 
 Interval = tuple[Fraction, Fraction]
@@ -94,6 +95,8 @@ class System:
     rest_of_calls : exact values of results at the operating point, by their symbols' names, where they are given.
     angles : names of states of which 2 pi more is the same place.
     constraints : expressions g by name, as the dynamics; g < 0 is asked for along trajectories.
+    measurements : those with which some of the uncertain parameters are consistent, constants that the measurements
+        leave no other range; None where ranges are assumed.
 
     Raises
     ------
@@ -123,6 +126,7 @@ class System:
     rest_of_calls: Mapping[str, Fraction] = field(default_factory=dict)
     angles: tuple[str, ...] = ()
     constraints: Mapping[str, Expression] = field(default_factory=dict)
+    measurements: Measurements | None = None
 
     def __post_init__(self) -> None:
         for key in ("parameters", "ranges", "units", "rest_of_calls", "constraints"):
