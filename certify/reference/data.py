@@ -5,7 +5,7 @@ The priors are divided. What the measurements leave of the parts lies in one box
 A parameter is the middle of its interval and half the width times a symbol d, a measured state what was measured and
 the noise times a symbol e. What the equations make of these until the next measurement, less that, is 0 where the
 parameters are true ones. So are all sums of such numbers with multipliers w: what such a sum has of d_j, subtracted
-from d_j, leaves a number that is d_j again, and that lies between the ends of its form.
+from d_j, leaves a number that is d_j again, and that lies between the ends of its form. That is right for every w.
 
 A parameter is one number at all times. Its symbol stands for it wherever it occurs in a series in time, while any other
 quantity may be another number at each place.
@@ -17,18 +17,18 @@ from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from flint import arb, arb_mat, fmpq
+from flint import arb, arb_mat
 
 from .balls import ONE, ZERO, total
 from .document import Certificate, Data, Interval
-from .evidence import Fit
+from .evidence import Fit, Round
+from .fields import exact
 from .flow import Moving, mean_on, moved_within
 from .leaves import LEAF, structure
 from .refusal import Refused, require
 from .taylor import Taylor, constant
 
 RULE = "data"
-GRID = 2**60  # ends of intervals are kept as multiples of half their width by this
 Box = Sequence[Interval]  # for each parameter
 
 
@@ -70,13 +70,18 @@ def hull(boxes: Sequence[Box]) -> Box:
     return [(min(lo for lo, _ in each), max(hi for _, hi in each)) for each in zip(*boxes, strict=True)]
 
 
-def after(c: Certificate, data: Data, fit: Fit, box: Box, rounds: Sequence[array[float]], at: str) -> Box | None:
+def after(c: Certificate, data: Data, fit: Fit, box: Box, rounds: Sequence[Round], at: str) -> Box | None:
     """What some rounds leave of a box, None where that is nothing."""
-    left: Box | None = box
-    for number, w in enumerate(rounds):
-        if left is not None:
-            left = Round(c, data, fit, left, f"{at} round {number}").narrowed(w)
-    return left
+    for number, each in enumerate(rounds):
+        Measured(c, data, fit, box, f"{at} round {number}").narrows(each)
+        box = [(exact(lo), exact(hi)) for lo, hi in zip(*halves(each.box), strict=True)]
+        if not all(lo <= hi for lo, hi in box):
+            return None
+    return box
+
+
+def halves(values: array[float]) -> tuple[array[float], array[float]]:
+    return values[: len(values) // 2], values[len(values) // 2 :]
 
 
 @dataclass(frozen=True)
@@ -112,8 +117,11 @@ class Residual:
     slack: arb
 
 
-class Round:
-    """What a box of the parameters makes of each transition, and the box that is left of it.
+NO_NUMBER = Residual(arb("nan"), {}, ZERO)
+
+
+class Measured:
+    """What a box of the parameters makes of each transition, and what is left of it.
 
     Models of a transition have the n symbols of its start, those of the parameters, and one of the period where that
     may be one of many. Of all symbols those of the parameters come first, then n for each row of each run.
@@ -132,26 +140,32 @@ class Round:
     def moving(self, middle: arb, symbol: int, size: arb) -> Taylor:
         return Taylor(middle, arb_mat(1, self.symbols, [size if k == symbol else ZERO for k in range(self.symbols)]))
 
-    def narrowed(self, w: array[float]) -> Box | None:
-        """The box that is left, or None where nothing is."""
-        size = self.data.steps * self.n
-        rows = [w[k : k + size] for k in range(0, len(w), size)]  # those of all lower bounds, then of all upper ones
-        found = dict[int, Residual]()
+    def narrows(self, stated: Round) -> None:
+        """By the multipliers no consistent parameters are beyond the stated box, or a refusal."""
+        require(any(stated.weights), RULE, self.at, "every multiplier is 0")
+        each = zip(self.data.parameters, self.box, *halves(stated.box), self.bounds(stated.weights), strict=True)
+        for name, (lo, hi), least, most, (below, above) in each:
+            bounded = exact(least) <= lo or is_at_most(arb(least), below)
+            require(bounded, RULE, f"{self.at} {name}", "a consistent one may be below the lower end of the box")
+            bounded = hi <= exact(most) or is_at_most(above, arb(most))
+            require(bounded, RULE, f"{self.at} {name}", "a consistent one may be above the upper end of the box")
+
+    def bounds(self, weights: array[float]) -> Iterator[tuple[arb, arb]]:
+        """Of each parameter numbers below and above all that are consistent, by a round's multipliers."""
+        size, found = self.data.steps * self.n, dict[int, Residual]()
+        rows = [weights[k : k + size] for k in range(0, len(weights), size)]
         for t in transitions(self.data):
             first = t.number * self.n
             if any(any(row[first : first + self.n]) for row in rows):
-                found.update(enumerate(self.residuals(t), first))
-        result = list[Interval]()
-        for j, (ends, below, above) in enumerate(zip(self.box, rows[: self.K], rows[self.K :], strict=True)):
-            middle, half = (ends[0] + ends[1]) / 2, (ends[1] - ends[0]) / 2
+                try:
+                    found.update(enumerate(self.residuals(t), first))
+                except Refused:  # a bound with it is no number, and says nothing
+                    found.update((first + i, NO_NUMBER) for i in range(self.n))
+        for j, ((lo, hi), below, above) in enumerate(zip(self.box, rows[: self.K], rows[self.K :], strict=True)):
+            middle, half = arb((lo + hi) / 2), arb((hi - lo) / 2)
             reach, shift = combined(j, below, found)
-            lo = middle + half * downward(-reach - shift)
-            reach, shift = combined(j, above, found)
-            hi = middle - half * downward(shift - reach)
-            if not lo <= hi:
-                return None
-            result.append((lo, hi))
-        return result
+            further, other = combined(j, above, found)
+            yield middle + half * (-reach - shift), middle + half * (further - other)
 
     def residuals(self, t: Transition) -> Iterator[Residual]:
         """What is reached less what was measured there, of each state."""
@@ -170,18 +184,15 @@ class Round:
         return arb(measured[i]) - self.origin[i]
 
     def reached(self, t: Transition) -> list[Taylor]:
-        """Models of the states at the end of a transition, or a refusal."""
+        """Models of the states at the end of a transition; a refusal where they have none."""
         at, plant = f"{self.at} transition {t.number}", self.c.plant
         states = {name: self.moving(self.middle(t.x, i), i, self.noise[i]) for i, name in enumerate(plant.states)}
         inputs = {name: Taylor(arb(v)) for name, v in zip(plant.inputs, t.u, strict=True)}
-        try:
-            if self.data.period is None:
-                values: list[Taylor] = plant.dynamics.evaluate({**states, **inputs, **self.quantities}, constant)
-                return values
-            for _ in range(self.fit.pieces):
-                states = self.followed(states, inputs, self.data.period, at)
-        except Refused as no:
-            raise Refused(RULE, at, no.detail) from None
+        if self.data.period is None:
+            values: list[Taylor] = plant.dynamics.evaluate({**states, **inputs, **self.quantities}, constant)
+            return values
+        for _ in range(self.fit.pieces):
+            states = self.followed(states, inputs, self.data.period, at)
         return list(states.values())
 
     def followed(
@@ -218,9 +229,6 @@ def combined(j: int, w: Sequence[float], found: Mapping[int, Residual]) -> tuple
     return total(map(abs, left.values())) + slack, shift
 
 
-def downward(v: arb) -> fmpq:
-    """A rational at or below v: -1 where v says nothing of a number in [-1, 1], 2 where it is above all of them."""
-    least = arb(v.lower())
-    if not (least.is_finite() and least > -1):
-        return fmpq(-1)
-    return fmpq(2) if least > 1 else fmpq(int((least * GRID).floor().unique_fmpz()), GRID)
+def is_at_most(a: arb, b: arb) -> bool:
+    """True if both certainly are numbers, and the first no greater one."""
+    return bool(a.is_finite()) and bool(b.is_finite()) and bool(a <= b)

@@ -13,7 +13,7 @@ from typing import Any
 
 from flint import fmpq, fmpq_mat
 
-from .evidence import REACHES, WITH_FLOOR, WITH_TUBE, Ranked, Tree, Trusted, read_evidence
+from .evidence import REACHES, WITH_FLOOR, WITH_TUBE, Fitted, Ranked, Tree, Trusted, read_evidence
 from .expressions import Equations, equations, rational
 from .fields import IDENTIFIER, MAX_NAMES, binary64, column, entries, exact, keys, numbers, square
 from .networks import Network, packed, read_networks
@@ -208,7 +208,7 @@ def read(raw: bytes) -> Certificate:
     least = floor[0] if floor else None
     further = beyond is not None
     longer = sample is not None and not plant.dynamics.calls  # a series goes through no network
-    fitted = None if measured is None else (2 * len(measured.parameters) * measured.steps * n, plant.discrete)
+    fitted = None if measured is None else Fitted(len(measured.parameters), measured.steps * n, plant.discrete)
     evidence = read_evidence(
         data["evidence"], n, len(plant.uncertain), claim, longer, further, ranked=ranks is not None, fitted=fitted
     )

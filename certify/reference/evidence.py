@@ -10,7 +10,7 @@ import math
 import re
 from array import array
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from flint import fmpq_mat
 
@@ -102,8 +102,16 @@ class Ranking:
 
 
 @dataclass(frozen=True)
+class Round:
+    """What measurements leave of a box of parameters, (2, K), by these multipliers, (2, K, T, n)."""
+
+    box: array[float]
+    weights: array[float]
+
+
+@dataclass(frozen=True)
 class Fit:
-    """Rounds for each leaf of a tree over the priors, and for all that they leave: multipliers (2, K, T, n).
+    """Rounds for each leaf of a tree over the priors, and for all that they leave.
 
     A transition is followed in `pieces` series of this order.
     """
@@ -111,8 +119,8 @@ class Fit:
     order: int
     pieces: int
     tree: bytes
-    leaves: tuple[tuple[array[float], ...], ...]
-    rounds: tuple[array[float], ...]
+    leaves: tuple[tuple[Round, ...], ...]
+    rounds: tuple[Round, ...]
 
 
 @dataclass(frozen=True)
@@ -156,12 +164,19 @@ class Trusted:
     version: str
 
 
+class Fitted(NamedTuple):
+    """Sizes of measurements: the number of `parameters`, that of `measured` states at the ends of transitions."""
+
+    parameters: int
+    measured: int
+    discrete: bool
+
+
 def read_evidence(
-    value: Any, n: int, k: int, claim: str, sampled: bool, further: bool, ranked: bool, fitted: tuple[int, bool] | None
+    value: Any, n: int, k: int, claim: str, sampled: bool, further: bool, ranked: bool, fitted: Fitted | None
 ) -> Tree | Ranked | Trusted:
     """`sampled` says whether a series in time may have an order above 1, `further` whether the claim has an `outer`,
-    `ranked` whether it has `ranks`; with `data` `fitted` has how many multipliers there are in a round, and whether
-    time is discrete."""
+    `ranked` whether it has `ranks`; `fitted` is there with `data`."""
     if claim == REACHES:
         return read_ranked(value, n, sampled)
     if isinstance(value, dict) and value.get("kind") == "trusted-solver":
@@ -189,7 +204,7 @@ def read_evidence(
     slabs = tuple(read_slab(v, f"evidence.tube.{k}", n, moves) for k, v in enumerate(tube))
     covering = read_covering(evidence["outer"], n, further)
     ranking = read_ranking(evidence["ranks"], n) if ranked else None
-    fit = read_fit(evidence["data"], *fitted) if fitted else None
+    fit = read_fit(evidence["data"], fitted) if fitted else None
     return Tree(T, root, tree, order, cells, ball, contraction, slabs, covering, ranking, fit)
 
 
@@ -206,24 +221,28 @@ def read_ranking(value: Any, n: int) -> Ranking:
     return Ranking(lo, hi, *(decoded(ranking[key], f"{at}.{key}") for key in ("tree", "ranks", "steps")))
 
 
-def read_fit(value: Any, count: int, discrete: bool) -> Fit:
-    """So many numbers in each round; in discrete time there is no series."""
+def read_fit(value: Any, fitted: Fitted) -> Fit:
+    """In discrete time there is no series."""
     at = "evidence.data"
     data = keys(value, at, "order", "pieces", "tree", "leaves", "rounds")
-    order, pieces = read_order(data["order"], f"{at}.order", not discrete), data["pieces"]
-    most = 1 if discrete else MAX_PIECES
+    order, pieces = read_order(data["order"], f"{at}.order", not fitted.discrete), data["pieces"]
+    most = 1 if fitted.discrete else MAX_PIECES
     good = type(pieces) is int and 1 <= pieces <= most  # True is an int to isinstance
     require(good, "format", f"{at}.pieces", f"an integer from 1 to {most} was expected")
     tree, leaves = decoded(data["tree"], f"{at}.tree"), entries(data["leaves"], f"{at}.leaves")
     require(1 <= len(leaves) <= MAX_LEAVES, "format", f"{at}.leaves", f"1 to {MAX_LEAVES} leaves are allowed")
-    each = tuple(read_rounds(rounds, f"{at}.leaves.{k}", count) for k, rounds in enumerate(leaves))
-    return Fit(order, pieces, tree, each, read_rounds(data["rounds"], f"{at}.rounds", count))
+    each = tuple(read_rounds(rounds, f"{at}.leaves.{k}", fitted) for k, rounds in enumerate(leaves))
+    return Fit(order, pieces, tree, each, read_rounds(data["rounds"], f"{at}.rounds", fitted))
 
 
-def read_rounds(value: Any, at: str, count: int) -> tuple[array[float], ...]:
-    rounds = entries(value, at)
+def read_rounds(value: Any, at: str, fitted: Fitted) -> tuple[Round, ...]:
+    rounds, found = entries(value, at), list[Round]()
     require(len(rounds) <= MAX_ROUNDS, "format", at, f"at most {MAX_ROUNDS} rounds are allowed")
-    return tuple(numbers(each, f"{at}.{k}", count) for k, each in enumerate(rounds))
+    for k, each in enumerate(rounds):
+        stated, ends = keys(each, f"{at}.{k}", "box", "weights"), 2 * fitted.parameters
+        box = numbers(stated["box"], f"{at}.{k}.box", ends)
+        found.append(Round(box, numbers(stated["weights"], f"{at}.{k}.weights", ends * fitted.measured)))
+    return tuple(found)
 
 
 def read_covering(value: Any, n: int, further: bool) -> Covering | None:

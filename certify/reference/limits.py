@@ -242,7 +242,7 @@ def in_ranks(c: Certificate, z: Sizes, evidence: Tree | Ranked) -> int:
     leaves, steps, wider = ranking.tree.count(LEAF), sum(ranking.steps), with_errors(z)
     work = 2**9 * len(ranking.tree) + 2**17 * leaves
     work += models_on_leaves(c, wider, steps + leaves, evidence.order)
-    return work + on_leaves(c, wider, steps, evidence.order)
+    return work + on_leaves(c, wider, steps + leaves, evidence.order)
 
 
 def of_data(c: Certificate, z: Sizes, evidence: Tree) -> int:
