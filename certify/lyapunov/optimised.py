@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +27,8 @@ from certify.effort import UNLIMITED, Effort
 from certify.errors import BackendError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.constraints import Constraints
-from certify.loop.plants import mean_rate
-from certify.lyapunov.candidates import increment_matrix, slowest_decay, solve_lyapunov
+from certify.lyapunov.candidates import increment_matrix, solve_lyapunov
+from certify.lyapunov.corners import Corners
 from certify.lyapunov.level_sets import domain_limit, volume
 from certify.lyapunov.programs import Inequality, smallest_trace
 
@@ -38,7 +39,7 @@ _TOUCHING, _LINEARISED = 16, 12  # rays from which states are looked for that vi
 _KEEP = 200  # rays of a search that are remembered for their crossing, and for their worst state
 _ROWS = 500  # states that each margin hands to the solver
 _ROUNDS = 30
-DECAYS = (0.2, 0.02)
+DECAYS, OF_CORNERS = (0.2, 0.02), (0.05, 0.02)  # the latter where ranges take their own part of the margin
 _REPEATS, _WORTH = 12, 1.05  # of the whole search, and growth of the volume that is worth another
 _SMALL = 0.01  # growth of the log of the volume, or trust radius, at which to stop
 _STEP = 1e-4  # relative, of the difference quotient along a ray
@@ -89,15 +90,15 @@ def _optimise(
     loop: ClosedLoop, start: Array, decays: tuple[float, ...], seed: int, effort: Effort, known: Array | None
 ) -> tuple[Array, float]:
     """P, and the ratio of its sampled volume and the start's; levels that sink to 0 overflow and are refused."""
-    A, h = loop.mean_rate(), loop.step
-    slowest = slowest_decay(A, h)
+    corners = Corners(loop)
+    start, slowest = corners.common(start), corners.slowest
     found = given = 0.0
     for decay in decays:
-        samples = _Samples(loop, 1e-3 * decay * slowest, np.random.default_rng(seed), effort)
+        samples = _Samples(corners, 1e-3 * decay * slowest, np.random.default_rng(seed), effort)
         if known is not None:
             samples.remember(known)
-        P = _enlarge(samples, A, start, decay * slowest)
-        if not (np.all(np.linalg.eigvalsh(P) > 0) and np.all(np.linalg.eigvalsh(increment_matrix(P, A, h)) < 0)):
+        P = _enlarge(samples, start, decay * slowest)
+        if not (np.all(np.linalg.eigvalsh(P) > 0) and corners.decrease(P)):
             raise BackendError(
                 "the optimised P must satisfy P > 0 and A'P + PA + h A'PA < 0; it does not. Use 'lyapunov'."
             )
@@ -122,12 +123,13 @@ def optimise_repeatedly(
     ------
     BackendError : of the first round.
     """
-    P, _ = _optimise(loop, start, DECAYS, 0, effort, known)
+    decays = OF_CORNERS if loop.system.ranges else DECAYS
+    P, _ = _optimise(loop, start, decays, 0, effort, known)
     for seed in range(1, _REPEATS):
         if effort.over:
             break
         try:
-            P, growth = _optimise(loop, P, DECAYS, seed, effort, known)
+            P, growth = _optimise(loop, P, decays, seed, effort, known)
         except BackendError:  # no larger one
             break
         if growth < _WORTH:
@@ -139,23 +141,25 @@ def optimise_repeatedly(
 def largest_sampled(loop: ClosedLoop, candidates: Sequence[Array], seed: int = 0, effort: Effort = UNLIMITED) -> Array:
     """The P, (n, n), of those given whose set inside the domain without a sampled violation has the largest volume;
     where the effort ends, fewer samples tell."""
-    slowest = slowest_decay(loop.mean_rate(), loop.step)
-    samples = _Samples(loop, 1e-3 * slowest, np.random.default_rng(seed), effort)
+    corners = Corners(loop)
+    samples = _Samples(corners, 1e-3 * corners.slowest, np.random.default_rng(seed), effort)
     return max(candidates, key=lambda P: volume(samples.fit(P, 0.0), 1.0))
 
 
-def _enlarge(samples: _Samples, A: Array, start: Array, alpha: float) -> Array:
+def _enlarge(samples: _Samples, start: Array, alpha: float) -> Array:
     """Rounds of sampling and solving, from `start` to P with its margin."""
-    h = samples.loop.step
-    Q = -increment_matrix(start, A, h)
-    # The linearisation of this P keeps `D <= -2 lambda V`: its equation is the one of A + lambda I.
-    P = solve_lyapunov(A, (Q + Q.T) / 2, h, _LINEAR * alpha)
+    h, rates = samples.loop.step, samples.corners.rates
+    P = start
+    if len(rates) == 1:
+        Q = -increment_matrix(start, rates[0], h)
+        # The linearisation of this P keeps `D <= -2 lambda V`: its equation is the one of A + lambda I.
+        P = solve_lyapunov(rates[0], (Q + Q.T) / 2, h, _LINEAR * alpha)
     P = samples.fit(P, _SCORED * alpha)
     radius, answers = 0.4, 0
     for _ in range(_ROUNDS):
         if answers and samples.effort.over:
             break
-        new = _solve(samples, P, A, alpha, radius)
+        new = _solve(samples, P, alpha, radius)
         if new is None:
             radius /= 2
             continue
@@ -180,14 +184,16 @@ def _enlarge(samples: _Samples, A: Array, start: Array, alpha: float) -> Array:
 class _Samples:
     """States that limit sublevel sets of the closed loop, remembered from search to search.
 
-    x, G(x), (dG/dx) x : (N, n), G being the mean rate of a step, F in continuous time. outside : (N,), the input leaves
-    its bounds at x, a constraint is violated, or G has a pole there. Where the effort has ended, one search does for
-    several.
+    x, G(x), (dG/dx) x : (N, n), G being the mean rate of a step, F in continuous time, at the corner of the ranges where
+    V grows most. outside : (N,), the input leaves its bounds at x, a constraint is violated, or G has a pole there.
+    Where the effort has ended, one search does for several.
     """
 
-    def __init__(self, loop: ClosedLoop, least: float, generator: np.random.Generator, effort: Effort) -> None:
-        self.loop, self.least, self.generator, self.effort = loop, least, generator, effort
-        self.f, self.step = loop.system.function(), loop.step
+    def __init__(self, corners: Corners, least: float, generator: np.random.Generator, effort: Effort) -> None:
+        self.corners, self.least, self.generator, self.effort = corners, least, generator, effort
+        self.loop, self.step = corners.loop, corners.step
+        self.P: Array | None = None  # of the V that grows most
+        loop = self.loop
         self.bounds = np.array([[float(v) for v in b] for b in loop.system.input_bounds]).T
         self.constraints = Constraints(loop) if loop.system.constraints else None
         self.x, self.F, self.dF = (np.zeros((0, loop.system.n)) for _ in range(3))
@@ -195,11 +201,11 @@ class _Samples:
 
     def field(self, x: Array) -> tuple[Array, NDArray[np.bool_]]:
         """G and `outside` at x, shapes (..., n) and (...)."""
-        self.effort.charge(_CALL + x.size / self.loop.system.n * self.loop.operations)
+        self.effort.charge(_CALL + x.size / self.loop.system.n * self.corners.operations)
         # One matrix product for all states: numpy would make one for each leading index.
         u = self.loop.policy(x.reshape(-1, x.shape[-1])).reshape(*x.shape[:-1], self.loop.system.m)
         with np.errstate(all="ignore"):
-            F = mean_rate(self.loop.system, self.f, x, u, self.step)
+            F = self.corners.worst(x, u, self.P)
         outside = ~np.isfinite(F).all(-1)
         F = np.where(outside[..., None], 0.0, F)
         outside |= np.any((u < self.bounds[0]) | (u > self.bounds[1]), axis=-1)
@@ -245,7 +251,7 @@ class _Samples:
 
     def search(self, P: Array, alpha: float) -> None:
         """Sample rays across {V <= 1.2}; remember where the first of them cross `g = 0`, and their worst states."""
-        L = np.linalg.cholesky(P)
+        L, self.P = np.linalg.cholesky(P), P
         n = len(P)
         z = self.generator.standard_normal((_FRESH, n))
         self.effort.charge(2 * _CALL + 4 * n * n * len(self.x))
@@ -289,15 +295,15 @@ class _Samples:
         self.outside = np.concatenate([self.outside, outside])
 
 
-def _solve(samples: _Samples, P: Array, A: Array, alpha: float, radius: float) -> Array | None:
+def _solve(samples: _Samples, P: Array, alpha: float, radius: float) -> Array | None:
     """The next P, (n, n), which is `L M L'` for the present `P = LL'`; None if the solver does not solve for it."""
     n = len(P)
     L = np.linalg.cholesky(P)
     inverse = np.linalg.inv(L)
     h = samples.step
-    along = L.T @ A @ inverse.T
 
-    def falls(M: Array) -> Array:
+    def falls(M: Array, A: Array) -> Array:
+        along = L.T @ A @ inverse.T
         rate = M @ along
         twice = rate + np.swapaxes(rate, -1, -2) + (h * _between(M, along) if h else 0.0)
         return np.asarray(-(twice + 2 * _LINEAR * alpha * M))
@@ -305,7 +311,7 @@ def _solve(samples: _Samples, P: Array, A: Array, alpha: float, radius: float) -
     matrices: list[Inequality] = [
         (lambda M: M, (1 - radius) * np.eye(n)),
         (lambda M: -M, -(1 + radius) * np.eye(n)),
-        (falls, np.zeros((n, n))),
+        *((partial(falls, A=A), np.zeros((n, n))) for A in samples.corners.rates),
     ]
     for (lo, hi), column in zip(samples.loop.system.domain, inverse.T, strict=True):
         e = column / min(float(-lo), float(hi))
