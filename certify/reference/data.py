@@ -33,7 +33,7 @@ Box = Sequence[Interval]  # for each parameter
 
 
 def data(c: Certificate, fit: Fit) -> None:
-    """What the leaves leave of the priors, all rounds of that, and at the end the ranges."""
+    """The box that the leaves' rounds leave, the one that all further rounds do, and at the end the ranges."""
     if c.data is None:
         raise Refused("format", "claim.data", "multipliers need measurements")
     count = structure(fit.tree, range(len(c.data.parameters)), RULE, "data ")
@@ -71,7 +71,7 @@ def hull(boxes: Sequence[Box]) -> Box:
 
 
 def after(c: Certificate, data: Data, fit: Fit, box: Box, rounds: Sequence[Round], at: str) -> Box | None:
-    """What some rounds leave of a box, None where that is nothing."""
+    """The box that some rounds leave of another, None where nothing is left."""
     for number, each in enumerate(rounds):
         Measured(c, data, fit, box, f"{at} round {number}").narrows(each)
         box = [(exact(lo), exact(hi)) for lo, hi in zip(*halves(each.box), strict=True)]
@@ -121,7 +121,7 @@ NO_NUMBER = Residual(arb("nan"), {}, ZERO)
 
 
 class Measured:
-    """What a box of the parameters makes of each transition, and what is left of it.
+    """Residuals of all transitions where the parameters are in a box, and bounds of those that are consistent.
 
     Models of a transition have the n symbols of its start, those of the parameters, and one of the period where that
     may be one of many. Of all symbols those of the parameters come first, then n for each row of each run.
@@ -151,7 +151,7 @@ class Measured:
             require(bounded, RULE, f"{self.at} {name}", "a consistent one may be above the upper end of the box")
 
     def bounds(self, weights: array[float]) -> Iterator[tuple[arb, arb]]:
-        """Of each parameter numbers below and above all that are consistent, by a round's multipliers."""
+        """Numbers below and above all that are consistent, for each parameter, by a round's multipliers."""
         size, found = self.data.steps * self.n, dict[int, Residual]()
         rows = [weights[k : k + size] for k in range(0, len(weights), size)]
         for t in transitions(self.data):
@@ -168,7 +168,7 @@ class Measured:
             yield middle + half * (-reach - shift), middle + half * (further - other)
 
     def residuals(self, t: Transition) -> Iterator[Residual]:
-        """What is reached less what was measured there, of each state."""
+        """The residual of each state: its value at the end, less the measured one and the noise."""
         for i, v in enumerate(self.reached(t)):
             mean = v.averaged(range(self.symbols))  # squares of symbols lie in 1/2 +- 1/2, products in 0 +- 1
             own, of_period = mean.slopes(self.symbols)[: self.n + self.K], mean.slopes(self.symbols)[self.n + self.K :]

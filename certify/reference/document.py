@@ -93,7 +93,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Data:
-    """What is known of the uncertain quantities with these names, that are constant: their `priors`, and measurements.
+    """Measurements from which the ranges of some uncertain quantities follow, that are constant and in their `priors`.
 
     A measured state is within `noise` of `origin` + x, a transition takes a time in `period`, None in discrete time.
     """

@@ -103,7 +103,7 @@ class Ranking:
 
 @dataclass(frozen=True)
 class Round:
-    """What measurements leave of a box of parameters, (2, K), by these multipliers, (2, K, T, n)."""
+    """A box (2, K) that measurements leave of another one, by these multipliers, (2, K, T, n)."""
 
     box: array[float]
     weights: array[float]
