@@ -36,7 +36,8 @@ def read_once(path: str) -> bytes:
 
 
 def in_words(c: Certificate) -> str:
-    return (of_ranks(c) if c.target is not None else of_trajectories(c) + further(c) + in_ranks(c)) + kept(c)
+    said = of_ranks(c) if c.target is not None else of_trajectories(c) + further(c) + in_ranks(c)
+    return said + kept(c) + measured(c)
 
 
 def of_trajectories(c: Certificate) -> str:
@@ -123,6 +124,23 @@ def kept(c: Certificate) -> str:
     when = "at every step" if c.plant.discrete else "at all times"
     count = len(c.keep.results)
     return f"; and along each of these trajectories the {count} expressions of keep are negative {when}{until}"
+
+
+def measured(c: Certificate) -> str:
+    """The words for parameters whose ranges follow from measurements."""
+    data = c.data
+    if data is None:
+        return ""
+    priors = zip(data.parameters, data.priors, strict=True)
+    constants = ", ".join(f"{name} in [{lo}, {hi}]" for name, (lo, hi) in priors)
+    states = zip(c.plant.states, data.origin, data.noise, strict=True)
+    around = ", ".join(f"{name}{'' if b == 0 else f' + {b}'} +- {e}" for name, b, e in states)
+    when = "" if data.period is None else f", each over some time in [{data.period[0]}, {data.period[1]}]"
+    return (
+        f"; and of all constants {constants} none is consistent with the {data.steps} transitions in {len(data.runs)} "
+        f"runs that the certificate states (sha256 of their file {data.sha256}; measured {around}{when}), unless it "
+        f"lies in these ranges"
+    )
 
 
 def stepping(c: Certificate) -> str:

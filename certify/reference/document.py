@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import Any
 
 from flint import fmpq, fmpq_mat
 
-from .evidence import REACHES, WITH_FLOOR, WITH_TUBE, Ranked, Tree, Trusted, read_evidence
+from .evidence import REACHES, WITH_FLOOR, WITH_TUBE, Fitted, Ranked, Tree, Trusted, read_evidence
 from .expressions import Equations, equations, rational
 from .fields import IDENTIFIER, MAX_NAMES, binary64, column, entries, exact, keys, numbers, square
 from .networks import Network, packed, read_networks
@@ -21,6 +22,7 @@ from .refusal import Refused, require
 MAX_BYTES, MAX_BYTES_BEYOND_ASCII = 256 * 2**20, 16 * 2**20
 MAX_TOKENS = 10**6  # commas and opening brackets
 MAX_EXPRESSIONS, MAX_RANK = 64, 65_534  # of `keep` or of `target`; of a leaf that is claimed
+MAX_STEPS, SHA256 = 2**16, re.compile(r"[0-9a-f]{64}")  # of all measured runs; of a file of measurements
 SCHEMA, CLAIMS = "certify-certificate/9", ("asymptotic", *WITH_FLOOR, *WITH_TUBE, REACHES)
 
 Interval = tuple[fmpq, fmpq]
@@ -81,13 +83,44 @@ class Ranks:
 
 
 @dataclass(frozen=True)
+class Run:
+    """A run of so many steps: rows of measured states, one more than of inputs."""
+
+    steps: int
+    states: tuple[array[float], ...]
+    inputs: tuple[array[float], ...]
+
+
+@dataclass(frozen=True)
+class Data:
+    """Measurements from which the ranges of some uncertain quantities follow, that are constant and in their `priors`.
+
+    A measured state is within `noise` of `origin` + x, a transition takes a time in `period`, None in discrete time.
+    """
+
+    sha256: str
+    parameters: tuple[str, ...]
+    priors: tuple[Interval, ...]
+    period: Interval | None
+    origin: tuple[fmpq, ...]
+    noise: tuple[fmpq, ...]
+    runs: tuple[Run, ...]
+
+    @property
+    def steps(self) -> int:
+        """The number of transitions of all runs."""
+        return sum(run.steps for run in self.runs)
+
+
+@dataclass(frozen=True)
 class Certificate:
     """`inner` and `outer`, between which the leaves show that V falls, are c1 and c2; `floor` is c0, if there is one.
 
     V falls at the `rate` lambda, D + 2 lambda V < 0. With a `sample` inputs are held for a time in this range.
     `start` is P_0 of a claim with a tube, `centre` the column c_0 around which it lies where the tube follows a path.
     `beyond` is the second function of a claim with an outer set, called `outer` in the file. Expressions of `keep` are
-    claimed to be negative, those of `target` to become at most 0.
+    claimed to be negative, those of `target` to become at most 0. With `data` the ranges of some uncertain quantities
+    are those that measurements leave.
 
     A claim with a target has no V: P has no entries and its levels are no numbers, so that no rule about V can hold.
     """
@@ -101,6 +134,7 @@ class Certificate:
     ranks: Ranks | None
     keep: Equations | None
     target: Equations | None
+    data: Data | None
     plant: Plant
     policy: Policy
     P: fmpq_mat
@@ -165,6 +199,7 @@ def read(raw: bytes) -> Certificate:
     plainly = beyond is None or simple
     require(plainly, "format", "claim.outer", "null was expected with a tube, a rate, a sample and in discrete time")
     ranks, keep, target = read_more(said, plant, claim in WITH_TUBE or beyond is not None)
+    measured = read_data(said["data"], plant, claim) if "data" in said else None
     policy = read_policy(data["policy"], networks, n, len(plant.inputs), claim)
     P = read_P(data["lyapunov"], n, claim)
     named_levels = () if claim == REACHES else ("floor", "local", "roa") if claim in WITH_FLOOR else ("local", "roa")
@@ -173,13 +208,14 @@ def read(raw: bytes) -> Certificate:
     least = floor[0] if floor else None
     further = beyond is not None
     longer = sample is not None and not plant.dynamics.calls  # a series goes through no network
+    fitted = None if measured is None else Fitted(len(measured.parameters), measured.steps * n, plant.discrete)
     evidence = read_evidence(
-        data["evidence"], n, len(plant.uncertain), claim, longer, further, ranked=ranks is not None
+        data["evidence"], n, len(plant.uncertain), claim, longer, further, ranked=ranks is not None, fitted=fitted
     )
     replayed = not isinstance(evidence, Trusted) or (simple and not further and keep is None)
     words = "a rate, a sample, discrete time, another set and constraints must be replayed"
     require(replayed, "format", "evidence.kind", words)
-    more = (start, centre, beyond, ranks, keep, target)
+    more = (start, centre, beyond, ranks, keep, target, measured)
     return Certificate(claim, rate, sample, *more, plant, policy, P, least, inner, outer, evidence)
 
 
@@ -191,7 +227,7 @@ def read_claim(value: Any) -> dict[str, Any]:
         said = keys(value, "claim", "kind", "sample", "target", "ranks", maybe=("keep",))
         return {**said, "rate": (0.0).hex(), "outer": None}
     more = {"enlarged": ("start",), "reached": ("start", "centre")}.get(value["kind"], ())
-    return keys(value, "claim", "kind", "rate", "sample", "outer", *more, maybe=("ranks", "keep"))
+    return keys(value, "claim", "kind", "rate", "sample", "outer", *more, maybe=("ranks", "keep", "data"))
 
 
 def read_more(
@@ -220,6 +256,54 @@ def read_ranks(value: Any, states: tuple[str, ...]) -> Ranks:
     good = type(steps) is int and 1 <= steps <= MAX_RANK  # True is an int to isinstance
     require(good, "format", f"{at}.steps", f"an integer from 1 to {MAX_RANK} was expected")
     return Ranks(tuple(angles), steps)
+
+
+def read_data(value: Any, plant: Plant, claim: str) -> Data:
+    at, n, m = "claim.data", len(plant.states), len(plant.inputs)
+    require(claim not in WITH_TUBE, "format", at, "it was not expected with a tube")
+    require(not plant.dynamics.calls, "format", at, "it was not expected where the equations call a network")
+    data = keys(value, at, "sha256", "parameters", "period", "origin", "noise", "runs")
+    sha256 = data["sha256"]
+    named = isinstance(sha256, str) and SHA256.fullmatch(sha256) is not None
+    require(named, "format", f"{at}.sha256", "64 hexadecimal digits were expected")
+    stated = entries(data["parameters"], f"{at}.parameters")
+    stated = [keys(each, f"{at}.parameters.{j}", "name", "range") for j, each in enumerate(stated)]
+    names = tuple(each["name"] for each in stated)
+    known = len(names) >= 1 and all(isinstance(name, str) and name in plant.uncertain for name in names)
+    different = known and len(set(names)) == len(names)
+    require(different, "format", f"{at}.parameters", "different uncertain quantities were expected, at least one")
+    priors = tuple(interval(each["range"], f"{at}.parameters.{j}.range") for j, each in enumerate(stated))
+    period = read_period(data["period"], plant.discrete)
+    origin = tuple(rational(q, f"{at}.origin.{i}") for i, q in enumerate(entries(data["origin"], f"{at}.origin", n)))
+    noise = tuple(rational(q, f"{at}.noise.{i}") for i, q in enumerate(entries(data["noise"], f"{at}.noise", n)))
+    require(all(q >= 0 for q in noise), "format", f"{at}.noise", "must not be negative")
+    runs = entries(data["runs"], f"{at}.runs")
+    require(1 <= len(runs) <= MAX_STEPS, "format", f"{at}.runs", f"1 to {MAX_STEPS} runs are allowed")
+    read = Data(
+        sha256, names, priors, period, origin, noise,
+        tuple(read_run(run, f"{at}.runs.{k}", n, m) for k, run in enumerate(runs)),
+    )  # fmt: skip
+    require(read.steps <= MAX_STEPS, "format", f"{at}.runs", f"more than {MAX_STEPS} steps in all")
+    return read
+
+
+def read_period(value: Any, discrete: bool) -> Interval | None:
+    at = "claim.data.period"
+    if discrete:
+        require(value is None, "format", at, "null was expected in discrete time")
+        return None
+    lo, hi = (rational(q, at) for q in entries(value, at, 2))
+    require(bool(0 < lo <= hi), "format", at, "0 < lo <= hi must hold")
+    return lo, hi
+
+
+def read_run(value: Any, at: str, n: int, m: int) -> Run:
+    run = keys(value, at, "steps", "states", "inputs")
+    steps = run["steps"]
+    good = type(steps) is int and 1 <= steps <= MAX_STEPS  # True is an int to isinstance
+    require(good, "format", f"{at}.steps", f"an integer from 1 to {MAX_STEPS} was expected")
+    x, u = numbers(run["states"], f"{at}.states", (steps + 1) * n), numbers(run["inputs"], f"{at}.inputs", steps * m)
+    return Run(steps, *(tuple(v[k : k + size] for k in range(0, len(v), size)) for v, size in ((x, n), (u, m))))
 
 
 def read_expressions(value: Any, at: str, names: set[str]) -> Equations:

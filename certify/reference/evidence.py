@@ -10,7 +10,7 @@ import math
 import re
 from array import array
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from flint import fmpq_mat
 
@@ -20,6 +20,7 @@ from .refusal import require
 MAX_SLABS = 10**4
 MAX_PARTS, MAX_CELLS = 64, 4096  # of one range; of all of them together
 MAX_ORDER = 8  # of a series in time
+MAX_PIECES, MAX_ROUNDS, MAX_LEAVES = 64, 64, 4096  # of a measured transition; of bounds from all of them; of priors
 WITH_TUBE = ("enlarged", "reached")  # claims about a set of starts that is no level set of V
 REACHES = "reaches"  # the claim without V
 WITH_FLOOR = ("practical", "nearby")  # claims about a set in which everything ends, {V <= c0}, and not the origin
@@ -101,11 +102,33 @@ class Ranking:
 
 
 @dataclass(frozen=True)
+class Round:
+    """A box (2, K) that measurements leave of another one, by these multipliers, (2, K, T, n)."""
+
+    box: array[float]
+    weights: array[float]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Rounds for each leaf of a tree over the priors, and for all that they leave.
+
+    A transition is followed in `pieces` series of this order.
+    """
+
+    order: int
+    pieces: int
+    tree: bytes
+    leaves: tuple[tuple[Round, ...], ...]
+    rounds: tuple[Round, ...]
+
+
+@dataclass(frozen=True)
 class Tree:
     """Evidence that can be replayed. `tube` belongs to claims that have a start, `contraction` to `nearby`.
 
     `covering`, which is `outer` in the file, belongs to claims that go beyond {V <= c2} by another function, `ranking`,
-    which is `ranks`, to those that go beyond it by ranks of boxes.
+    which is `ranks`, to those that go beyond it by ranks of boxes, `fit`, which is `data`, to those with data.
 
     Claims that have a floor may do without a `ball`.
     `cells` has a number for each uncertain quantity: into how many equal parts rule `local` cuts its range. `order` is
@@ -122,6 +145,7 @@ class Tree:
     tube: tuple[Slab, ...]
     covering: Covering | None
     ranking: Ranking | None
+    fit: Fit | None
 
 
 @dataclass(frozen=True)
@@ -140,11 +164,19 @@ class Trusted:
     version: str
 
 
+class Fitted(NamedTuple):
+    """Sizes of measurements: the number of `parameters`, that of `measured` states at the ends of transitions."""
+
+    parameters: int
+    measured: int
+    discrete: bool
+
+
 def read_evidence(
-    value: Any, n: int, k: int, claim: str, sampled: bool, further: bool, ranked: bool
+    value: Any, n: int, k: int, claim: str, sampled: bool, further: bool, ranked: bool, fitted: Fitted | None
 ) -> Tree | Ranked | Trusted:
     """`sampled` says whether a series in time may have an order above 1, `further` whether the claim has an `outer`,
-    `ranked` whether it has `ranks`."""
+    `ranked` whether it has `ranks`; `fitted` is there with `data`."""
     if claim == REACHES:
         return read_ranked(value, n, sampled)
     if isinstance(value, dict) and value.get("kind") == "trusted-solver":
@@ -153,7 +185,8 @@ def read_evidence(
         require(k == 0, "format", "evidence.kind", "what is uncertain must be replayed")
         return read_trusted(value)
     names = ("kind", "T", "root", "tree", "order", "cells", "local", "contraction", "tube", "outer")
-    evidence = keys(value, "evidence", *names, *(("ranks",) if ranked else ()))
+    further_names = (*(("ranks",) if ranked else ()), *(("data",) if fitted else ()))
+    evidence = keys(value, "evidence", *names, *further_names)
     require(evidence["kind"] == "partition-tree", "format", "evidence.kind", "an unknown kind")
     T, root = square(evidence["T"], "evidence.T", n), numbers(evidence["root"], "evidence.root", n)
     tree = decoded(evidence["tree"], "evidence.tree")
@@ -171,7 +204,8 @@ def read_evidence(
     slabs = tuple(read_slab(v, f"evidence.tube.{k}", n, moves) for k, v in enumerate(tube))
     covering = read_covering(evidence["outer"], n, further)
     ranking = read_ranking(evidence["ranks"], n) if ranked else None
-    return Tree(T, root, tree, order, cells, ball, contraction, slabs, covering, ranking)
+    fit = read_fit(evidence["data"], fitted) if fitted else None
+    return Tree(T, root, tree, order, cells, ball, contraction, slabs, covering, ranking, fit)
 
 
 def read_ranked(value: Any, n: int, sampled: bool) -> Ranked:
@@ -185,6 +219,30 @@ def read_ranking(value: Any, n: int) -> Ranking:
     ranking = keys(value, at, "lo", "hi", "tree", "ranks", "steps")
     lo, hi = (numbers(ranking[end], f"{at}.{end}", n) for end in ("lo", "hi"))
     return Ranking(lo, hi, *(decoded(ranking[key], f"{at}.{key}") for key in ("tree", "ranks", "steps")))
+
+
+def read_fit(value: Any, fitted: Fitted) -> Fit:
+    """In discrete time there is no series."""
+    at = "evidence.data"
+    data = keys(value, at, "order", "pieces", "tree", "leaves", "rounds")
+    order, pieces = read_order(data["order"], f"{at}.order", not fitted.discrete), data["pieces"]
+    most = 1 if fitted.discrete else MAX_PIECES
+    good = type(pieces) is int and 1 <= pieces <= most  # True is an int to isinstance
+    require(good, "format", f"{at}.pieces", f"an integer from 1 to {most} was expected")
+    tree, leaves = decoded(data["tree"], f"{at}.tree"), entries(data["leaves"], f"{at}.leaves")
+    require(1 <= len(leaves) <= MAX_LEAVES, "format", f"{at}.leaves", f"1 to {MAX_LEAVES} leaves are allowed")
+    each = tuple(read_rounds(rounds, f"{at}.leaves.{k}", fitted) for k, rounds in enumerate(leaves))
+    return Fit(order, pieces, tree, each, read_rounds(data["rounds"], f"{at}.rounds", fitted))
+
+
+def read_rounds(value: Any, at: str, fitted: Fitted) -> tuple[Round, ...]:
+    rounds, found = entries(value, at), list[Round]()
+    require(len(rounds) <= MAX_ROUNDS, "format", at, f"at most {MAX_ROUNDS} rounds are allowed")
+    for k, each in enumerate(rounds):
+        stated, ends = keys(each, f"{at}.{k}", "box", "weights"), 2 * fitted.parameters
+        box = numbers(stated["box"], f"{at}.{k}.box", ends)
+        found.append(Round(box, numbers(stated["weights"], f"{at}.{k}.weights", ends * fitted.measured)))
+    return tuple(found)
 
 
 def read_covering(value: Any, n: int, further: bool) -> Covering | None:

@@ -170,7 +170,8 @@ class Moving:
     """The numbers of a leaf by their names, models in d, `anything` being what is uncertain without a symbol.
 
     `bounds` are those of the |x_i| that count, None where all do, and `free` names states whose domain is not asked.
-    The symbols of quantities, and those of calls behind them, begin at `first`; `called` gives the entries of calls.
+    `varying` are the symbols of quantities and of calls, which in x_1 are those of means; `called` gives the entries of
+    calls.
     """
 
     states: Mapping[str, Taylor]
@@ -179,14 +180,23 @@ class Moving:
     anything: Mapping[str, Taylor]
     bounds: Sequence[arb] | None
     free: Collection[str]
-    first: int
-    called: Called
+    varying: Collection[int]
+    called: Called | None
 
 
 def reached_from(c: Certificate, leaf: Moving, at: str) -> dict[str, Taylor]:
-    """The states of a whole period, each within kappa of where it was, or a refusal."""
-    hi, names = arb(c.step), c.plant.states
-    far = [ZERO] * c.n
+    """The states of a whole period, each within kappa of where it was and in the domain, or a refusal."""
+    within, F = moved_within(c, leaf, arb(c.step), at)
+    states = [x.c + (x.first + x.r) * SPREAD for x in leaf.states.values()]
+    if leaf.bounds is not None:
+        states = [within_both(x, w) for x, w in zip(states, leaf.bounds, strict=True)]
+    in_domain(c, states, F, at, leaf.free)
+    return within
+
+
+def moved_within(c: Certificate, leaf: Moving, hi: arb, at: str) -> tuple[dict[str, Taylor], list[arb]]:
+    """The states until hi, each within kappa of where it was, and enclosures of f at these, or a refusal."""
+    names, far = c.plant.states, [ZERO] * c.n
     for _ in range(ATTEMPTS):
         moved = dict(zip(names, map(widened, leaf.states.values(), far), strict=True))
         try:
@@ -197,11 +207,7 @@ def reached_from(c: Certificate, leaf: Moving, at: str) -> dict[str, Taylor]:
         ranges = [arb((-(-f).bound()).lower()).union(arb(f.bound().upper())) for f in F]
         most = [arb((hi * abs(v)).upper()) for v in ranges]
         if all(v < k for v, k in zip(most, far, strict=True)):
-            states = [x.c + (x.first + x.r) * SPREAD for x in leaf.states.values()]
-            if leaf.bounds is not None:
-                states = [within_both(x, w) for x, w in zip(states, leaf.bounds, strict=True)]
-            in_domain(c, states, ranges, at, leaf.free)
-            return dict(zip(names, map(widened, leaf.states.values(), most), strict=True))
+            return dict(zip(names, map(widened, leaf.states.values(), most), strict=True)), ranges
         far = [MORE * v + LEAST for v in most]
     raise Refused("flow", at, "no bound of how far the state goes within a period was found")
 
@@ -231,7 +237,7 @@ def mean_on(
         tail = later(c.plant.dynamics, leaf.states, within, held, constant, order, lambda v: v, times_h)
     except Refused as no:
         raise Refused("flow", at, no.detail) from None
-    x_1 = [f.averaged(range(leaf.first, leaf.first + c.k + c.plant.dynamics.entries)) for f in x_1]
+    x_1 = [f.averaged(leaf.varying) for f in x_1]
     G = [f if t is None else f + t for f, t in zip(x_1, tail, strict=True)]
     require(all(g.is_finite() for g in G), "flow", at, "the series of F has no finite model")
     return G

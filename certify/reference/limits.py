@@ -184,6 +184,10 @@ def numbers(c: Certificate) -> int:
     if isinstance(evidence, Tree) and (ball or evidence.contraction or evidence.tube):
         count += values * (z.t + z.d * z.y + z.m + z.z) + z.d**4 // 4
         count += sum(4 * p * (z.d + g) for p, _, g in z.nets.shapes) + 3 * z.nets.units * z.t
+    if c.data is not None and isinstance(evidence, Tree) and evidence.fit is not None:
+        symbols = z.n + len(c.data.parameters)
+        count += 4 * len(c.plant.dynamics.steps) * evidence.fit.order * (symbols + 1) ** 2
+        count += 8 * c.data.steps * z.n * symbols
     if c.beyond is not None:
         N = c.beyond.expression
         over = nets(called(N))
@@ -221,7 +225,8 @@ def operations(c: Certificate) -> int:
     if asked_of_leaves(c, evidence):
         leaves = evidence.tree.count(LEAF)
         work += models_on_leaves(c, z, leaves, evidence.order) + on_leaves(c, z, leaves, evidence.order)
-    return work + on_balls(c, z, evidence) + in_tube(c, z, evidence) + beyond(c, z, evidence) + in_ranks(c, z, evidence)
+    work += on_balls(c, z, evidence) + in_tube(c, z, evidence) + beyond(c, z, evidence)
+    return work + in_ranks(c, z, evidence) + of_data(c, z, evidence)
 
 
 def models_on_leaves(c: Certificate, z: Sizes, leaves: int, order: int) -> int:
@@ -237,7 +242,19 @@ def in_ranks(c: Certificate, z: Sizes, evidence: Tree | Ranked) -> int:
     leaves, steps, wider = ranking.tree.count(LEAF), sum(ranking.steps), with_errors(z)
     work = 2**9 * len(ranking.tree) + 2**17 * leaves
     work += models_on_leaves(c, wider, steps + leaves, evidence.order)
-    return work + on_leaves(c, wider, steps, evidence.order)
+    return work + on_leaves(c, wider, steps + leaves, evidence.order)
+
+
+def of_data(c: Certificate, z: Sizes, evidence: Tree) -> int:
+    """Operations for all transitions in each round, and for their bounds of each parameter."""
+    data, fit = c.data, evidence.fit
+    if data is None or fit is None:
+        return 0
+    a, count = len(c.plant.dynamics.steps), len(data.parameters)
+    transitions = data.steps * (len(fit.rounds) + sum(map(len, fit.leaves)))
+    series, symbols = 1 if c.plant.discrete else 2 * fit.order**3 + 8, z.n + count
+    work = on_boxes(transitions, z.n, fit.pieces * (a * series + 4 * z.n), a * (fit.order + 1), symbols, 0)
+    return work + 2**6 * count * transitions * z.n * (symbols + 2**6)
 
 
 def inverting(n: int, length: int) -> int:

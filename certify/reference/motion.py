@@ -89,7 +89,8 @@ class Motion:
             middle, half = arb((lo + hi) / 2), arb((hi - lo) / 2)
             uncertain[name] = self.moving(middle, [ZERO] * self.d, self.quantities + j, half)
             anything[name] = Taylor(middle, r=half)
-        return Moving(states, inputs, uncertain, anything, self.bounds, self.free, self.quantities, self.called)
+        varying = range(self.quantities, self.calls + plant.dynamics.entries)
+        return Moving(states, inputs, uncertain, anything, self.bounds, self.free, varying, self.called)
 
     def called(self, call: Call, given: Sequence[Taylor]) -> list[Taylor]:
         return called(call, given, self.symbols, self.calls)

@@ -10,6 +10,7 @@ from flint import ctx
 from . import rational
 from .balls import ON_LEAVES, PRECISION
 from .contraction import contraction
+from .data import data
 from .document import Certificate, read
 from .evidence import WITH_TUBE, Ranked, Tree, Trusted
 from .leaves import Leaves, check_leaves, structure
@@ -69,6 +70,9 @@ def check(c: Certificate) -> int | None:
     S, inverse = rational.coordinates(c, evidence)
     rational.root(c, evidence, inverse)
     rational.centring(c)
+    if evidence.fit is not None:
+        with ctx.workprec(ON_LEAVES):
+            data(c, evidence.fit)
     loop = None
     if evidence.ball is not None:
         loop = Loop(c)
