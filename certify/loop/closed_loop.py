@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True, slots=True)
 class ClosedLoop:
     """A plant under a policy; `u_eq` is the exact equilibrium input, `folded` the policy without its centring,
-    `dynamics` the nominal equations. `operations` are about those of F at one state, as an `Effort` counts them.
+    `dynamics` the nominal equations. `operations` are about those of F at one state, as an `Effort` counts them, and
+    `of_equations` those of f among them.
 
     Raises
     ------
@@ -36,6 +37,7 @@ class ClosedLoop:
     folded: PolicyNetwork = field(init=False, repr=False, compare=False)
     dynamics: tuple[Expression, ...] = field(init=False, repr=False, compare=False)
     operations: float = field(init=False, repr=False, compare=False)
+    of_equations: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         system, network = self.system, self.network
@@ -54,8 +56,9 @@ class ClosedLoop:
         object.__setattr__(self, "folded", network.folded(u_eq))
         object.__setattr__(self, "dynamics", system.exact_dynamics())
         of = network.network
-        equations = sum(1 for _ in nodes(*self.dynamics)) + of.operations
-        object.__setattr__(self, "operations", 0.07 * of.entries + 2.0 * of.units + 4.0 * equations)
+        equations = 4.0 * sum(1 for _ in nodes(*self.dynamics))
+        object.__setattr__(self, "of_equations", equations)
+        object.__setattr__(self, "operations", 0.07 * of.entries + 2.0 * of.units + 4.0 * of.operations + equations)
 
     def require_rest(self) -> None:
         """Refuse a loop whose origin is not an equilibrium, exactly: `f(0, u_eq) = 0` and `pi(0) = u_eq`.

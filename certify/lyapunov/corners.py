@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from certify.errors import BackendError, InputError
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import nodes
 from certify.loop.plants import at_values, corners, mean_rate
 from certify.lyapunov.candidates import increment_matrix, slowest_decay
 from certify.lyapunov.programs import smallest_trace
@@ -21,7 +20,6 @@ Array = NDArray[np.float64]
 _ALIKE = 1e-9  # relative difference of linearisations that count as one
 _SHARES = (0.5, 0.3, 0.2, 0.1, 0.05, 0.02, 0.005)  # of the slowest decay of all corners, that V is to have
 _TOLERANCE = 1e-8  # of the solver
-_NODE = 4.0  # operations of a node of f
 
 
 class Corners:
@@ -44,8 +42,7 @@ class Corners:
     @property
     def operations(self) -> float:
         """Operations of `worst` at one state, as an `Effort` counts them: the policy's once, f's at every corner."""
-        again = max(0, len(self.values) - 1)
-        return self.loop.operations + again * _NODE * sum(1 for _ in nodes(*self.loop.dynamics))
+        return self.loop.operations + max(0, len(self.values) - 1) * self.loop.of_equations
 
     @property
     def slowest(self) -> float:

@@ -211,8 +211,9 @@ class _Search:
 
     def _charge(self, states: int, evaluations: int) -> None:
         """Count evaluations of the equations at states, and of the policy with each."""
-        times = len(self.corners) * len(self.periods) * (4 if self.loop.system.sample else 1)
-        self.effort.charge(_CALL + _EACH * states * evaluations * times * self.loop.operations)
+        again = len(self.corners) * len(self.periods) - 1  # the policy's values are the same for all
+        each = self.loop.operations + again * self.loop.of_equations
+        self.effort.charge(_CALL + _EACH * states * evaluations * each * (4 if self.loop.system.sample else 1))
 
     @np.errstate(all="ignore")
     def _at(self, x: Array, u: Array) -> tuple[Array, Array]:
