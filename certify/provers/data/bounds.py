@@ -52,8 +52,7 @@ class Program:
         return sign * _short(weights) / self.slack
 
     def contradiction(self) -> Array:
-        """Weights (M,) of rows whose sum is farthest from what it may be: those with which all slacks have to grow the
-        most, by one factor, to allow a z."""
+        """Weights (M,) of rows that need all slacks to grow the most, by one factor, to allow a z."""
         every = np.arange(len(self.offset))
         A, b = self._sides(every, every)
         A = sparse.hstack([A, sparse.csr_matrix(-np.ones((A.shape[0], 1)))]).tocsr()

@@ -62,13 +62,12 @@ class Identified:
 class Contradiction(InputError):
     """No parameter within the priors is consistent with the measurements: transitions (T,) that show it."""
 
-    def __init__(self, transitions: tuple[int, ...], excess: float) -> None:
-        self.transitions, self.excess = transitions, excess
+    def __init__(self, transitions: tuple[int, ...]) -> None:
+        self.transitions = transitions
         some = ", ".join(map(str, transitions[:6])) + (", ..." if len(transitions) > 6 else "")
         super().__init__(
             "no plant of this structure is consistent with the measurements: transitions "
-            f"{some} contradict one another, whatever the parameters within their priors are; noise would have to "
-            f"be {excess:.3g} times larger at least."
+            f"{some} contradict one another, whatever the parameters within their priors are."
         )
 
 
@@ -124,7 +123,7 @@ class _Box:
             for side, sign in enumerate((1.0, -1.0)):
                 found = program.extremes(k, sign)
                 if found is None:
-                    self._end(rows, chosen, program.contradiction().reshape(shape))
+                    self._end(rows, chosen, program)
                     return False
                 weights[side, k] = found.reshape(shape)
         box = {name: self._narrowed(rows, chosen, weights[:, k], k) for k, name in enumerate(names)}
@@ -139,19 +138,19 @@ class _Box:
         self.box, self.empty = box, any(lo > hi for lo, hi in box.values())
         self.history.append(box)
 
-    def _end(self, rows: Rows, chosen: NDArray[np.intp], weights: Array) -> None:
-        """Show that nothing is left, if the sum of rows with these weights does: with a large multiple of it, a
+    def _end(self, rows: Rows, chosen: NDArray[np.intp], program: Program) -> None:
+        """Show that nothing is left, if a sum of rows that contradict one another does: with a large multiple of it, a
         parameter's lower end comes above its upper end."""
+        weights = program.contradiction().reshape(rows.alpha.shape)
         excess = miss(rows, self.flows.noise, self.data.begins[chosen], weights)
-        size = float(np.abs(weights * rows.slack).sum())
-        if not excess > _SURE * size:
+        if not excess > _SURE * float(np.abs(weights * rows.slack).sum()):
             return
-        sign = -1.0 if (weights * rows.alpha).sum() > 0 else 1.0
+        sign = 1.0 if (weights * rows.alpha).sum() > 0 else -1.0
         whole = np.zeros((2, len(self.box), *rows.alpha.shape))
         whole[0, 0] = -sign * weights * (_FAR / excess)
-        found = self._narrowed(rows, chosen, whole[:, 0], 0)
-        self._keep(self.box | {next(iter(self.box)): found}, chosen, whole)
-        self.data.note(chosen, weights, excess / size)
+        nothing = self._narrowed(rows, chosen, whole[:, 0], 0)
+        self._keep(self.box | {next(iter(self.box)): nothing}, chosen, whole)
+        self.data.note(chosen, weights)
 
     def _narrowed(self, rows: Rows, chosen: NDArray[np.intp], weights: Array, k: int) -> Interval:
         """The interval of a parameter, a little wider than what the weights show."""
@@ -176,7 +175,6 @@ class _Data:
         self.begins = np.arange(self.count) + self.run
         self.shares = max(lengths) > 1
         self.against = set[int]()
-        self.least = np.inf
 
     def spread(self, most: int) -> NDArray[np.intp]:
         """Some transitions, from everywhere."""
@@ -188,10 +186,9 @@ class _Data:
         runs = min(len(self.measurements.runs), most // 2)
         return np.flatnonzero((self.place < most // runs) & (self.run < runs))
 
-    def note(self, chosen: NDArray[np.intp], weights: Array, excess: float) -> None:
+    def note(self, chosen: NDArray[np.intp], weights: Array) -> None:
         """Remember transitions that contradict one another."""
         self.against |= set(chosen[np.abs(weights).sum(0) > 0].tolist())
-        self.least = min(self.least, excess)
 
 
 def _fitting(data: _Data, box: Box) -> Flows:
@@ -259,14 +256,14 @@ def identify(system: System, measurements: Measurements) -> Identified:
     tree, parts = _parts(data, flows)
     left = [part.box for part in parts if not part.empty]
     if not left:
-        raise Contradiction(tuple(sorted(data.against)), 1 + data.least)
+        raise Contradiction(tuple(sorted(data.against)))
     hull = {name: (min(box[name][0] for box in left), max(box[name][1] for box in left)) for name in middle}
     whole = _Box(data, flows, hull)
     whole.separately(np.arange(data.count), _ROUNDS)
     if data.shares and not whole.empty:
         whole.jointly(data.windows())
     if whole.empty:
-        raise Contradiction(tuple(sorted(data.against)), 1 + data.least)
+        raise Contradiction(tuple(sorted(data.against)))
     return _found(data, flows, tree, parts, whole)
 
 
