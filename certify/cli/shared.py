@@ -14,7 +14,7 @@ from certify.errors import InputError
 
 if TYPE_CHECKING:
     from certify.analysis.inputs import Tell
-    from certify.loop.plants import System
+    from certify.loop.plants import Measurements, System
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.", rich_help_panel=FIRST)]
 Patient = Annotated[
@@ -122,6 +122,17 @@ def describe(s: System) -> dict[str, Any]:
         "units": dict(s.units),
         "angles": list(s.angles),
         "constraints": {name: f"{e} < 0" for name, e in constraints_of_values(s).items()},
+        "data": None if s.measurements is None else settings(s, s.measurements),
+    }
+
+
+def settings(s: System, data: Measurements) -> dict[str, Any]:
+    """The table `data` of a plant's file as plain values."""
+    return {
+        "sha256": data.sha256,
+        "period": None if data.period is None else [str(h) for h in data.period],
+        "noise": {x.name: str(w) for x, w in zip(s.states, data.noise, strict=True)},
+        "priors": {name: [str(lo), str(hi)] for name, (lo, hi) in data.priors.items()},
     }
 
 
