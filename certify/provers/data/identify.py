@@ -148,7 +148,7 @@ class _Box:
             return
         sign = -1.0 if (weights * rows.alpha).sum() > 0 else 1.0
         whole = np.zeros((2, len(self.box), *rows.alpha.shape))
-        whole[0, 0] = -sign * weights * (_FAR / excess)
+        whole[0, 0] = sign * weights * (_FAR / excess)
         found = self._narrowed(rows, chosen, whole[:, 0], 0)
         self._keep(self.box | {next(iter(self.box)): found}, chosen, whole)
         self.data.note(chosen, weights, excess / size)
