@@ -1,4 +1,4 @@
-"""Transitions of an environment of Gymnasium as a CSV file: a black box is identified from files like any other plant."""
+"""Transitions of an environment of Gymnasium as a CSV file: a black box is identified from files, as other plants are."""
 
 from __future__ import annotations
 
