@@ -83,8 +83,8 @@ def identify(
     note, system = noting(quiet), load_system(structure)
     if (data is None) is (env is None):
         raise InputError("name a file of measured transitions, or an environment with --env; one of the two.")
-    if out.suffix != ".toml" or out.resolve() == structure.resolve():
-        raise InputError(f"--out must be a .toml file other than the structure's; found {out}.")
+    if out.suffix != ".toml":
+        raise InputError(f"--out must be a .toml file; found {out}.")
     if env is not None:
         from certify.analysis.identifying.environments import Black, record
 

@@ -108,19 +108,24 @@ def _short(value: str) -> str:
 def _ranges(parameters: Sequence[Mapping[str, Any]]) -> Picture:
     """Each prior as a bar of one length, and in it the range."""
     height = 0.75 + 0.42 * len(parameters)
-    figure, axes = figure_of(8.6, height, left=1.1, bottom=0.5)
+    figure, axes = figure_of(8.6, height, left=1.1, right=0.2, bottom=0.5)
     for k, p in enumerate(reversed(parameters)):
         (a, b), (lo, hi) = ([float(Fraction(q)) for q in p[key]] for key in ("prior", "range"))
         axes.plot([0, 1], [k, k], color=LEAF_EDGE, lw=7, solid_capstyle="butt")
         left, right = (lo - a) / (b - a), (hi - a) / (b - a)
         axes.plot([left, right], [k, k], color=SET, lw=7, solid_capstyle="butt")
         axes.plot([(left + right) / 2], [k], color=SET, marker="|", ms=15, lw=0)
+        axes.text(1.012, k, f"{above(100 * (right - left), 3)} %", va="center", fontsize=8.0)
     axes.set_yticks(range(len(parameters)), [label(p["name"], p["unit"]) for p in reversed(parameters)])
+    axes.set_xlim(-0.02, 1.08)
     axes.set_ylim(-0.6, len(parameters) - 0.4)
     axes.set_xlabel("place in the prior, from its lower to its upper end")
     keys = (Key("prior", LEAF_EDGE, 5.0), Key("range that is left", SET, 5.0))
-    caption = "What the measurements leave of each prior. Every consistent constant value lies in the dark part."
-    return Picture("Priors and ranges.", caption, to_svg(figure), False, wide=True, legend=keys)
+    caption = (
+        "What the measurements leave of each prior. Every consistent constant value lies in the dark part; its share of "
+        "the prior is beside it."
+    )
+    return Picture("Priors and ranges", caption, to_svg(figure), False, wide=True, legend=keys)
 
 
 def _differences(residuals: Residuals) -> list[Picture]:
@@ -137,7 +142,7 @@ def _differences(residuals: Residuals) -> list[Picture]:
     found = list[Picture]()
     each = zip(residuals.names, residuals.units, residuals.difference, residuals.reach, strict=True)
     for name, unit, difference, reach in each:
-        figure, axes = figure_of(4.2, 2.6)
+        figure, axes = figure_of(4.2, 2.6, left=0.86)
         axes.vlines(shown, -reach[shown], reach[shown], color=LEAF_EDGE, lw=max(0.3, min(3.0, 200 / len(shown))))
         axes.axhline(0.0, color=MUTED, lw=0.6)
         size = max(1.0, min(3.5, 400 / len(shown)))
@@ -149,5 +154,5 @@ def _differences(residuals: Residuals) -> list[Picture]:
             f"{symbol(name)} at the end of each transition, less what the middle of the ranges predicts from its "
             "beginning. It may be off by parameters, noise and remainder, as far as the line reaches."
         )
-        found.append(Picture(f"{symbol(name)}.", caption, to_svg(figure), False, legend=keys))
+        found.append(Picture(symbol(name), caption, to_svg(figure), False, legend=keys))
     return found

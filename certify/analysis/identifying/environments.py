@@ -1,4 +1,4 @@
-"""Transitions of an environment of Gymnasium as a CSV file: a black box is identified from files, as other plants are."""
+"""Transitions of an environment of Gymnasium as a CSV file: a black box is identified from files, as others are."""
 
 from __future__ import annotations
 

@@ -51,6 +51,8 @@ def write_known(path: Path, structure: Path, known: System, source: str) -> None
     data = known.measurements
     if data is None:
         raise InputError("there must be measurements on which ranges rest; found none.")
+    if path.resolve() == structure.resolve():
+        raise InputError(f"the plant that is found must not be written over its structure, {structure}.")
     text = _text(read_plant_file(structure), structure, known, data, source)
     with tempfile.TemporaryDirectory(prefix="certify-") as folder:
         copy = Path(folder) / structure.name
