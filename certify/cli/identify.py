@@ -28,7 +28,7 @@ _ENVIRONMENT = "An environment"
 
 def identify(
     data: Annotated[
-        Path | None, typer.Argument(metavar="[DATA]", help="Measured transitions: .csv, .npz or .parquet.")
+        Path | None, typer.Argument(metavar="DATA", help="Measured transitions: .csv, .npz or .parquet.")
     ] = None,
     *,
     structure: Annotated[

@@ -122,8 +122,8 @@ def _ranges(parameters: Sequence[Mapping[str, Any]]) -> Picture:
     axes.set_xlabel("place in the prior, from its lower to its upper end")
     keys = (Key("prior", LEAF_EDGE, 5.0), Key("range that is left", SET, 5.0))
     caption = (
-        "What the measurements leave of each prior. Every consistent constant value lies in the dark part; its share of "
-        "the prior is beside it."
+        "What the measurements leave of each prior. Every consistent constant value lies in the dark part; its share "
+        "of the prior is beside it."
     )
     return Picture("Priors and ranges", caption, to_svg(figure), False, wide=True, legend=keys)
 

@@ -56,7 +56,7 @@ def record(black: Black, system: System, path: Path) -> None:
     try:
         env = gymnasium.make(black.name)
     except (gymnasium.error.Error, ImportError) as error:
-        raise InputError(f"gymnasium has no environment {black.name!r}: {error}.") from error
+        raise InputError(f"gymnasium has no environment {black.name!r}: {str(error).rstrip('.')}.") from error
     if not isinstance(env.action_space, gymnasium.spaces.Box) or env.action_space.shape != (system.m,):
         raise InputError(
             f"actions of {black.name} must be {system.m} numbers, the inputs of {system.name}; they are "
