@@ -69,6 +69,8 @@ class Polytope:
 
     def least_determined(self) -> Direction | None:
         """The direction in which most is left; None if linear programs do not find it."""
+        if not len(self.alpha):
+            return None
         found = [self._widest(k) for k in range(len(self.names))]
         known = [one for one in found if one is not None]
         if not known:
@@ -117,7 +119,7 @@ def polytope_of(found: Identified) -> Polytope:
     return Polytope(
         tuple(data.priors),
         kept.alpha.ravel(),
-        kept.slopes[:, n:].swapaxes(1, 2).reshape(kept.alpha.size, -1),
+        kept.slopes[:, n:].swapaxes(1, 2).reshape(kept.alpha.size, len(data.priors)),
         kept.slack.ravel(),
         error.ravel(),
         np.tile(good, n),
