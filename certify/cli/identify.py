@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from certify.analysis.arguments import bound_or_bounds, value_or_range
+from certify.cli.options import Bundle, parameter, takes
 from certify.cli.shared import Json, Quiet, noting, write
 from certify.cli.terminal import say, show
 from certify.errors import InputError
@@ -20,12 +22,39 @@ if TYPE_CHECKING:
 
     from certify.analysis.identifying.reading import Readings
     from certify.analysis.identifying.run import IdentifyResult
+    from certify.analysis.inputs import Tell
     from certify.loop.plants import System
     from certify.provers.data import Contradiction
 
-_ENVIRONMENT = "An environment"
+
+def _of_environment() -> Bundle:
+    """The options of an environment; the command receives those that are given, by name."""
+    shown: dict[str, Any] = {"rich_help_panel": "An environment"}
+    options = (
+        parameter(
+            "env",
+            "--env",
+            "Take the data from this environment of Gymnasium, and write them beside the plant.",
+            metavar="ID",
+            **shown,
+        ),
+        parameter("episodes", "--episodes", "Episodes. [default: 10]", int, min=1, **shown),
+        parameter(
+            "policy", "--policy", "Policy that acts; by default actions are random.", Path, metavar="FILE", **shown
+        ),
+        parameter(
+            "observed",
+            "--observed",
+            "What the environment shows, by states: 'cos(theta),sin(theta),theta_dot'. By default the states.",
+            metavar="LIST",
+            **shown,
+        ),
+        parameter("seed", "--seed", "Seed of episodes and actions. [default: 0]", int, **shown),
+    )
+    return Bundle({one.name: one for one in options}, dict)
 
 
+@takes(environment=_of_environment())
 def identify(
     data: Annotated[
         Path | None, typer.Argument(metavar="DATA", help="Measured transitions: .csv, .npz or .parquet.")
@@ -45,30 +74,7 @@ def identify(
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="Plant with the ranges that are left; a page lies beside it.")
     ] = Path("known.toml"),
-    env: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ID",
-            help="Take the data from this environment of Gymnasium, and write them beside the plant.",
-            rich_help_panel=_ENVIRONMENT,
-        ),
-    ] = None,
-    episodes: Annotated[int, typer.Option(help="Episodes.", min=1, rich_help_panel=_ENVIRONMENT)] = 10,
-    policy: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Policy that acts; by default actions are random.", rich_help_panel=_ENVIRONMENT
-        ),
-    ] = None,
-    observed: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LIST",
-            help="What the environment shows, by states: 'cos(theta),sin(theta),theta_dot'. Default: the states.",
-            rich_help_panel=_ENVIRONMENT,
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of episodes and actions.", rich_help_panel=_ENVIRONMENT)] = 0,
+    environment: dict[str, Any],
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -79,37 +85,44 @@ def identify(
     from certify.analysis.identifying.run import identify_plant, read_and_measure
     from certify.loop.plants import load_system
     from certify.provers.data import Contradiction
+    from certify.report.identified import page
 
     note, system = noting(quiet), load_system(structure)
-    if (data is None) is (env is None):
-        raise InputError("name a file of measured transitions, or an environment with --env; one of the two.")
     if out.suffix != ".toml":
         raise InputError(f"--out must be a .toml file; found {out}.")
-    if env is not None:
-        from certify.analysis.identifying.environments import Black, record
-
-        data = out.with_name(f"{out.stem}_data.csv")
-        record(Black(env, episodes, policy, observed, seed), system, data)
-        note(f"data     {data}, from {episodes} episodes of {env}")
-    if data is None:
-        raise InputError("there must be measured transitions.")
+    source = _recorded(data, environment, system, out, note)
     period = None if sample_time is None else value_or_range(sample_time, "sample_time")
-    measured, readings = read_and_measure(data, system, period, bound_or_bounds(noise, "noise"))
+    measured, readings = read_and_measure(source, system, period, bound_or_bounds(noise, "noise"))
     for line in readings.notes:
         note(line)
     try:
-        result = identify_plant(measured, readings, data.name, structure, out)
+        result = identify_plant(measured, readings, source.name, structure, out)
     except Contradiction as error:
-        _refuted(error, measured, readings, data, as_json)
+        _refuted(error, measured, readings, source, as_json)
         raise typer.Exit(1) from None
-    from certify.report.identified import page
-
     write(out.with_suffix(".html"), page(result.residuals(), result.to_dict()))
     if as_json:
         say(json.dumps(result.to_dict()))
     else:
         show(_summary(result))
         say(f"plant  {out}\npage   {out.with_suffix('.html')}")
+
+
+def _recorded(data: Path | None, environment: Mapping[str, Any], system: System, out: Path, note: Tell) -> Path:
+    """The file of measurements: the one that is given, or that of an environment, which is written first."""
+    if (data is None) is ("env" not in environment):
+        raise InputError("name a file of measured transitions, or an environment with --env; one of the two.")
+    if data is not None:
+        if environment:
+            raise InputError(f"--{next(iter(environment))} must be left out: it is for an environment, with --env.")
+        return data
+    from certify.analysis.identifying.environments import Black, record
+
+    found = {"episodes": 10} | dict(environment)
+    black, path = Black(found.pop("env"), **found), out.with_name(f"{out.stem}_data.csv")
+    record(black, system, path)
+    note(f"data     {path}, from {black.episodes} episodes of {black.name}")
+    return path
 
 
 def _refuted(error: Contradiction, measured: System, readings: Readings, data: Path, as_json: bool) -> None:

@@ -1,7 +1,7 @@
-"""What measurements say and what they leave open, for people: by linear programs over the last box of parameters.
+"""Directions that measurements leave open, and the noise that they allow, for people: by linear programs.
 
-Rows `alpha + slopes.(errors, d)` within a slack of 0 bound a polytope of the parameters' symbols d in [-1, 1]. It holds
-every consistent parameter, so that what it excludes is excluded; nothing here becomes a part of a proof.
+Rows of the last box, `alpha + slopes.(errors, d)` within a slack of 0, bound a polytope of the parameters' symbols d in
+[-1, 1]. It holds every consistent parameter, so that what it excludes is excluded; nothing here is a part of a proof.
 """
 
 from __future__ import annotations

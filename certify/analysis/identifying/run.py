@@ -65,7 +65,7 @@ class IdentifyResult:
         return self.system.measurements
 
     def shrink(self, name: str) -> float:
-        """How many times smaller a parameter's range is than its prior."""
+        """The factor by which a parameter's range is smaller than its prior."""
         (a, b), (lo, hi) = self.measurements.priors[name], self.system.ranges[name]
         return float((b - a) / (hi - lo))
 

@@ -60,7 +60,7 @@ def plant_of(certificate: Certificate | ReachCertificate) -> dict[str, Any]:
 
 
 def data_of(system: System) -> dict[str, str]:
-    """What measurements say of the plant's parameters, in words; empty where its ranges are assumed."""
+    """The words of measurements about the plant's parameters, in words; empty where its ranges are assumed."""
     data = Measured.of(system)
     if data is None:
         return {}
