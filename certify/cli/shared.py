@@ -114,6 +114,7 @@ def describe(s: System) -> dict[str, Any]:
         "parameters": {name: str(q) for name, q in s.parameters.items()},
         "disturbances": [w.name for w in s.disturbances],
         "ranges": {name: [str(lo), str(hi)] for name, (lo, hi) in s.ranges.items()},
+        "data": None if s.measurements is None else settings(s, s.measurements),
         "domain": {x.name: [str(lo), str(hi)] for x, (lo, hi) in zip(s.states, domain, strict=True)},
         "input_bounds": {u.name: [str(lo), str(hi)] for u, (lo, hi) in zip(s.inputs, s.input_bounds, strict=True)},
         "dynamics": {x.name: str(e) for x, e in zip(s.states, dynamics_of_values(s), strict=True)},
@@ -122,7 +123,6 @@ def describe(s: System) -> dict[str, Any]:
         "units": dict(s.units),
         "angles": list(s.angles),
         "constraints": {name: f"{e} < 0" for name, e in constraints_of_values(s).items()},
-        "data": None if s.measurements is None else settings(s, s.measurements),
     }
 
 
