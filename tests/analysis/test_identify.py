@@ -7,6 +7,7 @@ import hashlib
 import io
 import json
 import math
+import runpy
 import sys
 from collections.abc import Callable, Sequence
 from fractions import Fraction
@@ -25,6 +26,7 @@ from certify.cli.main import _run
 from certify.errors import InputError
 from certify.loop.plants import System, get_system, load_system
 from certify.provers.data import Contradiction
+from tests.support.marks import slow_after
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 Array = NDArray[np.float64]
@@ -514,6 +516,23 @@ def test_python_takes_data_as_the_command_does(known: Path) -> None:
     assert again.verdict == "PROVED" and again.to_dict()["data"]["sha256"] == found.to_dict()["data"]["sha256"]
 
 
+def test_what_fails_in_the_ranges_refutes_no_claim_about_data(known: Path) -> None:
+    """The middle of the ranges, or a corner, need not be a consistent plant."""
+    none = certify.PolicyNetwork.of_layers(
+        (np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none"
+    )
+    law = certify.PolicyNetwork.of_layers(
+        (np.array([[-4.0, -1.0]]),), (np.zeros(1),), np.array([6.0]), np.zeros(1), "tanh", "none"
+    )
+    for network, level, verdict in ((none, None, "UNKNOWN"), (law, 1.0, "UNKNOWN"), (law, 4.0, "REFUTED")):
+        found = [
+            certify.certify_roa(known / "known.toml", network, candidate="lyapunov", level=level, data=data)
+            for data in (None, known / "data.csv")
+        ]
+        assert [one.verdict.value for one in found] == ["REFUTED", verdict]
+        assert ("need not be consistent" in str(found[1].notice)) is (verdict == "UNKNOWN")
+
+
 def test_without_data_ranges_are_taken_as_they_stand(known: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert _run(certifying(known, "--json"), True) == 0
     said = capsys.readouterr()
@@ -541,3 +560,14 @@ def test_ranges_that_do_not_hold_what_is_left_are_refused(
     given = certifying(known, "--data", str(known / "data.csv"), "--param", narrow, "--out", str(tmp_path / "out"))
     assert _run(given, False) == 2
     assert "the range of c must hold all that the data leave" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", slow_after(1, ["pendulum", "cartpole"]))
+def test_the_examples_find_the_plants_that_ship(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, ships = tmp_path / "data.csv", get_system(name).parameters
+    monkeypatch.setattr(sys, "argv", ["measure.py", name, str(data), "--transitions", "100"])
+    runpy.run_path(str(EXAMPLES / "unknown" / "measure.py"), run_name="__main__")
+    found = certify.identify(data, EXAMPLES / "unknown" / f"{name}.toml", noise="1e-3", sample_time="0.02")
+    true = TRUE if name == "pendulum" else {p: float(q) for p, q in ships.items()}
+    assert len(found.ranges) == 3
+    assert all(lo <= Fraction(true[p]) <= hi and found.shrink(p) > 5 for p, (lo, hi) in found.ranges.items())
