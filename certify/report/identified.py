@@ -59,6 +59,8 @@ def noise_in_words(factor: float | None) -> str:
     """The least noise that the measurements allow."""
     if factor is None:
         return "no statement about the noise"
+    if factor == 0:
+        return "any smaller noise, down to none"
     return f"no noise smaller than {below(factor, 3)} times that, in all states at once: it is contradicted"
 
 
