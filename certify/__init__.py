@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from certify.analysis.api import certify_roa
+    from certify.analysis.identifying.api import identify
+    from certify.analysis.identifying.run import IdentifyResult
     from certify.analysis.options import RoaOptions
     from certify.analysis.results import RoaResult
     from certify.certificates.verdict import Verdict
@@ -62,6 +64,8 @@ _PUBLIC = {
     "save_lyapunov": "certify.lyapunov",
     "ClosedLoop": "certify.loop.closed_loop",
     "certify_roa": "certify.analysis.api",
+    "identify": "certify.analysis.identifying.api",
+    "IdentifyResult": "certify.analysis.identifying.run",
     "RoaResult": "certify.analysis.results",
     "RoaOptions": "certify.analysis.options",
     "ImportOptions": "certify.loop.policies.importers",
@@ -71,6 +75,7 @@ __version__ = "0.2.0.dev0"  # the only place; CHANGELOG.md has the same heading
 __all__ = [
     "CertifyError",
     "ClosedLoop",
+    "IdentifyResult",
     "ImportOptions",
     "InputError",
     "Neural",
@@ -89,6 +94,7 @@ __all__ = [
     "exp",
     "from_sympy",
     "get_system",
+    "identify",
     "load_lyapunov",
     "load_policy",
     "maximum",

@@ -82,6 +82,7 @@ class Keywords(TypedDict, total=False):
     sample_time: Exact | Sequence[Exact] | None
     keep: str | Sequence[str] | None
     avoid: str | Sequence[str] | None
+    data: str | os.PathLike[str] | None
 
 
 def certify_roa(

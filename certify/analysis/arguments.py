@@ -67,7 +67,7 @@ def _ranges(entries: Sequence[str], name: str) -> dict[str, Any]:
 def _entry(key: str, text: str, name: str) -> Fraction | tuple[Fraction, Fraction]:
     """The value or range of `key` in an option, which errors name with it."""
     try:
-        found = _value_or_range(text, key)
+        found = value_or_range(text, key)
     except OptionError as error:
         raise OptionError(
             f"`{name}` takes a finite number such as {key}=0.15 or {key}=3/20, or a range {key}=LO..HI; "
@@ -78,7 +78,8 @@ def _entry(key: str, text: str, name: str) -> Fraction | tuple[Fraction, Fractio
     return found
 
 
-def _value_or_range(text: str, name: str) -> Fraction | tuple[Fraction, Fraction]:
+def value_or_range(text: str, name: str) -> Fraction | tuple[Fraction, Fraction]:
+    """An exact number, or two of them as LO..HI."""
     ends = [_exact(end, name) for end in ends_of(text)]
     return ends[0] if len(ends) == 1 else (ends[0], ends[1])
 
@@ -161,6 +162,11 @@ def state(text: str, name: str) -> dict[str, Fraction]:
     return {key: _exact(value, key) for key, value in _assignments(text, f"`{name}`")}
 
 
+def bound_or_bounds(text: str, name: str) -> Fraction | dict[str, Fraction]:
+    """An exact number, or several by name."""
+    return state(text, name) if "=" in text else _exact(text, name)
+
+
 def _number(text: str, name: str) -> float:
     try:
         return float(text)
@@ -201,8 +207,8 @@ _READERS: Mapping[str, Callable[[Any, str], Any]] = {
     "state": state,
     "file": lambda text, _: Path(text),
     "ranges": _ranges,
-    "bounds": lambda text, name: state(text, name) if "=" in text else _exact(text, name),
-    "period": _value_or_range,
+    "bounds": bound_or_bounds,
+    "period": value_or_range,
     "comparisons": lambda text, name: comparisons([text] if isinstance(text, str) else text, name),
 }
 

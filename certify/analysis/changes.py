@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from certify.analysis.declaration import option
@@ -55,6 +57,10 @@ class PlantChanges:
         "States that no trajectory may meet: those at which the comparison holds."),
         written="As in '(x - 1)**2 + y**2 < 0.25'; repeatable.",
         python="A comparison or several, as text.")
+    data: str | PathLike[str] | None = option(None, "loop", "file", metavar="FILE", varies=False, help=(
+        "Measured transitions of which the plant's file has the table [data]: the claim then is for every constant "
+        "value of its parameters with which they are consistent."),
+        written="The file that certify identify has read.")
     # fmt: on
 
     def of(self, plant: System) -> System:
@@ -78,6 +84,10 @@ class PlantChanges:
 
             bounds = error if isinstance(error, Mapping) else {s.name: error for s in plant.inputs}
             plant = with_input_errors(plant, bounds)
+        if self.data is not None:
+            from certify.analysis.identifying.run import with_data
+
+            plant = with_data(plant, Path(self.data))
         held = self.sample_time
         lo, hi = held if isinstance(held, tuple) else (held, held)
         if lo is not None and hi is not None and not (0 <= lo <= hi and hi > 0):

@@ -338,7 +338,8 @@ def _correction(result: RoaResult, options: RoaOptions, plant: System) -> Step |
         return Step((), f"{other}; for this one no Lyapunov equation has a solution, so that you must give P yourself")
     if (slower := _slower(result, options)) is not None:
         return slower
-    if options.level is not None and result.verdict is Verdict.REFUTED:
+    failed = result.verdict is Verdict.REFUTED or (result.witness is not None and result.levels.roa is None)
+    if options.level is not None and failed:
         return Step((), "leave --level out for the largest level that can be proved")
     if result.levels.roa is None:
         try:

@@ -7,14 +7,14 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from certify.loop.equilibrium import Rest
-from certify.loop.plants import System, kind_of
+from certify.loop.plants import Measurements, System, kind_of
 from certify.lyapunov import extents, semi_axes
 from certify.provers.falsify import Witness
 
 if TYPE_CHECKING:
     from certify.analysis.results import RoaResult
 
-_STAGES = ("load", "candidate", "local", "ring", "tube", "learn", "outer", "write", "check", "total")
+_STAGES = ("load", "data", "candidate", "local", "ring", "tube", "learn", "outer", "write", "check", "total")
 
 
 def to_dict(result: RoaResult) -> dict[str, Any]:
@@ -30,6 +30,7 @@ def to_dict(result: RoaResult) -> dict[str, Any]:
         "system": system.name,
         "parameters": {name: str(q) for name, q in system.parameters.items()},
         "uncertain": _uncertain(system),
+        "data": None if system.measurements is None else _data(system, system.measurements),
         "states": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.states],
         "operating_point": {name: str(q) for name, q in system.operating_point().items()},
         "inputs": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.inputs],
@@ -73,6 +74,22 @@ def _uncertain(system: System) -> list[dict[str, str]]:
         {"name": name, "kind": kind_of(system, name), "lo": str(lo), "hi": str(hi), "unit": system.units.get(name, "")}
         for name, (lo, hi) in system.ranges.items()
     ]
+
+
+def _data(system: System, data: Measurements) -> dict[str, Any] | None:
+    """The measurements of the claim; None where only ranges are known to rest on some."""
+    if not data.runs:
+        return None
+    ranges = {name: [str(q) for q in system.ranges[name]] for name in data.priors}
+    return {
+        "sha256": data.sha256,
+        "transitions": data.transitions,
+        "runs": len(data.runs),
+        "period": None if data.period is None else [str(h) for h in data.period],
+        "noise": {s.name: str(w) for s, w in zip(system.states, data.noise, strict=True)},
+        "priors": {name: [str(q) for q in pair] for name, pair in data.priors.items()},
+        "ranges": ranges,
+    }
 
 
 def _witness(witness: Witness) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from certify.analysis.stages.ring import Ring
 from certify.analysis.stages.setting import Setting, setting_of
 from certify.analysis.stages.state import Report, Stage, State, Tools
 from certify.certificates import PartitionTree, earlier_aside, sole_writer
-from certify.certificates.verdict import Stop
+from certify.certificates.verdict import Stop, Verdict
 from certify.effort import WHOLE, Effort
 from certify.errors import InputError, SoundnessError
 from certify.loop.closed_loop import ClosedLoop
@@ -131,6 +131,7 @@ def _result(state: State, tools: Tools) -> RoaResult:
     except BaseException:  # Ctrl-C, a reader that has gone, a checker that cannot run: --resume continues from here
         tools.keeper.keep()
         raise
+    state = _of_consistent_plants(state)
     result, first = state.result, tools.keeper.first
     gained = first is not None and first.attempt.gained
     cut = result.stop.ran_out or result.stop is Stop.CLUSTER or (result.stop is Stop.BOXES and gained)
@@ -144,6 +145,16 @@ def _result(state: State, tools: Tools) -> RoaResult:
     result = replace(result, seconds=tools.timings(), notice="; ".join(notices) or None)
     result = replace(result, search=search if search.exists() else None)
     return replace(result, diagnosis=diagnose(result, state.options, state.proof, asked, tools.effort))
+
+
+def _of_consistent_plants(state: State) -> State:
+    """The state without a refutation by parameters with which the measurements need not be consistent."""
+    result = state.result
+    if state.data is None or result.verdict is not Verdict.REFUTED or result.stop is Stop.DOMAIN:
+        return state
+    return state.with_result(verdict=Verdict.UNKNOWN).noting(
+        "a condition fails for parameters in the ranges, with which the data need not be consistent: nothing is refuted"
+    )
 
 
 def _through(state: State, tools: Tools) -> State:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from certify.certificates.verdict import Verdict
+from certify.report.measured import Measured
 from certify.report.timing import TimingInWords
 from certify.report.words import below, estimated, varying, varying_in, volume_name, volume_unit
 
@@ -28,8 +29,12 @@ def in_one_line(result: RoaResult) -> str:
 def stated(result: RoaResult) -> list[tuple[str, str]]:
     """The rows, names and values."""
     rows = [("verdict", result.verdict.value), ("plant", result.system.name), ("claim", result.claim)]
-    if result.system.ranges:
-        rows.append(("for every", varying(varying_in(result.system))))
+    data, found = Measured.of(result.system), list(varying_in(result.system))
+    if data is not None:
+        rows.append(("for every", f"constant {data.in_priors} {data.consistent}"))
+        found = data.others(found)
+    if found:
+        rows.append(("for every" if data is None else "and every", varying(found)))
     timing = TimingInWords.of(result.system, result.timing.rate)
     if not timing.is_plain:
         rows.append(("in time", "by steps" if timing.discrete else f"input held over {timing.periods}"))

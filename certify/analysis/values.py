@@ -178,7 +178,23 @@ def _pair(value: Any, where: str) -> tuple[Fraction, Fraction]:
     return _exact(ends[0], where), _exact(ends[1], where)
 
 
-def _value_or_pair(value: Any, where: str) -> Fraction | tuple[Fraction, Fraction]:
+def bounds_in(value: Any, name: str) -> Fraction | dict[str, Fraction]:
+    """An exact number, or several by name.
+
+    Raises
+    ------
+    InputError : it is something else.
+    """
+    return _state(value, name) if isinstance(value, Mapping) else _exact(value, name)
+
+
+def period_in(value: Any, where: str) -> Fraction | tuple[Fraction, Fraction]:
+    """An exact number, or a pair of them.
+
+    Raises
+    ------
+    InputError : it is something else.
+    """
     return _exact(value, where) if isinstance(value, _NUMBERS) else _pair(value, where)
 
 
@@ -189,7 +205,7 @@ def _state(value: Any, name: str) -> dict[str, Fraction]:
 def _ranges(value: Any, name: str) -> dict[str, Any]:
     if name == "ranges":  # ranges of parameters, which have values of their own
         return _named(value, name, "pairs", _pair)
-    return _named(value, name, "half-widths or pairs", _value_or_pair)
+    return _named(value, name, "half-widths or pairs", period_in)
 
 
 def _matrix(value: Any, name: str) -> Any:
@@ -215,8 +231,8 @@ _READERS: Mapping[str, Callable[[Any, str], Any]] = {
     "matrix": _matrix,
     "file": lambda value, _: value,
     "ranges": _ranges,
-    "bounds": lambda value, name: _state(value, name) if isinstance(value, Mapping) else _exact(value, name),
-    "period": _value_or_pair,
+    "bounds": bounds_in,
+    "period": period_in,
     "comparisons": lambda value, name: comparisons(
         [text(v, name) for v in ([value] if isinstance(value, str) else _entries(value, name))], name
     ),

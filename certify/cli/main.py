@@ -29,6 +29,7 @@ from certify.errors import BackendError, CertifyError, OptionError, SoundnessErr
 _COMMANDS: dict[str, type[TyperCommand] | None] = {
     "roa": Grouped,
     "reach": Grouped,
+    "identify": Grouped,
     "sweep": None,
     "check": None,
     "contains": None,

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.table import Table
 
-    from certify.loop.plants import Controllability, Matrix, System
+    from certify.loop.plants import Controllability, Matrix, Measurements, System
 
 
 @takes(changes=changes_of_a_plant("parameters"))
@@ -119,10 +119,23 @@ def _facts(s: System, eigenvalues: Sequence[complex], reach: Controllability) ->
         rows.append(
             ("uncertain", f"{', '.join(s.ranges)}: any value in their ranges, at any time; A, B at nominal ones")
         )
+    if s.measurements is not None:
+        rows += _measured(s, s.measurements)
     if s.operating_point():
         reads = ", ".join(f"{x} - {_number(q)}" if q else x.name for x, q in zip(s.states, s.exact_x_eq(), strict=True))
         rows.append(("policy reads", f"{reads}: deviations from x_eq, and so do A, B, V and the certificate"))
     return rows
+
+
+def _measured(s: System, data: Measurements) -> list[tuple[str, str]]:
+    """The file on which ranges rest, and what was said of it."""
+    priors = [f"{name} {_number(lo)} to {_number(hi)}" for name, (lo, hi) in data.priors.items()]
+    noise = [f"{x} {_number(w)}" for x, w in zip(s.states, data.noise, strict=True)]
+    each = "" if data.period is None else f"; transitions of {' to '.join(map(_number, dict.fromkeys(data.period)))}"
+    return [
+        ("data", f"sha256 {data.sha256[:16]}...; noise at most {', '.join(noise)}{each}"),
+        ("before data", f"{', '.join(priors)}; --data makes the file a part of a claim"),
+    ]
 
 
 def _variables(s: System) -> Table:

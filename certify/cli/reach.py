@@ -9,6 +9,7 @@ import typer
 
 from certify.analysis.arguments import options_of, read_option, region
 from certify.analysis.changes import PlantChanges
+from certify.analysis.declaration import declared
 from certify.analysis.inputs import plant_of, policy_in
 from certify.cli.certifying import certified
 from certify.cli.importing import import_options, kind_called
@@ -26,7 +27,7 @@ _CLAIM = "The claim"
 
 @takes(
     importing=import_options(_KIND),
-    changes=changes_of_a_plant(),
+    changes=changes_of_a_plant(*(name for name in declared(PlantChanges) if name != "data")),
     typed=options_of_a_run("reach_from", "box", "resume", "effort", "time_limit", "jobs"),
 )
 def reach(

@@ -14,7 +14,7 @@ from certify.errors import InputError
 
 if TYPE_CHECKING:
     from certify.analysis.inputs import Tell
-    from certify.loop.plants import System
+    from certify.loop.plants import Measurements, System
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.", rich_help_panel=FIRST)]
 Patient = Annotated[
@@ -114,6 +114,7 @@ def describe(s: System) -> dict[str, Any]:
         "parameters": {name: str(q) for name, q in s.parameters.items()},
         "disturbances": [w.name for w in s.disturbances],
         "ranges": {name: [str(lo), str(hi)] for name, (lo, hi) in s.ranges.items()},
+        "data": None if s.measurements is None else settings(s, s.measurements),
         "domain": {x.name: [str(lo), str(hi)] for x, (lo, hi) in zip(s.states, domain, strict=True)},
         "input_bounds": {u.name: [str(lo), str(hi)] for u, (lo, hi) in zip(s.inputs, s.input_bounds, strict=True)},
         "dynamics": {x.name: str(e) for x, e in zip(s.states, dynamics_of_values(s), strict=True)},
@@ -122,6 +123,16 @@ def describe(s: System) -> dict[str, Any]:
         "units": dict(s.units),
         "angles": list(s.angles),
         "constraints": {name: f"{e} < 0" for name, e in constraints_of_values(s).items()},
+    }
+
+
+def settings(s: System, data: Measurements) -> dict[str, Any]:
+    """The table `data` of a plant's file as plain values."""
+    return {
+        "sha256": data.sha256,
+        "period": None if data.period is None else [str(h) for h in data.period],
+        "noise": {x.name: str(w) for x, w in zip(s.states, data.noise, strict=True)},
+        "priors": {name: [str(lo), str(hi)] for name, (lo, hi) in data.priors.items()},
     }
 
 

@@ -79,7 +79,7 @@ def multiplied_out(expression: Expression) -> Expression:
 def identifier(name: str) -> str:
     """A name in MathML; the dot of a derivative is set above, as large as the letter."""
     base = name.removesuffix("_dot")
-    if base and base != name:
+    if base and base != name and "_" not in symbol(base):
         return f'<mover>{identifier(base)}<mo scriptlevel="0">˙</mo></mover>'
     return f"<mi>{_escape(symbol(name))}</mi>"
 

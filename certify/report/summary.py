@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
+from certify.report.measured import Measured
 from certify.report.rows import (
     inner_of,
     is_missed,
@@ -120,7 +121,11 @@ _FEW = 3  # uncertain quantities that a headline names
 
 def _whatever(result: Mapping[str, Any]) -> str:
     """The uncertain quantities for the headline; empty for an exact plant."""
-    found = uncertain_of(result)
+    found, data = uncertain_of(result), Measured.of_result(result)
+    if data is not None:
+        others = data.others(found)
+        also = f" and every {varying(others)}" if others else ""
+        return f"for every constant {data.names} in the priors {data.consistent}{also}, "
     if not found:
         return ""
     if len(found) > _FEW:

@@ -32,12 +32,12 @@ PRACTICAL = frozenset({"practical", "nearby"})
 def symbol(name: str) -> str:
     """A name as a symbol: Greek letters, subscripts, a dot for `_dot`.
 
-    >>> symbol("theta"), symbol("x1"), symbol("speed")
-    ('θ', 'x₁', 'speed')
+    >>> symbol("theta"), symbol("x1"), symbol("speed"), symbol("residual_x_dot")
+    ('θ', 'x₁', 'speed', 'residual_x_dot')
     """
     if name.endswith("_dot") and len(name) > len("_dot"):
         base = symbol(name.removesuffix("_dot"))
-        return base[:1] + _DOT + base[1:]
+        return base[:1] + _DOT + base[1:] if "_" not in base else name  # residual_theta_dot is no rate
     match = re.fullmatch(r"([A-Za-z]+?)_?(\d*)", name)
     if match is None:
         return name

@@ -50,7 +50,9 @@ class Setting:
             )
         centre = None if options.reach_from is None else state_in(system, options.reach_from)
         state = replace(state, centre=centre)
-        if system.measurements is not None:
+        if system.measurements is not None and not system.measurements.runs:
+            state = _without_data(state)
+        elif system.measurements is not None:
             with self.tools.timing("data"):
                 state = _identified(state, system.measurements)
         with self.tools.timing("candidate"):
@@ -72,6 +74,15 @@ def setting_of(loop: ClosedLoop, options: RoaOptions) -> State:
     """The state before the first stage."""
     unknown = RoaResult(Verdict.UNKNOWN, Stop.REQUESTED, loop.system, loop.network, engine=options.engine)
     return State(loop, options, unknown)
+
+
+def _without_data(state: State) -> State:
+    """The plant for its ranges as they stand, whatever they rest on."""
+    loop = ClosedLoop(replace(state.loop.system, measurements=None), state.loop.network)
+    return replace(state, loop=loop).noting(
+        "the plant's ranges are taken as they stand; `data` makes the measurements, on which they rest, a part of the "
+        "claim"
+    )
 
 
 def _identified(state: State, measurements: Measurements) -> State:

@@ -27,8 +27,7 @@ from certify.analysis.studies.case import OPTIONS, PLANT_OPTIONS, TABLES, Case, 
 from certify.errors import InputError
 from certify.loop.plants import System, available_systems, exact
 from certify.loop.plants.equations import nearest
-from certify.loop.plants.source import PlantFile, read_plant_file
-from certify.loop.plants.toml import number_at
+from certify.loop.plants.source import PlantFile, number_at, read_plant_file
 from certify.loop.policies import load_policy
 
 _LISTS = ("policies", "systems", "candidates")

@@ -10,11 +10,13 @@ import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 from certify.errors import InputError
 from certify.loop.plants.equations import decimal, nearest
+from certify.loop.plants.system import Interval, exact
 
 _TABLE = re.compile(r"\s*\[([^\[\]]+)\]")
 _ENTRY = re.compile(r"""\s*((?:["']?[A-Za-z0-9_-]+["']?\s*\.\s*)*["']?[A-Za-z0-9_-]+["']?)\s*=""")
@@ -99,6 +101,41 @@ def read_plant_file(path: Path, what: str = "system file") -> PlantFile:
     except ValueError as error:  # an integer of thousands of digits
         raise InputError(f"{what} {path} cannot be read: {error}.") from error
     return PlantFile(path, data, _lines(text))
+
+
+def interval_at(file: PlantFile, table: str, name: str) -> Interval:
+    """The interval [lo, hi] of an entry.
+
+    Raises
+    ------
+    InputError : there is none, or lo is not below hi.
+    """
+    value = file.table(table).get(name)
+    if name not in file.table(table):
+        raise file.refuse(f"there must be bounds of {name}; none were found. Write {name} = [lo, hi].", table)
+    if not isinstance(value, list) or len(value) != 2:
+        raise file.refuse(f"the bounds of {name} must be a pair [lo, hi]; found {value!r}.", table, name)
+    lo, hi = (number_at(file, end, table, name) for end in value)
+    if not lo < hi:
+        raise file.refuse(
+            f"the bounds of {name} must satisfy lo < hi; found [{float(lo):g}, {float(hi):g}].", table, name
+        )
+    return lo, hi
+
+
+def number_at(file: PlantFile, value: Any, *keys: str) -> Fraction:
+    """The exact number at this key of a file.
+
+    Raises
+    ------
+    InputError : it is none.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | str | Fraction):
+        raise file.refuse(f"must be a number such as 0.15 or the text '3/20'; found {value!r}.", *keys)
+    try:
+        return exact(value, keys[-1])
+    except InputError as error:
+        raise file.refuse(str(error), *keys) from error
 
 
 def _hint(line: str) -> str:

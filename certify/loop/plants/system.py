@@ -83,20 +83,17 @@ class System:
         deviations from it already (`in_deviations` brings equations there), so that nothing of what is proved depends
         on it.
     disturbances : symbols of the dynamics that are 0 unless they have a range.
-    ranges : intervals by name, of uncertain parameters and of disturbances that act; values may change at any
-    time. A parameter's value in `parameters` lies in its range and is the nominal one, which u_eq, the
-    linearisation and simulation use.
+    ranges : intervals by name, of uncertain parameters and of disturbances that act; values may change at any time. A
+        parameter's value in `parameters` lies in its range and is the nominal one, which u_eq and simulation use.
     time : `continuous`, or `discrete`: then the equations are those of x+, the state one step later.
-    sample : the shortest and longest sampling period of a continuous plant; None if the input follows the
-        state at once.
+    sample : the shortest and longest sampling period of a continuous plant; None if the input follows at once.
     observations : expressions of the states' values and the parameters, which a policy for this plant reads if nothing
         else is said; empty for the states.
     calls : networks that the dynamics call, whose results stand there as symbols; see `certify.loop.composition`.
     rest_of_calls : exact values of results at the operating point, by their symbols' names, where they are given.
     angles : names of states of which 2 pi more is the same place.
     constraints : expressions g by name, as the dynamics; g < 0 is asked for along trajectories.
-    measurements : those with which some of the uncertain parameters are consistent, constants that the measurements
-        leave no other range; None where ranges are assumed.
+    measurements : those with which uncertain parameters, constants, are consistent; None where ranges are assumed.
 
     Raises
     ------

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import cast, get_args
 
 from certify.errors import InputError
 from certify.loop.expressions import (
@@ -27,8 +27,9 @@ from certify.loop.plants.calls import Call, Named
 from certify.loop.plants.deviations import in_deviations
 from certify.loop.plants.equations import nearest, parse_constraint, parse_expression
 from certify.loop.plants.operating_point import require_equilibrium
-from certify.loop.plants.source import PlantFile, read_plant_file
-from certify.loop.plants.system import Interval, System, Time, exact
+from certify.loop.plants.source import PlantFile, interval_at, number_at, read_plant_file
+from certify.loop.plants.system import Interval, System, Time
+from certify.loop.plants.unknown import measurements_in, parameter, residual_ranges, with_residuals
 
 _REQUIRED = ("name", "states", "inputs", "dynamics", "u_eq", "domain", "input_bounds")
 _KEYS = (
@@ -46,6 +47,8 @@ _KEYS = (
     "networks",
     "angles",
     "constraints",
+    "residual",
+    "data",
 )
 _TURN = "2*pi"  # the only period of an angle
 
@@ -66,8 +69,10 @@ def build_system(file: PlantFile) -> System:
     _check_keys(file)
     name, description, time = _text(file, "name"), _text(file, "description"), _time(file)
     states, inputs = _names(file, "states"), _names(file, "inputs")
-    parameters = {p: number_at(file, value, "parameters", p) for p, value in file.table("parameters").items()}
-    acting = {w: _disturbance(file, w) for w in file.table("disturbances")}
+    given = {p: parameter(file, p) for p in file.table("parameters")}
+    parameters = {p: value for p, (value, _) in given.items()}
+    ranges = {p: interval for p, (_, interval) in given.items() if interval is not None}
+    acting = {w: _disturbance(file, w) for w in file.table("disturbances")} | residual_ranges(file, states)
     everything = [*states, *inputs, *parameters, *acting]
     _check_names(file, states, inputs, parameters, acting)
     try:
@@ -78,6 +83,8 @@ def build_system(file: PlantFile) -> System:
         shorthand = _shorthand(file, symbol, networks)
         known = "state, input, parameter or disturbance" + (", and not defined in [where] above" if shorthand else "")
         dynamics = [_equation(file, "dynamics", s, symbol | shorthand, known, networks=networks) for s in states]
+        lacking = {s: _equation(file, "residual", s, symbol | shorthand, known) for s in file.table("residual")}
+        dynamics = with_residuals(dynamics, states, lacking, symbol)
         constraints = _constraints(file, symbol | shorthand, known, networks)
         calls = [call for network in networks.values() for call in network.made()]
         at = [symbol[s] for s in states], x_eq
@@ -95,16 +102,17 @@ def build_system(file: PlantFile) -> System:
             time=time,
             u_eq=tuple(u_eq),
             domain=tuple(_domain(file, s, e, parameters) for s, e in zip(states, x_eq, strict=True)),
-            input_bounds=tuple(_interval(file, "input_bounds", s) for s in inputs),
+            input_bounds=tuple(interval_at(file, "input_bounds", s) for s in inputs),
             units={name: _unit(file, name) for name in file.table("units")},
             x_eq=tuple(x_eq),
             disturbances=tuple(symbol[w] for w in acting),
-            ranges={w: interval for w, interval in acting.items() if interval is not None},
+            ranges=ranges | {w: interval for w, interval in acting.items() if interval is not None},
             calls=tuple(replace(call, arguments=in_deviations(call.arguments, *at)) for call in _in_order(calls)),
             rest_of_calls={name: q for network in networks.values() for name, q in network.at_rest().items()},
             angles=_angles(file, states),
             constraints=dict(zip(constraints, in_deviations(list(constraints.values()), *at), strict=True)),
             observations=tuple(_observations(file, {s: symbol[s] for s in (*states, *parameters)})),
+            measurements=measurements_in(file, states, ranges, time),
         )
     except InputError as error:
         if str(file.path) in str(error):
@@ -255,7 +263,7 @@ def _equation(
 
 def _domain(file: PlantFile, name: str, x_eq: Expression, parameters: Mapping[str, Fraction]) -> Interval:
     """The interval of a state's values as one of deviations."""
-    lo, hi = _interval(file, "domain", name)
+    lo, hi = interval_at(file, "domain", name)
     at = _at_rest(file, "x_eq", name, x_eq, parameters)
     if not lo < at < hi:
         raise file.refuse(
@@ -290,42 +298,13 @@ def _disturbance(file: PlantFile, name: str) -> Interval | None:
     """The range of a disturbance: a half-width or a pair; None for 0, which acts only on request."""
     value = file.table("disturbances")[name]
     if isinstance(value, list):
-        return _interval(file, "disturbances", name)
+        return interval_at(file, "disturbances", name)
     half = number_at(file, value, "disturbances", name)
     if half < 0:
         raise file.refuse(
             f"must be a half-width that is not negative, or a pair [lo, hi]; found {value!r}.", "disturbances", name
         )
     return (-half, half) if half else None
-
-
-def _interval(file: PlantFile, table: str, name: str) -> Interval:
-    value = file.table(table).get(name)
-    if name not in file.table(table):
-        raise file.refuse(f"there must be bounds of {name}; none were found. Write {name} = [lo, hi].", table)
-    if not isinstance(value, list) or len(value) != 2:
-        raise file.refuse(f"the bounds of {name} must be a pair [lo, hi]; found {value!r}.", table, name)
-    lo, hi = (number_at(file, end, table, name) for end in value)
-    if not lo < hi:
-        raise file.refuse(
-            f"the bounds of {name} must satisfy lo < hi; found [{float(lo):g}, {float(hi):g}].", table, name
-        )
-    return lo, hi
-
-
-def number_at(file: PlantFile, value: Any, *keys: str) -> Fraction:
-    """The exact number at this key of a file.
-
-    Raises
-    ------
-    InputError : it is none.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | str | Fraction):
-        raise file.refuse(f"must be a number such as 0.15 or the text '3/20'; found {value!r}.", *keys)
-    try:
-        return exact(value, keys[-1])
-    except InputError as error:
-        raise file.refuse(str(error), *keys) from error
 
 
 def _text(file: PlantFile, key: str) -> str:

@@ -21,6 +21,7 @@ from certify.lyapunov import Neural, extents
 from certify.report.claims import CHECKED_ALWAYS, INPUTS
 from certify.report.figures.sets import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of, start_of
 from certify.report.mathml import inequality, typeset
+from certify.report.measured import Measured, stated_of
 from certify.report.sections.shared import centre_in_words, duration_in_words, ranks_of, timing_of, words_of
 from certify.report.timing import TimingInWords
 from certify.report.words import (
@@ -34,9 +35,7 @@ from certify.report.words import (
     network_name,
     pretty_unit,
     shortest,
-    stated_for,
     symbol,
-    varying_in,
 )
 
 _MOST_OPERATIONS = 200  # of an expression N that is shown
@@ -71,7 +70,7 @@ def claim_of(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict
         constraints=listed(list(certificate.constraints)) if certificate.constraints else "",
     )
     return {
-        "statement": stated_for(varying_in(system), statement, by_steps=timing.discrete),
+        "statement": stated_of(system, statement, by_steps=timing.discrete),
         "definition": timing.definitions,
         "middle": below(certificate.inner) if practical and certificate.inner != inner_of(certificate) else "",
         "enlarged": certificate.claim.start is not None,
@@ -121,6 +120,16 @@ def _parts(certificate: Certificate, notes: Mapping[str, str]) -> list[tuple[str
         else:
             text = f"{condition}, {shown_by}." if shown_by else condition
         parts.append((name, text, note))
+    data = Measured.of(certificate.system)
+    if data is not None:
+        parts.append(
+            (
+                "Measurements",
+                f"Every constant {data.names} in the priors {data.consistent} lies in the ranges, by sums of what the "
+                "transitions say, with multipliers of linear programs.",
+                f"From a file with the sha256 {data.sha256}.",
+            )
+        )
     return parts
 
 

@@ -10,9 +10,10 @@ from collections.abc import Iterator
 from certify.certificates import Certificate, ReachCertificate
 from certify.loop.plants import System, input_errors
 from certify.report.claims import Words
+from certify.report.measured import Measured
 from certify.report.sections.shared import timing_of
 from certify.report.timing import TimingInWords
-from certify.report.words import Varying, held_at, listed, symbol
+from certify.report.words import Varying, held_at, listed, symbol, varying_in
 
 
 def not_proved_of(certificate: Certificate, words: Words) -> list[tuple[str, str]]:
@@ -122,6 +123,9 @@ def _not_of_the_plant(system: System) -> list[tuple[str, str]]:
             ),
             ("Disturbances.", "No wind, no sensor noise, no estimation error, no delay."),
         ]
+    data = Measured.of(system)
+    if data is not None:
+        return _not_of_the_measured(system, data)
     names = listed([symbol(name) for name in system.ranges])
     within = "its range" if len(system.ranges) == 1 else "their ranges"
     return [
@@ -135,6 +139,31 @@ def _not_of_the_plant(system: System) -> list[tuple[str, str]]:
             f"Only what {names} can be in these equations: no other force, no sensor noise, no estimation error, no "
             "delay.",
         ),
+    ]
+
+
+def _not_of_the_measured(system: System, data: Measured) -> list[tuple[str, str]]:
+    """The gaps about a plant whose parameters are known by measurements."""
+    others = [symbol(q.name) for q in data.others(varying_in(system))]
+    beside = f" beside {listed(others)} in {'its range' if len(others) == 1 else 'their ranges'}" if others else ""
+    return [
+        (
+            "That the plant is one of these.",
+            "Measurements can contradict equations, priors, noise and period, and never show them: they are assumed. "
+            f"Nothing is said of a plant with which the {data.transitions:,} transitions are not consistent, and a "
+            "single error larger than the noise makes it such a plant.",
+        ),
+        (
+            "Parameters that change.",
+            f"{data.names} {'is' if len(data.priors) == 1 else 'are'} constant, and the same in all the measurements "
+            "and for all time after them. What drifts is no parameter, but a disturbance of the equations.",
+        ),
+        (
+            "Chances.",
+            "No statement of statistics: no confidence, no distribution of the noise, and nothing about how likely a "
+            "plant is.",
+        ),
+        ("Other disturbances.", f"None{beside}: no other force, no sensor noise for the policy, no delay."),
     ]
 
 

@@ -9,10 +9,22 @@ from typing import Any
 
 from certify.certificates import Certificate, ReachCertificate
 from certify.loop.expressions import Expression, Number, Symbol, nodes
-from certify.loop.plants import input_errors
+from certify.loop.plants import System, input_errors
 from certify.report.mathml import identifier, is_long, multiplied_out, typeset
+from certify.report.measured import Measured
 from certify.report.sections.shared import centre_in_words, read_in_words
-from certify.report.words import above, at_rest, below, held_at, is_free, number, pretty_unit, symbol, varying_in
+from certify.report.words import (
+    above,
+    at_rest,
+    below,
+    held_at,
+    is_free,
+    number,
+    pretty_unit,
+    symbol,
+    varying,
+    varying_in,
+)
 
 
 def plant_of(certificate: Certificate | ReachCertificate) -> dict[str, Any]:
@@ -41,9 +53,18 @@ def plant_of(certificate: Certificate | ReachCertificate) -> dict[str, Any]:
         "u_eq": ", ".join(f"{symbol(s.name)} = {_short(u)}" for s, u in equilibrium),
         "uncertain": [q.words for q in varying_in(system)],
         "held": held_at(system),
+        "data": data_of(system),
         "listed": ", ".join(symbol(name) for name in system.ranges),
         "errors": [f"{symbol(u)} + {symbol(e)}" for u, e in input_errors(system).items()],
     }
+
+
+def data_of(system: System) -> dict[str, str]:
+    """The words of measurements about the plant's parameters, in words; empty where its ranges are assumed."""
+    data = Measured.of(system)
+    if data is None:
+        return {}
+    return {"names": data.names, "ranges": data.in_ranges, "others": varying(data.others(varying_in(system)))}
 
 
 def _numbers(expressions: Sequence[Expression], more: Sequence[Fraction]) -> list[Fraction]:

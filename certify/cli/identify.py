@@ -1,0 +1,215 @@
+"""`certify identify`: from measured transitions to a plant with the ranges that they leave of its parameters."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from certify.analysis.arguments import bound_or_bounds, value_or_range
+from certify.cli.options import Bundle, parameter, takes
+from certify.cli.shared import Json, Quiet, noting, write
+from certify.cli.terminal import say, show
+from certify.errors import InputError
+
+if TYPE_CHECKING:
+    from fractions import Fraction
+
+    from rich.console import RenderableType
+
+    from certify.analysis.identifying.reading import Readings
+    from certify.analysis.identifying.run import IdentifyResult
+    from certify.analysis.inputs import Tell
+    from certify.loop.plants import System
+    from certify.provers.data import Contradiction
+
+
+def _of_environment() -> Bundle:
+    """The options of an environment; the command receives those that are given, by name."""
+    shown: dict[str, Any] = {"rich_help_panel": "An environment"}
+    options = (
+        parameter(
+            "env",
+            "--env",
+            "Take the data from this environment of Gymnasium, and write them beside the plant.",
+            metavar="ID",
+            **shown,
+        ),
+        parameter("episodes", "--episodes", "Episodes. [default: 10]", int, min=1, **shown),
+        parameter(
+            "policy", "--policy", "Policy that acts; by default actions are random.", Path, metavar="FILE", **shown
+        ),
+        parameter(
+            "observed",
+            "--observed",
+            "What the environment shows, by states: 'cos(theta),sin(theta),theta_dot'. By default the states.",
+            metavar="LIST",
+            **shown,
+        ),
+        parameter("seed", "--seed", "Seed of episodes and actions. [default: 0]", int, **shown),
+    )
+    return Bundle({one.name: one for one in options}, dict)
+
+
+@takes(environment=_of_environment())
+def identify(
+    data: Annotated[
+        Path | None, typer.Argument(metavar="DATA", help="Measured transitions: .csv, .npz or .parquet.")
+    ] = None,
+    *,
+    structure: Annotated[
+        Path, typer.Option(metavar="PLANT.toml", help="The plant's equations, with ranges of unknown parameters.")
+    ],
+    noise: Annotated[
+        str,
+        typer.Option(metavar="E", help="Bound of each measured state's error: one, or NAME=E,NAME=E, in its units."),
+    ],
+    sample_time: Annotated[
+        str | None,
+        typer.Option(metavar="PERIOD", help="Time of a transition, as in 0.02, or LO..HI. Not in discrete time."),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="Plant with the ranges that are left; a page lies beside it.")
+    ] = Path("known.toml"),
+    environment: dict[str, Any],
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Bound a plant's unknown parameters by measured transitions.
+
+    The exit status is 0 for ranges, 1 if the measurements refute the structure with this noise.
+    """
+    from certify.analysis.identifying.run import identify_plant, read_and_measure
+    from certify.loop.plants import load_system
+    from certify.provers.data import Contradiction
+    from certify.report.identified import page
+
+    note, system = noting(quiet), load_system(structure)
+    if out.suffix != ".toml":
+        raise InputError(f"--out must be a .toml file; found {out}.")
+    source = _recorded(data, environment, system, out, note)
+    period = None if sample_time is None else value_or_range(sample_time, "sample_time")
+    measured, readings = read_and_measure(source, system, period, bound_or_bounds(noise, "noise"))
+    for line in readings.notes:
+        note(line)
+    try:
+        result = identify_plant(measured, readings, source.name, structure, out)
+    except Contradiction as error:
+        _refuted(error, measured, readings, source, as_json)
+        raise typer.Exit(1) from None
+    write(out.with_suffix(".html"), page(result.residuals(), result.to_dict()))
+    if as_json:
+        say(json.dumps(result.to_dict()))
+    else:
+        show(_summary(result))
+        say(f"plant  {out}\npage   {out.with_suffix('.html')}")
+
+
+def _recorded(data: Path | None, environment: Mapping[str, Any], system: System, out: Path, note: Tell) -> Path:
+    """The file of measurements: the one that is given, or that of an environment, which is written first."""
+    if (data is None) is ("env" not in environment):
+        raise InputError("name a file of measured transitions, or an environment with --env; one of the two.")
+    if data is not None:
+        if environment:
+            raise InputError(f"--{next(iter(environment))} must be left out: it is for an environment, with --env.")
+        return data
+    from certify.analysis.identifying.environments import Black, record
+
+    found = {"episodes": 10} | dict(environment)
+    black, path = Black(found.pop("env"), **found), out.with_name(f"{out.stem}_data.csv")
+    record(black, system, path)
+    note(f"data     {path}, from {black.episodes} episodes of {black.name}")
+    return path
+
+
+def _refuted(error: Contradiction, measured: System, readings: Readings, data: Path, as_json: bool) -> None:
+    """Print the finding that the measurements contradict the structure."""
+    from certify.analysis.identifying.run import SCHEMA, data_in_json
+
+    places, what = [readings.places[t] for t in error.transitions], "these data refute this structure with this noise"
+    if as_json:
+        found = {
+            "schema": SCHEMA,
+            "verdict": "REFUTED",
+            "system": measured.name,
+            "data": data_in_json(data.name, readings),
+            "reason": what,
+            "transitions": places,
+        }
+        say(json.dumps(found))
+        return
+    shown = ", ".join(places[:8]) + (f" and {len(places) - 8} more" if len(places) > 8 else "")
+    say(
+        f"REFUTED  {measured.name}: {what}, whatever the parameters within their ranges are\n\n"
+        f"shown by    transitions from {shown} of {data.name}\n"
+        "next        look at these rows first; then a friction, a delay or a unit that the equations lack, ranges that "
+        "are too narrow,\n            a wrong period, or noise that is larger than was said"
+    )
+
+
+def _summary(result: IdentifyResult) -> RenderableType:
+    from rich import box
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+    data, count = result.measurements, len(result.readings.places)
+    head = Text.assemble(
+        ("IDENTIFIED", "bold green"),
+        "  ",
+        (
+            f"{result.system.name}: {count:,} transitions, {int(result.found.used.sum()):,} of them show the ranges",
+            "bold",
+        ),
+    )
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, header_style="dim")
+    for title, justify in (
+        ("parameter", "left"),
+        ("unit", "left"),
+        ("prior", "right"),
+        ("range", "right"),
+        ("smaller", "right"),
+        ("shown most by", "left"),
+    ):
+        table.add_column(title, justify=justify)  # type: ignore[arg-type]
+    for name, prior in data.priors.items():
+        by = ", ".join(result.readings.places[t] for t in result.shown_by[name]) or "-"
+        cells = (
+            name,
+            result.system.units.get(name, ""),
+            _interval(prior),
+            _interval(result.system.ranges[name]),
+            f"{result.shrink(name):.3g} x",
+            by,
+        )
+        table.add_row(*map(Text, cells))
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(style="dim", no_wrap=True)
+    grid.add_column(overflow="fold")
+    for name, value in _rows(result):
+        grid.add_row(Text(name), Text(value))
+    return Group(head, Text(), table, Text(), grid, Text())
+
+
+def _rows(result: IdentifyResult) -> list[tuple[str, str]]:
+    from certify.report.identified import direction_in_words, noise_in_words
+
+    data, axis = result.measurements, result.least_determined
+    each = ", ".join(f"{s} {float(w):g}" for s, w in zip(result.system.states, data.noise, strict=True))
+    rows = [("noise at most", each), ("data allow", noise_in_words(result.least_noise))]
+    if data.period is not None:
+        rows.append(("period", " to ".join(dict.fromkeys(f"{float(h):g}" for h in data.period))))
+    if axis is not None:
+        rows.append(("least determined", direction_in_words(axis.entries, axis.share)))
+        rows.append(("to narrow it", f"more like {result.readings.places[axis.telling]}: {result.at(axis.telling)}"))
+    return [*rows, ("assumed", "the structure, the priors, constant parameters, noise and period as they were said")]
+
+
+def _interval(pair: tuple[Fraction, Fraction]) -> str:
+    """An interval that holds this one, in digits."""
+    from certify.report.words import above, below
+
+    return f"{below(pair[0])} to {above(pair[1])}"

@@ -1,0 +1,160 @@
+"""The page of an identified plant: priors against the ranges that are left, and measurements against predictions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.report.figures.style import (
+    INNER,
+    LEAF_EDGE,
+    MUTED,
+    RC,
+    SET,
+    SIMULATED,
+    Key,
+    Picture,
+    figure_of,
+    to_svg,
+)
+from certify.report.sheet import filled
+from certify.report.words import above, below, label, pretty_unit, symbol
+
+TEMPLATE = "certify.report", "identified.html"
+Array = NDArray[np.float64]
+_MOST_DOTS = 4000  # of a figure
+
+
+@dataclass(frozen=True, slots=True)
+class Residuals:
+    """Transitions against their predictions.
+
+    Parameters
+    ----------
+    names, units : of the n states.
+    difference : measured less predicted at the middle of the ranges, (n, T); NaN without a prediction.
+    reach : how far it may be off for some parameters and errors, (n, T).
+    used : transitions on which the ranges rest, (T,).
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    difference: Array
+    reach: Array
+    used: NDArray[np.bool_]
+
+
+def direction_in_words(entries: Mapping[str, float], share: float) -> str:
+    """The direction in which most is left, and the part of the priors that it is."""
+    moved = [f"{symbol(name)} {v:+.2g}" for name, v in entries.items() if abs(v) >= 0.01]
+    return f"{', '.join(moved)} in half-widths of priors; {above(100 * share, 3)} % of the priors is left along it"
+
+
+def noise_in_words(factor: float | None) -> str:
+    """The least noise that the measurements allow."""
+    if factor is None:
+        return "no statement about the noise"
+    if factor == 0:
+        return "any smaller noise, down to none"
+    return f"no noise smaller than {below(factor, 3)} times that, in all states at once: it is contradicted"
+
+
+def page(residuals: Residuals, data: Mapping[str, Any]) -> str:
+    """The page as one HTML document, from the object that `certify identify --json` prints."""
+    from matplotlib import rc_context
+
+    with rc_context(RC):
+        pictures = [_ranges(data["parameters"]), *_differences(residuals)]
+    axis = data["least_determined"]
+    return filled(
+        *TEMPLATE,
+        one_plane=True,
+        data=data,
+        parameters=[_row(p) for p in data["parameters"]],
+        noise=[_bound(name, w, residuals) for name, w in data["noise"].items()],
+        period=" to ".join(dict.fromkeys(_short(h) for h in data["period"] or ())),
+        pictures=pictures,
+        axis=None if axis is None else direction_in_words(axis["direction"], axis["share_of_priors"]),
+        telling=None if axis is None else axis["telling"],
+        least=noise_in_words(data["least_noise"]),
+        missing=int(np.count_nonzero(~np.isfinite(residuals.difference).all(0))),
+    )
+
+
+def _row(p: Mapping[str, Any]) -> dict[str, str]:
+    (a, b), (lo, hi) = (map(Fraction, p[key]) for key in ("prior", "range"))
+    return {
+        "name": symbol(p["name"]),
+        "unit": pretty_unit(p["unit"]),
+        "prior": f"{below(a)} to {above(b)}",
+        "range": f"{below(lo)} to {above(hi)}",
+        "shrink": below(p["shrink"], 3),
+        "by": ", ".join(p["shown_by"]) or "a partition of the priors",
+    }
+
+
+def _bound(name: str, bound: str, residuals: Residuals) -> str:
+    unit = pretty_unit(residuals.units[residuals.names.index(name)])
+    return f"{symbol(name)} {_short(bound)} {unit}".rstrip()
+
+
+def _short(value: str) -> str:
+    return f"{float(Fraction(value)):g}"
+
+
+def _ranges(parameters: Sequence[Mapping[str, Any]]) -> Picture:
+    """Each prior as a bar of one length, and in it the range."""
+    height = 0.75 + 0.42 * len(parameters)
+    figure, axes = figure_of(8.6, height, left=1.1, right=0.2, bottom=0.5)
+    for k, p in enumerate(reversed(parameters)):
+        (a, b), (lo, hi) = ([float(Fraction(q)) for q in p[key]] for key in ("prior", "range"))
+        axes.plot([0, 1], [k, k], color=LEAF_EDGE, lw=7, solid_capstyle="butt")
+        left, right = (lo - a) / (b - a), (hi - a) / (b - a)
+        axes.plot([left, right], [k, k], color=SET, lw=7, solid_capstyle="butt")
+        axes.plot([(left + right) / 2], [k], color=SET, marker="|", ms=15, lw=0)
+        axes.text(1.012, k, f"{above(100 * (right - left), 3)} %", va="center", fontsize=8.0)
+    axes.set_yticks(range(len(parameters)), [label(p["name"], p["unit"]) for p in reversed(parameters)])
+    axes.set_xlim(-0.02, 1.08)
+    axes.set_ylim(-0.6, len(parameters) - 0.4)
+    axes.set_xlabel("place in the prior, from its lower to its upper end")
+    keys = (Key("prior", LEAF_EDGE, 5.0), Key("range that is left", SET, 5.0))
+    caption = (
+        "What the measurements leave of each prior. Every consistent constant value lies in the dark part; its share "
+        "of the prior is beside it."
+    )
+    return Picture("Priors and ranges", caption, to_svg(figure), False, wide=True, legend=keys)
+
+
+def _differences(residuals: Residuals) -> list[Picture]:
+    """For each state the transitions' ends: measured less predicted, and how far that may be off."""
+    count = residuals.difference.shape[1]
+    shown = np.unique(np.linspace(0, count - 1, min(count, _MOST_DOTS)).astype(np.intp))
+    shown = np.union1d(shown, np.flatnonzero(residuals.used))
+    used = residuals.used[shown]
+    keys = (
+        Key("how far it may be off", LEAF_EDGE, 3.0),
+        Key("measured less predicted", SIMULATED, 3.0),
+        Key("the same, of transitions on which the ranges rest", INNER, 3.0),
+    )
+    found = list[Picture]()
+    each = zip(residuals.names, residuals.units, residuals.difference, residuals.reach, strict=True)
+    for name, unit, difference, reach in each:
+        figure, axes = figure_of(4.2, 2.6, left=0.86)
+        axes.vlines(shown, -reach[shown], reach[shown], color=LEAF_EDGE, lw=max(0.3, min(3.0, 200 / len(shown))))
+        axes.axhline(0.0, color=MUTED, lw=0.6)
+        size = max(1.0, min(3.5, 400 / len(shown)))
+        axes.plot(shown[~used], difference[shown[~used]], ".", color=SIMULATED, ms=size + 1)
+        axes.plot(shown[used], difference[shown[used]], ".", color=INNER, ms=4.5)
+        axes.set_xlabel("transition, in the file's order")
+        axes.set_ylabel(label(name, unit))
+        caption = (
+            f"{symbol(name)} at the end of each transition, less what the middle of the ranges predicts from its "
+            "beginning. It may be off by parameters, noise and remainder, as far as the line reaches."
+        )
+        found.append(Picture(symbol(name), caption, to_svg(figure), False, legend=keys))
+    return found

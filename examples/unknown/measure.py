@@ -1,0 +1,49 @@
+"""Measured transitions of a plant that ships, in place of an experiment: a state, an input held for 0.02 s, a state.
+
+`python examples/unknown/measure.py pendulum data.csv`. States and inputs are drawn at random, and each measured number
+is off by at most the noise; `certify identify` is told the noise and the time, and nothing of the plant's numbers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+
+import numpy as np
+
+from certify import get_system
+
+REACH = {"pendulum": [1.5, 2.0], "cartpole": [1.0, 0.5, 1.0, 1.0]}  # of the states from which transitions begin
+PERIOD, STEPS = 0.02, 20
+
+
+def main() -> None:
+    """Write the file."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("plant", choices=sorted(REACH))
+    parser.add_argument("out")
+    parser.add_argument("--transitions", type=int, default=200)
+    parser.add_argument("--noise", type=float, default=1e-3)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    plant, draw = get_system(given.plant), np.random.default_rng(given.seed)
+    f, N, h = plant.function(), given.transitions, PERIOD / STEPS
+    x = draw.uniform(-1, 1, (N, plant.n)) * REACH[given.plant]
+    lo, hi = np.array([[float(end) for end in pair] for pair in plant.input_bounds]).T
+    u = draw.uniform(lo, hi, (N, plant.m))
+    y = x
+    for _ in range(STEPS):  # Runge and Kutta's method, whose error here is far below the noise
+        k1 = f(y, u)
+        k2 = f(y + h / 2 * k1, u)
+        k3 = f(y + h / 2 * k2, u)
+        y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + f(y + h * k3, u))
+    off = draw.uniform(-given.noise, given.noise, (2, N, plant.n))
+    states = [s.name for s in plant.states]
+    with open(given.out, "w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow([*states, *(s.name for s in plant.inputs), *(f"{s}_next" for s in states)])
+        table.writerows(np.hstack([x + off[0], u, y + off[1]]).tolist())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,573 @@
+"""`certify identify`: files of measurements, the ranges that they leave, contradictions, and data in a claim."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import math
+import runpy
+import sys
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import certify
+from certify.analysis.identifying.reading import Readings, read_data
+from certify.analysis.identifying.writing import rounded
+from certify.certificates.checking import ask
+from certify.cli.main import _run
+from certify.errors import InputError
+from certify.loop.plants import System, get_system, load_system
+from certify.provers.data import Contradiction
+from tests.support.marks import slow_after
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+Array = NDArray[np.float64]
+STRUCTURE = """# a pendulum whose numbers are not known
+name = "pendulum"
+states = ["theta", "theta_dot"]
+inputs = ["u"]
+positive = ["c"]
+
+[parameters]
+a = [10, 30] # g/l
+b = [1, 4] # friction by inertia
+c = [10, 50]
+
+[dynamics]
+theta = "theta_dot"
+theta_dot = "a*sin(theta) - b*theta_dot + c*u"
+
+[u_eq]
+u = 0
+
+[domain]
+theta = [-3.14, 3.14]
+theta_dot = [-20, 20]
+
+[input_bounds]
+u = [-6, 6]
+
+[angles]
+theta = "2*pi"
+"""
+TRUE = {"a": 9.81 / 0.5, "b": 0.1 / 0.0375, "c": 1 / 0.0375}  # of the plant that ships
+NOISE = 1e-3
+COLUMNS = "theta,theta_dot,u,theta_next,theta_dot_next"
+
+
+def simulated(x: Array, u: Array, h: float = 0.02, drag: float = 0.0) -> Array:
+    """The plant's states a time h later, (N, 2)."""
+    f = get_system("pendulum").function()
+
+    def rate(y: Array) -> Array:
+        return f(y, u) - np.array([0.0, drag]) * y * np.abs(y)
+
+    for _ in range(8):
+        k = h / 8
+        one = rate(x)
+        two = rate(x + k / 2 * one)
+        three = rate(x + k / 2 * two)
+        x = x + k / 6 * (one + 2 * two + 2 * three + rate(x + k * three))
+    return x
+
+
+def transitions(count: int = 60, noise: float = NOISE, **how: float) -> Array:
+    """Measured transitions, (N, 5)."""
+    draw = np.random.default_rng(5)
+    x, u = draw.uniform(-1, 1, (count, 2)) * [1.5, 2.0], draw.uniform(-6, 6, (count, 1))
+    after = simulated(x, u, **how)
+    errors = draw.uniform(-noise, noise, (2, count, 2))
+    return np.hstack([x + errors[0], u, after + errors[1]])
+
+
+def write(path: Path, rows: Array, header: str = COLUMNS) -> Path:
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(header.split(","))
+    writer.writerows([repr(float(v)) for v in row] for row in rows)
+    path.write_text(stream.getvalue())
+    return path
+
+
+@pytest.fixture
+def structure(tmp_path: Path) -> Path:
+    path = tmp_path / "structure.toml"
+    path.write_text(STRUCTURE)
+    return path
+
+
+def system() -> System:
+    return get_system("pendulum")
+
+
+def identified(folder: Path, rows: Array, text: str = STRUCTURE, **given: Any) -> certify.IdentifyResult:
+    path = folder / "structure.toml"
+    path.write_text(text)
+    options = {"noise": str(NOISE), "sample_time": "0.02"} | given
+    return certify.identify(write(folder / "data.csv", rows), path, **options)
+
+
+def holds(found: certify.IdentifyResult, names: Sequence[str] = ("a", "b", "c")) -> bool:
+    return all(lo <= Fraction(TRUE[name]) <= hi for name, (lo, hi) in found.ranges.items() if name in names)
+
+
+# Files
+
+
+def test_transitions_and_rows_in_time_order_are_the_same_runs(tmp_path: Path) -> None:
+    rows = transitions(4)
+    single = read_data(write(tmp_path / "a.csv", rows), system())
+    assert [r.states.shape for r in single.runs] == [(2, 2)] * 4 and single.places[1] == "line 3"
+    assert np.array_equal(single.runs[2].states[1], rows[2, 3:]) and single.runs[2].inputs[0, 0] == rows[2, 2]
+    assert single.sha256 == hashlib.sha256((tmp_path / "a.csv").read_bytes()).hexdigest()
+    timed = np.zeros((8, 4))
+    timed[::2, :3], timed[1::2, :2], timed[:, 3] = rows[:, :3], rows[:, 3:], np.repeat(np.arange(4), 2)
+    again = read_data(write(tmp_path / "b.csv", timed, "theta,theta_dot,u,run"), system())
+    assert all(np.array_equal(p.states, q.states) for p, q in zip(single.runs, again.runs, strict=True))
+    assert again.places == ("line 2", "line 4", "line 6", "line 8")
+
+
+def test_a_long_run_keeps_its_rows(tmp_path: Path) -> None:
+    rows = transitions(7)[:, :3]
+    found = read_data(write(tmp_path / "a.csv", rows, "theta,theta_dot,u"), system())
+    assert len(found.runs) == 1 and np.array_equal(found.runs[0].states, rows[:, :2])
+    assert np.array_equal(found.runs[0].inputs, rows[:-1, 2:]) and len(found.places) == 6
+
+
+def arrays(kind: str) -> dict[str, Any]:
+    rows = transitions(6)
+    if kind == "single":
+        return {"x": rows[:, :2], "u": rows[:, 2:3], "x_next": rows[:, 3:]}
+    return {"states": rows[:, :2].reshape(2, 3, 2), "inputs": rows[:4, 2].reshape(2, 2, 1)}
+
+
+@pytest.mark.parametrize(("kind", "count", "place"), [("single", 6, "row 3"), ("runs", 4, "run 1, step 1")])
+def test_arrays_are_read(tmp_path: Path, kind: str, count: int, place: str) -> None:
+    np.savez(tmp_path / "a.npz", **arrays(kind))
+    found = read_data(tmp_path / "a.npz", system())
+    assert len(found.places) == count and found.places[3] == place
+
+
+def test_parquet_is_read_as_csv_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    rows = transitions(5)
+    columns = dict(zip(COLUMNS.split(","), rows.T.tolist(), strict=True))
+    parquet.write_table(pyarrow.table(columns), tmp_path / "a.parquet")
+    same = read_data(write(tmp_path / "a.csv", rows), system())
+    found = read_data(tmp_path / "a.parquet", system())
+    assert all(np.array_equal(p.states, q.states) for p, q in zip(found.runs, same.runs, strict=True))
+    columns["u"][2] = None  # type: ignore[call-overload]
+    parquet.write_table(pyarrow.table(columns), tmp_path / "a.parquet")
+    with pytest.raises(InputError, match="row 3, column u: there must be a number; found None"):
+        read_data(tmp_path / "a.parquet", system())
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    with pytest.raises(InputError, match="needs pyarrow"):
+        read_data(tmp_path / "a.parquet", system())
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        (lambda t: "", "it is empty"),
+        (lambda t: "\n\n", "must have a header"),
+        (lambda t: t.splitlines()[0] + "\n", "must have rows below its header"),
+        (lambda t: t.replace("theta_dot_next", "theta_next"), "found 'theta_next' twice"),
+        (lambda t: t.replace(",u,", ",force,"), "u is missing among theta, theta_dot, force"),
+        (lambda t: t.replace("theta_dot_next", "other"), "theta_dot_next is missing"),
+        (lambda t: t.replace("\n", ",1\n", 3), "line 4: there must be 6 entries, as in the header; found 5"),
+        (lambda t: _cell(t, 2, 3, "nan"), "line 4, column theta_next: a number must be finite; found nan"),
+        (lambda t: _cell(t, 0, 0, "-inf"), "line 2, column theta: a number must be finite"),
+        (lambda t: _cell(t, 3, 2, ""), "line 5, column u: there must be a number; found ''"),
+        (lambda t: _cell(t, 3, 2, "1_000"), "line 5, column u: there must be a number"),
+        (lambda t: _cell(t, 3, 2, "1;2"), "line 5, column u: there must be a number"),
+        (lambda t: t.replace("\n", "\n\n", 2), "line 2: there must be 5 entries, as in the header; found 0"),
+    ],
+)
+def test_nothing_of_a_table_is_dropped(tmp_path: Path, edit: Callable[[str], str], said: str) -> None:
+    path = write(tmp_path / "a.csv", transitions(4))
+    path.write_text(edit(path.read_text()))
+    with pytest.raises(InputError) as error:
+        read_data(path, system())
+    assert said in str(error.value)
+
+
+def _cell(text: str, row: int, column: int, value: str) -> str:
+    lines = text.splitlines()
+    cells = lines[row + 1].split(",")
+    cells[column] = value
+    lines[row + 1] = ",".join(cells)
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"x_next": None}, "x_next is missing"),
+        ({"u": np.zeros((5, 1))}, "must have as many rows"),
+        ({"u": np.zeros((6, 2))}, "array u: the shape must be (any, 1)"),
+        ({"u": np.zeros(6)}, "array u: the shape must be (any, 1)"),
+        ({"x": np.full((6, 2), np.nan)}, "numbers must be finite; found nan at [0, 0]"),
+        ({"x": np.zeros((6, 2), dtype=complex)}, "there must be numbers"),
+        ({"x": np.array([["a", "b"]] * 6)}, "there must be numbers"),
+        ({"x": np.array([[None, 1]] * 6, dtype=object)}, "no npz file of numbers"),
+    ],
+)
+def test_nothing_of_arrays_is_dropped(tmp_path: Path, change: dict[str, Any], said: str) -> None:
+    given = {name: value for name, value in (arrays("single") | change).items() if value is not None}
+    np.savez(tmp_path / "a.npz", **given)
+    with pytest.raises(InputError) as error:
+        read_data(tmp_path / "a.npz", system())
+    assert said in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("runs", "said"),
+    [("0,0,1,1,0,0", "rows of a run must stand together"), ("0,0,1,2,2,2", "line 4: a run must have two rows")],
+)
+def test_runs_stand_together(tmp_path: Path, runs: str, said: str) -> None:
+    rows = np.column_stack([transitions(6)[:, :3], [float(r) for r in runs.split(",")]])
+    with pytest.raises(InputError, match=said):
+        read_data(write(tmp_path / "a.csv", rows, "theta,theta_dot,u,run"), system())
+
+
+def test_an_unknown_ending_and_a_missing_file_are_named(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("1")
+    for name, said in (("a.txt", "must be one of .csv, .npz, .parquet"), ("b.csv", "cannot be read")):
+        with pytest.raises(InputError, match=said):
+            read_data(tmp_path / name, system())
+
+
+def test_angles_are_unwrapped_and_other_states_are_not(tmp_path: Path, structure: Path) -> None:
+    turning = np.array([[3.0, 9.0, 0.0], [-3.1, 9.0, 0.0], [-2.9, 9.0, 0.0], [3.1, -9.0, 0.0]])
+    path = write(tmp_path / "a.csv", turning, "theta,theta_dot,u")
+    found: Readings = read_data(path, load_system(structure))
+    x = found.runs[0].states
+    assert np.all(np.abs(np.diff(x[:, 0])) < math.pi) and np.array_equal(x[:, 1], turning[:, 1])
+    assert np.abs(np.sin(x[:, 0]) - np.sin(turning[:, 0])).max() < 1e-14
+    assert "2 differences of theta were unwrapped" in found.notes[0]
+    assert np.array_equal(read_data(path, system()).runs[0].states, turning[:, :2])  # it declares no angle
+
+
+def test_numbers_beyond_the_plants_bounds_are_told(tmp_path: Path) -> None:
+    rows = transitions(4)
+    rows[1, 2] = 7.0
+    notes = read_data(write(tmp_path / "a.csv", rows, COLUMNS), system()).notes
+    assert notes == ("1 values of u lie beyond its bounds: data must have what acted",)
+
+
+# Ranges
+
+
+def test_the_true_parameters_lie_in_ranges_that_are_small(tmp_path: Path) -> None:
+    found = identified(tmp_path, transitions(), out=tmp_path / "known.toml")
+    assert holds(found) and all(found.shrink(name) > 10 for name in TRUE)
+    known = load_system(tmp_path / "known.toml")
+    for name, (lo, hi) in found.ranges.items():
+        low, high = known.ranges[name]
+        assert low <= lo <= hi <= high and (high - low) <= (hi - lo) * Fraction(100_001, 100_000)
+    assert known.dynamics == found.system.dynamics and known.ranges == found.system.ranges
+    assert (tmp_path / "known.toml").read_text().startswith("# a pendulum whose numbers are not known\n")
+    assert "# friction by inertia" in (tmp_path / "known.toml").read_text()
+
+
+def test_runs_and_a_period_of_some_length(tmp_path: Path) -> None:
+    """True periods lie in the range that is given, and so do the parameters in theirs."""
+    draw, rows = np.random.default_rng(2), list[Array]()
+    for run in range(5):
+        x = draw.uniform(-1, 1, (1, 2))
+        for k in range(6):
+            u = draw.uniform(-2, 2, (1, 1))
+            rows.append(np.concatenate([x[0] + draw.uniform(-1e-4, 1e-4, 2), u[0], [run]]))
+            x = simulated(x, u, h=0.0199 if k % 2 else 0.0201)
+    path = write(tmp_path / "run.csv", np.array(rows), "theta,theta_dot,u,run")
+    (tmp_path / "s.toml").write_text(STRUCTURE)
+    found = certify.identify(path, tmp_path / "s.toml", noise="1e-4", sample_time=("0.0199", "0.0201"))
+    assert holds(found) and found.shrink("c") > 5
+
+
+def test_noise_that_is_smaller_than_it_was_is_contradicted(tmp_path: Path) -> None:
+    rows = transitions(200)
+    found = identified(tmp_path, rows)
+    assert found.least_noise is not None and 0.5 < found.least_noise <= 1
+    for factor in (0.5, 0.99 * found.least_noise):
+        with pytest.raises(Contradiction) as error:
+            identified(tmp_path, rows, noise=NOISE * factor)
+        assert error.value.transitions
+    axis = found.least_determined
+    assert axis is not None and max(axis.entries.values()) == 1 and 0 < axis.share <= 2
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        STRUCTURE.replace(" - b*theta_dot", "").replace("b = [1, 4] # friction by inertia\n", ""),
+        STRUCTURE.replace("a = [10, 30]", "a = [21, 30]"),
+        STRUCTURE.replace('theta = "theta_dot"', 'theta = "theta_dot*1.1"', 1),
+    ],
+    ids=["no friction", "a prior without the truth", "another equation"],
+)
+def test_a_structure_that_the_data_contradict_is_refuted(tmp_path: Path, text: str) -> None:
+    with pytest.raises(Contradiction):
+        identified(tmp_path, transitions(noise=1e-4), text, noise="1e-4")
+
+
+def test_what_the_equations_lack_is_a_residual(tmp_path: Path) -> None:
+    """With a drag that they do not have the data refute them; with a bound of it the truth is inside."""
+    rows = transitions(noise=1e-4, drag=0.2)
+    with pytest.raises(Contradiction):
+        identified(tmp_path, rows, noise="1e-4")
+    lacking = STRUCTURE.replace("[u_eq]", '[residual]\ntheta_dot = "0.2*theta_dot**2"\n\n[u_eq]')
+    found = identified(tmp_path, rows, lacking, noise="1e-4")
+    assert holds(found) and found.system.ranges["residual_theta_dot"] == (-1, 1)
+
+
+def test_a_wrong_period_is_refuted_and_one_in_a_range_is_not(tmp_path: Path) -> None:
+    """A period that is 1 % off moves theta by 4e-4 at 2 rad/s, more than this noise."""
+    rows = transitions(noise=1e-5)
+    with pytest.raises(Contradiction):
+        identified(tmp_path, rows, noise="1e-5", sample_time="0.0202")
+    assert holds(identified(tmp_path, rows, noise="1e-5", sample_time=("0.0198", "0.0202")))
+
+
+@pytest.mark.parametrize("fault", ["outlier", "degrees", "millinewtons"])
+def test_outliers_and_wrong_units_are_refuted(tmp_path: Path, fault: str) -> None:
+    rows = transitions()
+    if fault == "outlier":
+        rows[17, 3] += 0.1
+    if fault == "degrees":
+        rows[:, [0, 3]] *= 180 / math.pi
+    if fault == "millinewtons":
+        rows[:, 2] *= 1000
+    with pytest.raises(Contradiction) as error:
+        identified(tmp_path, rows)
+    assert fault != "outlier" or 17 in error.value.transitions
+
+
+def test_ranges_are_rounded_outwards_within_the_priors() -> None:
+    priors = {"p": (Fraction(1, 3), Fraction(2)), "q": (Fraction(-1), Fraction(1, 10**9))}
+    ranges = {"p": (Fraction(1, 3), Fraction(5, 7)), "q": (Fraction(-1, 7), Fraction(1, 10**9))}
+    found = rounded(ranges, priors)
+    assert found["p"][0] == Fraction(1, 3) and found["q"][1] == Fraction(1, 10**9)
+    for name, (lo, hi) in ranges.items():
+        low, high = found[name]
+        assert low <= lo and hi <= high and high - low <= (hi - lo) * Fraction(100_001, 100_000)
+
+
+# The command
+
+
+def command(folder: Path, *more: str, rows: Array | None = None, text: str = STRUCTURE) -> list[str]:
+    write(folder / "data.csv", transitions() if rows is None else rows)
+    (folder / "structure.toml").write_text(text)
+    files = ["identify", str(folder / "data.csv"), "--structure", str(folder / "structure.toml")]
+    return [*files, "--sample-time", "0.02", "--noise", "1e-3", "--out", str(folder / "known.toml"), *more]
+
+
+def test_the_command_prints_ranges_and_draws_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert _run(command(tmp_path), False) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("IDENTIFIED") and "least determined" in shown and "noise smaller than" in shown
+    page = (tmp_path / "known.html").read_text()
+    assert "<script" not in page and page.count("<img") == 3 and 'src="http' not in page
+    assert _run(command(tmp_path, "--json"), True) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["schema"] == "certify-identify/1" and found["data"]["transitions"] == 60
+    known = load_system(tmp_path / "known.toml")
+    for entry in found["parameters"]:
+        lo, hi = map(Fraction, entry["range"])
+        assert known.ranges[entry["name"]] == (lo, hi) and lo <= Fraction(TRUE[entry["name"]]) <= hi
+        assert all(place.startswith("line ") for place in entry["shown_by"])
+
+
+def test_a_contradiction_is_a_finding_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = transitions()
+    rows[17, 3] += 0.1
+    assert _run(command(tmp_path, rows=rows), False) == 1
+    shown = capsys.readouterr().out
+    assert shown.startswith("REFUTED") and "line 19" in shown and not (tmp_path / "known.toml").exists()
+    assert _run(command(tmp_path, "--json", rows=rows), True) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found["verdict"] == "REFUTED" and "line 19" in found["transitions"]
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--noise", "theta=1e-3"], "--noise takes a bound for each of theta, theta_dot; theta_dot is missing"),
+        (["--noise", "theta=1e-3,omega=1"], "omega is no state"),
+        (["--noise", "-1"], "--noise must be at least 0"),
+        (["--sample-time", "0"], "--sample-time must be a positive time"),
+        (["--sample-time", "soon"], "must be a finite number"),
+        (["--env", "Pendulum-v1"], "one of the two"),
+        (["--out", "known.txt"], "must be a .toml file"),
+    ],
+)
+def test_bad_input_ends_with_2(tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str], said: str) -> None:
+    assert _run(command(tmp_path, *more), False) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("a = [10, 30] # g/l\nb = [1, 4] # friction by inertia\nc = [10, 50]", "a = 20\nb = 2\nc = 20", "found none"),
+        ("a = [10, 30] # g/l", "a = [10,\n 30]", "the range must stand on a line of its own"),
+        (
+            "[angles]",
+            f'[data]\nfile = "d"\nsha256 = "{"0" * 64}"\nperiod = 1\nnoise = {{theta = 1, theta_dot = 1}}\n'
+            "priors = {a = [1, 2]}\n[angles]",
+            "must have no table [data] yet",
+        ),
+    ],
+)
+def test_a_structure_that_cannot_be_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, said: str
+) -> None:
+    assert STRUCTURE.count(old) == 1
+    assert _run(command(tmp_path, text=STRUCTURE.replace(old, new)), False) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "known.toml").exists()
+
+
+def test_the_structure_is_not_written_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert _run(command(tmp_path, "--out", str(tmp_path / "structure.toml")), False) == 2
+    assert "must not be written over" in capsys.readouterr().err
+    assert (tmp_path / "structure.toml").read_text() == STRUCTURE
+
+
+def test_an_environment_is_recorded_into_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Gymnasium's pendulum, as a black box that shows cos and sin of its angle."""
+    pytest.importorskip("gymnasium")
+    plant = tmp_path / "plant.toml"
+    plant.write_text(
+        'name = "box"\ntime = "discrete"\nstates = ["theta", "omega"]\ninputs = ["u"]\n[parameters]\na = [0.5, 1.5]\n'
+        'b = [0.05, 0.3]\n[where]\nfaster = "clip(omega + a*sin(theta) + b*u, -8, 8)"\n[dynamics]\n'
+        'theta = "theta + 0.05*faster"\nomega = "faster"\n[u_eq]\nu = 0\n[domain]\ntheta = [-3.2, 3.2]\n'
+        'omega = [-9, 9]\n[input_bounds]\nu = [-2, 2]\n[angles]\ntheta = "2*pi"\n'
+    )
+    given = ["identify", "--env", "Pendulum-v1", "--episodes", "1", "--structure", str(plant), "--noise", "1e-5"]
+    given += ["--out", str(tmp_path / "known.toml")]
+    assert _run(given, False) == 2 and "Say what they are with --observed" in capsys.readouterr().err
+    assert _run([*given, "--observed", "cos(theta),sin(theta)"], False) == 2
+    assert _run([*given, "--observed", "cos(theta),sin(theta),omega", "--json"], True) == 0
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert found["data"]["transitions"] == 200 and found["data"]["file"] == "known_data.csv"
+    raw = (tmp_path / "known_data.csv").read_bytes()
+    assert found["data"]["sha256"] == hashlib.sha256(raw).hexdigest()
+    (a_lo, a_hi), (b_lo, b_hi) = (map(float, map(Fraction, p["range"])) for p in found["parameters"])
+    assert a_lo <= 0.75 <= a_hi and b_lo <= 0.15 <= b_hi and a_hi - a_lo < 1e-3
+
+
+# Data in a claim
+
+
+POLICY = EXAMPLES / "policies" / "pendulum.pt"
+
+
+def certifying(folder: Path, *more: str) -> list[str]:
+    files = ["roa", str(POLICY), "--system", str(folder / "known.toml"), "--out", str(folder / "out")]
+    return [*files, "--candidate", "lyapunov", "--level", "1e-3", *more]
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the file of a plant that was identified, and its data."""
+    folder = tmp_path_factory.mktemp("known")
+    assert _run(command(folder, "--quiet"), False) == 0
+    return folder
+
+
+def test_data_become_a_part_of_the_claim(known: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert _run(certifying(known, "--data", str(known / "data.csv"), "--json"), True) == 0
+    found = json.loads(capsys.readouterr().out)
+    data, plant = found["data"], load_system(known / "known.toml")
+    stated = json.loads((known / "out" / "certificate.json").read_text())
+    assert found["verdict"] == "PROVED" and found["checked"] == "ACCEPTED"
+    assert ask(known / "out" / "certificate.json", "reference")[1]["result"] == "ACCEPTED"
+    assert stated["claim"]["data"]["sha256"] == data["sha256"] == plant.measurements.sha256  # type: ignore[union-attr]
+    assert data["transitions"] == sum(run["steps"] for run in stated["claim"]["data"]["runs"]) <= 60
+    assert data["noise"] == {"theta": "1/1000", "theta_dot": "1/1000"} and data["period"] == ["1/50", "1/50"]
+    assert data["priors"]["c"] == ["10", "50"] and Fraction(data["ranges"]["c"][0]) == plant.ranges["c"][0]
+    page = " ".join((known / "out" / "report.html").read_text().split())
+    assert "For every constant a in [10, 30], b in [1, 4] and c in [10, 50] with which" in page
+    assert "Parameters that change." in page and "drifting or jumping" not in page
+    assert _run(["contains", str(known / "out" / "certificate.json"), "theta=0.001"], False) == 0
+    assert _run(["plot", str(known / "out" / "certificate.json"), "--out", str(known / "out" / "set.svg")], False) == 0
+    assert _run(["prove-in-coq", str(known / "out" / "certificate.json"), "--out", str(known / "coq")], False) == 2
+    assert "uncertain quantities" in capsys.readouterr().err
+
+
+def test_python_takes_data_as_the_command_does(known: Path) -> None:
+    given = {"candidate": "lyapunov", "level": 1e-3, "data": known / "data.csv"}
+    found = certify.certify_roa(known / "known.toml", POLICY, **given)  # type: ignore[arg-type]
+    assert found.verdict == "PROVED" and found.to_dict()["data"]["transitions"] > 0
+    assert "constant a in [10, 30]" in found._repr_html_()
+    plant = certify.identify(
+        known / "data.csv", known / "structure.toml", noise={"theta": 1e-3, "theta_dot": 1e-3}, sample_time="0.02"
+    ).system
+    again = certify.certify_roa(plant, POLICY, candidate="lyapunov", level=1e-3)
+    assert again.verdict == "PROVED" and again.to_dict()["data"]["sha256"] == found.to_dict()["data"]["sha256"]
+
+
+def test_what_fails_in_the_ranges_refutes_no_claim_about_data(known: Path) -> None:
+    """The middle of the ranges, or a corner, need not be a consistent plant."""
+    none = certify.PolicyNetwork.of_layers(
+        (np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none"
+    )
+    law = certify.PolicyNetwork.of_layers(
+        (np.array([[-4.0, -1.0]]),), (np.zeros(1),), np.array([6.0]), np.zeros(1), "tanh", "none"
+    )
+    for network, level, verdict in ((none, None, "UNKNOWN"), (law, 1.0, "UNKNOWN"), (law, 4.0, "REFUTED")):
+        found = [
+            certify.certify_roa(known / "known.toml", network, candidate="lyapunov", level=level, data=data)
+            for data in (None, known / "data.csv")
+        ]
+        assert [one.verdict.value for one in found] == ["REFUTED", verdict]
+        assert ("need not be consistent" in str(found[1].notice)) is (verdict == "UNKNOWN")
+
+
+def test_without_data_ranges_are_taken_as_they_stand(known: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert _run(certifying(known, "--json"), True) == 0
+    said = capsys.readouterr()
+    found = json.loads(said.out)
+    assert found["data"] is None and "--data makes the measurements" in said.err
+    assert "data" not in json.loads((known / "out" / "certificate.json").read_text())["claim"]
+
+
+def test_other_data_are_refused(known: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (known / "data.csv").read_text()
+    (tmp_path / "data.csv").write_text(text.replace("\n", "\n", 1) + "\n")  # the same rows in other bytes
+    assert _run(certifying(known, "--data", str(tmp_path / "data.csv")), False) == 2
+    assert "must be the one from which the plant was identified" in capsys.readouterr().err
+    assert _run(["roa", str(POLICY), "--data", str(known / "data.csv"), "--out", str(tmp_path / "out")], False) == 2
+    assert "must have a table [data]" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("share", [0.0, 0.9])
+def test_ranges_that_do_not_hold_what_is_left_are_refused(
+    known: Path, tmp_path: Path, share: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Somebody narrows a range in the file, or on the command line."""
+    lo, hi = load_system(known / "known.toml").ranges["c"]
+    narrow = f"c={float(lo):.12f}..{float(lo + (hi - lo) * Fraction(max(share, 0.1))):.12f}"
+    given = certifying(known, "--data", str(known / "data.csv"), "--param", narrow, "--out", str(tmp_path / "out"))
+    assert _run(given, False) == 2
+    assert "the range of c must hold all that the data leave" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", slow_after(1, ["pendulum", "cartpole"]))
+def test_the_examples_find_the_plants_that_ship(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, ships = tmp_path / "data.csv", get_system(name).parameters
+    monkeypatch.setattr(sys, "argv", ["measure.py", name, str(data), "--transitions", "100"])
+    runpy.run_path(str(EXAMPLES / "unknown" / "measure.py"), run_name="__main__")
+    found = certify.identify(data, EXAMPLES / "unknown" / f"{name}.toml", noise="1e-3", sample_time="0.02")
+    true = TRUE if name == "pendulum" else {p: float(q) for p, q in ships.items()}
+    assert len(found.ranges) == 3
+    assert all(lo <= Fraction(true[p]) <= hi and found.shrink(p) > 5 for p, (lo, hi) in found.ranges.items())
