@@ -134,7 +134,6 @@ class Flows:
         total = Near(alpha.value.ravel(), alpha.error.shaped(-1)).sum()
         return (-total).wider(reach).ends
 
-
     def after(self, box: Intervals, weights: Array, chosen: Array) -> Intervals:
         """The box that weights (2, K, T, n) of some transitions leave of a box; lo > hi where that is nothing."""
         rows, found = self.rows(box, chosen), []
@@ -212,7 +211,9 @@ def _leaves(data: Data) -> Iterator[Intervals]:
             continue
         lo, hi = box[axis]
         middle = (lo + hi) / 2
-        waiting += [tuple(end if k == axis else pair for k, pair in enumerate(box)) for end in ((middle, hi), (lo, middle))]
+        waiting += [
+            tuple(end if k == axis else pair for k, pair in enumerate(box)) for end in ((middle, hi), (lo, middle))
+        ]
 
 
 OF_DATA = (("data", is_whole_tree), ("data", in_ranges))

@@ -97,9 +97,7 @@ def _by_ranks(c: Certificate, ranks: Ranks, start: str, rest: str) -> str:
 
 def _consistent(c: Certificate, data: Data) -> str:
     """The statement of chapter data."""
-    priors = ", ".join(
-        f"{name} in {_interval(pair)}" for name, pair in zip(data.parameters, data.priors, strict=True)
-    )
+    priors = ", ".join(f"{name} in {_interval(pair)}" for name, pair in zip(data.parameters, data.priors, strict=True))
     noise = ", ".join(f"{name} within {_number(w)}" for name, w in zip(c.states, data.noise, strict=True))
     moved = [f"{name} + {_number(q)}" for name, q in zip(c.states, data.origin, strict=True) if q]
     of = f"; measured are {', '.join(moved)}" if moved else ""

@@ -74,7 +74,9 @@ def at_values(system: System, values: Mapping[str, Fraction]) -> System:
     constraints = {name: substitute(e, held) for name, e in system.constraints.items()}
     u_eq = tuple(map(Number, system.exact_u_eq()))
     plant = system.with_parameters(known)
-    return replace(plant, dynamics=dynamics, constraints=constraints, u_eq=u_eq, disturbances=(), ranges={}, measurements=None)
+    return replace(
+        plant, dynamics=dynamics, constraints=constraints, u_eq=u_eq, disturbances=(), ranges={}, measurements=None
+    )
 
 
 def corners(system: System, most: int = 64) -> tuple[dict[str, Fraction], ...]:

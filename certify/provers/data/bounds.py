@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
+from numpy.typing import NDArray
 from scipy.optimize import linprog
 from scipy.sparse import csr_matrix
 
@@ -61,7 +62,7 @@ class Program:
         multipliers = np.maximum(-answer.ineqlin.marginals, 0.0)
         return _short(multipliers[len(every) :] - multipliers[: len(every)]) / self.slack
 
-    def _sides(self, above: Array, below: Array) -> tuple[csr_matrix, Array]:
+    def _sides(self, above: NDArray[np.intp], below: NDArray[np.intp]) -> tuple[csr_matrix, Array]:
         """The inequalities of the upper sides of some rows, and of the lower sides of some."""
         A = sparse.vstack([self.matrix[above], -self.matrix[below]]).tocsr()
         return A, np.concatenate([1 - self.offset[above], 1 + self.offset[below]])
@@ -80,7 +81,7 @@ def separate(rows: Rows, noise: Array) -> Program:
     return _in_units(sparse.csr_matrix(g), rows.alpha.ravel(), slack.ravel())
 
 
-def joint(rows: Rows, noise: Array, begins: Array) -> Program:
+def joint(rows: Rows, noise: Array, begins: NDArray[np.intp]) -> Program:
     """The program of rows that share errors: `begins` (T,) are numbers of the measurements where transitions begin."""
     n, T = rows.alpha.shape
     K = rows.slopes.shape[1] - n
@@ -100,7 +101,7 @@ def _in_units(matrix: csr_matrix, offset: Array, slack: Array) -> Program:
     return Program(sparse.csr_matrix(sparse.diags(1 / slack) @ matrix), offset / slack, slack)
 
 
-def bound(rows: Rows, noise: Array, begins: Array, weights: Array, axis: int) -> tuple[float, float]:
+def bound(rows: Rows, noise: Array, begins: NDArray[np.intp], weights: Array, axis: int) -> tuple[float, float]:
     """Between what parameter `axis`'s symbol lies, by rows with weights (n, T), as the checkers bound it."""
     n, T = rows.alpha.shape
     own = np.einsum("it,ist->s", weights, rows.slopes[:, n:])
@@ -113,7 +114,7 @@ def bound(rows: Rows, noise: Array, begins: Array, weights: Array, axis: int) ->
     return float(middle - reach), float(middle + reach)
 
 
-def miss(rows: Rows, noise: Array, begins: Array, weights: Array) -> float:
+def miss(rows: Rows, noise: Array, begins: NDArray[np.intp], weights: Array) -> float:
     """By how much the sum of rows with weights (n, T) is away from all that it may be; positive if the rows contradict
     one another."""
     n = rows.alpha.shape[0]

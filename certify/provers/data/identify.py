@@ -33,8 +33,10 @@ _SLACK = Fraction(1, 10**6)  # of a range's half-width, by which a checker's may
 _SURE = 1e-9  # of a contradiction, beyond all rounding
 _FAR = 4.0  # half-widths of a box by which a contradiction moves an end, beyond the other
 _ENOUGH = 0.5  # share of the transitions that must have an enclosure
-_MOST_PARTS, _FOR_PARTS, _ROUNDS_OF_PARTS = 512, 64, 3
+_MOST_PARTS, _FOR_PARTS, _ROUNDS_OF_PARTS = 96, 64, 3
+_WIDE, _NO_ROWS = 4.0, 1e6  # shares of the noise, in slack, that a part's width may have; of none with rows
 Box = dict[str, Interval]
+Numbers = NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,51 +73,35 @@ class Contradiction(InputError):
         )
 
 
-def identify(system: System, measurements: Measurements) -> Identified:
-    """Bound the parameters of a plant by measurements.
-
-    Raises
-    ------
-    Contradiction : no parameter within the priors is consistent with the measurements.
-    InputError : measurements are not of this plant, or the flow over them has no enclosure.
-    """
-    require_measurable(system, measurements)
-    search = _Search(system, measurements)
-    search.separately()
-    if search.shares:
-        search.jointly()
-    return search.found()
-
-
 class _Box:
     """A box of parameters that rounds make smaller; `empty` if nothing is left of it."""
 
     def __init__(self, data: _Data, flows: Flows, box: Box) -> None:
         self.data, self.flows, self.box = data, flows, box
         self.history, self.empty = [box], False
-        self.rounds = list[tuple[NDArray[np.intp], Array, Box]]()
+        self.rounds = list[tuple[Numbers, Array, Box]]()
 
-    def separately(self, chosen: NDArray[np.intp], most: int) -> None:
+    def separately(self, chosen: Numbers, most: int) -> None:
         """At most so many rounds in which every transition stands for itself."""
         for _ in range(most):
             some, rows = self._rows(chosen)
             if not len(some) or not self._round(rows, some, separate(rows, self.flows.noise)):
                 break
 
-    def jointly(self, chosen: NDArray[np.intp]) -> None:
+    def jointly(self, chosen: Numbers) -> None:
         """Rounds in which transitions in a row share errors."""
         for _ in range(_JOINT_ROUNDS):
             some, rows = self._rows(chosen)
             if not len(some) or not self._round(rows, some, joint(rows, self.flows.noise, self.data.begins[some])):
                 break
 
-    def _rows(self, chosen: NDArray[np.intp]) -> tuple[NDArray[np.intp], Rows]:
+    def _rows(self, chosen: Numbers) -> tuple[Numbers, Rows]:
         """Transitions of those that have an enclosure, and what they say."""
         rows = self.flows.rows(self.box, chosen)
         good = np.flatnonzero(rows.exist)
         return chosen[good], rows.at(good)
 
-    def _round(self, rows: Rows, chosen: NDArray[np.intp], program: Program) -> bool:
+    def _round(self, rows: Rows, chosen: Numbers, program: Program) -> bool:
         """A round; False if it gains too little for another."""
         names, shape = list(self.box), rows.alpha.shape
         weights = np.zeros((2, len(names), *shape))
@@ -133,12 +119,12 @@ class _Box:
         self._keep(box, chosen, weights)
         return gain < _SHRUNK and not self.empty
 
-    def _keep(self, box: Box, chosen: NDArray[np.intp], weights: Array) -> None:
+    def _keep(self, box: Box, chosen: Numbers, weights: Array) -> None:
         self.rounds.append((chosen, weights, box))
         self.box, self.empty = box, any(lo > hi for lo, hi in box.values())
         self.history.append(box)
 
-    def _end(self, rows: Rows, chosen: NDArray[np.intp], program: Program) -> None:
+    def _end(self, rows: Rows, chosen: Numbers, program: Program) -> None:
         """Show that nothing is left, if a sum of rows that contradict one another does: with a large multiple of it, a
         parameter's lower end comes above its upper end."""
         weights = program.contradiction().reshape(rows.alpha.shape)
@@ -152,7 +138,7 @@ class _Box:
         self._keep(self.box | {next(iter(self.box)): nothing}, chosen, whole)
         self.data.note(chosen, weights)
 
-    def _narrowed(self, rows: Rows, chosen: NDArray[np.intp], weights: Array, k: int) -> Interval:
+    def _narrowed(self, rows: Rows, chosen: Numbers, weights: Array, k: int) -> Interval:
         """The interval of a parameter, a little wider than what the weights show."""
         noise, begins = self.flows.noise, self.data.begins[chosen]
         lo, hi = self.box[list(self.box)[k]]
@@ -176,17 +162,17 @@ class _Data:
         self.shares = max(lengths) > 1
         self.against = set[int]()
 
-    def spread(self, most: int) -> NDArray[np.intp]:
+    def spread(self, most: int) -> Numbers:
         """Some transitions, from everywhere."""
         return np.unique(np.linspace(0, self.count - 1, min(most, self.count)).astype(np.intp))
 
-    def windows(self) -> NDArray[np.intp]:
+    def windows(self) -> Numbers:
         """Transitions for a joint program: the beginnings of runs, of equal length, as many as it may have."""
         most = max(2, _JOINT_ROWS // self.system.n)
         runs = min(len(self.measurements.runs), most // 2)
         return np.flatnonzero((self.place < most // runs) & (self.run < runs))
 
-    def note(self, chosen: NDArray[np.intp], weights: Array) -> None:
+    def note(self, chosen: Numbers, weights: Array) -> None:
         """Remember transitions that contradict one another."""
         self.against |= set(chosen[np.abs(weights).sum(0) > 0].tolist())
 
@@ -211,34 +197,39 @@ def _fitting(data: _Data, box: Box) -> Flows:
 
 
 def _parts(data: _Data, flows: Flows) -> tuple[bytes, list[_Box]]:
-    """A partition of the priors into boxes over which most transitions have an enclosure, each made smaller.
+    """A partition of the priors into boxes that are narrow enough, or that their rounds make narrow enough, for rows
+    in which the box's width counts little beside the noise; as far as there may be so many.
 
     Raises
     ------
-    InputError : there are too many.
+    InputError : most transitions have no enclosure in any of them.
     """
     tree, found, waiting, probes = bytearray(), list[_Box](), [dict(data.measurements.priors)], data.spread(_PROBES)
+    middle = flows.rows({name: _shrunk(pair) for name, pair in waiting[0].items()}, probes)
+    base = middle.slack + np.abs(middle.slopes[:, : data.system.n]).sum(1) + flows.noise[:, None]
     while waiting:
         box = waiting.pop()
-        share = float(np.mean(flows.rows(box, probes).exist))
-        if share >= _ENOUGH:
+        part = _Box(data, flows, box)
+        part.separately(data.spread(_FOR_PARTS), _ROUNDS_OF_PARTS)
+        left = 0.0 if part.empty else _width_counts(flows, part.box, probes, base)
+        if left <= _WIDE or len(found) + len(waiting) >= _MOST_PARTS:
             tree.append(LEAF)
-            found.append(_Box(data, flows, box))
+            found.append(part)
             continue
         halves = [_halved(box, name) for name in box]
-        shares = [sum(float(np.mean(flows.rows(half, probes).exist)) for half in pair) for pair in halves]
-        axis = max(range(len(halves)), key=lambda k: (shares[k], _relative(list(box.values())[k])))
+        counts = [sum(_width_counts(flows, half, probes, base) for half in pair) for pair in halves]
+        axis = min(range(len(halves)), key=lambda k: (counts[k], -_relative(list(box.values())[k])))
         tree.append(axis)
         waiting += reversed(halves[axis])
-        if len(found) + len(waiting) > _MOST_PARTS:
-            raise InputError(
-                f"the flow over most transitions has no enclosure for the priors, nor for {_MOST_PARTS} parts of them: "
-                "narrow the priors, or measure more often."
-            )
-    if len(found) > 1:
-        for part in found:
-            part.separately(data.spread(_FOR_PARTS), _ROUNDS_OF_PARTS)
+    if not any(part.rounds for part in found):
+        raise InputError("the measurements narrow no prior: narrow the priors, or measure more often.")
     return bytes(tree), found
+
+
+def _width_counts(flows: Flows, box: Box, probes: Numbers, base: Array) -> float:
+    """The share that a box's width has in the slack of most transitions, beside noise; large where there is none."""
+    slack = flows.rows(box, probes).slack / base
+    return min(_NO_ROWS, float(np.median(np.where(np.isfinite(slack), slack, np.inf).max(0))))
 
 
 def identify(system: System, measurements: Measurements) -> Identified:
@@ -272,8 +263,8 @@ def require_measurable(system: System, measurements: Measurements) -> None:
 
     Raises
     ------
-    InputError : a parameter has no range in the plant, states or inputs are not as many, there is no transition, one has
-        no time in continuous time or one in discrete time, or equations call a network.
+    InputError : a parameter has no range in the plant, states or inputs are not as many, there is no transition, one
+        has no time in continuous time or one in discrete time, or equations call a network.
     """
     odd = [name for name in measurements.priors if name not in system.ranges]
     if odd:
@@ -305,7 +296,7 @@ def _found(data: _Data, flows: Flows, tree: bytes, parts: list[_Box], whole: _Bo
     return Identified(whole.box, history, kept, bounds, used, rows)
 
 
-def _stored(chosen: NDArray[np.intp], weights: Array, used: NDArray[np.bool_]) -> Array:
+def _stored(chosen: Numbers, weights: Array, used: NDArray[np.bool_]) -> Array:
     """Weights (2, K, n, T) of some transitions as those (2, K, T, n) of all that are used."""
     place, own = np.cumsum(used) - 1, used[chosen]
     whole = np.zeros((*weights.shape[:2], int(used.sum()), weights.shape[2]))
