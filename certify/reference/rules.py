@@ -11,7 +11,8 @@ from . import rational
 from .balls import ON_LEAVES, PRECISION
 from .contraction import contraction
 from .document import Certificate, read
-from .evidence import WITH_TUBE, Ranked, Tree, Trusted
+from .evidence import WITH_TUBE, Covering, Ranked, Tree, Trusted
+from .invariant import invariant
 from .leaves import Leaves, check_leaves, structure
 from .limits import limits
 from .local import local
@@ -57,6 +58,10 @@ def check(c: Certificate) -> int | None:
     if isinstance(c.evidence, Ranked):
         rational.centring(c)
         return with_ranks(c, c.evidence)
+    if isinstance(c.evidence, Covering):
+        rational.centring(c)
+        with ctx.workprec(ON_LEAVES):
+            return invariant(c, c.evidence)
     rational.levels(c)
     inverse = rational.inverse_diagonal(c.P, "lyapunov")
     if c.ends_at_origin:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from certify.certificates import Certificate, ReachCertificate
+from certify.certificates import AnyCertificate, Certificate, ReachCertificate
 from certify.loop.plants import System, input_errors
 from certify.report.claims import Words
 from certify.report.sections.shared import timing_of
@@ -72,7 +72,7 @@ def not_reached_of(certificate: ReachCertificate) -> list[tuple[str, str]]:
     ]
 
 
-def _turns(certificate: Certificate | ReachCertificate) -> Iterator[tuple[str, str]]:
+def _turns(certificate: AnyCertificate) -> Iterator[tuple[str, str]]:
     """The gap about angles, unless full turns of them are the same place."""
     ranks, said = certificate.claim.ranks, "States are real numbers: an angle of a full turn is not the origin."
     if ranks is None or not ranks.angles:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from certify.certificates import Certificate, PartitionTree, RanksAlone, ReachCertificate, TrustedSolver
+from certify.certificates import AnyCertificate, Certificate, PartitionTree, RanksAlone, TrustedSolver
 from certify.errors import SoundnessError
 from certify.report.claims import CHECKED_ALWAYS, words_for
 from certify.report.words import point
@@ -34,7 +34,7 @@ class Status:
         return self.kind == "ACCEPTED"
 
 
-def status_of(certificate: Certificate | ReachCertificate, sha256: str, answer: Mapping[str, Any] | None) -> Status:
+def status_of(certificate: AnyCertificate, sha256: str, answer: Mapping[str, Any] | None) -> Status:
     """The status that the checker's answer gives the certificate whose bytes have this hash.
 
     Raises
