@@ -88,10 +88,13 @@ class LearningFlow:
             self._limits = np.array([[float(end) for end in pair] for pair in system.input_bounds]).T
         generator = np.random.default_rng(0)
         rates = eigenvalues_of(self.rate, self.uniform(_RATE_SAMPLES, generator), self.high - self.low)
+        self.step = _STEP / float(np.max(np.abs(rates), initial=1e-9))
+        self.steps = min(_MAX_STEPS, math.ceil(_HORIZON / max(self._slowest(), 1e-9) / self.step))
+
+    def _slowest(self) -> float:
+        """The rate at which the slowest motion about the origin decays; not positive if one does not."""
         at_rest = eigenvalues_of(self.rate, np.zeros((1, self.n)), self.high - self.low)
-        fastest, slowest = float(np.max(np.abs(rates), initial=1e-9)), float(np.min(-at_rest.real, initial=math.inf))
-        self.step = _STEP / fastest
-        self.steps = min(_MAX_STEPS, math.ceil(_HORIZON / max(slowest, 1e-9) / self.step))
+        return float(np.min(-at_rest.real, initial=math.inf))
 
     def uniform(self, count: int, generator: np.random.Generator) -> Array:
         """States of the domain, (count, n)."""

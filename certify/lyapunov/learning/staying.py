@@ -44,6 +44,10 @@ class StayingFlow(LearningFlow):
         self.ends = self._ends(generator)
         self.near = cKDTree(self.ends / self.half)
 
+    def _slowest(self) -> float:
+        """0: the origin need not be where anything decays to."""
+        return 0.0
+
     def _ends(self, generator: np.random.Generator) -> Array:
         """The last states of long runs, (K, n)."""
         x = self.uniform(_RUNS, generator)

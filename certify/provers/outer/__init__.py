@@ -4,7 +4,7 @@ gives way."""
 from __future__ import annotations
 
 from certify.provers.outer.falsify import Rise
-from certify.provers.outer.mend import split_again, split_face_again
+from certify.provers.outer.mend import split_again, split_face_again, split_face_of, split_staying
 from certify.provers.outer.prove import Nothing, OuterProof, prove_outer
 from certify.provers.outer.staying import StayProof, prove_staying
 
@@ -17,4 +17,6 @@ __all__ = [
     "prove_staying",
     "split_again",
     "split_face_again",
+    "split_face_of",
+    "split_staying",
 ]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from certify.certificates import AnyCertificate, Certificate, ReachCertificate
+from certify.certificates import AnyCertificate, Certificate, InvariantCertificate, ReachCertificate
 from certify.loop.plants import System, input_errors
 from certify.report.claims import Words
 from certify.report.sections.shared import timing_of
@@ -69,6 +69,23 @@ def not_reached_of(certificate: ReachCertificate) -> list[tuple[str, str]]:
         _rounding(system),
         *_turns(certificate),
         ("Simulated figures.", "Runs that are drawn are illustrations in floating point."),
+    ]
+
+
+def not_staying_of(certificate: InvariantCertificate) -> list[tuple[str, str]]:
+    """Heads and texts of the gaps of a claim that a set is never left."""
+    system, timing = certificate.system, timing_of(certificate)
+    return [
+        (
+            "Where trajectories go.",
+            "Nothing is said of what they do in the set: they may come to rest or circle.",
+        ),
+        ("States outside the set.", "Of them nothing is said: they may enter it, or not. They need not be unsafe."),
+        *_not_of_the_plant(system),
+        *(one for one in _other_times(timing) if "set" not in one[0]),
+        _rounding(system),
+        *_turns(certificate),
+        ("Simulated figures.", "Runs that are drawn, and the size of the set, are by samples in floating point."),
     ]
 
 
