@@ -121,11 +121,11 @@ class Function:
 
     def is_above(self, x: Form, level: float) -> Array:
         """True on boxes on which N is certainly above the level."""
-        return self._has(x, lambda N: upper_bound(-N) < -level)
+        return self._has(x, lambda N: upper_bound(constants(N)(Fraction(level)) + -N) < 0)
 
     def is_below(self, x: Form, level: float) -> Array:
         """True on boxes on which N is certainly below the level."""
-        return self._has(x, lambda N: upper_bound(N) < level)
+        return self._has(x, lambda N: upper_bound(N + constants(N)(-Fraction(level))) < 0)
 
     def _has(self, x: Form, shown: Callable[[Taylor], Array]) -> Array:
         found = np.zeros(x.value.shape[2], dtype=bool)
