@@ -39,7 +39,7 @@ def proved(name: str, network: PolicyNetwork, folder: Path, **options: str) -> I
     save_policy(folder / name / "policy.pt", Policy(network, plant.name))
     chosen = options_of({"claim": "invariant", **options}, plant, print)
     result = certify_invariant(plant, network, folder / name, chosen)
-    print(f"{name}: {result.verdict.value}, certificate {result.certificate}")
+    print(f"{name}: {result.verdict.value}\ncertificate  {result.certificate}")
     return result
 
 

@@ -35,7 +35,7 @@ def outer(c: Certificate, evidence: Tree) -> None:
 
 
 def covered(c: Certificate, covering: Covering) -> Models:
-    """What comes before the leaves; the function."""
+    """The rules before those for leaves; returns the function."""
     if c.beyond is None:
         raise Refused("format", "claim.outer", "the claim needs a second function")
     models = Models(c.beyond, c.plant.states)
