@@ -37,28 +37,22 @@ def proved(name: str, network: PolicyNetwork, folder: Path, **options: str) -> I
     plant = load_system(PLANTS / f"{name}.toml")
     (folder / name).mkdir(parents=True, exist_ok=True)
     save_policy(folder / name / "policy.pt", Policy(network, plant.name))
-    chosen = options_of({"claim": "invariant", **options}, plant, print)
-    result = certify_invariant(plant, network, folder / name, chosen)
+    result = certify_invariant(
+        plant, network, folder / name, options_of({"claim": "invariant", **options}, plant, print)
+    )
     print(f"{name}: {result.verdict.value}\ncertificate  {result.certificate}")
     return result
 
 
 def main(folder: str | Path = "out/examples/invariant_sets") -> list[InvariantResult]:
-    """Prove both sets."""
+    """Prove both sets: the oscillator with a brake, the car that turns more the farther it is outside of the course."""
     generator = np.random.default_rng(1)
-    x = generator.uniform([-3, -4], [3, 4], (2000, 2))
-    brake = imitate(lambda x: -0.2 * x[:, 1], x, 6, 1.0, 0.0)
-    radius, angle, psi = generator.uniform([1.3, 0, -0.6], [2.7, 2 * np.pi, 0.6], (4000, 3)).T
-    steer = imitate(_steering, np.stack([radius * np.cos(angle), radius * np.sin(angle), psi], 1), 40, 2.5, 0.5)
+    brake = imitate(lambda x: -0.2 * x[:, 1], generator.uniform([-3, -4], [3, 4], (2000, 2)), 6, 1.0, 0.0)
     cycle = proved("limit_cycle", brake, Path(folder), candidate="polynomial", degree="8")
-    course = proved("round_course", steer, Path(folder), lyapunov=COURSE)
-    return [cycle, course]
-
-
-def _steering(x: Any) -> Any:
-    """The turning rate of the course, v/course = 1/2, more where the car is outside of it, less if it turns inwards."""
-    beside = (x[:, 0] ** 2 + x[:, 1] ** 2 - 4) / 4
-    return 0.5 + 0.8 * beside - 1.2 * x[:, 2]
+    r, angle, psi = generator.uniform([1.3, 0, -0.6], [2.7, 2 * np.pi, 0.6], (4000, 3)).T
+    x = np.stack([r * np.cos(angle), r * np.sin(angle), psi], 1)
+    steer = imitate(lambda x: 0.5 + 0.2 * (x[:, 0] ** 2 + x[:, 1] ** 2 - 4) - 1.2 * x[:, 2], x, 40, 2.5, 0.5)
+    return [cycle, proved("round_course", steer, Path(folder), lyapunov=COURSE)]
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from certify.provers.outer import OuterProof
     from certify.provers.ranks import RankProof
 
-StageName = Literal["candidate", "ring", "tube", "learn", "outer", "ranks", "check"]
+StageName = Literal["candidate", "ring", "tube", "learn", "outer", "ranks", "function", "set", "check"]
 Report = Callable[[StageName, Progress | None], None]
 
 

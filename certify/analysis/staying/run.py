@@ -121,10 +121,10 @@ def _proved(
     N, learned = _function(loop, options, effort, tools)
     result = replace(result, learned=learned)
     with tools.timing("search"):
-        tools.tell("outer")
+        tools.tell("set")
         budget = Budget(effort.share(_FOR_SEARCH), options.max_boxes)
         found = prove_staying(
-            loop, keep, N, options.lyapunov_level, budget, ThreadRunner(), lambda state: tools.tell("outer", state)
+            loop, keep, N, options.lyapunov_level, budget, ThreadRunner(), lambda state: tools.tell("set", state)
         )
     if isinstance(found, Nothing):
         return replace(result, reason=found.why, following=_following(options, effort.over))
@@ -160,8 +160,10 @@ def _function(loop: ClosedLoop, options: RoaOptions, effort: Effort, tools: _Too
     terms = options.learned == "polynomial"
     model = Terms(loop.system.n, options.degree) if terms else Network(loop.system.n, options.hidden)
     with tools.timing("learn"):
-        tools.tell("learn")
-        learned = learn_staying(loop, model, options.seed, effort.share(_FOR_LEARNING), lambda _: tools.tell("learn"))
+        tools.tell("function")
+        learned = learn_staying(
+            loop, model, options.seed, effort.share(_FOR_LEARNING), lambda _: tools.tell("function")
+        )
     N = learned.function
     said = f"in {len(learned.history)} rounds; {learned.cover:.1%} of the sampled states whose runs stay lie below"
     if isinstance(N, Polynomial):
