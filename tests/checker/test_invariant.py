@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import json
+from fractions import Fraction
 
 import numpy as np
 import pytest
 
-from certify.certificates import parse_any
+from certify.certificates import InvariantCertificate, OuterTree, parse_any
+from certify.certificates.claims import Invariant, Outer
 from certify.checker import invariant, words
 from certify.checker.boxes import Boxes
+from certify.checker.limits import Sizes
+from certify.loop.plants.system import System
+from certify.lyapunov import Symbolic
+from certify.reference import limits as reference_limits
+from certify.reference.document import read
 from tests.support.certificates import LEAF, Document, dump, edited, parse, verdict
 from tests.support.outer import packed, unpacked
 from tests.support.reference import judge
@@ -17,6 +24,7 @@ from tests.support.staying import (
     ANNULUS,
     BASES,
     RADIUS,
+    Q,
     U,
     X,
     Y,
@@ -165,3 +173,70 @@ def test_a_rest_is_not_needed() -> None:
     data = document(system, network, proof(system, network, (X - 1) ** 2, 0.5))
     assert verdict(data) == "ACCEPTED" and judge(data) is None
     assert RADIUS == X**2 + Y**2
+
+
+@pytest.mark.parametrize("name", BASES)
+def test_both_count_the_same_work(name: str) -> None:
+    """The sums of FORMAT.md's last chapter, by both."""
+    data = base(name)
+    mine, other = Sizes(parse(data)), read(dump(data))
+    assert (mine.numbers(), mine.work()) == (reference_limits.numbers(other), reference_limits.operations(other))
+
+
+def test_too_much_work_is_refused_before_it_is_done() -> None:
+    """N of many powers on a tree of many leaves."""
+    data, tree = base("an annulus"), bytes([LEAF])
+    for k in range(17):
+        tree = bytes([k % 2]) + 2 * tree
+    powers = [["**", ["+", "x", str(k)], 63] for k in range(900)]
+    data = edited(edited(data, "evidence.outer.tree", packed(tree)), "claim.outer.expression", ["+", *powers])
+    assert verdict(data) == judge(data) == "limits"
+
+
+def _of_chance(generator: np.random.Generator) -> tuple[Document, bool]:
+    """A loop, N, a level and a tree of chance, and if no sample of the domain refutes the claim."""
+    a, b, c, d, e, q = (Fraction(round(float(v), 2)).limit_denominator(100) for v in generator.uniform(-1, 1, 6))
+    f = (Y + a * X * (b - RADIUS) + e / 2, -X + c * Y * (1 + d - RADIUS) + U / 5)
+    wide = {"q": (-abs(q) - Fraction(1, 50), abs(q) + Fraction(1, 50))}
+    system = plant((f[0] + Q / 4, f[1]), ("2", "2"), [X - Fraction(17, 10)], ranges=wide)
+    N = (RADIUS - (1 + d / 2)) ** 2 + e * X * Y / 3
+    level, tree = float(generator.uniform(0.05, 1.5)), bytes([LEAF])
+    for k in range(10):
+        tree = bytes([k % 2]) + 2 * tree
+    evidence = OuterTree(np.eye(2), np.full(2, 2.0), tree, (_line(1), _line(1), _line(0), _line(0)))
+    claim = Invariant(Outer(Symbolic(N, (X, Y)), level), tuple(system.constraints.values()))
+    data: Document = json.loads(InvariantCertificate(system, policy([0.0, -1.0]), claim, evidence).to_json())
+    return data, _holds(system, Symbolic(N, (X, Y)), level)
+
+
+def _line(axis: int) -> bytes:
+    tree = bytes([LEAF])
+    for _ in range(6):
+        tree = bytes([axis]) + 2 * tree
+    return tree
+
+
+def _holds(system: System, N: Symbolic, level: float) -> bool:
+    """At points of the curve N = n2, of the set and of the faces, all of them dense."""
+    side = np.linspace(-2, 2, 801)
+    x = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+    value = N(x)
+    on_faces = np.any(np.abs(x) == 2, axis=-1)
+    near = x[np.abs(value - level) < 1e-3]
+    u = np.tanh(-near[:, 1:])
+    f = system.uncertain_function()
+    falls = [(N.gradient(near) * f(near, u, [float(end)])).sum(-1).max(initial=-1.0) for end in system.ranges["q"]]
+    kept = x[value <= level][:, 0].max(initial=-1.0) < 1.7
+    return bool(value[on_faces].min() > level and max(falls) < 0.05 and kept)
+
+
+def test_accepted_claims_of_chance_are_true() -> None:
+    """And of those that hold by a margin many are accepted, by both."""
+    generator, accepted, true = np.random.default_rng(11), 0, 0
+    for _ in range(120):
+        data, holds = _of_chance(generator)
+        true += holds
+        if verdict(data) == "ACCEPTED":
+            accepted += 1
+            assert holds and judge(data) is None
+    assert accepted >= 5 and true >= accepted
