@@ -41,7 +41,14 @@ def ends_with_its_certificate(printed: str, folder: Path) -> Path:
 
 def test_each_is_one_screen_and_named_in_the_page() -> None:
     page = (EXAMPLES / "README.md").read_text("utf-8")
-    assert [path.stem for path in SCRIPTS] == ["candidates", "output_feedback", "own_policy", "pendulum", "van_der_pol"]
+    assert [path.stem for path in SCRIPTS] == [
+        "candidates",
+        "invariant_sets",
+        "output_feedback",
+        "own_policy",
+        "pendulum",
+        "van_der_pol",
+    ]
     for path in SCRIPTS:
         text = path.read_text("utf-8")
         assert len(text.splitlines()) <= 60
@@ -124,3 +131,15 @@ def test_output_feedback_with_an_observer_that_is_trained_there(
     assert result.contains([[2.1, 0, 0, 0], [0, 0, 2.1, 0]]).all()
     assert [s.name for s in result.system.inputs] == ["u", "observer_0"]
     assert ends_with_its_certificate(capsys.readouterr().out, tmp_path).exists()
+
+
+@pytest.mark.slow
+def test_sets_that_are_never_left(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A ring around the limit cycle, of at least 36 in area, and the car's set up to the obstacle, N = 0.1467."""
+    cycle, course = script("invariant_sets").main(tmp_path)
+    for result in (cycle, course):
+        assert result.verdict is Verdict.PROVED and result.certificate.is_relative_to(tmp_path)
+        assert ask(result.certificate, "checker")[1]["result"] == "ACCEPTED"
+        assert ask(result.certificate, "reference")[1]["result"] == "ACCEPTED"
+    assert cycle.outer.volume > 36 and 0.14 < course.outer.level < 0.1468
+    ends_with_its_certificate(capsys.readouterr().out, tmp_path)

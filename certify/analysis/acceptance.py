@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from certify.certificates import (
+    AnyCertificate,
     Certificate,
     PartitionTree,
-    ReachCertificate,
     TrustedSolver,
     run_checker,
     write_beside,
@@ -158,9 +158,7 @@ class Clerk:
             if self.cluster is not None and lowerings:
                 mended += f"; boxes were bounded by the workers of {self.cluster}, who may be at fault"
 
-    def ask(
-        self, certificate: Certificate | ReachCertificate, *, final: bool = False
-    ) -> tuple[bytes, Mapping[str, Any]]:
+    def ask(self, certificate: AnyCertificate, *, final: bool = False) -> tuple[bytes, Mapping[str, Any]]:
         """The certificate's bytes and the checker's answer; the file gets its name only if that is not a refusal.
 
         `final` : whether the run ends with this certificate if it is accepted.
@@ -187,7 +185,7 @@ class Clerk:
         return data, answer
 
 
-def _require_about(answer: Mapping[str, Any], data: bytes, certificate: Certificate | ReachCertificate) -> None:
+def _require_about(answer: Mapping[str, Any], data: bytes, certificate: AnyCertificate) -> None:
     """Raise SoundnessError unless an answer is about these bytes and levels."""
     for what, said, meant in (
         ("bytes", answer["certificate_sha256"], hashlib.sha256(data).hexdigest()),
@@ -215,7 +213,7 @@ def _what_is_lower(first: Certificate, certificate: Certificate) -> str:
     return ", ".join(said)
 
 
-def _wanted(certificate: Certificate | ReachCertificate) -> str:
+def _wanted(certificate: AnyCertificate) -> str:
     return "TRUSTED" if isinstance(certificate.evidence, TrustedSolver) else "ACCEPTED"
 
 

@@ -278,7 +278,8 @@ def _function(given: Any, plant: System, tell: Callable[[str], None]) -> Neural 
     """A function of the states, given as such or by its file."""
     if isinstance(given, Neural | Polynomial | Symbolic):
         return given
-    return function_in(Path(path_in(given, "lyapunov")), plant, tell).function
+    found = function_in(str(path_in(given, "lyapunov")), plant, tell)
+    return found if isinstance(found, Symbolic) else found.function
 
 
 def _policy(

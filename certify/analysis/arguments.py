@@ -29,11 +29,14 @@ def options_of(texts: Mapping[str, Any], plant: System, tell: Tell) -> RoaOption
     ------
     InputError : a text is not what its option takes, or options do not go together.
     """
-    read = {name: read_option(name, text) for name, text in texts.items()}
-    if "lyapunov" in read:
-        beyond = function_in(read["lyapunov"], plant, tell)
-        read["lyapunov"] = beyond.function
-        if read.get("candidate", "auto") == "auto" and not {"Q", "R", "level"} & read.keys():
+    read = {name: read_option(name, text) for name, text in texts.items() if name != "lyapunov"}
+    if "lyapunov" in texts:
+        from certify.lyapunov import StoredLyapunov
+
+        beyond = function_in(str(texts["lyapunov"]), plant, tell)
+        read["lyapunov"] = beyond.function if isinstance(beyond, StoredLyapunov) else beyond
+        shaped = read.get("candidate", "auto") == "auto" and not {"Q", "R", "level"} & read.keys()
+        if shaped and read.get("claim") != "invariant" and isinstance(beyond, StoredLyapunov):
             read["P"] = ellipsoid_beside(beyond, plant)
     return RoaOptions(**read)
 

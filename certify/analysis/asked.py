@@ -30,6 +30,11 @@ def require_one_that_knows(system: System, options: RoaOptions) -> None:
     ------
     InputError : the option, and what has a range or goes in steps.
     """
+    if options.claim == "invariant":
+        raise OptionError(
+            "`claim` invariant must be asked alone: of `certify roa` for one policy, in Python of "
+            "`certify.analysis.staying.certify_invariant`."
+        )
     if options.lyapunov is None and options.lyapunov_level is not None:
         raise OptionError("`lyapunov_level` must be the level of a function; give one as `lyapunov`.")
     if options.goes_beyond and system.in_steps:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from certify.analysis.facts import OuterFacts, RankFacts
 from certify.analysis.options import RoaOptions
-from certify.certificates import Certificate, ReachCertificate, TrustedSolver
+from certify.certificates import AnyCertificate, PartitionTree, RanksAlone
 from certify.certificates.claims import Claim, Outer, Problem
 from certify.certificates.ranked import count
 from certify.loop.plants.constraints import in_words
@@ -38,10 +38,10 @@ def outer_facts(problem: Problem, claim: Claim, outer: Outer, found: OuterProof)
     )
 
 
-def rank_facts(certificate: Certificate | ReachCertificate, search: RankProof | None = None) -> RankFacts | None:
+def rank_facts(certificate: AnyCertificate, search: RankProof | None = None) -> RankFacts | None:
     """The facts on the boxes with ranks of a certificate; None without any."""
     ranks, evidence = certificate.claim.ranks, certificate.evidence
-    tree = None if isinstance(evidence, TrustedSolver) else evidence.ranks
+    tree = evidence.ranks if isinstance(evidence, PartitionTree | RanksAlone) else None
     if ranks is None or tree is None:
         return None
     names = [s.name for s in certificate.system.states]
@@ -50,7 +50,7 @@ def rank_facts(certificate: Certificate | ReachCertificate, search: RankProof | 
     return facts if search is None else replace(facts, rounds=search.rounds, done=search.done)
 
 
-def constraints_in_words(certificate: Certificate | ReachCertificate) -> dict[str, str]:
+def constraints_in_words(certificate: AnyCertificate) -> dict[str, str]:
     """The claim's constraints by name, over the states' values, as in `p - 3/2 < 0`."""
     return in_words(replace(certificate.system, constraints=certificate.constraints))
 

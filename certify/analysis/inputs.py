@@ -9,6 +9,7 @@ and no caller has to remember it.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from fractions import Fraction
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from certify.loop.policies import Centre, Policy
     from certify.loop.policies.importers import Imported, ImportOptions
     from certify.loop.policies.importers.comparing import Difference
-    from certify.lyapunov import StoredLyapunov
+    from certify.lyapunov import StoredLyapunov, Symbolic
 
     Array = NDArray[np.float64]
 
@@ -146,15 +147,19 @@ def tell_of_other(stored: Policy, plant: System, tell: Tell) -> None:
         tell(f"the policy was trained with {', '.join(off)}; --system says otherwise, and counts")
 
 
-def function_in(path: Path, plant: System, tell: Tell) -> StoredLyapunov:
-    """The content of a Lyapunov file, for this plant; a notice says so if the file names another.
+def function_in(text: str, plant: System, tell: Tell) -> StoredLyapunov | Symbolic:
+    """The content of a Lyapunov file, for this plant; a notice says so if the file names another. A text that names no
+    file and has an operator is an expression of the states' values and of parameters.
 
     Raises
     ------
-    InputError : the file cannot be read, or its function has another number of states.
+    InputError : the file cannot be read, its function has another number of states, or the text is no expression.
     """
     from certify.lyapunov import load_lyapunov
 
+    path = Path(text)
+    if not path.exists() and path.suffix != ".pt" and re.search(r"[-+*(]", text):
+        return _expressed(text, plant)
     stored = load_lyapunov(path)
     if stored.function.n != plant.n:
         raise InputError(
@@ -163,6 +168,23 @@ def function_in(path: Path, plant: System, tell: Tell) -> StoredLyapunov:
     if stored.system != plant.name:
         tell(f"Lyapunov file {path} is of {stored.system}; it is proved for {plant.name}")
     return stored
+
+
+def _expressed(text: str, plant: System) -> Symbolic:
+    """A function as an expression over the states' values and parameters without a range."""
+    from certify.loop.expressions import Number, Symbol, substitute
+    from certify.loop.plants import in_deviations
+    from certify.loop.plants.equations import parse_expression
+    from certify.lyapunov import Symbolic
+
+    known = [*plant.states, *(Symbol(name) for name in plant.parameters if name not in plant.ranges)]
+    try:
+        N = parse_expression(text, {s.name: s for s in known}, "state or parameter")
+    except InputError as error:
+        raise InputError(f"--lyapunov takes a file, or an expression of states and parameters: {error}") from error
+    (shifted,) = in_deviations([N], plant.states, plant.x_eq)
+    numbers = {Symbol(name): Number(q) for name, q in plant.parameters.items()}
+    return Symbolic(substitute(shifted, numbers), plant.states)
 
 
 def ellipsoid_beside(stored: StoredLyapunov, plant: System) -> Array | None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 EngineName = Literal["bounds", "dreal", "both"]
-Asked = Literal["auto", "asymptotic", "practical", "nearby"]
+Asked = Literal["auto", "asymptotic", "practical", "nearby", "invariant"]
 Around = Literal["auto", "origin", "rest"]
 _MOST_JOBS = 256  # processes of the checker
 
@@ -40,7 +40,8 @@ class RoaOptions:
     claim: Asked = option("auto", "claim", "word", first=True, help=(
         "asymptotic: trajectories converge to the origin. practical: they enter a small set and stay there. nearby: "
         "they also converge to one equilibrium in it, if that can be shown. auto: asymptotic if the origin is "
-        "exactly an equilibrium of the loop, else nearby."))
+        "exactly an equilibrium of the loop, else nearby. invariant: a set {N <= n2} is never left, without an "
+        "equilibrium; N is given, or learned: a network, unless the candidate is polynomial."))
     around: Around = option("auto", "claim", "word", metavar="POINT", help=(
         "Where V is 0 if the origin is no equilibrium. origin: there. rest: at the loop's equilibrium, which then "
         "is the operating point. auto: rest if that is a stable point and nothing is given around the origin."))
@@ -64,9 +65,9 @@ class RoaOptions:
     ranks: bool = option(False, "claim", "flag", help=(
         "In discrete time and with held inputs: prove from which boxes of the domain every trajectory reaches the "
         "proved set, in how many steps at most; angles of the plant count modulo 2 pi."))
-    lyapunov: Neural | Polynomial | Symbolic | None = option(None, "claim", "file", metavar="FILE", help=(
-        "A second function N: prove the largest outer set {N <= n2} in the domain, from which every trajectory enters "
-        "the proved ellipsoid."),
+    lyapunov: Neural | Polynomial | Symbolic | None = option(None, "claim", "file", metavar="N", help=(
+        "A second function N, by its file or as an expression of the states' values: prove the largest outer set "
+        "{N <= n2} in the domain, from which every trajectory enters the proved ellipsoid."),
         written="If the file (certify-lyapunov/1) says with which ellipsoid N was learned, that ellipsoid is proved, "
         "unless a candidate, weights or a level are given.",
         python="A function of deviations from the operating point, or the path of its file.")
@@ -166,8 +167,20 @@ def _choices() -> Mapping[str, tuple[Any, ...]]:
     return {name: get_args(kind) for name, kind in kinds.items()}
 
 
+def _is_odd(o: RoaOptions) -> bool:
+    """True if an option is set that says nothing of a set that is never left."""
+    unset = (o.level, o.box, o.reach_from, o.Q, o.R, o.P, o.cluster)
+    plain = not (o.rate or o.enlarge or o.ranks or o.resume) and o.engine == "bounds" and o.around != "rest"
+    return not plain or any(v is not None for v in unset) or (o.candidate != "auto" and o.learned is None)
+
+
 _Rule = tuple[Callable[[RoaOptions], bool], str]
 _RULES: tuple[_Rule, ...] = (
+    (
+        lambda o: o.claim == "invariant" and _is_odd(o),
+        "`claim` invariant has no ellipsoid: leave out what is about one (`level`, `rate`, `Q`, `R`, `enlarge`, `box`, "
+        "`ranks`, `around`, `engine`, `cluster`, `resume`); the candidate is neural, polynomial or none.",
+    ),
     (lambda o: o.cluster is not None and o.engine != "bounds", "`cluster` needs the engine bounds."),
     (
         lambda o: o.resume and (o.engine != "bounds" or o.P is not None or o.only is not None),

@@ -23,7 +23,13 @@ if TYPE_CHECKING:
         Waypoint,
     )
     from certify.certificates.limits import require_short, require_within_limits
-    from certify.certificates.model import Certificate, ReachCertificate, loop_sections
+    from certify.certificates.model import (
+        AnyCertificate,
+        Certificate,
+        InvariantCertificate,
+        ReachCertificate,
+        loop_sections,
+    )
     from certify.certificates.reading import parse_any, parse_certificate, read_certificate, read_raw
     from certify.certificates.tree import leaves, leaves_within
     from certify.certificates.writing import (
@@ -51,7 +57,7 @@ _NAMES = {
         "Waypoint",
     ),
     "limits": ("require_short", "require_within_limits"),
-    "model": ("Certificate", "ReachCertificate", "loop_sections"),
+    "model": ("AnyCertificate", "Certificate", "InvariantCertificate", "ReachCertificate", "loop_sections"),
     "reading": ("parse_any", "parse_certificate", "read_certificate", "read_raw"),
     "tree": ("leaves", "leaves_within"),
     "writing": ("SEARCH", "earlier_aside", "remove", "set_aside", "sole_writer", "write_atomically", "write_beside"),
@@ -60,8 +66,10 @@ _PLACES = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = [
     "SEARCH",
+    "AnyCertificate",
     "Certificate",
     "Contraction",
+    "InvariantCertificate",
     "LocalBall",
     "OuterTree",
     "PartitionTree",

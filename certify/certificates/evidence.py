@@ -198,7 +198,9 @@ class TrustedSolver:
     queries: tuple[tuple[str, str], ...]
 
 
-def evidence_section(evidence: PartitionTree | TrustedSolver | RanksAlone) -> dict[str, Any]:
+def evidence_section(evidence: PartitionTree | TrustedSolver | RanksAlone | OuterTree) -> dict[str, Any]:
+    if isinstance(evidence, OuterTree):
+        return {"kind": "outer", "outer": _outer_tree(evidence)}
     if isinstance(evidence, RanksAlone):
         return {"kind": "ranks", "order": evidence.order, "ranks": _rank_tree(evidence.ranks)}
     if isinstance(evidence, PartitionTree):
@@ -260,6 +262,12 @@ def read_ranks_alone(data: Mapping[str, Any], n: int) -> RanksAlone:
     if data["kind"] != "ranks":
         raise ValueError(f"evidence of this claim must be of kind 'ranks'; found {data['kind']!r}")
     return RanksAlone(_read_rank_tree(data["ranks"], n), int(data["order"]))
+
+
+def read_outer_alone(data: Mapping[str, Any], n: int) -> OuterTree:
+    if data["kind"] != "outer":
+        raise ValueError(f"evidence of this claim must be of kind 'outer'; found {data['kind']!r}")
+    return _read_outer_tree(data["outer"], n)
 
 
 def _outer_tree(evidence: OuterTree) -> dict[str, Any]:

@@ -22,7 +22,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates import Certificate, PartitionTree, ReachCertificate, parse_any, read_raw, run_checker
+from certify.certificates import (
+    AnyCertificate,
+    InvariantCertificate,
+    PartitionTree,
+    ReachCertificate,
+    parse_any,
+    read_raw,
+    run_checker,
+)
 from certify.certificates.ellipsoids import Box, Ellipsoid, steepest, sublevel_set, tube_start
 from certify.certificates.formats import version_in
 from certify.certificates.located import Containment, Located
@@ -44,7 +52,7 @@ NOTHING_PROVED = Located(Containment.UNDECIDED)
 @dataclass(frozen=True, slots=True)
 class Region:
     """The union of `ellipsoids` and, where a claim has them, of an `outer` set or of `ranked` boxes, in deviations from
-    x_eq; under a claim without V of `ranked` boxes alone."""
+    x_eq; under a claim without V of `outer` or `ranked` alone."""
 
     ellipsoids: tuple[Ellipsoid, ...]
     outer: Sublevel | None = None
@@ -53,7 +61,9 @@ class Region:
     @property
     def n(self) -> int:
         """The number of states."""
-        return len(self.ellipsoids[0].P) if self.ranked is None else len(self.ranked.tree.lo)
+        if self.ranked is not None:
+            return len(self.ranked.tree.lo)
+        return len(self.ellipsoids[0].P) if self.outer is None else self.outer.function.n
 
     @property
     def largest(self) -> Ellipsoid:
@@ -218,10 +228,12 @@ def set_of(raw: bytes, name: str) -> ProvedSet:
     )
 
 
-def region_of(read: Certificate | ReachCertificate) -> Region:
+def region_of(read: AnyCertificate) -> Region:
     """The region that a certificate is about; whether it is proved is for the checker to say."""
     if isinstance(read, ReachCertificate):
         return Region((), ranked=Ranked(read.evidence.ranks, None, angles_in(read.system)))
+    if isinstance(read, InvariantCertificate):
+        return Region((), Sublevel(read.claim.outer.function, read.claim.outer.level, tuple(read.system.domain)))
     claim = read.claim
     starts = () if claim.start is None else (tube_start(claim.start.P, claim.centre),)
     outer = (

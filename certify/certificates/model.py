@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates.claims import Claim, Outer, Ranks, Reaches
+from certify.certificates.claims import Claim, Invariant, Outer, Ranks, Reaches
 from certify.certificates.data import DataBounds, data_claim, data_evidence
 from certify.certificates.encoding import encode, network_section
-from certify.certificates.evidence import PartitionTree, RanksAlone, TrustedSolver, evidence_section
+from certify.certificates.evidence import OuterTree, PartitionTree, RanksAlone, TrustedSolver, evidence_section
 from certify.certificates.formats import SCHEMA
 from certify.errors import InputError
 from certify.loop.expressions import Expression, to_tree
@@ -202,6 +202,56 @@ class ReachCertificate(_Stated):
             "levels": {},
             "evidence": evidence_section(self.evidence),
         }
+
+
+@dataclass(frozen=True, slots=True)
+class InvariantCertificate(_Stated):
+    """A claim that a set is never left, with its evidence.
+
+    Parameters
+    ----------
+    system, network : the closed loop; parameters are already put into the equations.
+    claim, evidence : the set, and trees of boxes over the domain and its faces.
+    provenance : anything that helps people; the checker ignores it.
+
+    Raises
+    ------
+    InputError : the loop's time goes in steps.
+    """
+
+    system: System
+    network: PolicyNetwork
+    claim: Invariant
+    evidence: OuterTree
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.system.in_steps:
+            raise InputError("a claim that a set is never left must be about a loop whose time does not go in steps.")
+
+    @property
+    def kept(self) -> tuple[Expression, ...]:
+        """The claim's constraints."""
+        return self.claim.keep
+
+    @property
+    def kind(self) -> str:
+        """The claim's kind."""
+        return self.claim.kind
+
+    def sections(self) -> dict[str, Any]:
+        """The sections of the claim, V, its levels and the evidence, and of networks beside the policy's."""
+        claim = self.claim
+        return {
+            "claim": {"kind": claim.kind, "outer": _outer(claim.outer, self.system)} | _keep(claim.keep),
+            "networks": _networks(claim.outer),
+            "lyapunov": None,
+            "levels": {},
+            "evidence": evidence_section(self.evidence),
+        }
+
+
+AnyCertificate = Certificate | ReachCertificate | InvariantCertificate
 
 
 def loop_sections(system: System, network: PolicyNetwork) -> dict[str, Any]:

@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates.claims import CLAIMS, Claim, Outer, Ranks, Reaches
+from certify.certificates.claims import CLAIMS, Claim, Invariant, Outer, Ranks, Reaches
 from certify.certificates.data import read_data_bounds, read_measurements
 from certify.certificates.encoding import decode, network_named, read_network
-from certify.certificates.evidence import read_evidence, read_ranks_alone
+from certify.certificates.evidence import read_evidence, read_outer_alone, read_ranks_alone
 from certify.certificates.formats import SCHEMA, other_version
-from certify.certificates.model import Certificate, ReachCertificate
+from certify.certificates.model import AnyCertificate, Certificate, InvariantCertificate, ReachCertificate
 from certify.errors import CertificateFormatError
 from certify.loop.expressions import Expression, Number, Symbol, from_tree
 from certify.loop.plants import System
@@ -90,15 +90,16 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
     CertificateFormatError : the bytes are no certificate, or one without V.
     """
     found = parse_any(raw, name)
-    if isinstance(found, ReachCertificate):
+    if not isinstance(found, Certificate):
+        what = "a region is reached" if isinstance(found, ReachCertificate) else "a set is never left"
         raise CertificateFormatError(
-            f"{name} says that a region is reached, and has no V, of which a certificate for this command must be. "
-            "certify check, certify contains and certify report take it."
+            f"{name} says that {what}, and has no V, of which a certificate for this command must be. certify check, "
+            "certify contains and certify report take it."
         )
     return found
 
 
-def parse_any(raw: bytes, name: str) -> Certificate | ReachCertificate:
+def parse_any(raw: bytes, name: str) -> AnyCertificate:
     """The certificate that the bytes hold, of any claim. This does not check it.
 
     Raises
@@ -112,17 +113,24 @@ def parse_any(raw: bytes, name: str) -> Certificate | ReachCertificate:
             raise CertificateFormatError(
                 f"{name}: `schema` must be {SCHEMA!r}; found {data['schema']!r:.60}.{f' {known}' if known else ''}"
             )
-        kind, kinds = data["claim"]["kind"], (*CLAIMS, Reaches.kind)
+        kind, kinds = data["claim"]["kind"], (*CLAIMS, Reaches.kind, Invariant.kind)
         if kind not in kinds:
             raise CertificateFormatError(f"{name}: `claim.kind` must be one of {', '.join(kinds)}; found {kind!r}.")
         n = len(data["plant"]["states"])
         provenance, people = _read_provenance(data["provenance"], data["plant"])
-        system, names = _read_system(data["plant"], data["claim"]["sample"], people), provenance.pop("constraints", "")
+        system = _read_system(data["plant"], data["claim"].get("sample"), people)
+        names = provenance.pop("constraints", "")
         network = _read_network(data["policy"], data["networks"], n, len(data["plant"]["inputs"]))
         if kind == Reaches.kind:
             reaches = _read_reaches(data["claim"], system)
             evidence = read_ranks_alone(data["evidence"], n)
             return ReachCertificate(_with_constraints(system, reaches, names), network, reaches, evidence, provenance)
+        if kind == Invariant.kind:
+            stays = Invariant(
+                _read_outer(data["claim"]["outer"], data["networks"], system.states), _read_keep(data["claim"], system)
+            )
+            tree = read_outer_alone(data["evidence"], n)
+            return InvariantCertificate(_with_constraints(system, stays, names), network, stays, tree, provenance)
         claim, measured, bounds = _read_claim(data, system), None, None
         if "data" in data["claim"]:
             measured = read_measurements(data["claim"]["data"], n, system.m)
@@ -190,7 +198,7 @@ def _read_provenance(data: Any, plant: Mapping[str, Any]) -> tuple[dict[str, str
     return {k: str(v) for k, v in found.items() if not read.get(k)}, read
 
 
-def _with_constraints(system: System, claim: Claim | Reaches, names: str) -> System:
+def _with_constraints(system: System, claim: Claim | Reaches | Invariant, names: str) -> System:
     """The plant with the claim's angles, and its constraints by the names that the file has for people, if it has a
     usable one for each."""
     found = re.findall(r"'([A-Za-z_][A-Za-z0-9_]{0,63})'", names)

@@ -80,9 +80,12 @@ def _examine(path: str, jobs: int, patient: bool) -> tuple[int, dict[str, Any]]:
     elif isinstance(c.evidence, document.Partition):
         margins = {"local": tally.local_margin, "ring": tally.ring_margin, "outer": tally.outer_margin}
         answer |= {"leaves": tally.rules["tree"], "ring_leaves": tally.rules["ring"], "margins": margins}
-        if c.outer is not None and c.evidence.outer is not None:
-            leaves = {"leaves": c.evidence.outer.tree.count(LEAF), "face_leaves": tally.rules["faces"]}
-            answer["outer"] = {"level": c.outer.level, **leaves}
+    elif isinstance(c.evidence, document.OuterTree):
+        answer |= {"leaves": tally.rules["outer"], "margins": {"outer": tally.outer_margin}}
+    tree = c.evidence.outer if isinstance(c.evidence, document.Partition) else c.evidence
+    if c.outer is not None and isinstance(tree, document.OuterTree):
+        leaves = {"leaves": tree.tree.count(LEAF), "face_leaves": tally.rules["faces"]}
+        answer["outer"] = {"level": c.outer.level, **leaves}
     if c.ranks is not None:
         answer["ranks"] = {"leaves": len(c.ranks.steps), "steps": c.ranks.most, "of": sum(map(bool, c.ranks.steps))}
     if c.start is not None:

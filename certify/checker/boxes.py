@@ -148,14 +148,15 @@ class Boxes(ABC):
         p[self.symbols :][np.flatnonzero(i_j[0] == i_j[1])[: self.n]] = q.value
         return Taylor(c.value, p, c.error + g.error.sum() + q.error.sum() + self.cross(size(centre) + radius))
 
-    def least_bound(self, rise: Taylor, gaps: Sequence[Callable[[Array], Taylor]]) -> Array:
+    def least_bound(self, rise: Taylor, gaps: Sequence[Callable[[Array], Taylor]], least: float = 0.0) -> Array:
         """An upper bound of `rise` where no gap is negative: that of `rise` or of `rise + k gap` for one gap and some
-        k >= 0, whichever is least. A gap is a function of the indices of the boxes that it is wanted on."""
+        k >= 0, whichever is least. A gap is a function of the indices of the boxes that it is wanted on. With a `least`
+        k of -inf it bounds `rise` where a gap is 0."""
         bound = upper_bound(rise)
         for gap_on in gaps:
             left = np.flatnonzero(np.logical_not(bound < 0))
             gap, part = gap_on(left), rise.at(left)
-            for k in multipliers(part.g[: self.n], gap.g[: self.n], gap.c):
+            for k in multipliers(part.g[: self.n], gap.g[: self.n], gap.c, least):
                 still = np.flatnonzero(np.logical_not(bound[left] < 0))
                 other = upper_bound(combination((1.0, part.at(still)), (k[still], gap.at(still))))
                 bound[left[still]] = np.fmin(bound[left[still]], other)
@@ -167,12 +168,13 @@ def _by(S: Array, x: Array, y: Array) -> Near:
     return Near(S) * Near(x) * Near(y)
 
 
-def multipliers(a: Array, b: Array, c: Array) -> Array:
-    """The k at which a term of `c k + sum_i |a_i + k b_i|` vanishes, or 0 if that is negative: (n, B), the best first.
+def multipliers(a: Array, b: Array, c: Array, least: float = 0.0) -> Array:
+    """The k at which a term of `c k + sum_i |a_i + k b_i|` vanishes, at `least` if it is less: (n, B), the best first.
 
-    Any number k >= 0 is valid for the proof; an infinite one or NaN makes the bound NaN.
+    Any number k >= 0 is valid for the proof, and k < 0 where what it multiplies is 0; an infinite one or NaN makes the
+    bound NaN.
     """
-    k = np.maximum(np.where(b != 0, -a / b, 0.0), 0.0)
+    k = np.maximum(np.where(b != 0, -a / b, 0.0), least)
     value = c * k + np.sum(np.abs(a[:, None] + k * b[:, None]), axis=0)
     return np.take_along_axis(k, np.argsort(value, axis=0, kind="stable"), 0)
 

@@ -36,8 +36,8 @@ class Case:
     @property
     def order(self) -> int:
         """The order of the series in time on leaves."""
-        if isinstance(self.c.evidence, Trusted):
-            raise TypeError("this rule is about leaves")
+        if isinstance(self.c.evidence, Trusted | OuterTree):
+            raise TypeError("this rule is about leaves with a series in time")
         return self.c.evidence.order
 
     @property
@@ -88,9 +88,10 @@ class Case:
     @property
     def outer(self) -> tuple[Outer, OuterTree]:
         """The second function N and its evidence, of a claim with an outer set."""
-        if self.c.outer is None or self.partition.outer is None:
+        tree = self.c.evidence if isinstance(self.c.evidence, OuterTree) else self.partition.outer
+        if self.c.outer is None or tree is None:
             raise TypeError("this rule is about an outer set")
-        return self.c.outer, self.partition.outer
+        return self.c.outer, tree
 
     @cached_property
     def P_inverse(self) -> list[Fraction]:

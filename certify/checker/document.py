@@ -24,7 +24,8 @@ MAX_ORDER = 8  # of a series in time
 MAX_CELLS, MAX_CUTS = 4096, 64  # of the box of uncertain quantities in all, and of one range
 MAX_CONSTRAINTS, MAX_RANK = 64, 2**16 - 1  # that rank is none
 MAX_TRANSITIONS, MAX_ROUNDS, MAX_PARTS = 2**16, 64, 4096  # of data; rounds of a part of the priors
-CLAIMS = ("asymptotic", "practical", "nearby", "enlarged", "reached", "reaches")
+CLAIMS = ("asymptotic", "practical", "nearby", "enlarged", "reached", "reaches", "invariant")
+WITHOUT_V = ("reaches", "invariant")
 PRACTICAL = ("practical", "nearby")
 WITH_TUBE = ("enlarged", "reached")
 Array = NDArray[np.float64]
@@ -209,7 +210,7 @@ class Certificate:
     """The claim and its evidence. Provenance is not kept: nothing may depend on it.
 
     `levels` are as stated: c0 (`floor`) of a practical claim, the inner edge of the ring c1 (`local`), and c2 (`roa`);
-    under `reaches` there are none, and P has no entries.
+    a claim without V has none, and its P no entries.
     """
 
     claim: str
@@ -229,11 +230,11 @@ class Certificate:
     policy: Policy
     P: Array
     levels: dict[str, float]
-    evidence: Partition | Trusted | Ranked
+    evidence: Partition | Trusted | Ranked | OuterTree
     sha256: str
     start: Array | None = None  # P_0 of a claim with a tube
     centre: Array | None = None  # c_0 of a claim whose tube follows a path
-    outer: Outer | None = None  # whose set trajectories leave into {V <= c2} only
+    outer: Outer | None = None  # whose set trajectories leave into {V <= c2} only; never, if there is no V
     ranks: Ranks | None = None  # of the leaves from which trajectories reach the target
     target: Tape | None = None  # whose outputs are at most 0 there; None if the target is {V <= c2}
     keep: Tape | None = None  # whose outputs stay negative
@@ -242,6 +243,10 @@ class Certificate:
     @property
     def practical(self) -> bool:
         return self.claim in PRACTICAL
+
+    @property
+    def without_V(self) -> bool:
+        return self.claim in WITHOUT_V
 
     @property
     def c0(self) -> float:
@@ -282,12 +287,35 @@ def certificate(data: Any, sha256: str) -> Certificate:
     stated["policy"] = _policy(policy, networks, n, m, kind in PRACTICAL)
     stated["networks"], stated["sha256"] = tuple(networks.values()), sha256
     provenance.must(isinstance(provenance.raw, dict), "an object")
-    read_rest = _reaching if kind == "reaches" else _attracting
+    read_rest = {"reaches": _reaching, "invariant": _staying}.get(kind, _attracting)
     return read_rest(stated, claim, lyapunov, levels, evidence)
 
 
+def _staying(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: Value, evidence: Value) -> Certificate:
+    """The rest of a certificate for a set that is not left."""
+    n, networks = len(stated["states"]), {net.name: net for net in stated["networks"]}
+    _, beyond, *others = claim.keys(f"kind outer{claim.maybe('keep')}")
+    claim.must(not stated["discrete"], "another where time is discrete")
+    beyond.must(beyond.raw is not None, "an object under this claim")
+    lyapunov.must(lyapunov.raw is None, "null under this claim")
+    levels.keys("")
+    kind, tree = evidence.keys("kind outer")
+    kind.choice("outer")
+    return Certificate(
+        "invariant",
+        0.0,
+        None,
+        **stated,
+        P=np.zeros((0, 0)),
+        levels={},
+        evidence=_outer_tree(tree, n),
+        outer=_outer(beyond, stated["states"], networks),
+        keep=_constraints(others[0], _names(stated)) if others else None,
+    )
+
+
 def _reaching(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: Value, evidence: Value) -> Certificate:
-    """The rest of a certificate without V."""
+    """The rest of a certificate for a region that is reached."""
     n, names = len(stated["states"]), stated["states"]
     _, sample, target, ranks, *others = claim.keys(f"kind sample target ranks{claim.maybe('keep')}")
     periods = _sample(sample)
@@ -496,10 +524,7 @@ def _outer(value: Value, states: tuple[str, ...], networks: Mapping[str, Network
     return Outer(parse((tree.raw,), states, tree.at, networks), n2)
 
 
-def _outer_tree(value: Value, n: int, asked: bool) -> OuterTree | None:
-    if not asked:
-        value.must(value.raw is None, "null where the claim has none")
-        return None
+def _outer_tree(value: Value, n: int) -> OuterTree:
     T, root, tree, faces = value.keys("T root tree faces")
     return OuterTree(T.array(n, n), root.array(n), tree.octets(), faces.listed(Value.octets, 2 * n))
 
@@ -577,7 +602,8 @@ def _evidence(
         ball = _local(local, n, claim, most)
         close = _contraction(contraction, n, claim)
         by_boxes = T.array(n, n), root.array(n), tree.octets(), order.integer(1, most)
-        return Partition(*by_boxes, cuts, ball, close, slabs, _outer_tree(beyond, n, outer))
+        beyond.must(outer or beyond.raw is None, "null where the claim has none")
+        return Partition(*by_boxes, cuts, ball, close, slabs, _outer_tree(beyond, n) if outer else None)
     _, solver, version, precision, queries = value.keys("kind solver version precision queries")
     precision.must(precision.binary64() > 0, "positive")
     answers = queries.listed(lambda pair: pair.listed(Value.word, 2), 0, MAX_VALUES)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from math import prod
 
 from .case import Case, Failures
-from .document import Array, Certificate, Partition, Trusted
+from .document import Array, Certificate, OuterTree, Partition, Trusted
 from .expression import Tape
 from .networks import Map, Network
 
@@ -99,22 +99,26 @@ class Sizes:
 
     def numbers(self) -> int:
         """Held at once."""
-        found = 4 * self.net.entries + self.of_measured()
+        found = 4 * self.net.entries + self.of_function() + self.of_measured()
         if not isinstance(self.evidence, Partition):
             return found + self.of_following()
         order = max(self.evidence.order, self.evidence.local.order if self.evidence.local else 1)
         values = (4 * order if self.c.sample else 1) * self.a + 2 * self.n + 8
-        if self.asked or self.c.outer:
+        if self.asked and not self.c.outer:
             found += self.on_leaves(order, self.s)
         if self.evidence.local or self.evidence.contraction or self.evidence.tube:
             found += values * (self.t + self.d * self.y + self.m + self.z) + self.d**4 // 4
             found += self.net.held_on_a_ball(self.d, self.t)
-        if self.c.outer:
-            tape, area = self.c.outer.function, (self.s + 1) ** 2
-            N, of_tape = Net(_called(tape)), tape.size
-            found += 4 * N.entries + sum(2 * rows * area for rows, *_ in N.steps) + 8 * of_tape * area
-            found += N.held_on_leaves(self.s + 1)
         return found + self.of_following()
+
+    def of_function(self) -> int:
+        """Numbers for N and the loop on leaves of its tree."""
+        if self.c.outer is None:
+            return 0
+        tape, area = self.c.outer.function, (self.s + 1) ** 2
+        N, of_tape = Net(_called(tape)), tape.size
+        found = 4 * N.entries + sum(2 * rows * area for rows, *_ in N.steps) + 8 * of_tape * area
+        return found + N.held_on_leaves(self.s + 1) + self.on_leaves(1, self.s)
 
     def on_leaves(self, order: int, symbols: int) -> int:
         """Numbers on as many leaves as are examined at once."""
@@ -124,7 +128,7 @@ class Sizes:
 
     def of_following(self) -> int:
         """Numbers for leaves that are followed by steps."""
-        if self.c.ranks is None or isinstance(self.evidence, Trusted):
+        if self.c.ranks is None or isinstance(self.evidence, Trusted | OuterTree):
             return 0
         return 2**4 * len(self.c.ranks.tree) + self.on_leaves(self.evidence.order, self.s + self.n)
 
@@ -141,17 +145,17 @@ class Sizes:
     def work(self) -> int:
         """Elementary operations."""
         found = 2**15 * self.a + self.net.folded
-        found += self.inverse(self.bits(self.c.P)) if self.c.target is None else 0
-        if not self.c.practical and self.c.target is None:
+        found += 0 if self.c.without_V else self.inverse(self.bits(self.c.P))
+        if not (self.c.practical or self.c.without_V):
             found += 2**12 * self.net.entries + 2**19 * Net(_called(self.c.dynamics)).entries
-        found += self.of_ranks() + self.of_data()
+        found += self.of_ranks() + self.of_outer() + self.of_data()
         if not isinstance(self.evidence, Partition):
             return found
         seen = min(2 * self.bits(self.evidence.T) + self.bits(self.c.P) + 16, 2**16 // self.n)
         found += self.inverse(seen) + 2**8 * len(self.evidence.tree)
         if self.asked:
             found += self.of_leaves(self.evidence.tree.count(LEAF), self.evidence.order, self.s)
-        return found + self.of_balls() + self.of_tube() + self.of_outer()
+        return found + self.of_balls() + self.of_tube()
 
     @property
     def asked(self) -> bool:
@@ -197,7 +201,7 @@ class Sizes:
     def of_ranks(self) -> int:
         """Steps from leaves, and the leaves that their images meet."""
         ranks = self.c.ranks
-        if ranks is None or isinstance(self.evidence, Trusted):
+        if ranks is None or isinstance(self.evidence, Trusted | OuterTree):
             return 0
         leaves = len(ranks.steps)
         of_all = self.of_leaves(leaves + sum(ranks.steps), self.evidence.order, self.s + self.n)
@@ -252,8 +256,8 @@ class Sizes:
         return len(tube) * of_each + sum(self.inverse(self.bits(P)) for P in nodes)
 
     def of_outer(self) -> int:
-        evidence = self._partition.outer
-        if self.c.outer is None or evidence is None:
+        evidence = self.evidence.outer if isinstance(self.evidence, Partition) else self.evidence
+        if self.c.outer is None or not isinstance(evidence, OuterTree):
             return 0
         tape = self.c.outer.function
         N, of_tape = Net(_called(tape)), tape.size
@@ -265,7 +269,7 @@ class Sizes:
         found += (faces + leaves) * N.on_a_leaf(self.n + 1) // 8 + (1 + faces + leaves) * N.paths
         models, calls = self.a + 8 * of_tape + 4 * self.n, calls + self.n * self.s**2 + 160 * self.net.reads
         found += self.boxes(leaves, models, max(values, self.a), self.s, calls)
-        return found + leaves * N.models((self.s + 4) ** 2) + self.policies(leaves, self._partition.order, self.s)
+        return found + leaves * N.models((self.s + 4) ** 2) + self.policies(leaves, 1, self.s)
 
     @property
     def _partition(self) -> Partition:

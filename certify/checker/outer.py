@@ -1,4 +1,5 @@
 """The rules for {N <= n2} beyond {V <= c2}: N is above n2 on the domain's faces, and falls where V >= c2 and N <= n2.
+Those for a set that is never left, without V, are in invariant.py.
 
 They take models of N, and of its derivative along F, on boxes. Networks go through them step by step, the entries of a
 vector on an axis of their own.
@@ -120,17 +121,24 @@ class Function:
 
     def is_above(self, x: Form, level: float) -> Array:
         """True on boxes on which N is certainly above the level."""
-        above = np.zeros(x.value.shape[2], dtype=bool)
-        if self.tape.calls:  # forms are good where boxes are large
-            above = self._shows(x, level, self._by_forms)
-        left = np.flatnonzero(np.logical_not(above))
-        above[left] = self._shows(x[:, left], level, lambda states: self.along(states, [None] * len(states)).value)
-        return above
+        return self._has(x, lambda N: upper_bound(constants(N)(Fraction(level)) + -N) < 0)
 
-    def _shows(self, x: Form, level: float, value: Callable[[list[Taylor]], Taylor]) -> Array:
+    def is_below(self, x: Form, level: float) -> Array:
+        """True on boxes on which N is certainly below the level."""
+        return self._has(x, lambda N: upper_bound(N + constants(N)(-Fraction(level))) < 0)
+
+    def _has(self, x: Form, shown: Callable[[Taylor], Array]) -> Array:
+        found = np.zeros(x.value.shape[2], dtype=bool)
+        if self.tape.calls:  # forms are good where boxes are large
+            found = self._by(self._by_forms, x, shown)
+        left = np.flatnonzero(np.logical_not(found))
+        found[left] = self._by(lambda states: self.along(states, [None] * len(states)).value, x[:, left], shown)
+        return found
+
+    def _by(self, value: Callable[[list[Taylor]], Taylor], x: Form, shown: Callable[[Taylor], Array]) -> Array:
         N = value(models(Form(x.value), x.error))
-        shown: Array = np.isfinite(N.size.top) & (upper_bound(-N) < -level)
-        return shown
+        found: Array = np.isfinite(N.size.top) & shown(N)
+        return found
 
     def _by_forms(self, states: list[Taylor]) -> Taylor:
         """N by the forms of the networks' values, each with a symbol for its error."""
@@ -208,12 +216,27 @@ def falls(leaves: Leaves) -> Failures:
     return int(leaves.hold.size)
 
 
+@dataclass(frozen=True)
+class Course:
+    """N on boxes whose states are x, in forms, and how it changes: N'F and n2 - N; True where they and F are finite;
+    the inputs, and the models of what equations read."""
+
+    x: Form
+    rise: Taylor
+    below: Taylor
+    finite: Array
+    inputs: Form
+    states: list[Taylor]
+    held: list[Taylor]
+
+
 class Beyond(Boxes):
     """The bounds that rule `outer` asks for, on boxes lo and hi (n, B) in the coordinates z of its tree."""
 
     def __init__(self, case: Case) -> None:
         claim, evidence = case.outer
-        super().__init__(case, evidence.T, case.seen_from(evidence.T))
+        none = fmpq_mat(len(case.c.states), len(case.c.states))
+        super().__init__(case, evidence.T, none if case.c.without_V else case.seen_from(evidence.T))
         self.function, self.level, self.evidence = _function(case), claim.level, evidence
         ends_of = [[near(end).ends[side] for side, end in enumerate(pair)] for pair in self.c.domain]
         self.least, self.largest = np.array(ends_of).T[:, :, None]  # at or beyond the domain's ends, (n, 1)
@@ -228,22 +251,35 @@ class Beyond(Boxes):
         """The leaves with these corners, numbered from `first`, of which N'F is asked."""
         centre, radius = middle(lo, hi)
         x = self.states(centre, radius)
-        close = np.flatnonzero(np.logical_not(self.is_outside(x) | (self.levels(lo, hi)[1] < self.c.c2)))
-        left = close[np.logical_not(self.function.is_above(x[:, close], self.level))]
-        x, centre, radius = x[:, left], centre[:, left], radius[:, left]
-        u = enclose_on_boxes(self.net, x)
-        states, held = self.models(x, u)
-        F = self.f(states, [*held, *self.quantities(len(left))])
-        both = self.function.along(models(Form(x.value), x.error), F)
-        N, none = both.value.widened(self.symbols), constant(Fraction(0), self.symbols, len(left))
-        rise = none if both.rate is None else both.rate
-        below = constant(Fraction(self.level), self.symbols, len(left)) + -N
+        left = self.close(x, self.levels(lo, hi)[1] < self.c.c2)
+        course = self.course(x[:, left])
+        centre, radius = centre[:, left], radius[:, left]
         bound = self.least_bound(
-            rise, [below.at, lambda few: self.gap(centre[:, few], radius[:, few], self.c.c2, -1.0)]
+            course.rise,
+            [course.below.at, lambda few: self.gap(centre[:, few], radius[:, few], self.c.c2, -1.0)],
         )
-        finite = np.all([np.isfinite(v.size.top) for v in (N, *F)], axis=0)
         none_kept = np.zeros((0, len(left)), dtype=bool)
-        return Leaves(self, first + left, "outer leaf ", u.range, bound, (bound < 0) & finite, none_kept)
+        hold = (bound < 0) & course.finite
+        return Leaves(self, first + left, "outer leaf ", course.inputs.range, bound, hold, none_kept)
+
+    def close(self, x: Form, free: Array) -> Array:
+        """The numbers of boxes that are not free, may meet the domain, and have N at its level or below somewhere."""
+        found = np.flatnonzero(np.logical_not(self.is_outside(x) | free))
+        some: Array = found[np.logical_not(self.function.is_above(x[:, found], self.level))]
+        return some
+
+    def course(self, x: Form) -> Course:
+        """N, the loop and N'F on boxes."""
+        u = enclose_on_boxes(self.net, x)
+        batch = x.value.shape[2]
+        states, inputs = self.models(x, u)
+        held = [*inputs, *self.quantities(batch)]
+        F = self.f(states, held)
+        both = self.function.along(models(Form(x.value), x.error), F)
+        N, none = both.value.widened(self.symbols), constant(Fraction(0), self.symbols, batch)
+        below = constant(Fraction(self.level), self.symbols, batch) + -N
+        finite = np.all([np.isfinite(v.size.top) for v in (N, *F)], axis=0)
+        return Course(x, none if both.rate is None else both.rate, below, finite, u, states, held)
 
     def is_outside(self, x: Form) -> Array:
         """True on each box that certainly lies outside the domain, along one of the states."""

@@ -92,7 +92,7 @@ def centring(case: Case) -> Failures:
         limits = zip(*(end.tolist() for end in policy.clip), u_eq, strict=True)
         if not all(Fraction(lo) < u < Fraction(hi) for lo, hi, u in limits):
             yield "policy.clip", "u_eq must lie strictly inside the clip"
-    if policy.centre == "none" and not case.c.practical and case.c.target is None:
+    if policy.centre == "none" and not (case.c.practical or case.c.without_V):
         try:
             shown = policy_at_origin(policy) == list(u_eq)
         except Undecided:
@@ -180,9 +180,9 @@ def check(c: Certificate, jobs: int = 1, patient: bool = False) -> Tally:
     """
     self_test()
     np.empty(_KEPT)  # given back at once: an allocator that adapts then keeps arrays, and need not ask for each anew
-    replayed, without_V = isinstance(c.evidence, Partition), c.claim == "reaches"
+    replayed = isinstance(c.evidence, Partition)
     spared = {"equilibrium": c.practical, "coordinates": not replayed, "root": not replayed}
-    spared |= dict.fromkeys(("levels", "lyapunov", "equilibrium", "domain"), True) if without_V else {}
+    spared |= dict.fromkeys(("levels", "lyapunov", "equilibrium", "domain"), True) if c.without_V else {}
     with np.errstate(all="ignore"):  # overflow becomes infinity or NaN, and every test then fails
         tally, case = Tally(), Case(c, jobs, patient)
         tally.hold([(name, rule) for name, rule in STATED if not spared.get(name)], case)
@@ -192,6 +192,8 @@ def check(c: Certificate, jobs: int = 1, patient: bool = False) -> Tally:
             tally.hold(data.OF_DATA, case)
         if replayed:
             _examine(tally, case)
+        if c.outer is not None:
+            _examine_outer(tally, case)
         if c.ranks is not None:
             from . import ranks
 
@@ -223,10 +225,17 @@ def _examine(tally: Tally, case: Case) -> None:
         from . import contraction
 
         tally.hold(contraction.OF_CONTRACTION, contraction.Contracted(case, case.partition.contraction))
-    if c.outer is not None:
-        from . import outer
 
-        for table in (outer.OF_OUTER, outer.ON_FACES, outer.OF_OUTER_TREE):
-            tally.hold(table, case)
-        beyond, tree = outer.Beyond(case), case.outer[1].tree
-        tally.outer_margin = tally.hold_on_leaves(outer.ON_OUTER_LEAVES, beyond, tree, lambda leaves: leaves.bound)
+
+def _examine_outer(tally: Tally, case: Case) -> None:
+    """The rules about a second function."""
+    from . import outer
+
+    for table in (outer.OF_OUTER, outer.ON_FACES, outer.OF_OUTER_TREE):
+        tally.hold(table, case)
+    bounds, on_leaves = outer.Beyond(case), tuple(outer.ON_OUTER_LEAVES)
+    if case.c.without_V:
+        from . import invariant
+
+        bounds, on_leaves = invariant.Staying(case), tuple(invariant.ON_LEAVES)
+    tally.outer_margin = tally.hold_on_leaves(on_leaves, bounds, case.outer[1].tree, lambda leaves: leaves.bound)

@@ -54,7 +54,7 @@ def claim(c: Certificate) -> list[str]:
         lines.append(f"  the input is held from each sampling instant to the next, for {each} units of time")
     if c.rate:
         lines.append(f"  {_falls(c)}, lambda = {c.rate!r}")
-    if c.outer is not None:
+    if c.outer is not None and not c.without_V:
         lines.append(
             f"  and every trajectory that starts in the union of V <= {c.c2!r} and of the states of the domain with "
             f"N(x) <= {c.outer.level!r} stays in this union, enters V <= {c.c2!r} in finite time, and from then on is "
@@ -72,6 +72,13 @@ def claim(c: Certificate) -> list[str]:
         )
     if c.data is not None:
         lines.append(f"  {_consistent(c, c.data)}")
+    if c.claim == "invariant" and c.outer is not None:
+        said = (
+            f"every trajectory of the closed loop that starts in a state of the domain with N(x) <= {c.outer.level!r} "
+            "exists and is in such a state at all times, and in the interior of the domain; nothing is claimed of "
+            "where it goes"
+        )
+        return [f"claim: {said}; u stays in its bounds", *lines]
     if c.ranks is not None and c.claim == "reaches":
         said = _by_ranks(c, c.ranks, when["start"], "")
         return [f"claim: every trajectory of the closed loop that {said}; nothing is claimed of later", *lines]
@@ -140,6 +147,10 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
     inputs = zip(c.inputs, c.input_bounds, c.u_eq, strict=True)
     if c.claim == "reaches":
         rest, verdict = f"leaves {answer['ranks']['leaves']}", answer["result"]
+    elif c.claim == "invariant":
+        margin = answer["margins"]["outer"]
+        least = "" if margin is None else f"; smallest bound of -N'F on a leaf on which N may be its level {margin:.3g}"
+        rest, verdict = f"leaves {answer['outer']['leaves']}{least}", answer["result"]
     elif answer["result"] == "TRUSTED":
         rest = f"not checked, the solver's word: {', '.join(answer['answers'])}"
         verdict = f"TRUSTED {answer['solver']} {answer['version']}"
@@ -166,7 +177,8 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         f"{_clip(c.policy)}"
         f"sha256 {c.policy.sha256()}",
         *([] if c.policy.origin is None else [f"  its network reads ({_matrix(c.policy.origin[None])}) + x"]),
-        *([f"V(x) = x'Px with P = {_matrix(c.P)}"] if c.target is None else _target(c.target)),
+        *([] if c.without_V else [f"V(x) = x'Px with P = {_matrix(c.P)}"]),
+        *([] if c.target is None else _target(c.target)),
         *([] if c.start is None else [f"S = {_matrix(c.start)}"]),
         *([] if c.centre is None else [f"c = {' '.join(map(repr, c.centre.tolist()))}"]),
         *([] if c.outer is None else [f"N(x) = {expression(c.outer.function.trees[0])}"]),

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from certify.analysis.maximise import Quantity
     from certify.analysis.options import RoaOptions
     from certify.analysis.results import RoaResult
+    from certify.analysis.staying import InvariantResult
     from certify.loop.plants import System
     from certify.loop.policies import Policy
 
@@ -85,7 +86,7 @@ def certified(
     if result.certificate is not None and result.raw is not None:
         answer = None if result.checker is None else dict(result.checker)
         write(folder / "report.html", drawing.page_of(result.raw, result.certificate, answer, data))
-    where = None if asked is None else _where(result, asked)
+    where = None if asked is None else where_of(result, asked)
     if where is not None:
         data["contains"] = where[0]
     if as_json:
@@ -133,7 +134,7 @@ def _with_next_command(data: dict[str, Any], context: typer.Context, policy: Pat
     return data
 
 
-def _where(result: RoaResult, asked: str) -> tuple[dict[str, Any], str]:
+def where_of(result: RoaResult | InvariantResult, asked: str) -> tuple[dict[str, Any], str]:
     """The answer if the proved set contains a box, for JSON and in words, from the very bytes that were checked.
 
     The box is read as of the result's plant, in whose deviations the set is: those of the plant that was asked about

@@ -15,8 +15,9 @@ from certify.cli.certifying import CONTAINS, certified
 from certify.cli.importing import import_options
 from certify.cli.options import FIRST, Bundle, changes_of_a_plant, options_of_a_run, takes
 from certify.cli.shared import Json, PlantName, PolicyArgument, PolicyFile, Quiet, Results, noting, the_policy
+from certify.cli.staying import stayed
 from certify.cli.terminal import tell
-from certify.errors import BackendError, InputError
+from certify.errors import BackendError, InputError, OptionError
 
 if TYPE_CHECKING:
     from certify.analysis.maximise import Quantity
@@ -63,6 +64,11 @@ def roa(
     options = options_of(typed | {"engine": _engine(context, typed.get("engine", "bounds"))}, plant, note)
     if contains is not None:
         region(contains, plant, CONTAINS)  # an error in it is reported before the run
+    if options.claim == "invariant":
+        if largest is not None:
+            raise OptionError("`claim` invariant has neither a rate nor a period; leave out max.")
+        stayed(path, stored, plant, options, out, start, quiet, as_json, contains)
+        return
     certified(context, path, stored, plant, options, out, start, quiet, as_json, contains, largest)
 
 

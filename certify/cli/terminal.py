@@ -47,9 +47,9 @@ def tell(line: str) -> None:
 def ring_line(stage: str, state: Progress) -> str:
     """The progress of a proof in one line: the level of V, or of N for the outer set, or the share of boxes."""
     left = "" if state.seconds_left is None else f", at most {max(state.seconds_left, 0):.0f} s left"
-    if stage == "ranks":
+    if stage in ("ranks", "set"):
         covered = math.floor(1000 * state.proved) / 10
-        return f"ranks: {covered:.1f} % of the box is proved, {state.boxes} boxes, {state.open} open{left}"
+        return f"{stage}: {covered:.1f} % of the box is proved, {state.boxes} boxes, {state.open} open{left}"
     letter, name = ("N", "beyond the ellipsoid") if stage == "outer" else ("V", state.name)
     proved = f"{letter} = {state.level:.4g}"
     aim = f"down to {proved}, the aim is" if state.down else f"to {proved} of"
@@ -66,6 +66,8 @@ _STAGES = {
     "tube": "looking for a tube",
     "learn": "learning beyond the ellipsoid",
     "outer": "proving beyond the ellipsoid",
+    "function": "learning a function",
+    "set": "proving that the set is not left",
     "ranks": "proving ranks of boxes",
     "check": "checking",
 }

@@ -18,7 +18,7 @@ from fractions import Fraction
 from typing import Any
 
 from .document import MAX_BYTES, Certificate
-from .evidence import Tree
+from .evidence import INVARIANT, WITHOUT_V, Tree
 from .limits import MAX_IN_PATIENCE
 from .rules import Verdict, judge
 
@@ -36,6 +36,8 @@ def read_once(path: str) -> bytes:
 
 
 def in_words(c: Certificate) -> str:
+    if c.claim == INVARIANT:
+        return of_staying(c) + kept(c)
     said = of_ranks(c) if c.target is not None else of_trajectories(c) + further(c) + in_ranks(c)
     return said + kept(c) + measured(c)
 
@@ -86,6 +88,17 @@ def of_ranks(c: Certificate) -> str:
     return (
         f"{c.plant.name}, policy {c.policy.sha256}{stepping(c)}: {from_leaves(c)} where {reached} that the certificate "
         f"states as its target is at most 0{on_the_way(c)}; nothing is said of what happens there"
+    )
+
+
+def of_staying(c: Certificate) -> str:
+    """The statement of a claim that a set is never left."""
+    level = None if c.beyond is None else c.beyond.level
+    return (
+        f"{c.plant.name}, policy {c.policy.sha256}: every trajectory that starts in the domain where N(x) <= {level!r}"
+        ", N being the expression that the certificate states, exists at all times and stays in that set, in the "
+        f"interior of the domain, with {', '.join(c.plant.inputs)} within the input bounds{whatever(c)}; nothing is "
+        "said of where in it it goes"
     )
 
 
@@ -204,7 +217,7 @@ def time_of_tube(c: Certificate) -> float | None:
 
 def level_names(c: Certificate) -> tuple[tuple[str, str, float], ...]:
     """Key in the file, letter, value; none without V."""
-    if c.target is not None:
+    if c.claim in WITHOUT_V:
         return ()
     least = () if c.floor is None else (("floor", "c0", c.floor),)
     return *least, ("local", "c1", c.inner), ("roa", "c2", c.outer)

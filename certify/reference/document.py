@@ -13,7 +13,19 @@ from typing import Any
 
 from flint import fmpq, fmpq_mat
 
-from .evidence import REACHES, WITH_FLOOR, WITH_TUBE, Fitted, Ranked, Tree, Trusted, read_evidence
+from .evidence import (
+    INVARIANT,
+    REACHES,
+    WITH_FLOOR,
+    WITH_TUBE,
+    WITHOUT_V,
+    Covering,
+    Fitted,
+    Ranked,
+    Tree,
+    Trusted,
+    read_evidence,
+)
 from .expressions import Equations, equations, rational
 from .fields import IDENTIFIER, MAX_NAMES, binary64, column, entries, exact, keys, numbers, square
 from .networks import Network, packed, read_networks
@@ -23,7 +35,7 @@ MAX_BYTES, MAX_BYTES_BEYOND_ASCII = 256 * 2**20, 16 * 2**20
 MAX_TOKENS = 10**6  # commas and opening brackets
 MAX_EXPRESSIONS, MAX_RANK = 64, 65_534  # of `keep` or of `target`; of a leaf that is claimed
 MAX_STEPS, SHA256 = 2**16, re.compile(r"[0-9a-f]{64}")  # of all measured runs; of a file of measurements
-SCHEMA, CLAIMS = "certify-certificate/9", ("asymptotic", *WITH_FLOOR, *WITH_TUBE, REACHES)
+SCHEMA, CLAIMS = "certify-certificate/9", ("asymptotic", *WITH_FLOOR, *WITH_TUBE, *WITHOUT_V)
 
 Interval = tuple[fmpq, fmpq]
 
@@ -122,7 +134,7 @@ class Certificate:
     claimed to be negative, those of `target` to become at most 0. With `data` the ranges of some uncertain quantities
     are those that measurements leave.
 
-    A claim with a target has no V: P has no entries and its levels are no numbers, so that no rule about V can hold.
+    Some claims have no V: P has no entries and its levels are no numbers, so that no rule about V can hold.
     """
 
     claim: str
@@ -141,7 +153,7 @@ class Certificate:
     floor: float | None
     inner: float
     outer: float
-    evidence: Tree | Ranked | Trusted
+    evidence: Tree | Ranked | Covering | Trusted
 
     @property
     def n(self) -> int:
@@ -164,7 +176,7 @@ class Certificate:
     @property
     def ends_at_origin(self) -> bool:
         """True if the claim is about the equilibrium at the origin; every model is at rest there."""
-        return self.claim not in (*WITH_FLOOR, REACHES)
+        return self.claim not in (*WITH_FLOOR, *WITHOUT_V)
 
     @property
     def step(self) -> fmpq:
@@ -198,11 +210,14 @@ def read(raw: bytes) -> Certificate:
     simple = not (claim in WITH_TUBE or rate > 0 or sample is not None or plant.discrete)
     plainly = beyond is None or simple
     require(plainly, "format", "claim.outer", "null was expected with a tube, a rate, a sample and in discrete time")
-    ranks, keep, target = read_more(said, plant, claim in WITH_TUBE or beyond is not None)
+    timeless = claim != INVARIANT or not plant.discrete
+    require(timeless, "format", "plant.time", f"time must be continuous with claim '{claim}'")
+    apart = claim in WITH_TUBE or (beyond is not None and claim != INVARIANT)
+    ranks, keep, target = read_more(said, plant, apart)
     measured = read_data(said["data"], plant, claim) if "data" in said else None
     policy = read_policy(data["policy"], networks, n, len(plant.inputs), claim)
     P = read_P(data["lyapunov"], n, claim)
-    named_levels = () if claim == REACHES else ("floor", "local", "roa") if claim in WITH_FLOOR else ("local", "roa")
+    named_levels = () if claim in WITHOUT_V else ("floor", "local", "roa") if claim in WITH_FLOOR else ("local", "roa")
     levels = keys(data["levels"], "levels", *named_levels)
     *floor, inner, outer = [binary64(levels[name], f"levels.{name}") for name in named_levels] or [math.nan] * 2
     least = floor[0] if floor else None
@@ -220,9 +235,14 @@ def read(raw: bytes) -> Certificate:
 
 
 def read_claim(value: Any) -> dict[str, Any]:
-    """Its keys by its kind. A claim without V has no rate and no outer set, as if these were 0 and null."""
+    """Its keys by its kind. Claims without V have no rate, as if it were 0, and one of them no outer set, the other no
+    sample, as if these were null."""
     named = isinstance(value, dict) and value.get("kind") in CLAIMS
     require(named, "format", "claim.kind", f"one of {', '.join(CLAIMS)} was expected")
+    if value["kind"] == INVARIANT:
+        said = keys(value, "claim", "kind", "outer", maybe=("keep",))
+        require(said["outer"] is not None, "format", "claim.outer", "an object was expected")
+        return {**said, "rate": (0.0).hex(), "sample": None}
     if value["kind"] == REACHES:
         said = keys(value, "claim", "kind", "sample", "target", "ranks", maybe=("keep",))
         return {**said, "rate": (0.0).hex(), "outer": None}
@@ -314,7 +334,7 @@ def read_expressions(value: Any, at: str, names: set[str]) -> Equations:
 
 
 def read_P(value: Any, n: int, claim: str) -> fmpq_mat:
-    if claim == REACHES:
+    if claim in WITHOUT_V:
         require(value is None, "format", "lyapunov", f"null was expected with claim '{claim}'")
         return fmpq_mat(0, 0)
     lyapunov = keys(value, "lyapunov", "kind", "P")

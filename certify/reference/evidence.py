@@ -22,7 +22,8 @@ MAX_PARTS, MAX_CELLS = 64, 4096  # of one range; of all of them together
 MAX_ORDER = 8  # of a series in time
 MAX_PIECES, MAX_ROUNDS, MAX_LEAVES = 64, 64, 4096  # of a measured transition; of bounds from all of them; of priors
 WITH_TUBE = ("enlarged", "reached")  # claims about a set of starts that is no level set of V
-REACHES = "reaches"  # the claim without V
+REACHES, INVARIANT = "reaches", "invariant"
+WITHOUT_V = (REACHES, INVARIANT)
 WITH_FLOOR = ("practical", "nearby")  # claims about a set in which everything ends, {V <= c0}, and not the origin
 WORD = re.compile(r"[A-Za-z0-9_.+-]{1,80}")
 
@@ -82,7 +83,7 @@ class Slab:
 
 @dataclass(frozen=True)
 class Covering:
-    """Trees over all of the domain, in coordinates x = T z, and over each of its faces."""
+    """Trees over all of the domain, in coordinates x = T z, and over each of its faces; of some claims they are all."""
 
     T: fmpq_mat
     root: array[float]
@@ -150,7 +151,7 @@ class Tree:
 
 @dataclass(frozen=True)
 class Ranked:
-    """Evidence for a claim without V, that can be replayed as well."""
+    """Evidence for a claim that a region is reached, that can be replayed as well."""
 
     order: int
     ranking: Ranking
@@ -174,11 +175,15 @@ class Fitted(NamedTuple):
 
 def read_evidence(
     value: Any, n: int, k: int, claim: str, sampled: bool, further: bool, ranked: bool, fitted: Fitted | None
-) -> Tree | Ranked | Trusted:
+) -> Tree | Ranked | Covering | Trusted:
     """`sampled` says whether a series in time may have an order above 1, `further` whether the claim has an `outer`,
     `ranked` whether it has `ranks`; `fitted` is there with `data`."""
     if claim == REACHES:
         return read_ranked(value, n, sampled)
+    if claim == INVARIANT:
+        alone = keys(value, "evidence", "kind", "outer")
+        require(alone["kind"] == "outer", "format", "evidence.kind", f"'outer' was expected with claim '{claim}'")
+        return read_covering(alone["outer"], n)
     if isinstance(value, dict) and value.get("kind") == "trusted-solver":
         said = claim not in (*WITH_TUBE, "nearby")
         require(said, "format", "evidence.kind", f"claim '{claim}' must be replayed")
@@ -202,7 +207,9 @@ def read_evidence(
     require(fits, "format", "evidence.tube", f"{least} to {most} slabs are allowed with claim '{claim}'")
     moves = claim == "reached"
     slabs = tuple(read_slab(v, f"evidence.tube.{k}", n, moves) for k, v in enumerate(tube))
-    covering = read_covering(evidence["outer"], n, further)
+    none = further or evidence["outer"] is None
+    require(none, "format", "evidence.outer", "null was expected, which claim.outer is")
+    covering = read_covering(evidence["outer"], n) if further else None
     ranking = read_ranking(evidence["ranks"], n) if ranked else None
     fit = read_fit(evidence["data"], fitted) if fitted else None
     return Tree(T, root, tree, order, cells, ball, contraction, slabs, covering, ranking, fit)
@@ -245,11 +252,8 @@ def read_rounds(value: Any, at: str, fitted: Fitted) -> tuple[Round, ...]:
     return tuple(found)
 
 
-def read_covering(value: Any, n: int, further: bool) -> Covering | None:
+def read_covering(value: Any, n: int) -> Covering:
     at = "evidence.outer"
-    if not further:
-        require(value is None, "format", at, "null was expected, which claim.outer is")
-        return None
     covering = keys(value, at, "T", "root", "tree", "faces")
     T, root = square(covering["T"], f"{at}.T", n), numbers(covering["root"], f"{at}.root", n)
     tree, faces = decoded(covering["tree"], f"{at}.tree"), entries(covering["faces"], f"{at}.faces", 2 * n)

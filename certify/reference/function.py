@@ -159,15 +159,27 @@ class Models:
 
     def is_above(self, x: Sequence[Taylor]) -> bool:
         """True if N is certainly defined, and above its level, on all of the box; x without remainders."""
-        if not self.N.calls:
-            return self.exceeds(self.value(x))
-        try:
-            return self.exceeds(self.value(x)) or self.exceeds(self.by_forms(x))
-        except Refused:
-            return self.exceeds(self.by_forms(x))
+        return self.certainly(x, lambda N: bool(-(-N).bound() > self.level))
 
-    def exceeds(self, N: Taylor) -> bool:
-        return N.is_finite() and bool(-(-N).bound() > self.level)
+    def is_below(self, x: Sequence[Taylor]) -> bool:
+        """The same with N below its level."""
+        return self.certainly(x, lambda N: bool(N.bound() < self.level))
+
+    def certainly(self, x: Sequence[Taylor], test: Callable[[Taylor], bool]) -> bool:
+        """True if one of the models of N is finite and passes."""
+        ways = (self.value, self.by_forms) if self.N.calls else (self.value,)
+        refused = None
+        for way in ways:
+            try:
+                N = way(x)
+            except Refused as no:
+                refused = no
+                continue
+            if N.is_finite() and test(N):
+                return True
+        if refused is not None and len(ways) == 1:
+            raise refused
+        return False
 
     def by_forms(self, x: Sequence[Taylor]) -> Taylor:
         """N with the affine forms of its calls' values, each entry with a symbol for its error."""

@@ -156,7 +156,7 @@ def sizes_of(c: Certificate) -> Sizes:
     return Sizes(c.n, c.m, z, c.n + c.m + y + z, c.n + (c.claim == "reached"), y, a, nets(called(f), policy))
 
 
-def asked_of_leaves(c: Certificate, evidence: Tree | Ranked) -> bool:
+def asked_of_leaves(c: Certificate, evidence: Tree | Ranked | Covering) -> bool:
     return isinstance(evidence, Tree) and (evidence.ball is None or c.inner != c.outer)
 
 
@@ -175,9 +175,9 @@ def numbers(c: Certificate) -> int:
     if isinstance(evidence, Trusted):
         return count
     ball = evidence.ball if isinstance(evidence, Tree) else None
-    order = max(evidence.order, ball.order if ball else 1)
+    order = max(1 if isinstance(evidence, Covering) else evidence.order, ball.order if ball else 1)
     values = z.a * (1 if c.sample is None else 4 * order) + 2 * z.n + 8
-    if evidence.ranking is not None:
+    if not isinstance(evidence, Covering) and evidence.ranking is not None:
         count += 2**4 * len(evidence.ranking.tree) + held_on_leaves(with_errors(z), values)
     elif asked_of_leaves(c, evidence) or c.beyond is not None:
         count += held_on_leaves(z, values)
@@ -215,6 +215,8 @@ def operations(c: Certificate) -> int:
     work = 2**15 * z.a + z.nets.folding
     if isinstance(evidence, Ranked):
         return work + in_ranks(c, z, evidence)
+    if isinstance(evidence, Covering):
+        return work + beyond(c, z, evidence)
     work += inverting(z.n, bits(c.P))
     if c.ends_at_origin:
         work += 2**12 * z.nets.weights + 2**19 * nets(called(c.plant.dynamics)).weights
@@ -225,7 +227,7 @@ def operations(c: Certificate) -> int:
     if asked_of_leaves(c, evidence):
         leaves = evidence.tree.count(LEAF)
         work += models_on_leaves(c, z, leaves, evidence.order) + on_leaves(c, z, leaves, evidence.order)
-    work += on_balls(c, z, evidence) + in_tube(c, z, evidence) + beyond(c, z, evidence)
+    work += on_balls(c, z, evidence) + in_tube(c, z, evidence) + beyond(c, z, evidence.covering)
     return work + in_ranks(c, z, evidence) + of_data(c, z, evidence)
 
 
@@ -313,9 +315,8 @@ def in_tube(c: Certificate, z: Sizes, evidence: Tree) -> int:
     return len(evidence.tube) * each + sum(inverting(z.n, bits(P)) for P in matrices)
 
 
-def beyond(c: Certificate, z: Sizes, evidence: Tree) -> int:
+def beyond(c: Certificate, z: Sizes, covering: Covering | None) -> int:
     """Operations for another function N, on the faces of the domain and on its own leaves."""
-    covering: Covering | None = evidence.covering
     if c.beyond is None or covering is None:
         return 0
     N = c.beyond.expression
@@ -328,4 +329,4 @@ def beyond(c: Certificate, z: Sizes, evidence: Tree) -> int:
     work += over.forms(faces + leaves, z.n + 1) + (1 + faces + leaves) * over.paths
     calls += z.n * z.s**2 + 160 * z.nets.read
     work += on_boxes(leaves, z.n, z.a + 8 * a + 4 * z.n, max(held, z.a), z.s, calls)
-    return work + leaves * over.models(z.s) + on_leaves(c, z, leaves, evidence.order)
+    return work + leaves * over.models(z.s) + on_leaves(c, z, leaves, 1)

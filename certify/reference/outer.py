@@ -28,15 +28,22 @@ RULE, FACES = "outer", "faces"
 
 def outer(c: Certificate, evidence: Tree) -> None:
     """Faces in their order, then T and the root, then the whole tree, then its leaves."""
-    N, covering = c.beyond, evidence.covering
-    if N is None or covering is None:
+    covering = evidence.covering
+    if covering is None:
         raise Refused("format", "evidence.outer", "the claim needs a tree over the domain")
-    models = Models(N, c.plant.states)
+    check_leaves(c, covered(c, covering), covering)
+
+
+def covered(c: Certificate, covering: Covering) -> Models:
+    """The rules before those for leaves; returns the function."""
+    if c.beyond is None:
+        raise Refused("format", "claim.outer", "the claim needs a second function")
+    models = Models(c.beyond, c.plant.states)
     for k, tree in enumerate(covering.faces):
         face(c, models, k, tree)
     covers_domain(c, covering)
     structure(covering.tree, range(c.n), RULE)
-    check_leaves(c, models, covering)
+    return models
 
 
 # ------------------------------------------------------------------------------------------------------------ the faces
@@ -100,20 +107,16 @@ def covers_domain(c: Certificate, covering: Covering) -> None:
         require(bool(reach <= exact(b)), RULE, f"axis {i}", "the root box does not contain the domain")
 
 
-class Region:
-    """Data shared by the leaves of a covering; `leaves` has V and the policy in the covering's coordinates."""
+class OverDomain:
+    """Data shared by the leaves of a covering."""
 
     def __init__(self, c: Certificate, models: Models, covering: Covering) -> None:
-        T = covering.T
         self.c, self.models = c, models
-        self.leaves = Leaves(c, T, fmpq_mat(T.transpose() * c.P * T))
-        self.T = arb_mat(T).tolist()
+        self.T = arb_mat(covering.T).tolist()
         self.domain = [(arb(lo), arb(hi)) for lo, hi in c.plant.domain]
 
     def is_free(self, box: Box) -> bool:
-        """True if certainly the box lies outside the domain, or V is below c2 or N above n2 on all of it."""
-        if self.leaves.is_below(self.leaves.outer, box):
-            return True
+        """True if certainly the box lies outside the domain, or N is above n2 on all of it."""
         x = self.states(box)
         if any(v.c - v.first > hi or v.c + v.first < lo for v, (lo, hi) in zip(x, self.domain, strict=True)):
             return True
@@ -132,6 +135,19 @@ class Region:
             )
             for row in self.T
         ]
+
+
+class Region(OverDomain):
+    """The same beside {V <= c2}; `leaves` has V and the policy in the covering's coordinates."""
+
+    def __init__(self, c: Certificate, models: Models, covering: Covering) -> None:
+        super().__init__(c, models, covering)
+        T = covering.T
+        self.leaves = Leaves(c, T, fmpq_mat(T.transpose() * c.P * T))
+
+    def is_free(self, box: Box) -> bool:
+        """True if moreover V is certainly below c2 on all of it."""
+        return self.leaves.is_below(self.leaves.outer, box) or super().is_free(box)
 
     def falls(self, leaf: Leaf) -> bool:
         """True if N'F, N'F + k (n2 - N) or N'F + k (V - c2) is certainly negative, for some k >= 0."""

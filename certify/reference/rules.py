@@ -12,7 +12,8 @@ from .balls import ON_LEAVES, PRECISION
 from .contraction import contraction
 from .data import data
 from .document import Certificate, read
-from .evidence import WITH_TUBE, Ranked, Tree, Trusted
+from .evidence import WITH_TUBE, Covering, Ranked, Tree, Trusted
+from .invariant import invariant
 from .leaves import Leaves, check_leaves, structure
 from .limits import limits
 from .local import local
@@ -58,6 +59,10 @@ def check(c: Certificate) -> int | None:
     if isinstance(c.evidence, Ranked):
         rational.centring(c)
         return with_ranks(c, c.evidence)
+    if isinstance(c.evidence, Covering):
+        rational.centring(c)
+        with ctx.workprec(ON_LEAVES):
+            return invariant(c, c.evidence)
     rational.levels(c)
     inverse = rational.inverse_diagonal(c.P, "lyapunov")
     if c.ends_at_origin:

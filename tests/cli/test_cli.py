@@ -280,7 +280,11 @@ def test_bad_options_exit_2(
         ("roa", ["--box", "q=1"], "--box must name states of pendulum"),
         ("roa", ["--enlarge", "--claim", "practical"], "--enlarge looks for a tube"),
         ("roa", ["--Q", "1"], "--Q must have 2 positive numbers"),
-        ("roa", ["--claim", "global"], "--claim must be one of auto, asymptotic, practical, nearby; found 'global'"),
+        (
+            "roa",
+            ["--claim", "global"],
+            "--claim must be one of auto, asymptotic, practical, nearby, invariant; found 'global'",
+        ),
         ("roa", ["--around", "rest", "--claim", "asymptotic"], "--around rest needs another --claim than asymptotic"),
         ("roa", ["--candidate", "neural", "--rate", "1"], "--candidate neural needs the engine bounds"),
         ("float-error", ["--tanh-ulp", "-1"], "--tanh-ulp must be a number from 0"),

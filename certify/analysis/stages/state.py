@@ -16,9 +16,9 @@ from certify.analysis.results import RoaResult
 from certify.analysis.saved_search import Keeper
 from certify.analysis.selection import Race
 from certify.certificates import PartitionTree, TrustedSolver
-from certify.certificates.data import DataBounds
 from certify.certificates.claims import Claim
 from certify.certificates.claims.claim import Kind
+from certify.certificates.data import DataBounds
 from certify.effort import Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.provers.base import Progress, Proof
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from certify.provers.outer import OuterProof
     from certify.provers.ranks import RankProof
 
-StageName = Literal["candidate", "ring", "tube", "learn", "outer", "ranks", "check"]
+StageName = Literal["candidate", "ring", "tube", "learn", "outer", "ranks", "function", "set", "check"]
 Report = Callable[[StageName, Progress | None], None]
 
 

@@ -27,6 +27,7 @@ from certify.certificates.claims.conditions import (
     Vdot,
     conditions,
 )
+from certify.certificates.claims.invariant import Invariant
 from certify.certificates.claims.reaches import MOST_TARGETS, Reaches
 
 __all__ = [
@@ -41,6 +42,7 @@ __all__ = [
     "Condition",
     "Enlarged",
     "Guard",
+    "Invariant",
     "Nearby",
     "OfInput",
     "OfState",

@@ -1,7 +1,8 @@
-"""Learn second functions N for sets beyond an ellipsoid, in floats; the provers prove them."""
+"""Learn second functions N for sets beyond an ellipsoid, or that are never left, in floats; the provers prove them."""
 
 from __future__ import annotations
 
-from certify.lyapunov.learning.learned import Learned, Round, fit_polynomial, learn
+from certify.lyapunov.learning.learned import Learned, Round, fit_polynomial, learn, learn_staying
+from certify.lyapunov.learning.models import Network, Terms
 
-__all__ = ["Learned", "Round", "fit_polynomial", "learn"]
+__all__ = ["Learned", "Network", "Round", "Terms", "fit_polynomial", "learn", "learn_staying"]

@@ -32,10 +32,16 @@ class Search:
         self.spread = self.region.std(0)
 
     def rising(
-        self, function: LyapunovFunction, below: float, above: float, known: Array, generator: np.random.Generator
+        self,
+        function: LyapunovFunction,
+        below: float,
+        above: float,
+        known: Array,
+        generator: np.random.Generator,
+        least: float = -np.inf,
     ) -> tuple[Array, Array, Array]:
-        """States z (B, n) with N < `below` where N falls by less than -`above` per scaled length; the unit vector of
-        the flow that is the worst of all corners, (B, n); and N's derivative along it, (B,).
+        """States z (B, n) with `least` <= N < `below` where N falls by less than -`above` per scaled length; the unit
+        vector of the flow that is the worst of all corners, (B, n); and N's derivative along it, (B,).
 
         Parameters
         ----------
@@ -51,10 +57,10 @@ class Search:
             again = known[generator.integers(len(known), size=_SAMPLES // 3)] * self.scale
             x.append(again + _BESIDE * self.spread * generator.normal(size=again.shape))
         z = self._asked(np.concatenate(x) / self.scale)
-        z = z[function(z) < below]
+        z = _between(function, z, least, below)
         v, slope = self.worst(function, z)
         z = np.concatenate([z, self._climbed(function, z[np.argsort(-slope, kind="stable")[:_CLIMBERS]])])
-        z = z[function(z) < below]
+        z = _between(function, z, least, below)
         v, slope = self.worst(function, z)
         some = slope > above
         return z[some], v[some], slope[some]
@@ -89,7 +95,7 @@ class Search:
 
     def _asked(self, z: Array) -> Array:
         x = z * self.scale
-        return np.asarray(z[self.flow.inside(x) & (self.flow.V(x) > self.flow.c)])
+        return np.asarray(z[self.flow.inside(x) & ~self.flow.is_home(x)])
 
     def _climbed(self, function: LyapunovFunction, z: Array) -> Array:
         """States driven to where N falls less, by differences along each axis."""
@@ -102,3 +108,8 @@ class Search:
             way = ((slopes[1:] - slopes[0]) / 1e-4).T
             z = z + _STRIDE * way / (np.linalg.norm(way, axis=-1, keepdims=True) + 1e-12)
         return self._asked(z)
+
+
+def _between(function: LyapunovFunction, z: Array, least: float, below: float) -> Array:
+    value = function(z)
+    return np.asarray(z[(value < below) & (value >= least)])

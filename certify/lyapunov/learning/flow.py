@@ -27,6 +27,7 @@ _STEP = 0.5  # of the time constant of the fastest eigenvalue
 _HORIZON = 12.0  # time constants of the slowest
 _MAX_STEPS = 3000
 _RATE_SAMPLES = 300
+_SHELL = 0.75  # of c, inside of which nothing is asked
 _NEAR = 0.93  # of a domain's half-width: from here on its faces are near
 
 _CALL = 2e5  # operations of evaluating few states at once
@@ -70,6 +71,8 @@ class LearningFlow:
     inner, c : matrix and level of the ellipsoid.
     """
 
+    collar = 1.0  # of the values below that of the boundary, for which the function has to fall
+
     def __init__(self, loop: ClosedLoop, inner: Quadratic, c: float, effort: Effort = UNLIMITED) -> None:
         system = loop.system
         self.loop, self.V, self.c, self.n, self.effort = loop, inner, c, system.n, effort
@@ -85,10 +88,13 @@ class LearningFlow:
             self._limits = np.array([[float(end) for end in pair] for pair in system.input_bounds]).T
         generator = np.random.default_rng(0)
         rates = eigenvalues_of(self.rate, self.uniform(_RATE_SAMPLES, generator), self.high - self.low)
+        self.step = _STEP / float(np.max(np.abs(rates), initial=1e-9))
+        self.steps = min(_MAX_STEPS, math.ceil(_HORIZON / max(self._slowest(), 1e-9) / self.step))
+
+    def _slowest(self) -> float:
+        """The rate at which the slowest motion about the origin decays; not positive if one does not."""
         at_rest = eigenvalues_of(self.rate, np.zeros((1, self.n)), self.high - self.low)
-        fastest, slowest = float(np.max(np.abs(rates), initial=1e-9)), float(np.min(-at_rest.real, initial=math.inf))
-        self.step = _STEP / fastest
-        self.steps = min(_MAX_STEPS, math.ceil(_HORIZON / max(slowest, 1e-9) / self.step))
+        return float(np.min(-at_rest.real, initial=math.inf))
 
     def uniform(self, count: int, generator: np.random.Generator) -> Array:
         """States of the domain, (count, n)."""
@@ -116,6 +122,23 @@ class LearningFlow:
         rates = np.stack([np.asarray(self._general(x, u, values)) for values in self._corners]) / scale
         return np.asarray(rates / (np.linalg.norm(rates, axis=-1, keepdims=True) + 1e-12))
 
+    def is_home(self, x: Array) -> Mask:
+        """True for each state from which nothing is asked any more, (B,)."""
+        return np.asarray(self.V(x) <= self.c)
+
+    def homes(self, count: int, generator: np.random.Generator) -> Array:
+        """States (count, n), uniform in the inner ellipsoid."""
+        x = generator.normal(size=(count, self.n))
+        x /= np.linalg.norm(x, axis=1, keepdims=True)
+        x = x * generator.random((count, 1)) ** (1 / self.n)
+        return np.asarray(x @ np.linalg.inv(np.linalg.cholesky(self.V.P / self.c)))
+
+    def shell(self, count: int, generator: np.random.Generator) -> Array:
+        """States (count, n) of the inner ellipsoid near its boundary."""
+        y = generator.normal(size=(count, self.n))
+        y *= np.sqrt(generator.uniform(_SHELL, 1.0, (count, 1))) / np.linalg.norm(y, axis=1, keepdims=True)
+        return np.asarray(y @ np.linalg.inv(np.linalg.cholesky(self.V.P / self.c)))
+
     def run(self, starts: Array, scale: Array) -> Runs:
         """Simulate from states (B, n)."""
         middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
@@ -124,7 +147,7 @@ class LearningFlow:
         x, alive = starts, np.arange(len(starts))
         with np.errstate(all="ignore"):
             for _ in range(self.steps):
-                home, kept = self.V(x) <= self.c, self.inside(x)
+                home, kept = self.is_home(x), self.inside(x)
                 fate[alive[home & kept]], fate[alive[~kept]] = Fate.CONVERGED, Fate.LOST
                 on = kept & ~home
                 x, alive = x[on], alive[on]

@@ -33,7 +33,6 @@ from certify.lyapunov.polynomial import Polynomial
 
 Array = NDArray[np.float64]
 _WITHIN = 0.5  # of c2: the ellipsoid outside of which N is to fall
-_SHELL = 0.75  # of that, inside of which nothing is asked
 _ROUNDS, _FIRST, _STEPS = 20, 36, 12  # of counterexamples; steps of the first fit and of each other
 _RELAXED = 0.4  # of the rounds, after which values may be anything below the level
 _MARGIN = 0.1  # the least fall of N per scaled length,
@@ -127,23 +126,54 @@ def fit_polynomial(
     return _learned(loop, inner, c2, Terms(loop.system.n, degree), seed, effort, progress)
 
 
+def learn_staying(
+    loop: ClosedLoop, model: Model, seed: int = 0, effort: Effort = UNLIMITED, progress: Report | None = None
+) -> Learned:
+    """Learn a function for a set that is never left: N falls on the way to where simulated runs end up, and is high
+    where a run leaves the domain, or violates a constraint or the bounds of an input.
+
+    Parameters
+    ----------
+    model : a `Network` or `Terms` of the plant's states.
+    loop, seed, effort, progress : as of `learn`.
+
+    Raises
+    ------
+    InputError : the loop goes in steps, or too few runs stay in the domain to learn from.
+    """
+    from certify.lyapunov.learning.staying import StayingFlow
+
+    _require_continuous(loop)
+    generator = np.random.default_rng(seed)
+    return _taught(StayingFlow(loop, generator, effort), model, generator, effort, progress)
+
+
 def _learned(
     loop: ClosedLoop, inner: Quadratic, c2: float, model: Model, seed: int, effort: Effort, progress: Report | None
 ) -> Learned:
-    start = time.monotonic()
     system = loop.system
-    if system.in_steps:
-        raise InputError(
-            f"a function is learned for plants in continuous time whose input follows the state at once; the time of "
-            f"{system.name} goes in steps."
-        )
+    _require_continuous(loop)
     if inner.n != system.n or not (math.isfinite(c2) and c2 > 0):
         raise InputError(
             f"the ellipsoid must be of the {system.n} states of {system.name}, at a positive level; "
             f"found {inner.n} states and the level {c2}."
         )
     generator = np.random.default_rng(seed)
-    flow = LearningFlow(loop, inner, _WITHIN * c2, effort)
+    return _taught(LearningFlow(loop, inner, _WITHIN * c2, effort), model, generator, effort, progress)
+
+
+def _require_continuous(loop: ClosedLoop) -> None:
+    if loop.system.in_steps:
+        raise InputError(
+            f"a function is learned for plants in continuous time whose input follows the state at once; the time of "
+            f"{loop.system.name} goes in steps."
+        )
+
+
+def _taught(
+    flow: LearningFlow, model: Model, generator: np.random.Generator, effort: Effort, progress: Report | None
+) -> Learned:
+    start = time.monotonic()
     samples = draw(flow, generator)
     lesson = _Lesson(flow, samples, generator)
     search = Search(flow, samples)
@@ -156,7 +186,7 @@ def _learned(
         p, damping = fitted.p, max(fitted.damping, 1e-4) if done else 1.0
         function = model.function(p)
         effort.charge(_SEARCHED * _EACH * len(p))
-        z, v, slope = search.rising(function, lesson.sought, -_NATURAL * _MARGIN, lesson.risen, generator)
+        z, v, slope = search.rising(function, lesson.sought, -_NATURAL * _MARGIN, lesson.risen, generator, lesson.least)
         low = search.low(function, lesson.sought, generator)
         level = min(
             float(function(z[slope >= 0]).min(initial=math.inf)),
@@ -184,6 +214,7 @@ class _Lesson:
         # Of several states the rim holds most of the volume, and to follow it costs a proof dearly.
         self.top = (0.95 if n <= 2 else 0.65) ** (1 / n)
         self.sought = self.top + _ABOVE / 2  # below which counterexamples are looked for
+        self.least = -math.inf if flow.collar == 1 else (1 - flow.collar) * self.top  # and from which on
         mixed = generator.permutation(len(samples.x))
         some = mixed[: _ROWS * n]
         faces = flow.faces(_FACES * n, generator) / scale
@@ -195,7 +226,7 @@ class _Lesson:
         self._edge = _EDGE_WEIGHT * (_FACES * n) ** -0.5
         falls = mixed[: _ROWS * n]
         falls = falls[samples.attracted[falls]]
-        shell = _shell(flow, max(_ROWS * n // 5, 1), generator)
+        shell = flow.shell(max(_ROWS * n // 5, 1), generator)
         x = np.concatenate([samples.x[falls], shell])
         self._falls = x / scale
         self._flow = _drawn(flow.directions(x, scale), generator)
@@ -220,7 +251,9 @@ class _Lesson:
         """Bounds of N's derivative where N is low now; none before the first fit, and heavier with each round."""
         most = np.concatenate([self._most, np.full(len(self.risen), -_NATURAL * _MARGIN)])
         z, v = np.concatenate([self._falls, self.risen]), np.concatenate([self._flow, self._risen_flow])
-        some = (function(z) < self.top + _ABOVE) if self._rounds else np.zeros(len(z), dtype=bool)
+        value = function(z)
+        asked = (value < self.top + _ABOVE) & (value >= self.least)
+        some = asked if self._rounds else np.zeros(len(z), dtype=bool)
         weight = self._slope_weight * min(1.0, (self._rounds + 0.3) / (0.4 * _ROUNDS))
         return Slopes(z[some], v[some], most[some], np.full(int(some.sum()), weight))
 
@@ -234,13 +267,6 @@ class _Lesson:
         self._z = np.concatenate([self._z, low])
         self._value = np.concatenate([self._value, np.full(len(low), math.inf)])
         self._weight = np.concatenate([self._weight, np.full(len(low), self._edge)])
-
-
-def _shell(flow: LearningFlow, count: int, generator: np.random.Generator) -> Array:
-    """States (count, n) of the inner ellipsoid near its boundary."""
-    y = generator.normal(size=(count, flow.n))
-    y *= np.sqrt(generator.uniform(_SHELL, 1.0, (count, 1))) / np.linalg.norm(y, axis=1, keepdims=True)
-    return np.asarray(y @ np.linalg.inv(np.linalg.cholesky(flow.V.P / flow.c)))
 
 
 def _drawn(directions: Array, generator: np.random.Generator) -> Array:

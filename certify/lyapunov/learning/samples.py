@@ -78,7 +78,7 @@ def draw(flow: LearningFlow, generator: np.random.Generator) -> Samples:
         others = generator.permutation(len(beyond))[: _STATES // 2]
         x = np.concatenate([region[some], beyond[others], flow.uniform(_STATES // 4, generator)])
     runs = flow.run(x, scale)
-    home = flow.V(x) <= flow.c
+    home = flow.is_home(x)
     way = runs.converged & ~home & (runs.nearness < 1)
     if way.sum() < _FEWEST:
         raise InputError(
@@ -108,10 +108,7 @@ def _walk(flow: LearningFlow, generator: np.random.Generator) -> tuple[Array, Ar
     A random walk that moves only to what converges, with steps as long as the region is wide so far: samples of the
     domain would hit a region of several states too seldom.
     """
-    root = np.linalg.inv(np.linalg.cholesky(flow.V.P / flow.c)).T
-    x = generator.normal(size=(_CHAINS, flow.n))
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    x = (x * generator.random((_CHAINS, 1)) ** (1 / flow.n)) @ root.T
+    x = flow.homes(_CHAINS, generator)
     kept, beyond = [], []
     for move in range(_MOVES):
         spread = np.linalg.cholesky(np.cov(x.T).reshape(flow.n, flow.n))

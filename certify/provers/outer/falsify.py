@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from certify.certificates.claims import Problem
 from certify.effort import UNLIMITED, Effort
+from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, corners
 from certify.loop.policies import bounded_by_form
 from certify.lyapunov.neural import Neural
@@ -33,42 +34,42 @@ _PUSH = 0.05  # away from the edge of what violates, beside a step along it
 
 @dataclass(frozen=True, slots=True)
 class Rise:
-    """A state `x` (n,) in the domain and outside of {V < c2} with N'F >= 0 (kind `rise`) or an input out of bounds
-    (`input`), in floats; `level` is N(x). `values` are those of the uncertain quantities."""
+    """A state `x` (n,) in the domain and outside of {V < c2} with N'F >= 0 (kind `rise`), an input out of bounds
+    (`input`) or a `constraint` that is violated (`keep`), in floats; `level` is N(x). `values` are those of the
+    uncertain quantities."""
 
     x: Array
     level: float
-    kind: Literal["rise", "input"]
+    kind: Literal["rise", "input", "keep"]
     values: Mapping[str, Fraction] = field(default_factory=dict)
+    constraint: str = ""
 
     def describe(self, system: System) -> str:
         """The violation in words."""
         names = ", ".join(f"{s} = {v:.6g}" for s, v in zip(system.states, self.x, strict=True))
         names += "".join(f", {name} = {float(q):.6g}" for name, q in self.values.items())
         what = "the input leaves its bounds" if self.kind == "input" else "N does not fall"
+        what = f"the constraint {self.constraint} is violated" if self.kind == "keep" else what
         return f"{what} at {names} with N = {self.level:.6g}"
 
 
-class Falsifier:
-    """A search of the domain outside of {V < c2}."""
+class Sampler:
+    """A search of the domain of a loop for states at which N does not fall, or an input leaves its bounds."""
 
-    def __init__(
-        self, problem: Problem, c2: float, T: Array, function: Neural | Symbolic, effort: Effort = UNLIMITED
-    ) -> None:
-        self.problem, self.c2, self.T, self.N, self.effort = problem, c2, T, function, effort
-        self.system = problem.loop.system
+    def __init__(self, loop: ClosedLoop, function: Neural | Symbolic, effort: Effort = UNLIMITED) -> None:
+        self.loop, self.N, self.effort, self.system = loop, function, effort, loop.system
         self.f = self.system.uncertain_function()
         self.corners = corners(self.system)
         self.low, self.high = np.array([[float(e) for e in pair] for pair in self.system.domain]).T
         self.half = (self.high - self.low) / 2
         ends = np.array([[float(e) for e in pair] for pair in self.system.input_bounds]).T
         self.least, self.most = ends
-        self.check_inputs = not bounded_by_form(problem.loop.network, self.system.input_bounds)
+        self.check_inputs = not bounded_by_form(loop.network, self.system.input_bounds)
 
     def rates(self, x: Array) -> tuple[Array, Array]:
         """(N'F at each corner of the ranges (C, B), how far the worst input lies outside its bounds (B,))."""
-        self.effort.charge(_CALL + 2 * len(x) * len(self.corners) * self.problem.loop.operations)
-        u, gradient = self.problem.loop.policy(x), self.N.gradient(x)
+        self.effort.charge(_CALL + 2 * len(x) * len(self.corners) * self.loop.operations)
+        u, gradient = self.loop.policy(x), self.N.gradient(x)
         rows = [(gradient * self.f(x, u, [float(q) for q in values.values()])).sum(-1) for values in self.corners]
         return np.stack(rows), np.maximum(self.least - u, u - self.most).max(-1)
 
@@ -84,9 +85,13 @@ class Falsifier:
         return np.where(self.check_inputs & (worst < 0) & (excess > 0), excess, worst)
 
     def asked(self, x: Array) -> NDArray[np.bool_]:
-        """True where a condition is asked: in the domain, V >= c2."""
+        """True where a condition is asked: in the domain."""
         inside: NDArray[np.bool_] = np.all((x >= self.low) & (x <= self.high), axis=-1)
-        return inside & (self.problem.V(x) >= self.c2)
+        return inside
+
+    def wall(self, x: Array) -> Array:
+        """The direction (B, n) along which states are asked for only up to some surface; zeros if there is none."""
+        return np.zeros_like(x)
 
     def sample(self, generator: np.random.Generator) -> Array:
         """Points of the domain, (B, n)."""
@@ -94,7 +99,7 @@ class Falsifier:
 
     @np.errstate(all="ignore")
     def least_value(self, seed: int = 1) -> float:
-        """The least N of samples of the domain outside of {V < c2}; infinite if there is none."""
+        """The least N of samples of the domain that are asked for; infinite if there is none."""
         x = self.sample(np.random.default_rng(seed))
         return float(np.min(self.value(x[self.asked(x)]), initial=np.inf))
 
@@ -111,7 +116,7 @@ class Falsifier:
         bad = x[violation >= 0]
         best = x[np.argsort(-violation, kind="stable")[: _CLIMBERS // 2]]
         drawn = x[generator.integers(len(x), size=_CLIMBERS // 2)]
-        climbed = self._climb(np.concatenate([best, drawn]))
+        climbed = self.climb(np.concatenate([best, drawn]))
         climbed = climbed[self.asked(climbed) & (self.violation(climbed) >= 0)]
         found = self.lowest(np.concatenate([bad, climbed]))
         return found if found is not None and found.level <= cap else None
@@ -137,9 +142,10 @@ class Falsifier:
             x, level = moved, lower
             if step.max() < 1e-9:
                 break
-        return self._rise(x[int(np.argmin(level))])
+        return self.rise(x[int(np.argmin(level))])
 
-    def _rise(self, x: Array) -> Rise:
+    def rise(self, x: Array) -> Rise:
+        """The violation at a state (n,)."""
         rates, _ = self.rates(x[None])
         level = float(self.value(x))
         if rates.max() >= 0:
@@ -149,7 +155,7 @@ class Falsifier:
     def _ways_down(self, x: Array) -> list[Array]:
         """Directions (B, n) in the domain's own scale: down, down along the edge, and that along V = c2 as well."""
         down = _unit(-self.N.gradient(x) * self.half)
-        edge, wall = _unit(self._uphill(x)), _unit(self.problem.V.gradient(x) * self.half)
+        edge, wall = _unit(self._uphill(x)), _unit(self.wall(x) * self.half)
         along = _unit(_without(down, edge))
         beside = _unit(_without(_without(down, wall), _unit(_without(edge, wall))))
         return [down, along + _PUSH * edge, _without(down, wall) + _PUSH * wall, beside + _PUSH * (edge + wall)]
@@ -160,7 +166,7 @@ class Falsifier:
         values = self.violation((x[None] + steps[:, None]).reshape(-1, x.shape[1])).reshape(len(steps), -1)
         return np.asarray(np.nan_to_num(((values[1:] - values[0]) / _APART).T, nan=0.0, posinf=0.0, neginf=0.0))
 
-    def _climb(self, x: Array) -> Array:
+    def climb(self, x: Array) -> Array:
         """Points driven to where the violation is larger, about along N = const."""
         step = 0.05
         for _ in range(_CLIMB):
@@ -190,6 +196,22 @@ class Falsifier:
                     step = np.where(better, 1.5 * step, 0.4 * step)
                 least = min(least, float(level.min()))
         return least
+
+
+class Falsifier(Sampler):
+    """A search of the domain outside of {V < c2}."""
+
+    def __init__(self, problem: Problem, c2: float, function: Neural | Symbolic, effort: Effort = UNLIMITED) -> None:
+        super().__init__(problem.loop, function, effort)
+        self.V, self.c2 = problem.V, c2
+
+    def asked(self, x: Array) -> NDArray[np.bool_]:
+        """True where a condition is asked: in the domain, V >= c2."""
+        return super().asked(x) & (self.V(x) >= self.c2)
+
+    def wall(self, x: Array) -> Array:
+        """The gradient of V."""
+        return self.V.gradient(x)
 
 
 def _unit(v: Array) -> Array:

@@ -85,9 +85,9 @@ def prove_outer(
     ------
     InputError : the plant has steps or a rate is asked for, or N is a function of other states.
     """
-    _require(problem, function)
+    require_function(system := problem.loop.system, function, problem.rate)
     start = time.monotonic()
-    search = Falsifier(problem, c2, T, function, budget.effort)
+    search = Falsifier(problem, c2, function, budget.effort)
     floor = search.least_value()
     if not math.isfinite(floor):
         return Nothing("every sampled state of the domain lies in the ellipsoid")
@@ -98,7 +98,7 @@ def prove_outer(
     seconds = {"falsify": time.monotonic() - start}
 
     share = replace(budget, effort=budget.effort.share(_FOR_FACES))
-    found = _faces(problem, function, top, floor, share, runner)
+    found = prove_faces(system, function, top, floor, share, runner)
     if isinstance(found, Nothing):
         return found
     boxes, faces, on_faces, stopped = found
@@ -113,7 +113,7 @@ def prove_outer(
             witness = deeper
         return math.inf if deeper is None else deeper.level
 
-    root, rule = root_around(problem, T), FallBound(problem, c2, T, function)
+    root, rule = root_around(system, T), FallBound(problem, c2, T, function)
     cover = Cover(rule, -root, root, runner, top, floor, _BESIDE_RISE * span, deepen)
     stopped = cover.advance(budget, report)
     if not cover.level > floor:
@@ -121,7 +121,7 @@ def prove_outer(
     if cover.level < top:
         stop = stopped
     if cover.level < top - _AGAIN * span:
-        again = _faces(problem, function, cover.level, floor, share, runner)
+        again = prove_faces(system, function, cover.level, floor, share, runner)
         if not isinstance(again, Nothing) and again[2] == cover.level:
             boxes, faces = boxes + again[0], again[1]
     seconds["leaves"] = time.monotonic() - start - seconds["falsify"] - seconds["faces"]
@@ -153,9 +153,9 @@ def _aim(search: Falsifier, floor: float, level: float | None) -> tuple[float, f
     return top, span, stop, witness
 
 
-def root_around(problem: Problem, T: Array) -> Array:
+def root_around(system: System, T: Array) -> Array:
     """Half-widths (n,) of a box in z around the domain, a hair larger for the checker's rationals."""
-    widest = np.array([float(max(-lo, hi)) for lo, hi in problem.loop.system.domain])
+    widest = np.array([float(max(-lo, hi)) for lo, hi in system.domain])
     inverse = np.linalg.inv(T)
     doubt = 1e-9 + 1e-14 * len(T) * np.linalg.cond(T)
     return np.asarray(np.abs(inverse) @ widest * (1 + doubt))
@@ -169,11 +169,10 @@ def face_box(system: System, axis: int, side: int) -> tuple[Array, Array]:
     return lo, hi
 
 
-def _faces(
-    problem: Problem, function: Neural | Symbolic, level: float, floor: float, budget: Budget, runner: Runner
+def prove_faces(
+    system: System, function: Neural | Symbolic, level: float, floor: float, budget: Budget, runner: Runner
 ) -> tuple[int, tuple[bytes, ...], float, Stop] | Nothing:
     """Boxes, trees of all faces, the level below which N is on none of them, and what limits it."""
-    system = problem.loop.system
     trees: list[bytes] = []
     boxes, stop = 0, Stop.DOMAIN
     for axis in range(system.n):
@@ -208,10 +207,15 @@ def _outwards(value: float, exact: Fraction, towards: float) -> float:
     return math.nextafter(value, towards) if beyond else value
 
 
-def _require(problem: Problem, function: Neural | Symbolic) -> None:
-    system = problem.loop.system
-    if system.in_steps or problem.rate:
-        found = "steps" if system.in_steps else f"the rate {problem.rate:g}"
+def require_function(system: System, function: Neural | Symbolic, rate: float = 0.0) -> None:
+    """Refuse a plant or a function that no set {N <= n2} is proved of.
+
+    Raises
+    ------
+    InputError : the plant has steps or a rate is asked for, or N is a function of other states.
+    """
+    if system.in_steps or rate:
+        found = "steps" if system.in_steps else f"the rate {rate:g}"
         raise InputError(f"an outer set is for plants in continuous time whose input follows at once; found {found}.")
     if function.n != system.n:
         raise InputError(f"N must be a function of the {system.n} states of {system.name}; it has {function.n}.")

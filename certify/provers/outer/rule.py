@@ -7,13 +7,16 @@ only falls with it and the multipliers do not depend on it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from certify.certificates.claims import Problem
-from certify.loop.expressions import Expression, evaluate, nodes
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Expression, Symbol, evaluate, nodes
 from certify.loop.plants import System
 from certify.loop.policies import bounded_by_form
 from certify.lyapunov.neural import Neural
@@ -54,27 +57,47 @@ class OuterBounds(NamedTuple):
     violated: Array
 
 
+@dataclass(frozen=True, slots=True)
+class OnBoxes:
+    """Models on boxes: `fall` of N'F, `N`, and `values` of what equations read; `smooth` (B,) where N and F are finite;
+    the shares of the inputs' errors and of remainders with which each axis (n, B) is charged; centres and radii."""
+
+    fall: Taylor
+    N: Taylor
+    smooth: Mask
+    values: Mapping[Symbol, Taylor]
+    share: Array
+    spread: Array
+    centre: Array
+    radius: Array
+
+    def score(self, excess: Array, of: Taylor) -> Array:
+        """The score (n, B) of each axis by a bound's `excess`: the inputs' errors are charged to the axes that spread
+        the policy, and the rest to those of N."""
+        n = len(self.centre)
+        return np.asarray(excess[:n] + self.share * excess[n:].sum(0) + self.spread * of.r)
+
+
 def enclosure_of(function: Neural | Symbolic) -> NeuralEnclosure | SymbolicEnclosure:
     """Models of N, whatever it is."""
     return NeuralEnclosure(function) if isinstance(function, Neural) else SymbolicEnclosure(function)
 
 
-class FallBound:
-    """The rule that N falls on boxes in the coordinates z, x = T z, wherever N <= n2 and V >= c2 in the domain."""
+class LoopOnN(ABC):
+    """A rule about N and the loop on boxes in the coordinates z, x = T z, wherever N <= n2 in the domain."""
 
-    def __init__(self, problem: Problem, c2: float, T: Array, function: Neural | Symbolic) -> None:
-        self.system, self.c2 = problem.loop.system, c2
+    def __init__(self, loop: ClosedLoop, T: Array, function: Neural | Symbolic) -> None:
+        self.system = loop.system
         self.T = np.ascontiguousarray(T)
-        self.V = FormBound(problem.V.P, T)
         self.N = enclosure_of(function)
-        self.policy = policy_enclosure(problem.loop)
+        self.policy = policy_enclosure(loop)
         self.dynamics = self.system.uncertain_dynamics()
-        self.check_inputs = not bounded_by_form(problem.loop.network, self.system.input_bounds)
+        self.check_inputs = not bounded_by_form(loop.network, self.system.input_bounds)
         self.ends = np.array([[float(end) for end in pair] for pair in self.system.domain]).T[:, :, None]
         symbols = self.system.n + self.system.m + len(self.system.uncertain)
         equations = sum(1 for _ in nodes(*self.dynamics)) + 3 * self.system.n
         own = _EACH * (1 + symbols) ** 2 * (equations + 4 * self.N.units)
-        self.operations = operations_of_policy(problem.loop.network) + own  # of a box, roughly
+        self.operations = operations_of_policy(loop.network) + own  # of a box, roughly
         self.piece = max(16, _NUMBERS // (self.N.units * (1 + symbols) * (2 + symbols) // 2))
 
     @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
@@ -85,7 +108,7 @@ class FallBound:
         radius = np.maximum(hi - centre, centre - lo) * (1 + EPS)
         x = np.concatenate([product(self.T, centre)[:, None], self.T[:, :, None] * radius], 1)
         error = 2 * (n + 4) * EPS * product(np.abs(self.T), np.abs(centre) + radius) + TINY
-        settled = self._outside(x, error) | (self.V.levels(lo, hi)[1] < self.c2 * (1 - _SLACK))
+        settled = self._outside(x, error) | self.free(lo, hi)
         index = chosen(~settled)
         found = OuterBounds(
             settled,
@@ -105,9 +128,22 @@ class FallBound:
         if opened:
             models, lefts, parts = zip(*opened, strict=True)
             left = np.concatenate(parts)
-            here = self._falls(models, lefts, [v.take(left, -1) for v in (x, error, centre, radius)], outer)
+            here = self._judged(models, lefts, [v.take(left, -1) for v in (x, error, centre, radius)], outer)
             found.proved[left], found.bound[left], found.score[:, left], found.violated[left] = here
         return found
+
+    @abstractmethod
+    def free(self, lo: Array, hi: Array) -> Mask:
+        """True for the boxes (B,) in z of which nothing is asked, whatever N is there."""
+
+    @abstractmethod
+    def asks(self, z: Array) -> Mask:
+        """True for the points (n, B) of which something is asked, if N is at most the level there."""
+
+    @abstractmethod
+    def judged(self, on: OnBoxes, level: float) -> tuple[Mask, Array, Array, Mask]:
+        """`proved`, `bound` and `score` of the boxes as of `OuterBounds`, and True where a condition fails at the
+        centre if N is at most the level there; bounds of inputs are not meant."""
 
     def _outside(self, x: Array, error: Array) -> Mask:
         """True for the boxes (B,) that lie outside of the domain."""
@@ -124,7 +160,7 @@ class FallBound:
         inside: Mask = ((x > low + slack) & (x < high - slack)).all(0)
         return inside
 
-    def _falls(
+    def _judged(
         self,
         known: Sequence[NeuralModels | SymbolicModels],
         lefts: Sequence[Index],
@@ -134,7 +170,6 @@ class FallBound:
         """`proved`, `bound`, `score` and `violated` of the boxes on which N may be at most the level: those at the
         indices `lefts` of pieces, whose models are known; of the boxes are given x, its error, centres and radii."""
         x, error, centre, radius = boxes
-        n = len(x)
         mid, slopes, wide, share = self.policy(x, error)
         models = loop_models(self.system, x, error, mid, slopes, wide)
         values = {**models.states, **models.inputs, **models.quantities}
@@ -146,27 +181,50 @@ class FallBound:
             part = np.arange(first, first := first + len(left))
             pieces.append((*piece.along([f.at(part) for f in F], left), piece.value.at(left)))
         falls, spreads, values_of_n = zip(*pieces, strict=True)
-        fall, spread = _joined(falls), joined(spreads)
-        bound, excess = upper_bound(fall)
+        fall = _joined(falls)
         N = _widened(_joined(values_of_n), fall)
-        inputs = n + self.system.m
-        doubt = np.abs(fall.g[n:inputs]).sum(0) + np.abs(fall.Q[n:, n:]).sum((0, 1)) + fall.r
-        rises = fall.c + np.abs(fall.g[inputs:]).sum(0) - doubt >= 0
-        # The inputs' errors are charged to the axes that spread the policy, and the rest to those of N.
-        score = excess[:n] + share * excess[n:].sum(0) + spread * fall.r
-        smooth = np.isfinite(bound)
+        smooth = np.ones(len(N.c), dtype=bool)
         for model in (N, *F):  # a component that is multiplied by 0 must be enclosed as well
             smooth = smooth & np.isfinite(sum(model.norms()) + model.r)
-        bound = self._where_asked(bound, fall, N, centre, radius, level)
-        bound = np.where(smooth, bound, np.inf)
-        proved = bound < 0
+        on = OnBoxes(fall, N, smooth, values, share, joined(spreads), centre, radius)
+        proved, bound, score, rises = self.judged(on, level)
         score = np.where(np.isfinite(score) & smooth, score, np.abs(x[:, 1:]).sum(0))
         if self.check_inputs:
             for j, (inside, outside) in enumerate(input_bounds_kept(self.system, mid, slopes, wide)):
                 proved, rises = proved & inside, rises | outside
                 score = np.where(inside, score, np.abs(slopes[j]) + share * wide[j])
-        asked = (N.c <= level) & (self.V.at(centre) >= self.c2) & self._inside(x[:, 0])
+        asked = (N.c <= level) & self.asks(centre) & self._inside(x[:, 0])
         return proved, bound, score, np.where(rises & asked, N.c, np.inf)
+
+
+class FallBound(LoopOnN):
+    """The rule that N falls wherever N <= n2 and V >= c2 in the domain."""
+
+    def __init__(self, problem: Problem, c2: float, T: Array, function: Neural | Symbolic) -> None:
+        super().__init__(problem.loop, T, function)
+        self.c2, self.V = c2, FormBound(problem.V.P, T)
+
+    def free(self, lo: Array, hi: Array) -> Mask:
+        """True where V < c2."""
+        free: Mask = self.V.levels(lo, hi)[1] < self.c2 * (1 - _SLACK)
+        return free
+
+    def asks(self, z: Array) -> Mask:
+        """True where V >= c2."""
+        asks: Mask = self.V.at(z) >= self.c2
+        return asks
+
+    def judged(self, on: OnBoxes, level: float) -> tuple[Mask, Array, Array, Mask]:
+        """N'F, where N <= n2 and V >= c2."""
+        n, fall = len(on.centre), on.fall
+        bound, excess = upper_bound(fall)
+        inputs = n + self.system.m
+        doubt = np.abs(fall.g[n:inputs]).sum(0) + np.abs(fall.Q[n:, n:]).sum((0, 1)) + fall.r
+        rises = fall.c + np.abs(fall.g[inputs:]).sum(0) - doubt >= 0
+        smooth = on.smooth & np.isfinite(bound)
+        bound = self._where_asked(bound, fall, on.N, on.centre, on.radius, level)
+        bound = np.where(smooth, bound, np.inf)
+        return bound < 0, bound, np.where(smooth, on.score(excess, fall), np.inf), rises
 
     def _where_asked(self, bound: Array, fall: Taylor, N: Taylor, centre: Array, radius: Array, level: float) -> Array:
         """The bound, made tighter where it is not negative by `k (n2 - N)` and `k (V - c2)`, which are >= 0 there."""

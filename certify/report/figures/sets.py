@@ -8,7 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates import Certificate, PartitionTree, RankTree, ReachCertificate, Slab, TrustedSolver
+from certify.certificates import (
+    AnyCertificate,
+    Certificate,
+    PartitionTree,
+    RanksAlone,
+    RankTree,
+    Slab,
+)
 from certify.certificates.ellipsoids import sublevel_set
 from certify.certificates.membership import angles_in
 from certify.certificates.ranked import Ranked
@@ -62,9 +69,10 @@ def slabs_of(certificate: Certificate) -> tuple[Slab, ...]:
     return certificate.evidence.tube if isinstance(certificate.evidence, PartitionTree) else ()
 
 
-def tree_of(certificate: Certificate | ReachCertificate) -> RankTree | None:
+def tree_of(certificate: AnyCertificate) -> RankTree | None:
     """The tree of the boxes with ranks; None without any."""
-    return None if isinstance(certificate.evidence, TrustedSolver) else certificate.evidence.ranks
+    evidence = certificate.evidence
+    return evidence.ranks if isinstance(evidence, PartitionTree | RanksAlone) else None
 
 
 def ranked_of(certificate: Certificate) -> Ranked | None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from certify.certificates import Certificate, ReachCertificate
+from certify.certificates import AnyCertificate, Certificate, InvariantCertificate, ReachCertificate
 from certify.loop.plants import System, input_errors
 from certify.report.claims import Words
 from certify.report.measured import Measured
@@ -73,7 +73,24 @@ def not_reached_of(certificate: ReachCertificate) -> list[tuple[str, str]]:
     ]
 
 
-def _turns(certificate: Certificate | ReachCertificate) -> Iterator[tuple[str, str]]:
+def not_staying_of(certificate: InvariantCertificate) -> list[tuple[str, str]]:
+    """Heads and texts of the gaps of a claim that a set is never left."""
+    system, timing = certificate.system, timing_of(certificate)
+    return [
+        (
+            "Where trajectories go.",
+            "Nothing is said of what they do in the set: they may come to rest or circle.",
+        ),
+        ("States outside the set.", "Of them nothing is said: they may enter it, or not. They need not be unsafe."),
+        *_not_of_the_plant(system),
+        *(one for one in _other_times(timing) if "set" not in one[0]),
+        _rounding(system),
+        *_turns(certificate),
+        ("Simulated figures.", "Runs that are drawn, and the size of the set, are by samples in floating point."),
+    ]
+
+
+def _turns(certificate: AnyCertificate) -> Iterator[tuple[str, str]]:
     """The gap about angles, unless full turns of them are the same place."""
     ranks, said = certificate.claim.ranks, "States are real numbers: an angle of a full turn is not the origin."
     if ranks is None or not ranks.angles:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates import Certificate, ReachCertificate, TrustedSolver
+from certify.certificates import AnyCertificate, Certificate, TrustedSolver
 from certify.certificates.claims import Outer
 from certify.errors import CertifyError
 from certify.loop.closed_loop import ClosedLoop
@@ -121,7 +121,7 @@ def _sizes(certificate: Certificate, sets: Sequence[Ellipsoid]) -> Rows:
     ]
 
 
-def ranked_rows(certificate: Certificate | ReachCertificate, target: str = "{V ≤ c₂}") -> Rows:
+def ranked_rows(certificate: AnyCertificate, target: str = "{V ≤ c₂}") -> Rows:
     """The boxes with ranks: how many, how large, how far away."""
     found, tree, system = ranks_of(certificate), tree_of(certificate), certificate.system
     if found is None or tree is None:
@@ -191,7 +191,7 @@ def _evidence(certificate: Certificate, accepted: Mapping[str, Any] | None, sha2
     return rows
 
 
-def file_rows(certificate: Certificate | ReachCertificate, sha256: str, size: int | None) -> Rows:
+def file_rows(certificate: AnyCertificate, sha256: str, size: int | None) -> Rows:
     """The policy and the file."""
     network = certificate.network
     return [
@@ -233,7 +233,7 @@ def _candidates(certificate: Certificate, result: Mapping[str, Any] | None) -> l
     ]
 
 
-def _unit_of(certificate: Certificate | ReachCertificate) -> str:
+def _unit_of(certificate: AnyCertificate) -> str:
     """The unit of a volume of states."""
     system = certificate.system
     return volume_unit([system.units.get(s.name, "") for s in system.states])
@@ -281,7 +281,7 @@ def _lengths(certificate: Certificate, sets: Sequence[Ellipsoid]) -> tuple[list[
     return heads, [*axes, *most]
 
 
-def _clip(certificate: Certificate | ReachCertificate) -> str:
+def _clip(certificate: AnyCertificate) -> str:
     """Each input's limits, in its unit."""
     inputs, clip = certificate.system.inputs, certificate.network.clip or ()
     each = zip(inputs, *clip, strict=True)

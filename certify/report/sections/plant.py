@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any
 
-from certify.certificates import Certificate, ReachCertificate
+from certify.certificates import AnyCertificate, Certificate
 from certify.loop.expressions import Expression, Number, Symbol, nodes
 from certify.loop.plants import System, input_errors
 from certify.report.mathml import identifier, is_long, multiplied_out, typeset
@@ -27,7 +27,7 @@ from certify.report.words import (
 )
 
 
-def plant_of(certificate: Certificate | ReachCertificate) -> dict[str, Any]:
+def plant_of(certificate: AnyCertificate) -> dict[str, Any]:
     """Its equations, its ranges and its operating point, by their names in the template."""
     system, units = certificate.system, certificate.system.units
     expressions, steps = system.uncertain_dynamics(), system.time == "discrete"

@@ -12,7 +12,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates import Certificate, PartitionTree, ReachCertificate
+from certify.certificates import AnyCertificate, Certificate, PartitionTree
 from certify.certificates.membership import angles_in
 from certify.certificates.ranked import Count, count
 from certify.errors import CertificateFormatError
@@ -22,7 +22,7 @@ from certify.report.timing import TimingInWords
 from certify.report.words import ABSENT, above, number, point, symbol
 
 
-def timing_of(certificate: Certificate | ReachCertificate) -> TimingInWords:
+def timing_of(certificate: AnyCertificate) -> TimingInWords:
     """The timing of its loop, with the rate at which V is claimed to fall."""
     rate = certificate.claim.rate if isinstance(certificate, Certificate) else 0.0
     return TimingInWords.of(certificate.system, rate)
@@ -45,7 +45,7 @@ def additions_of(certificate: Certificate) -> Additions:
     )
 
 
-def ranks_of(certificate: Certificate | ReachCertificate) -> Count | None:
+def ranks_of(certificate: AnyCertificate) -> Count | None:
     """The numbers of its boxes with ranks; None without any, and where a rejected file's tree is none."""
     tree = tree_of(certificate)
     try:
@@ -98,7 +98,7 @@ def duration_in_words(certificate: Certificate) -> str:
     return f"{above(sum(map(Fraction, each)))} s" if each and all(map(math.isfinite, each)) else ABSENT
 
 
-def read_in_words(certificate: Certificate | ReachCertificate) -> str:
+def read_in_words(certificate: AnyCertificate) -> str:
     """The layers' inputs under a policy whose origin is another state, in the states' units."""
     states, origin = certificate.system.states, certificate.network.origin.tolist()
     each = zip(states, origin, strict=True)

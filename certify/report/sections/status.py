@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from certify.certificates import Certificate, PartitionTree, RanksAlone, ReachCertificate, TrustedSolver
+from certify.certificates import AnyCertificate, OuterTree, PartitionTree, RanksAlone, ReachCertificate, TrustedSolver
 from certify.errors import SoundnessError
 from certify.report.claims import CHECKED_ALWAYS, words_for
 from certify.report.words import point
@@ -34,7 +34,10 @@ class Status:
         return self.kind == "ACCEPTED"
 
 
-def status_of(certificate: Certificate | ReachCertificate, sha256: str, answer: Mapping[str, Any] | None) -> Status:
+_REPLAYED = PartitionTree | RanksAlone | OuterTree
+
+
+def status_of(certificate: AnyCertificate, sha256: str, answer: Mapping[str, Any] | None) -> Status:
     """The status that the checker's answer gives the certificate whose bytes have this hash.
 
     Raises
@@ -53,7 +56,7 @@ def status_of(certificate: Certificate | ReachCertificate, sha256: str, answer: 
     levels = answer.get("levels")
     given = dict(levels) if isinstance(levels, Mapping) else {}
     beyond, ranks = answer.get("outer"), certificate.claim.ranks
-    stated = certificate.claim.outer if isinstance(certificate, Certificate) else None
+    stated = None if isinstance(certificate, ReachCertificate) else certificate.claim.outer
     beyond = beyond if beyond is None or (isinstance(beyond, Mapping) and "level" in beyond) else {"level": "none"}
     for what, found, wanted in (
         ("bytes with sha256", answer.get("certificate_sha256"), sha256),
@@ -65,7 +68,7 @@ def status_of(certificate: Certificate | ReachCertificate, sha256: str, answer: 
             None if stated is None else [stated.level],
         ),
         ("steps of ranks", _steps(answer.get("ranks")), None if ranks is None else ranks.steps),
-        ("evidence to replay", kind == "ACCEPTED", isinstance(certificate.evidence, PartitionTree | RanksAlone)),
+        ("evidence to replay", kind == "ACCEPTED", isinstance(certificate.evidence, _REPLAYED)),
     ):
         if found != wanted:
             raise SoundnessError(

@@ -1,0 +1,81 @@
+"""The run of `certify roa --claim invariant`: its files, its summary."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from certify.cli.certifying import where_of
+from certify.cli.shared import noting, page_of, write
+from certify.cli.terminal import ProgressLine, say, show
+
+if TYPE_CHECKING:
+    from certify.analysis.options import RoaOptions
+    from certify.loop.plants import System
+    from certify.loop.policies import Policy
+
+
+def stayed(
+    policy: Path,
+    stored: Policy,
+    plant: System,
+    options: RoaOptions,
+    out: Path | None,
+    start: float,
+    quiet: bool,
+    as_json: bool,
+    asked: str | None = None,
+) -> None:
+    """Run, write certificate and report, print the result; ends the command with the verdict's exit status.
+
+    Parameters
+    ----------
+    stored, plant : the policy in the file `policy`, and the plant.
+    out : folder for the results.
+    start : when the command began, by `time.perf_counter`.
+    asked : a state or a box, as people write it; the result says if the proved set contains it.
+    """
+    from certify.analysis.installation import versions
+    from certify.analysis.staying import certify_invariant
+    from certify.report.stayed import summary
+
+    note, folder = noting(quiet), out if out is not None else Path("out") / policy.stem
+    progress, later = None if quiet else ProgressLine(), list[str]()
+    try:
+        result = certify_invariant(
+            plant,
+            stored.network,
+            folder,
+            options,
+            load_seconds=time.perf_counter() - start,
+            provenance={"policy": policy.name, **versions()},
+            progress=progress,
+            tell=later.append,
+        )
+    finally:
+        if progress is not None:
+            progress.close()
+        for line in later:
+            note(line)
+    if result.notice is not None:
+        note(result.notice)
+    data = result.to_dict()
+    if result.certificate is not None and result.raw is not None:
+        answer = None if result.checker is None else dict(result.checker)
+        write(folder / "report.html", page_of(result.raw, result.certificate, answer, data))
+    where = None if asked is None else where_of(result, asked)
+    if where is not None:
+        data["contains"] = where[0]
+    if as_json:
+        say(json.dumps(data))
+    else:
+        show(summary(data))
+        if where is not None:
+            say(where[1])
+        if result.certificate is not None:
+            say(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}")
+    raise typer.Exit(result.verdict.exit_status)

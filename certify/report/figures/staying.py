@@ -1,0 +1,120 @@
+"""Pictures of a set that is never left: its extent in planes of the states, its constraints, simulated runs from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.certificates import InvariantCertificate
+from certify.loop.plants import corners
+from certify.loop.plants.floating_point import function_of
+from certify.report.figures.pairs import MOST, Pair
+from certify.report.figures.style import INK, PAPER, SET, START, Picture, figure_of, to_svg
+from certify.report.flow import Flow, simulate, time_scales
+from certify.report.words import deviation
+
+Array = NDArray[np.float64]
+_POINTS, _DEEP = 200, 240  # of a picture along each side; values of the other states at each of them
+_STARTS, _STEPS, _SAMPLES = 8, 1500, 200_000
+_RUNS = (PAPER, 1.4), (INK, 0.6)
+
+
+def staying_pictures(certificate: InvariantCertificate, accepted: bool) -> list[Picture]:
+    """The set's extent for each pair of states, or along the line of one."""
+    system, n = certificate.system, certificate.system.n
+    lo, hi = np.array([[float(end) for end in pair] for pair in system.domain]).T
+    runs = _runs(certificate, lo, hi)
+    shown = zip(system.states, system.exact_x_eq(), strict=True)
+    labels = [deviation(s.name, q, system.units.get(s.name, "")) for s, q in shown]
+    pairs = list(combinations(range(n), 2))[:MOST] if n > 1 else [(0, 0)]
+    return [_picture(certificate, accepted, labels, (lo, hi), runs, pair) for pair in pairs]
+
+
+def _picture(
+    certificate: InvariantCertificate,
+    accepted: bool,
+    labels: Sequence[str],
+    box: tuple[Array, Array],
+    runs: Array,
+    pair: Pair,
+) -> Picture:
+    """The set in one plane."""
+    (lo, hi), (i, j), n = box, pair, len(labels)
+    figure, axes = figure_of(4.4, 3.6 if n > 1 else 1.6, left=0.86)
+    outer = certificate.claim.outer
+    a, b, states = _plane(lo, hi, pair)
+    with np.errstate(all="ignore"):
+        value = np.nan_to_num(outer.function(states), nan=np.inf).min(0)
+        kept = _worst(certificate, states).min(0)
+    if n > 1:
+        finite = np.where(np.isfinite(value), value, outer.level + 1)
+        axes.contourf(a, b, finite, levels=[-np.inf, outer.level], colors=[SET], alpha=0.25, zorder=1)
+        axes.contour(a, b, finite, levels=[outer.level], colors=[SET], linewidths=[1.6], zorder=4)
+        if np.any(kept >= 0):
+            axes.contourf(a, b, kept, levels=[0.0, np.inf], colors=[START], alpha=0.35, zorder=2)
+        for run in range(runs.shape[1]):
+            for colour, width in _RUNS:
+                axes.plot(runs[:, run, i], runs[:, run, j], color=colour, lw=width, zorder=3)
+        axes.set_ylabel(labels[j])
+        axes.set_ylim(lo[j], hi[j])
+        units = [certificate.system.units.get(certificate.system.states[k].name) for k in pair]
+        if units[0] is not None and units[0] == units[1]:
+            axes.set_aspect("equal")
+    else:
+        for left, right, inside in zip(a, a[1:], value[0] <= outer.level, strict=False):
+            if inside:
+                axes.axvspan(left, right, color=SET, alpha=0.4, lw=0)
+        axes.set_yticks([])
+    axes.set_xlim(lo[i], hi[i])
+    axes.set_xlabel(labels[i])
+    extent = "the states of the set, whatever the others are, by samples of these" if n > 2 else "the set"
+    unless = "" if accepted else ", if the claim is true"
+    red = " Magenta: a constraint is violated there." if np.any(kept >= 0) else ""
+    return Picture(
+        "The set that is never left" if n <= 2 else f"The set: {labels[i]}, {labels[j]}",
+        f"Blue: {extent}, which no trajectory leaves{unless}.{red} Thin lines: simulated runs from states of the set.",
+        to_svg(figure),
+        simulated=True,
+    )
+
+
+def _plane(lo: Array, hi: Array, pair: Pair) -> tuple[Array, Array, Array]:
+    """Points along two states, and the states there with samples of all others, (samples, rows, columns, n)."""
+    n, (i, j) = len(lo), pair
+    a, b = (np.linspace(lo[k], hi[k], _POINTS) for k in pair)
+    others = np.random.default_rng(0).uniform(lo, hi, (_DEEP if n > 2 else 1, n))
+    if n > 2:
+        others[0] = np.clip(0.0, lo, hi)
+    states = np.tile(others[:, None, None], (1, _POINTS if n > 1 else 1, _POINTS, 1))
+    states[..., i] = a
+    if n > 1:
+        states[..., j] = b[:, None]
+    return a, b, states
+
+
+def _worst(certificate: InvariantCertificate, states: Array) -> Array:
+    """The largest of all constraints' g at states (..., n), for the worst uncertain quantities; -inf without any."""
+    keep, system = tuple(certificate.constraints.values()), certificate.system
+    if not keep:
+        return np.full(states.shape[:-1], -np.inf)
+    g = function_of(system, keep, [s for s, _ in system.uncertain], "numpy")
+    flat = states.reshape(-1, system.n)
+    u = np.asarray(certificate.network.folded(system.exact_u_eq())(flat, system.exact_u_eq()))
+    found = [np.asarray(g(flat, u, [float(q) for q in values.values()])).max(-1) for values in corners(system)]
+    return np.asarray(np.max(found, axis=0)).reshape(states.shape[:-1])
+
+
+def _runs(certificate: InvariantCertificate, lo: Array, hi: Array) -> Array:
+    """Simulated runs from states of the set, (steps, runs, n)."""
+    outer = certificate.claim.outer
+    x = np.random.default_rng(1).uniform(lo, hi, (_SAMPLES, len(lo)))
+    with np.errstate(all="ignore"):
+        value = outer.function(x)
+    inside = np.flatnonzero(value <= outer.level)
+    order = inside[np.argsort(-value[inside], kind="stable")]
+    starts = x[order[np.linspace(0, len(order) - 1, _STARTS).astype(int)]] if len(order) else x[:0]
+    flow = Flow.of(certificate.system, certificate.network)
+    return simulate(flow, starts, flow.fitting(time_scales(flow)[0] / 2), _STEPS)
