@@ -15,6 +15,7 @@ from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
 from certify.analysis.saved_search import Keeper
 from certify.analysis.selection import Race
+from certify.analysis.simulated import SimulatedRegion
 from certify.certificates import PartitionTree, TrustedSolver
 from certify.certificates.claims import Claim
 from certify.certificates.claims.claim import Kind
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from certify.provers.outer import OuterProof
     from certify.provers.ranks import RankProof
 
-StageName = Literal["candidate", "ring", "tube", "learn", "outer", "ranks", "check"]
+StageName = Literal["candidate", "ring", "tube", "simulate", "learn", "outer", "ranks", "check"]
 Report = Callable[[StageName, Progress | None], None]
 
 
@@ -47,6 +48,7 @@ class State:
     claim, evidence : what is to be certified.
     beyond : the set of another function around the ellipsoid.
     ranked : boxes with ranks, as the search found them.
+    simulated : the region of attraction by runs.
     missed : why no tube holds `centre`.
     accepted : the certificate that the checker accepts.
     done : the result is final.
@@ -64,6 +66,7 @@ class State:
     evidence: PartitionTree | TrustedSolver | None = None
     beyond: OuterProof | None = None
     ranked: RankProof | None = None
+    simulated: SimulatedRegion | None = None
     missed: str = ""
     accepted: Accepted | None = None
     done: bool = False
