@@ -56,11 +56,10 @@ class RoaResult:
     are those that trajectories are to keep, in words by their names; with a certificate they are proved. `simulated`
     counts simulated runs, in up to three states. `checker` is the checker's answer, None if it was not reached, about
     `raw`, the certificate's bytes; `solver` has dReal's version and every query with its answer, None if it was not
-    asked. `notices` are facts about plant and policy known before the run, such as a domain that was cut; `folder`
-    keeps a temporary folder of the certificate alive. `search` is a file that `resume` continues.
+    asked. `notices` are facts known before the run, such as a domain that was cut; `folder` keeps a temporary folder
+    of the certificate alive. `search` is a file that `resume` continues.
 
-    In Python: `contains`, `volume`, `plot`, `report`, `certificate` (the file's path), `to_dict`.
-    """
+    In Python: `contains`, `volume`, `plot`, `report`, `certificate` (the file's path), `to_dict`."""
 
     verdict: Verdict
     stop: Stop
