@@ -1,8 +1,7 @@
 """A run goes on beyond the ellipsoid where that is little of what converges in simulation, and says the share.
 
 The plant is x' = x (x - 1) (x + 3) under no input: its region of attraction is -3 < x < 1 by inspection, of which an
-ellipsoid around 0 holds half. In discrete time it is x+ = x + x (x - 1) (x + 3) / 10, with the same region where nothing
-is too fast.
+ellipsoid around 0 holds half. In discrete time it is x+ = x + x (x - 1) (x + 3) / 10, with the same region.
 """
 
 from __future__ import annotations
