@@ -61,7 +61,7 @@ def stated(result: RoaResult) -> list[tuple[str, str]]:
             rows[-1] = (rows[-1][0], f"{rows[-1][1]}, of V <= {below(level)}")
             rows.append(("with N", estimated(result.outer.volume, result.outer.deviation, unit)))
         if result.simulated is not None and result.simulated.share is not None:
-            rows.append(("by simulation", share_of_runs(result.simulated.to_dict())))
+            rows.append(("simulated", share_of_runs(result.simulated.to_dict())))
         rows.append(("limited by", result.reason))
     else:
         rows.append(("reason", result.reason))

@@ -122,7 +122,7 @@ def _simulated(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     found = result.get("simulated") or {}
     if not found or found["share"] is None:
         return []
-    return [("by simulation", f"{share_of_runs(found)}; this is no part of the proof")]
+    return [("simulated", f"{share_of_runs(found)}; this is no part of the proof")]
 
 
 def _candidates(result: Mapping[str, Any]) -> tuple[str, str]:

@@ -84,7 +84,7 @@ def test_the_default_goes_beyond_the_ellipsoid(by_default: RoaResult) -> None:
     assert share is not None and share > 0.85
     stated = by_default.to_dict()["simulated"]
     assert stated["proved"] <= stated["converging"] <= stated["runs"] and stated["share"] == share
-    said = dict(rows_of(by_default.to_dict(), True))["by simulation"]
+    said = dict(rows_of(by_default.to_dict(), True))["simulated"]
     assert f"about {100 * share:.0f} % of what converges is proved" in said and "no part of the proof" in said
 
 
