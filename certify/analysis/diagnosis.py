@@ -237,14 +237,16 @@ def _boxes(result: RoaResult, options: RoaOptions) -> Step | None:
     free = options.level is None and options.P is None and not options.resume and options.engine == "bounds"
     if result.verdict is not Verdict.PROVED or not result.system.in_steps or result.system.n > _FEW or not free:
         return None
+    simulated = result.simulated
+    if simulated is not None and (simulated.share or 0.0) >= NEARLY_ALL:
+        return None
     if options.ranks:
         found = result.ranks
         if found is None or found.done or found.covered > _ALL:
             return None
         why = f"{number(100 * (1 - found.covered), 2)} % of the box has no rank yet, and its boxes get smaller"
         return Step((("--effort", _round(4 * options.effort)),), why)
-    simulated = result.simulated
-    if result.ranks is not None or (simulated is not None and (simulated.share or 0.0) >= NEARLY_ALL):
+    if result.ranks is not None:
         return None
     return Step((("--ranks", ""),), "boxes of the domain may be proved to lead into this set")
 

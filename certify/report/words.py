@@ -198,10 +198,10 @@ def share_of_runs(found: Mapping[str, Any]) -> str:
     """The share of the simulated region that is proved, from a result's entry on it.
 
     >>> share_of_runs({"runs": 2000, "converging": 1063, "proved": 774, "share": 774 / 1063})
-    'about 73 % of what converges is proved: 774 of the 1,063 runs, of 2,000 from drawn states, that stay in the domain'
+    'about 73 % of what converges is proved: 774 of the 1,063 states that do so in the domain, of 2,000 drawn'
     """
-    of = f"{found['proved']:,} of the {found['converging']:,} runs, of {found['runs']:,} from drawn states,"
-    return f"about {100 * found['share']:.0f} % of what converges is proved: {of} that stay in the domain"
+    of = f"{found['proved']:,} of the {found['converging']:,} states that do so in the domain, of {found['runs']:,} drawn"
+    return f"about {100 * found['share']:.0f} % of what converges is proved: {of}"
 
 
 def estimated(volume: float, deviation: float, unit: str) -> str:

@@ -184,6 +184,7 @@ def test_a_ring_that_is_cut_for_more_is_resumed_without_it(tmp_path: Path, monke
     options = {"candidate": "auto", "effort": 0.2}
     plain = certify_roa(get_system("pendulum"), network, tmp_path / "plain", **options)  # type: ignore[arg-type]
     monkeypatch.setattr(simulation, "_FOR_MORE", 1.0)
+    monkeypatch.setattr(simulation, "_FOR_RING", 0.0)
     cut = certify_roa(get_system("pendulum"), network, tmp_path / "cut", **options)  # type: ignore[arg-type]
     assert cut.verdict is Verdict.PROVED and cut.volume == plain.volume
 

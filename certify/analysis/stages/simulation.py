@@ -19,6 +19,8 @@ from certify.errors import InputError
 
 _FOR_RUNS = 0.06  # share of the whole effort for simulated runs
 _FOR_MORE = 0.35  # share of the whole effort that the ring leaves, for what lies beyond
+_FOR_RING = 0.5  # share of the effort that is left which the ring has in any case
+_LEAST = 0.04  # share of the whole effort, with less of which nothing more is begun
 _WANTED = 0.95  # share of it in boxes with ranks, with which their search ends
 
 
@@ -37,11 +39,13 @@ class Onwards:
 
     def extend(self, state: State, effort: Effort) -> State:
         """Add an outer set or ranks where the ellipsoid is too little; the ring takes what is left without them."""
-        found = self._with_ring(state, effort.part(max(0.0, effort.left - _FOR_MORE * self.tools.whole)))
+        left = effort.left
+        found = self._with_ring(state, effort.part(max(left - _FOR_MORE * self.tools.whole, _FOR_RING * left)))
         cut = found.result.stop.ran_out
         if found.done:
             return self._with_ring(state, effort) if cut else found
-        found = self._with_more(found, effort)
+        if effort.left >= _LEAST * self.tools.whole:
+            found = self._with_more(found, effort)
         gained = found.beyond is not None or found.ranked is not None
         if gained or not cut:
             return found
