@@ -200,8 +200,9 @@ def share_of_runs(found: Mapping[str, Any]) -> str:
     >>> share_of_runs({"runs": 2000, "converging": 1063, "proved": 774, "share": 774 / 1063})
     'about 73 % of what converges is proved: 774 of the 1,063 states that do so in the domain, of 2,000 drawn'
     """
-    of = f"{found['proved']:,} of the {found['converging']:,} states that do so in the domain, of {found['runs']:,} drawn"
-    return f"about {100 * found['share']:.0f} % of what converges is proved: {of}"
+    proved, converging, runs = (f"{found[name]:,}" for name in ("proved", "converging", "runs"))
+    about = f"about {100 * found['share']:.0f} % of what converges is proved"
+    return f"{about}: {proved} of the {converging} states that do so in the domain, of {runs} drawn"
 
 
 def estimated(volume: float, deviation: float, unit: str) -> str:
