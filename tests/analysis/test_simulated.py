@@ -29,6 +29,7 @@ from certify.loop.policies import load_policy
 from certify.lyapunov import Polynomial
 from certify.lyapunov.function import Quadratic
 from certify.report.rows import rows_of
+from certify.report.sections.simulated import drawn_of
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
 x, u = Symbol("x"), Symbol("u")
@@ -79,7 +80,7 @@ def test_runs_that_cannot_be_decided_tell_nothing() -> None:
 
 def test_the_default_goes_beyond_the_ellipsoid(by_default: RoaResult) -> None:
     assert by_default.outer is not None and by_default.simulated is not None
-    assert by_default.contains([[-2.0], [0.9], [-3.01], [1.01]]).tolist() == [True, True, False, False]
+    assert np.array_equal(by_default.contains([[-2.0], [0.9], [-3.01], [1.01]]), [True, True, False, False])
     share = by_default.simulated.share
     assert share is not None and share > 0.85
     stated = by_default.to_dict()["simulated"]
@@ -106,7 +107,7 @@ def test_the_same_run_gives_the_same_bytes(by_default: RoaResult, tmp_path: Path
     ],
 )
 def test_what_asks_for_an_ellipsoid_gets_one(options: dict[str, object], tmp_path: Path) -> None:
-    result = proved(tmp_path, **options)
+    result = proved(tmp_path, plant(), **options)
     assert result.outer is None and result.simulated is not None
     assert result.simulated.share is not None and result.simulated.share < 0.6
     assert not result.contains([-2.0])
@@ -126,8 +127,7 @@ def test_an_ellipsoid_that_is_most_of_it_is_enough(tmp_path: Path) -> None:
     """The certificate is then the very one of the ellipsoid alone, and nothing is learned."""
     network = load_policy(POLICIES / "pendulum.pt").network
     found = [
-        certify_roa(get_system("pendulum"), network, tmp_path / name, candidate=name)  # type: ignore[arg-type]
-        for name in ("auto", "ellipsoid")
+        certify_roa(get_system("pendulum"), network, tmp_path / name, candidate=name) for name in ("auto", "ellipsoid")
     ]
     assert found[0].raw == found[1].raw and found[0].outer is None
     assert all(one.simulated is not None and 0.8 < (one.simulated.share or 0.0) < 0.9 for one in found)
@@ -233,3 +233,9 @@ def test_a_share_is_that_of_the_accepted_set(by_default: RoaResult) -> None:
     assert found is not None and by_default.simulated is not None
     exact = np.asarray(by_default.contains(found.converging, deviations=True))
     assert int(exact.sum()) == by_default.simulated.proved
+
+
+def test_the_page_says_the_share_where_there_is_no_grid(by_default: RoaResult) -> None:
+    said = drawn_of(by_default.to_dict())
+    assert said.startswith("about ") and "of what converges is proved" in said
+    assert drawn_of(None) == drawn_of({"simulated": None}) == ""
