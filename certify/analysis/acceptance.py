@@ -312,8 +312,9 @@ def _local_only(refused: _Refused) -> Certificate | None:
 
 
 def _without_ranks(refused: _Refused) -> Certificate | None:
-    """The claim without boxes with ranks, if it is refused under their rules, as where the loop has no such angles."""
-    if refused.rule not in ("angles", "ranks"):
+    """The claim without boxes with ranks, if it is refused under their rules, as where the loop has no such angles, or
+    as too large."""
+    if refused.rule not in ("angles", "ranks", "limits"):
         return None
     return refused.with_claim(refused.claim.without_ranks(), ranks=None)
 

@@ -20,13 +20,15 @@ from certify.analysis.candidates.trials import trial
 from certify.analysis.facts import Diagnosis, Share, Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
+from certify.analysis.simulated import NEARLY_ALL
+from certify.analysis.suggested import beyond_the_ellipsoid, by_centring, by_learning, side
 from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT, UNLIMITED, WHOLE, Effort
 from certify.errors import InputError
 from certify.loop.activations import activation
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, require_equilibrium
-from certify.loop.policies import Centre, PolicyNetwork
+from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import domain_limit, extents, increment_matrix, volume
 from certify.provers.ball.models import paths
 from certify.provers.base import FEW, Proof
@@ -175,11 +177,10 @@ def _next(
         return correction
     if (boxes := _boxes(result, options)) is not None:
         return boxes
-    if result.claim in ("practical", "nearby") and (centre := _centring(*asked)) is not None:
-        return Step(
-            (("--centre", centre),),
-            "shifted so that pi(0) = u_eq the operating point is the equilibrium, and the stronger claim can be tried",
-        )
+    if result.claim in ("practical", "nearby") and (centred := by_centring(result, asked, effort)) is not None:
+        return centred
+    if (beyond := beyond_the_ellipsoid(result, options, effort)) is not None:
+        return beyond
     if result.stop is Stop.DOMAIN and options.level is None:
         return _wider_domain(result, options, effort)
     if result.stop is Stop.PATH:
@@ -226,9 +227,8 @@ def _another_candidate(result: RoaResult, options: RoaOptions) -> Step:
     reached = max((t.proved_volume or 0.0 for t in result.tried), default=0.0)
     if reached and tried > _WORTH * reached:
         return Step((("--effort", _round(4 * options.effort)),), "another candidate reaches further")
-    if _may_go_beyond(result, options):
-        why = "what this V can show is proved; a function of higher degree may show more, beyond the ellipsoid"
-        return Step((("--candidate", "polynomial"),), why)
+    if (learned := by_learning(result, options, "neural")) is not None:
+        return learned
     return Step((), "what this V can show is proved; a larger set needs another policy or another kind of V")
 
 
@@ -237,12 +237,17 @@ def _boxes(result: RoaResult, options: RoaOptions) -> Step | None:
     free = options.level is None and options.P is None and not options.resume and options.engine == "bounds"
     if result.verdict is not Verdict.PROVED or not result.system.in_steps or result.system.n > _FEW or not free:
         return None
+    simulated = result.simulated
+    if simulated is not None and (simulated.share or 0.0) >= NEARLY_ALL:
+        return None
     if options.ranks:
         found = result.ranks
         if found is None or found.done or found.covered > _ALL:
             return None
         why = f"{number(100 * (1 - found.covered), 2)} % of the box has no rank yet, and its boxes get smaller"
         return Step((("--effort", _round(4 * options.effort)),), why)
+    if result.ranks is not None:
+        return None
     return Step((("--ranks", ""),), "boxes of the domain may be proved to lead into this set")
 
 
@@ -259,14 +264,6 @@ def _around_a_constraint(result: RoaResult, options: RoaOptions) -> Step:
         return Step((("--effort", _round(4 * options.effort)),), "another candidate reaches further")
     why = "a larger set needs a looser constraint, or a policy that turns away from it in time"
     return Step((), f"V is shaped around the constraints already; {why}" if shaped else why)
-
-
-def _may_go_beyond(result: RoaResult, options: RoaOptions) -> bool:
-    """True if a function beyond the ellipsoid can be learned, and pays: of few states, in continuous time."""
-    plain = result.timing.is_plain and not options.rate and not options.enlarges and options.engine == "bounds"
-    plain = plain and not result.constraints
-    free = options.level is None and options.only is None and options.P is None and not options.resume
-    return plain and free and not options.goes_beyond and result.system.n <= _FEW and not result.system.ranges
 
 
 def _can_be_flattened(result: RoaResult) -> bool:
@@ -363,20 +360,6 @@ def _slower(result: RoaResult, options: RoaOptions) -> Step | None:
     return Step((("--rate", f"{_BELOW * falls:.3g}"),), why)
 
 
-def _centring(system: System, network: PolicyNetwork) -> str | None:
-    """A centring with which the loop rests at the origin, exactly; None if it has one, or none can be had."""
-    if network.centre != "none":
-        return None
-    centres: tuple[Centre, ...] = ("preactivation", "output")
-    for centre in centres:
-        try:
-            ClosedLoop(system, replace(network, centre=centre)).require_rest()
-        except InputError:
-            continue
-        return centre
-    return None
-
-
 def _hurting(result: RoaResult, proof: Proof | None) -> list[tuple[str, float]]:
     direction = _direction(result, proof, None, ClosedLoop(result.system, result.network))
     names = [s.name for s in result.system.states]
@@ -427,10 +410,10 @@ def _wider_domain(result: RoaResult, options: RoaOptions, effort: Effort) -> Ste
             which = "a V that is stretched along with the domain" if stretched else "this V"
             why = f"if the equations hold there, samples allow {grown:.3g} times the volume to {which}"
             other = (("--candidate", "auto"),) if stretched and options.only not in (None, "optimised") else ()
-            return Step((("--domain", _side(system, i, factor)), *other), why)
+            return Step((("--domain", side(system, i, factor)), *other), why)
         if len(found) < len(kinds):  # samples cannot tell, or the operations for them have ended
             why = "if the equations hold there, the set may be larger"
-            return Step((("--domain", _side(system, i, _WIDER)),), why)
+            return Step((("--domain", side(system, i, _WIDER)),), why)
     which = ", and to one that is stretched along with the domain," if free else ""
     where = " or ".join(symbol(system.states[i].name) for i in binding)
     return Step((), f"samples allow hardly more to this V{which} where the domain is wider in {where}")
@@ -465,13 +448,6 @@ def _reach(
     except InputError:
         return 0.0
     return None if effort.over else found.volume
-
-
-def _side(system: System, i: int, factor: Fraction) -> str:
-    """The option's value for a state's side of the domain that is wider by this factor: values, not deviations."""
-    name, (lo, hi) = system.states[i].name, (factor * side for side in system.domain[i])
-    at = system.operating_point().get(name, Fraction(0))
-    return f"{name}={float(hi):g}" if lo == -hi else f"{name}={float(lo + at):g}..{float(hi + at):g}"
 
 
 def _round(value: float) -> str:

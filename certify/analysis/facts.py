@@ -161,6 +161,25 @@ class RankFacts:
 
 
 @dataclass(frozen=True, slots=True)
+class SimulatedFacts:
+    """Counts of simulated runs from states drawn from the domain, which are no part of a proof: of all `runs`, of those
+    `converging` without leaving the domain, and of these that start in the `proved` set."""
+
+    runs: int
+    converging: int
+    proved: int
+
+    @property
+    def share(self) -> float | None:
+        """The share of the simulated region of attraction that is proved; None if nothing converges."""
+        return self.proved / self.converging if self.converging else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, with the share."""
+        return {**asdict(self), "share": self.share}
+
+
+@dataclass(frozen=True, slots=True)
 class Share:
     """The set's reach along a state, and that as a share of the nearer side of its domain."""
 

@@ -14,7 +14,21 @@ from certify.provers.falsify import Witness
 if TYPE_CHECKING:
     from certify.analysis.results import RoaResult
 
-_STAGES = ("load", "data", "candidate", "local", "ring", "tube", "learn", "outer", "write", "check", "total")
+_STAGES = (
+    "load",
+    "data",
+    "candidate",
+    "local",
+    "ring",
+    "tube",
+    "simulate",
+    "learn",
+    "outer",
+    "ranks",
+    "write",
+    "check",
+    "total",
+)
 
 
 def to_dict(result: RoaResult) -> dict[str, Any]:
@@ -49,6 +63,7 @@ def to_dict(result: RoaResult) -> dict[str, Any]:
         "outer": None if result.outer is None else result.outer.to_dict(),
         "ranks": None if result.ranks is None else result.ranks.to_dict(),
         "constraints": dict(result.constraints),
+        "simulated": None if result.simulated is None else result.simulated.to_dict(),
         "witness": None if result.witness is None else _witness(result.witness),
         "eigenvalues": list(result.eigenvalues),
         "rest": None if result.rest is None else _rest(result, result.rest),

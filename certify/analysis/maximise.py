@@ -74,6 +74,8 @@ def certify_largest(
     InputError, BackendError, SoundnessError : those of `certify_roa`, also where the options allow no such quantity.
     """
     start = time.perf_counter() - load_seconds
+    if options.candidate == "auto":
+        options = replace(options, candidate="ellipsoid")  # the set is that of a level
     plain = system.with_sample(None) if quantity == "period" else system
     _require_possible(quantity, plain, options)
     effort = effort_of(options, load_seconds)

@@ -76,8 +76,10 @@ class RoaOptions:
         "Prove exactly N <= LEVEL; a smaller outer set counts as UNKNOWN. By default the largest is looked for."))
     candidate: Candidate = option("auto", "candidate", "word", first=True, varies=False, help=(
         "Where the matrix P comes from: lyapunov, scaled, lqr, optimised, robust, or peak, which makes the floor of a "
-        "practical claim small. auto: several, of which the largest proved set counts; with Q or a level lyapunov, "
-        "with R lqr. neural, polynomial: as auto, and a second function is learned for an outer set."))
+        "practical claim small. ellipsoid: several, of which the largest proved set counts; with Q or a level "
+        "lyapunov, with R lqr. auto: as ellipsoid; and if that is not most of what converges in simulation, in up to "
+        "three states a second function is learned for an outer set, or boxes get ranks where time goes in steps. "
+        "neural, polynomial: as ellipsoid, and this kind of second function is learned in any case."))
     Q: tuple[float, ...] | None = option(None, "candidate", "row", metavar="NUMBERS", written="As in 1,1.", help=(
         "Diagonal of the weights Q, a positive number for each state; ones by default."))
     R: tuple[float, ...] | None = option(None, "candidate", "row", metavar="NUMBERS", written="As in 1.", help=(
@@ -138,6 +140,12 @@ class RoaOptions:
         return self.lyapunov is not None or self.learned is not None
 
     @property
+    def goes_on(self) -> bool:
+        """True if the run may go on beyond the ellipsoid by itself: nothing is asked for that the ellipsoid answers."""
+        asked = self.only is not None or self.P is not None or bool(self.rate) or self.engine != "bounds"
+        return self.candidate == "auto" and not (asked or self.enlarges or self.goes_beyond or self.ranks)
+
+    @property
     def beyond(self) -> str:
         """The option that asks for an outer set."""
         return "`lyapunov`" if self.learned is None else f"`candidate` {self.learned}"
@@ -145,7 +153,7 @@ class RoaOptions:
     @property
     def only(self) -> Named | None:
         """The one candidate that is asked for, if P is not given; None if several are tried."""
-        if self.candidate != "auto" and self.learned is None:
+        if self.candidate not in ("auto", "ellipsoid") and self.learned is None:
             return cast("Named", self.candidate)
         return "lqr" if self.R is not None else "lyapunov" if self.Q is not None or self.level is not None else None
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certify.analysis.facts import Diagnosis, Levels, OuterFacts, RankFacts, Tried, TubeFacts
+from certify.analysis.facts import Diagnosis, Levels, OuterFacts, RankFacts, SimulatedFacts, Tried, TubeFacts
 from certify.analysis.json_object import to_dict
 from certify.analysis.stated import in_one_line, stated
 from certify.certificates import parse_certificate, write_atomically
@@ -53,14 +53,13 @@ class RoaResult:
     `notice` says what is not as it was asked for. `reach_from` is the state that was asked about, by the states'
     values; if the verdict on it is UNKNOWN by `Stop.PATH`, `certificate` and `levels` are of a proved set without it.
     If the verdict is UNKNOWN by `Stop.BEYOND` they, and `outer`, are of a smaller set than was asked for. `constraints`
-    are those that trajectories are to keep, in words by their names; with a certificate they are proved.
-    `checker` is the checker's answer, None if it was not reached, about `raw`, the certificate's bytes; `solver` has
-    dReal's version and every query with its answer, None if it was not asked. `notices` are facts about plant and
-    policy known before the run, such as a domain that was cut; `folder` keeps a temporary folder of the certificate
-    alive. `search` is a file with the search, if more effort could continue it (`resume`).
+    are those that trajectories are to keep, in words by their names; with a certificate they are proved. `simulated`
+    counts simulated runs, in up to three states. `checker` is the checker's answer, None if it was not reached, about
+    `raw`, the certificate's bytes; `solver` has dReal's version and every query with its answer, None if it was not
+    asked. `notices` are facts known before the run, such as a domain that was cut; `folder` keeps a temporary folder
+    of the certificate alive. `search` is a file that `resume` continues.
 
-    In Python: `contains`, `volume`, `plot`, `report`, `certificate` (the file's path), `to_dict`.
-    """
+    In Python: `contains`, `volume`, `plot`, `report`, `certificate` (the file's path), `to_dict`."""
 
     verdict: Verdict
     stop: Stop
@@ -76,6 +75,7 @@ class RoaResult:
     tube: TubeFacts | None = None
     outer: OuterFacts | None = None
     ranks: RankFacts | None = None
+    simulated: SimulatedFacts | None = None
     constraints: Mapping[str, str] = field(default_factory=dict)
     reach_from: tuple[Fraction, ...] | None = None
     witness: Witness | None = None

@@ -21,6 +21,7 @@ from certify.analysis.stages.candidate import Candidate
 from certify.analysis.stages.further import Beyond, ByRanks, Equilibrium, Route, Tube
 from certify.analysis.stages.ring import Ring
 from certify.analysis.stages.setting import Setting, setting_of
+from certify.analysis.stages.simulation import Onwards, Simulation, goes_on
 from certify.analysis.stages.state import Report, Stage, State, Tools
 from certify.certificates import PartitionTree, earlier_aside, sole_writer
 from certify.certificates.verdict import Stop, Verdict
@@ -161,6 +162,8 @@ def _through(state: State, tools: Tools) -> State:
     """Through the setting, the search, and the stages that the claim asks for."""
     state = Setting(tools).extend(state, tools.effort)
     options = state.options
+    if goes_on(state):
+        return _extended(state, [Candidate(tools), Onwards(tools), Acceptance(tools), Simulation(tools)], tools.effort)
     share = _BEFORE_TUBE if options.enlarges else _BEFORE_OUTER if options.goes_beyond else 1.0
     search = tools.effort.share(share)
     state = _extended(state, [Candidate(tools), Ring(tools)], search)
@@ -189,4 +192,4 @@ def _stages_after(state: State, tools: Tools) -> list[Stage]:
     stages.append(Acceptance(tools))
     if options.engine == "both":
         stages.append(Confirmation(tools))
-    return stages
+    return [*stages, Simulation(tools)]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from certify.certificates.verdict import Verdict
 from certify.report.measured import Measured
 from certify.report.timing import TimingInWords
-from certify.report.words import below, estimated, varying, varying_in, volume_name, volume_unit
+from certify.report.words import below, estimated, share_of_runs, varying, varying_in, volume_name, volume_unit
 
 if TYPE_CHECKING:
     from certify.analysis.results import RoaResult
@@ -65,6 +65,8 @@ def stated(result: RoaResult) -> list[tuple[str, str]]:
         if result.outer is not None:
             rows[-1] = (rows[-1][0], f"{rows[-1][1]}, of V <= {below(level)}")
             rows.append(("with N", estimated(result.outer.volume, result.outer.deviation, unit)))
+        if result.simulated is not None and result.simulated.share is not None:
+            rows.append(("simulated", share_of_runs(result.simulated.to_dict())))
         rows.append(("limited by", result.reason))
     else:
         rows.append(("reason", result.reason))

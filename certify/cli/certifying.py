@@ -160,7 +160,7 @@ def _known(context: typer.Context) -> list[str]:
     from certify.lyapunov import BEYOND
 
     found = {f"--{key}": context.params.get(key) for key in _OF_SEARCH}
-    return [name for name, value in found.items() if value not in (None, "auto", *BEYOND)]
+    return [name for name, value in found.items() if value not in (None, "auto", "ellipsoid", *BEYOND)]
 
 
 def _command(context: typer.Context, changed: Mapping[str, str]) -> str:

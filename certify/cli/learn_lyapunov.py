@@ -104,11 +104,14 @@ def _ellipsoid(plant: System, stored: Policy, effort: Effort, progress: Progress
     ------
     InputError : none is proved with that effort.
     """
+    from certify.analysis.options import RoaOptions
     from certify.analysis.run import certify_roa
     from certify.certificates.verdict import Verdict
 
     with tempfile.TemporaryDirectory() as folder:
-        found = certify_roa(plant, stored.network, Path(folder), progress=progress, effort=effort)
+        found = certify_roa(
+            plant, stored.network, Path(folder), RoaOptions(candidate="ellipsoid"), progress=progress, effort=effort
+        )
     if found.verdict is not Verdict.PROVED or found.P is None or found.levels.roa is None:
         raise InputError(
             "an ellipsoid must be proved before a function beyond it is learned; the verdict on one is "

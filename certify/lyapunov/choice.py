@@ -18,7 +18,9 @@ Array = NDArray[np.float64]
 Solved = Literal["lyapunov", "scaled", "lqr"]
 Named = Literal["lyapunov", "scaled", "lqr", "optimised", "robust", "peak"]
 Beyond = Literal["neural", "polynomial"]
-Candidate = Literal["auto", "lyapunov", "scaled", "lqr", "optimised", "robust", "peak", "neural", "polynomial"]
+Candidate = Literal[
+    "auto", "ellipsoid", "lyapunov", "scaled", "lqr", "optimised", "robust", "peak", "neural", "polynomial"
+]
 SOLVED: tuple[Solved, ...] = ("lyapunov", "scaled", "lqr")
 """The candidates that solve a Lyapunov equation."""
 BEYOND: tuple[Beyond, ...] = ("neural", "polynomial")

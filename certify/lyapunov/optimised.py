@@ -184,8 +184,8 @@ def _enlarge(samples: _Samples, start: Array, alpha: float) -> Array:
 class _Samples:
     """States that limit sublevel sets of the closed loop, remembered from search to search.
 
-    x, G(x), (dG/dx) x : (N, n), G being the mean rate of a step, F in continuous time, at the corner of the ranges where
-    V grows most. outside : (N,), the input leaves its bounds at x, a constraint is violated, or G has a pole there.
+    x, G(x), (dG/dx) x : (N, n), G being the mean rate of a step, F in continuous time, at the corner of ranges where V
+    grows most. outside : (N,), the input leaves its bounds at x, a constraint is violated, or G has a pole there.
     Where the effort has ended, one search does for several.
     """
 

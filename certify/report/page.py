@@ -28,7 +28,7 @@ from certify.report.sections.not_proved import not_proved_of
 from certify.report.sections.numbers import matrices_of, tables_of
 from certify.report.sections.plant import plant_of
 from certify.report.sections.shared import timing_of, words_of
-from certify.report.sections.simulated import simulated_of
+from certify.report.sections.simulated import drawn_of, simulated_of
 from certify.report.sections.status import Status, missed_of, status_of
 from certify.report.sheet import filled
 
@@ -107,6 +107,7 @@ def render_html(
         tables=tables_of(certificate, status, answer, result, sha256, size),
         matrices=matrices_of(certificate),
         roa=None if roa is None else simulated_of(roa, certificate),
+        drawn=drawn_of(result),
         timing=timing_of(certificate),
         provenance=sorted((str(k), str(v)) for k, v in certificate.provenance.items()),
         file=certificate_path.name,

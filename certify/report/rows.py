@@ -29,13 +29,27 @@ from certify.report.words import (
     pretty_unit,
     quantity,
     seconds,
+    share_of_runs,
     shortest,
     symbol,
     volume_name,
     volume_unit,
 )
 
-_STAGES = ("load", "data", "candidate", "local", "ring", "tube", "learn", "outer", "ranks", "write", "check")
+_STAGES = (
+    "load",
+    "data",
+    "candidate",
+    "local",
+    "ring",
+    "tube",
+    "simulate",
+    "learn",
+    "outer",
+    "ranks",
+    "write",
+    "check",
+)
 _LONG = 200  # characters of an expression, beyond which it is not shown
 
 
@@ -118,7 +132,15 @@ def _set_rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
         if result.get("outer"):
             union = estimated(result["outer"]["volume"], result["outer"]["deviation"], unit)
             rows.append(("with outer set", union))
-    return rows
+    return [*rows, *_simulated(result)]
+
+
+def _simulated(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The proved share of what converges in simulation, of drawn states."""
+    found = result.get("simulated") or {}
+    if not found or found["share"] is None:
+        return []
+    return [("simulated", f"{share_of_runs(found)}; this is no part of the proof")]
 
 
 def _candidates(result: Mapping[str, Any]) -> tuple[str, str]:

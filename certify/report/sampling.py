@@ -207,16 +207,16 @@ def simulated_roa_fraction(
     x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, system.n)
     certified = _in_sets(x, P, level, start, centre, beyond)
     target = SETTLED * level if settled is None else settled
-    attracted, left, reached = _run(flow, x, P, target, step, horizon, effort)
+    attracted, left, reached = run_until_near(flow, x, P, target, step, horizon, effort)
     suspects = np.flatnonzero(certified & left)
     if suspects.size and not flow.discrete:
-        again, gone, _ = _run(flow, x[suspects], P, target, step / _FINER, reached, effort)
+        again, gone, _ = run_until_near(flow, x[suspects], P, target, step / _FINER, reached, effort)
         attracted[suspects], left[suspects] = again, gone
     shape = (points,) * system.n
     return SimulatedRoa(axes, attracted.reshape(shape), left.reshape(shape), certified.reshape(shape), step, reached)
 
 
-def _run(
+def run_until_near(
     flow: Flow, x: Array, P: Array, target: float, step: float, horizon: float, effort: Effort = UNLIMITED
 ) -> tuple[Mask, Mask, float]:
     """Simulate; return the runs that reached `V <= target`, those that left the domain, and the simulated seconds."""
@@ -274,7 +274,7 @@ def edge_of(
         ask = ~known & (around.any((2, 3)) != around.all((2, 3)))
         a, b = _halved(a), _halved(b)
         points = np.stack(np.meshgrid(a, b, indexing="ij"), -1)[ask]
-        fine[ask] = _run(flow, points, P, target, roa.step, roa.horizon, effort)[0]
+        fine[ask] = run_until_near(flow, points, P, target, roa.step, roa.horizon, effort)[0]
         mask = fine
     return a, b, _smoothed(_smoothed(mask.astype(np.float64)).T).T
 

@@ -26,7 +26,7 @@ def history(
     effort: Annotated[
         float, typer.Option("--effort", help="Effort of the proof of one policy, as of `certify roa`.")
     ] = 1.0,
-    candidate: Annotated[str, typer.Option("--candidate", help="Source of P, as of `certify roa`.")] = "auto",
+    candidate: Annotated[str, typer.Option("--candidate", help="Source of P, as of `certify roa`.")] = "ellipsoid",
     every: Annotated[int, typer.Option("--every", help="Prove each policy of so many; the last one always.")] = 1,
     no_proofs: Annotated[bool, typer.Option("--no-proofs", help="Draw the gain only, and prove nothing.")] = False,
     system: ChosenPlant = None,

@@ -67,7 +67,7 @@ class ProvingOptions:
     """
 
     effort: float = 1.0
-    candidate: Candidate = "auto"
+    candidate: Candidate = "ellipsoid"
 
     def __post_init__(self) -> None:
         if not 0 < self.effort < math.inf:

@@ -493,7 +493,7 @@ def test_a_result_shows_itself_in_a_line_and_a_table(proved: RoaResult, away: Ro
     odd = dataclasses.replace(away, notices=("<script>alert(1)</script> & more",))
     html = odd._repr_html_()
     assert "<script>" not in html and "&lt;script&gt;alert(1)&lt;/script&gt; &amp; more" in html
-    assert html.count("<tr>") == html.count("</tr>") == 8
+    assert html.count("<tr>") == html.count("</tr>") == 9
 
 
 def test_report_draws_what_was_checked(proved: RoaResult, tmp_path: Path) -> None:

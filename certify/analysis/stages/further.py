@@ -144,7 +144,8 @@ class Beyond:
                 trial.task.problem, claim.roa, trial.T, N, options.lyapunov_level, budget, tools.runner, report
             )
         if isinstance(found, Nothing):
-            return state.noting(f"no set of the function `lyapunov` is proved to lead into the ellipsoid: {found.why}")
+            which = "the function `lyapunov`" if options.learned is None else "the learned function"
+            return state.noting(f"no set of {which} is proved to lead into the ellipsoid: {found.why}")
         return replace(
             state,
             beyond=found,
@@ -170,6 +171,7 @@ class ByRanks:
     """The stage that proves from which boxes of the domain trajectories reach the proved set."""
 
     tools: Tools
+    enough: float | None = None  # share of the box of places, at which the search ends if nobody asked for ranks
 
     def extend(self, state: State, effort: Effort) -> State:
         """Add the boxes; a note says why there are none."""
@@ -183,12 +185,14 @@ class ByRanks:
 
         with tools.timing("ranks"):
             tools.tell("ranks")
-            least = _FOR_RANKS * tools.whole
+            least, enough = _FOR_RANKS * tools.whole, 1.0 if self.enough is None else self.enough
             share = effort.part(max(least, effort.left - least), even_if_over=True)
+            if self.enough is not None:
+                share = effort.share(_FOR_SEARCH)
             told = None if tools.progress is None else report
             target = Sublevel(problem.V, claim.roa)
             question = Question(problem.loop, target, claim.keep, root_box(problem.loop), evidence.order)
-            found = prove_ranks(question, share, tools.runner, told)
+            found = prove_ranks(question, share, tools.runner, told, enough=enough)
         if found is None:
             return state.noting("no box of the domain beyond the set is proved to lead into it")
         return replace(

@@ -15,6 +15,7 @@ from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
 from certify.analysis.saved_search import Keeper
 from certify.analysis.selection import Race
+from certify.analysis.simulated import SimulatedRegion
 from certify.certificates import PartitionTree, TrustedSolver
 from certify.certificates.claims import Claim
 from certify.certificates.claims.claim import Kind
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from certify.provers.outer import OuterProof
     from certify.provers.ranks import RankProof
 
-StageName = Literal["candidate", "ring", "tube", "learn", "outer", "ranks", "function", "set", "check"]
+StageName = Literal["candidate", "ring", "tube", "simulate", "learn", "outer", "ranks", "function", "set", "check"]
 Report = Callable[[StageName, Progress | None], None]
 
 
@@ -49,6 +50,7 @@ class State:
     data : evidence that measurements bound the plant's parameters; None where ranges are assumed.
     beyond : the set of another function around the ellipsoid.
     ranked : boxes with ranks, as the search found them.
+    simulated : the region of attraction by runs.
     missed : why no tube holds `centre`.
     accepted : the certificate that the checker accepts.
     done : the result is final.
@@ -67,6 +69,7 @@ class State:
     data: DataBounds | None = None
     beyond: OuterProof | None = None
     ranked: RankProof | None = None
+    simulated: SimulatedRegion | None = None
     missed: str = ""
     accepted: Accepted | None = None
     done: bool = False

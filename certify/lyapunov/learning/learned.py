@@ -211,8 +211,8 @@ class _Lesson:
     def __init__(self, flow: LearningFlow, samples: Samples, generator: np.random.Generator) -> None:
         n, scale = flow.n, samples.scale
         self.flow, self.scale, self.generator, self.relaxed = flow, scale, generator, False
-        # Of several states the rim holds most of the volume, and to follow it costs a proof dearly.
-        self.top = (0.95 if n <= 2 else 0.65) ** (1 / n)
+        # Of many states the rim holds most of the volume, and to follow it costs a proof dearly.
+        self.top = (0.95 if n <= 2 else 0.85 if n == 3 else 0.65) ** (1 / n)
         self.sought = self.top + _ABOVE / 2  # below which counterexamples are looked for
         self.least = -math.inf if flow.collar == 1 else (1 - flow.collar) * self.top  # and from which on
         mixed = generator.permutation(len(samples.x))

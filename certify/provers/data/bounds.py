@@ -103,7 +103,7 @@ def _in_units(matrix: csr_matrix, offset: Array, slack: Array) -> Program:
 
 def bound(rows: Rows, noise: Array, begins: NDArray[np.intp], weights: Array, axis: int) -> tuple[float, float]:
     """Between what parameter `axis`'s symbol lies, by rows with weights (n, T), as the checkers bound it."""
-    n, T = rows.alpha.shape
+    n = rows.alpha.shape[0]
     own = np.einsum("it,ist->s", weights, rows.slopes[:, n:])
     own[axis] -= 1.0
     errors = np.zeros((n, int(begins.max()) + 2))

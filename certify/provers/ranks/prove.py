@@ -121,6 +121,7 @@ def prove_ranks(
     runner: Runner,
     report: Callable[[float, int, int], None] | None = None,
     wanted: Wanted | None = None,
+    enough: float = 1.0,
 ) -> RankProof | None:
     """Prove from which leaves of a box trajectories reach a target.
 
@@ -128,6 +129,7 @@ def prove_ranks(
     ----------
     report : called after every round with the share that is proved, the boxes looked at, and the leaves that wait.
     wanted : a box on which alone it depends; the search ends once it is proved.
+    enough : share of the root box, at which the search ends.
 
     Returns
     -------
@@ -146,7 +148,13 @@ def prove_ranks(
             if report is not None:
                 report(search.share, search.boxes, len(search.unknown))
             done = search.is_done(near)
-            if done or effort.over or len(search.cover.leaves) > _MOST_LEAVES or search.pairs > _MOST_PAIRS:
+            if (
+                done
+                or search.share >= enough
+                or effort.over
+                or len(search.cover.leaves) > _MOST_LEAVES
+                or search.pairs > _MOST_PAIRS
+            ):
                 break
             new = search.further(near)
     search.tighten()

@@ -5,6 +5,9 @@ The runs themselves are those of `certify/report/sampling.py`; the figures draw 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from certify.certificates import Certificate
@@ -12,7 +15,7 @@ from certify.report.claims import words_for
 from certify.report.sampling import SimulatedRoa
 from certify.report.sections.shared import timing_of
 from certify.report.timing import TimingInWords
-from certify.report.words import ABSENT, TIMES, number, volume_name
+from certify.report.words import ABSENT, TIMES, number, share_of_runs, volume_name
 
 
 def simulated_of(roa: SimulatedRoa, certificate: Certificate) -> dict[str, str]:
@@ -31,6 +34,12 @@ def simulated_of(roa: SimulatedRoa, certificate: Certificate) -> dict[str, str]:
         "of": volume_name(certificate.system.n),
         "who": words_for(certificate.kind).simulated,
     }
+
+
+def drawn_of(result: Mapping[str, Any] | None) -> str:
+    """The share of the run's own simulation, from drawn states, in words; empty without one."""
+    found: Mapping[str, Any] = (result or {}).get("simulated") or {}
+    return share_of_runs(found) if found and found["share"] is not None else ""
 
 
 def _integrated(roa: SimulatedRoa, timing: TimingInWords) -> str:

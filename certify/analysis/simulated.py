@@ -1,0 +1,101 @@
+"""The simulated region of attraction: drawn states of the domain from which runs converge without leaving it.
+
+It says how much of what is there has been proved, and so if more is worth its effort. Nothing in it is part of a proof.
+The same loop and effort draw the same states, whatever machine simulates them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.analysis.facts import SimulatedFacts
+from certify.certificates.membership import Region
+from certify.effort import Effort
+from certify.errors import InputError
+from certify.loop.closed_loop import ClosedLoop
+from certify.lyapunov.function import Quadratic
+from certify.provers.ranks import root_box, turning
+from certify.report.flow import Flow, time_scales
+from certify.report.sampling import run_until_near
+
+Array = NDArray[np.float64]
+FEW = 3
+"""States of a plant up to which drawn states meet the region often enough to tell its share."""
+MOST, NEARLY_ALL = 0.8, 0.9
+"""Shares of the simulated region: an ellipsoid with the first is most of it, and a run does not go beyond it by itself;
+with the second hardly more is to be proved in this domain."""
+_LEAST, _ENOUGH, _MOST = 250, 1000, 4000  # states drawn at once at least, that converge, and in all
+_QUICK = 10.0  # multiplications of many runs at once that are worth an operation
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedRegion:
+    """The region of attraction by runs.
+
+    Parameters
+    ----------
+    converging : the drawn states whose runs converge, (N, n), in deviations from the operating point.
+    runs : the number of states drawn.
+    """
+
+    converging: Array
+    runs: int
+
+    def __post_init__(self) -> None:
+        if not len(self.converging) <= self.runs:
+            raise InputError(f"at most all of {self.runs} runs may converge; found {len(self.converging)}.")
+
+    def facts(self, region: Region) -> SimulatedFacts:
+        """The counts, with those of the converging runs that start in a proved set."""
+        return SimulatedFacts(self.runs, len(self.converging), int(_are_in(region, self.converging).sum()))
+
+
+def simulated_region(loop: ClosedLoop, V: Quadratic, level: float, effort: Effort) -> SimulatedRegion | None:
+    """Simulate from states drawn uniformly from the domain, until enough of them converge: they enter {V <= level}.
+
+    Parameters
+    ----------
+    loop : of what is uncertain it has the nominal values, of several periods the longest.
+    effort : None is returned if it ends before the first states are decided.
+
+    Notes
+    -----
+    Where boxes may have ranks, one turn of each angle is drawn from, and full turns count as the same place.
+    """
+    flow = Flow.of(loop.system, loop.network)
+    if loop.system.in_steps:
+        lo, hi = root_box(loop)
+        flow = replace(flow, lo=lo, hi=hi, angles=tuple(turning(loop)))
+    else:
+        flow = replace(flow, angles=())
+    step, horizon = time_scales(flow)
+    step, generator = flow.fitting(step), np.random.default_rng(0)
+    left = Effort(_QUICK * effort.left)
+    dear = left.left / ((flow.operations(2) - flow.operations(1)) * horizon / step)  # states that may stay undecided
+    batch = int(min(max(dear, _LEAST), _ENOUGH))
+    found, runs = list[Array](), 0
+    while runs < _MOST and sum(map(len, found)) < _ENOUGH:
+        x = generator.uniform(flow.lo, flow.hi, (batch, loop.system.n))
+        converge, _, _ = run_until_near(flow, x, V.P, level, step, horizon, left)
+        if left.over:
+            break
+        found.append(x[converge])
+        runs += batch
+    effort.charge(left.spent / _QUICK)
+    return SimulatedRegion(np.concatenate(found), runs) if runs else None
+
+
+def _are_in(region: Region, x: Array) -> NDArray[np.bool_]:
+    """True for states (N, n) in a proved set, in floats."""
+    inside = np.zeros(len(x), dtype=np.bool_)
+    for one in region.ellipsoids:
+        y = x if not one.centre else x - np.array(one.centre)
+        inside |= np.einsum("bi,ij,bj->b", y, one.P, y) <= one.level
+    if region.outer is not None:
+        inside |= region.outer.function(x) <= region.outer.level
+    if region.ranked is not None:
+        inside |= np.isfinite(region.ranked.ranks_at(x))
+    return inside

@@ -1,0 +1,105 @@
+"""The stages that simulate: how much of what converges is proved, and more of it where an ellipsoid is too little.
+
+A function N is learned where inputs follow at once; with steps boxes get ranks. Whatever these do not prove, the claim
+about the ellipsoid stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from certify.analysis.simulated import FEW, MOST, SimulatedRegion, simulated_region
+from certify.analysis.stages.further import Beyond, ByRanks, Equilibrium
+from certify.analysis.stages.ring import Ring
+from certify.analysis.stages.state import State, Tools
+from certify.certificates.ellipsoids import sublevel_set
+from certify.certificates.membership import Region, region_of
+from certify.effort import Effort
+from certify.errors import InputError
+
+_FOR_RUNS = 0.06  # share of the whole effort for simulated runs
+_FOR_MORE = 0.35  # share of the whole effort that the ring leaves, for what lies beyond
+_FOR_RING = 0.5  # share of the effort that is left which the ring has in any case
+_LEAST = 0.04  # share of the whole effort, with less of which nothing more is begun
+_WANTED = 0.95  # share of it in boxes with ranks, with which their search ends
+
+
+def goes_on(state: State) -> bool:
+    """True if the run may go on beyond the ellipsoid: few states, and a claim to which an outer set or ranks can be
+    added."""
+    system = state.loop.system
+    return state.options.goes_on and system.n <= FEW and (system.in_steps or not system.constraints)
+
+
+@dataclass(frozen=True)
+class Onwards:
+    """The stage that proves the ring and then, with what this leaves of the effort, more of the simulated region."""
+
+    tools: Tools
+
+    def extend(self, state: State, effort: Effort) -> State:
+        """Add an outer set or ranks where the ellipsoid is too little; the ring takes what is left without them."""
+        left = effort.left
+        found = self._with_ring(state, effort.part(max(left - _FOR_MORE * self.tools.whole, _FOR_RING * left)))
+        cut = found.result.stop.ran_out
+        if found.done:
+            return self._with_ring(state, effort) if cut else found
+        if effort.left >= _LEAST * self.tools.whole:
+            found = self._with_more(found, effort)
+        gained = found.beyond is not None or found.ranked is not None
+        if gained or not cut:
+            return found
+        again = self._with_ring(state, effort)
+        return again if again.done else replace(again, notes=found.notes, simulated=found.simulated)
+
+    def _with_ring(self, state: State, effort: Effort) -> State:
+        state = Ring(self.tools).extend(state, effort)
+        return Equilibrium(self.tools).extend(state, effort) if state.converging and not state.done else state
+
+    def _with_more(self, state: State, effort: Effort) -> State:
+        state = _simulated(state, self.tools, effort)
+        if state.simulated is not None:
+            problem, (claim, _) = state.contest.best.trial.task.problem, state.proved
+            share = state.simulated.facts(Region((sublevel_set(problem.V.P, claim.roa),))).share
+            if share is None or share >= MOST:
+                return state
+        if state.loop.system.in_steps:
+            return ByRanks(self.tools, _enough(state.simulated)).extend(state, effort)
+        try:
+            more = Beyond(self.tools).extend(replace(state, options=replace(state.options, candidate="neural")), effort)
+        except InputError as error:  # too little converges from outside of the ellipsoid to learn from
+            return state.noting(f"no function is learned for a set beyond the ellipsoid: {error}")
+        return replace(more, options=state.options)
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """The last stage: the share of the simulated region that the accepted claim covers, in few states."""
+
+    tools: Tools
+
+    def extend(self, state: State, effort: Effort) -> State:
+        """Add the counts of runs to the result."""
+        accepted = state.accepted
+        if accepted is None or state.loop.system.n > FEW:
+            return state
+        state = state if state.simulated is not None else _simulated(state, self.tools, effort)
+        if state.simulated is None:
+            return state
+        return state.with_result(simulated=state.simulated.facts(region_of(accepted.certificate)))
+
+
+def _simulated(state: State, tools: Tools, effort: Effort) -> State:
+    """The state with runs, as far as they can be had."""
+    problem, claim = state.contest.best.trial.task.problem, state.claim
+    if claim is None:
+        return state
+    with tools.timing("simulate"):
+        tools.tell("simulate")
+        share = effort.part(_FOR_RUNS * tools.whole)
+        return replace(state, simulated=simulated_region(problem.loop, problem.V, claim.roa, share))
+
+
+def _enough(simulated: SimulatedRegion | None) -> float:
+    """The share of the box of places in boxes with ranks that is nearly all of what converges."""
+    return 1.0 if simulated is None else _WANTED * len(simulated.converging) / simulated.runs

@@ -1,0 +1,148 @@
+"""Next steps that simulated runs suggest, in few states: each is tried on the spot, and suggested only where it gains.
+
+Runs are no proof. A step says what they found, and the command that follows from it proves what it can.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+
+from certify.analysis.facts import Step
+from certify.analysis.options import RoaOptions
+from certify.analysis.results import RoaResult
+from certify.analysis.simulated import FEW, MOST, NEARLY_ALL, simulated_region
+from certify.certificates.verdict import Verdict
+from certify.effort import UNIT, Effort
+from certify.errors import InputError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import System
+from certify.loop.policies import Centre, PolicyNetwork
+from certify.lyapunov import domain_limit, slowest_decay, solve_lyapunov
+from certify.lyapunov.function import Quadratic
+from certify.provers.ranks import turning
+
+WIDER = Fraction(3, 2)
+"""Factor of the side of the domain that is tried."""
+_WORTH = 1.1  # growth of the simulated region that is worth a word
+_NEAR = 1e-3  # of the largest level in the domain: a run that comes so low has converged
+_LOOK = 3 * UNIT  # operations for one look
+
+
+def centring(system: System, network: PolicyNetwork) -> Centre | None:
+    """A centring with which the loop rests at the origin, exactly; None if it has one, or none can be had."""
+    if network.centre != "none":
+        return None
+    centres: tuple[Centre, ...] = ("preactivation", "output")
+    for centre in centres:
+        try:
+            ClosedLoop(system, replace(network, centre=centre)).require_rest()
+        except InputError:
+            continue
+        return centre
+    return None
+
+
+def by_centring(result: RoaResult, asked: tuple[System, PolicyNetwork], effort: Effort) -> Step | None:
+    """The step of a policy that is not centred where centring gains: the stronger claim, of a loop that is stable and
+    converges from as many states of the domain, or more of these."""
+    system, network = asked
+    centre = centring(system, network)
+    proved = result.verdict is Verdict.PROVED
+    weaker = result.claim == "practical" or not proved
+    if centre is None or (system.n > FEW and not weaker):
+        return None
+    loop, more = ClosedLoop(system, replace(network, centre=centre)), ""
+    L = loop.mean_rate()
+    if not slowest_decay(L, loop.step) > 0:
+        return None
+    if system.n <= FEW:
+        P = solve_lyapunov(L, np.eye(system.n), loop.step)
+        there = _share(loop, Quadratic(P), _NEAR * domain_limit(P, system.domain), effort)
+        here = _converging(result)
+        if there is None or here is None or there < (1.0 if weaker else _WORTH) * here:
+            return None
+        more = f"; in simulation {there / here:.3g} times as many states converge" if here and there > here else ""
+    why = "shifted so that pi(0) = u_eq the operating point is the equilibrium, and the stronger claim can be tried"
+    return Step((("--centre", centre),), why + more)
+
+
+def beyond_the_ellipsoid(result: RoaResult, options: RoaOptions, effort: Effort) -> Step | None:
+    """The step after a set that goes beyond the ellipsoid, or where the ellipsoid is little of what there is; None
+    where the ellipsoid's own limits come first."""
+    simulated = result.simulated
+    if result.verdict is not Verdict.PROVED or simulated is None or simulated.share is None:
+        return None
+    if result.outer is None and result.ranks is None:
+        other = "polynomial" if options.goes_on else "auto"  # auto has tried to learn a network
+        return by_learning(result, options, other) if simulated.share < MOST else None
+    if options.lyapunov_level is not None:
+        return None
+    wider, said = _in_a_wider_domain(result, effort), _share_in_words(result)
+    if wider is not None:
+        return wider
+    if simulated.share >= NEARLY_ALL:
+        return Step((), f"{said}, and hardly more converges in a wider domain: a larger set needs another policy")
+    if result.ranks is not None or (result.outer is not None and result.outer.limit in ("effort", "boxes")):
+        return Step((("--effort", f"{4 * options.effort:g}"),), f"{said}, and the set grows with the effort")
+    return None
+
+
+def by_learning(result: RoaResult, options: RoaOptions, candidate: str) -> Step | None:
+    """The step by which a function is learned for an outer set, where that may gain something and is allowed."""
+    system, free = result.system, options.level is None and options.P is None and not options.resume
+    plain = not (options.rate or options.enlarges or result.constraints) and options.engine == "bounds"
+    nearly = result.simulated is None or (result.simulated.share or 0.0) >= NEARLY_ALL
+    if not (free and plain) or system.in_steps or nearly or options.goes_beyond:
+        return None
+    why = f"{_share_in_words(result)}; a function that is learned may show more of it, beyond the ellipsoid"
+    return Step((("--candidate", candidate),), why)
+
+
+def _share_in_words(result: RoaResult) -> str:
+    share = None if result.simulated is None else result.simulated.share
+    return f"{100 * (share or 0.0):.2g} % of what converges in simulation is proved"
+
+
+def _in_a_wider_domain(result: RoaResult, effort: Effort) -> Step | None:
+    """The domain that is wider in the state for which the simulated region grows most, if it does."""
+    system, here = result.system, _converging(result)
+    if result.problem is None or result.levels.roa is None or not here:
+        return None
+    turned, found = turning(ClosedLoop(system, result.network)) if system.in_steps else [], list[tuple[float, int]]()
+    for i, (lo, hi) in enumerate(system.domain):
+        if i in turned:
+            continue
+        try:
+            wider = system.with_domain({system.states[i].name: (WIDER * lo, WIDER * hi)})
+            there = _share(ClosedLoop(wider, result.network), result.problem.V, result.levels.roa, effort)
+        except InputError:
+            continue
+        found.append((0.0 if there is None else float(WIDER) * there / here, i))
+    grown, i = max(found, default=(0.0, 0))
+    if grown < _WORTH:
+        return None
+    why = f"if the equations hold there, runs converge in simulation from {grown:.3g} times the volume"
+    return Step((("--domain", side(system, i, WIDER)),), why)
+
+
+def _share(loop: ClosedLoop, V: Quadratic, level: float, effort: Effort) -> float | None:
+    """The share of the domain's states from which runs come to {V <= level}; None if the effort ends before."""
+    found = simulated_region(loop, V, level, effort.part(_LOOK, even_if_over=True))
+    return None if found is None else len(found.converging) / found.runs
+
+
+def _converging(result: RoaResult) -> float | None:
+    """The share of the domain's states that converge in simulation; 0 where nothing was proved."""
+    if result.simulated is None:
+        return 0.0 if result.levels.roa is None else None
+    return result.simulated.converging / result.simulated.runs
+
+
+def side(system: System, i: int, factor: Fraction) -> str:
+    """The option's value for a state's side of the domain that is wider by this factor: values, not deviations."""
+    name, (lo, hi) = system.states[i].name, (factor * end for end in system.domain[i])
+    at = system.operating_point().get(name, Fraction(0))
+    return f"{name}={float(hi):g}" if lo == -hi else f"{name}={float(lo + at):g}..{float(hi + at):g}"

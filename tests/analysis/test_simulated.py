@@ -1,0 +1,241 @@
+"""A run goes on beyond the ellipsoid where that is little of what converges in simulation, and says the share.
+
+The plant is x' = x (x - 1) (x + 3) under no input: its region of attraction is -3 < x < 1 by inspection, of which an
+ellipsoid around 0 holds half. In discrete time it is x+ = x + x (x - 1) (x + 3) / 10, with the same region.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from certify import PolicyNetwork, System, certify_roa, get_system
+from certify.analysis.acceptance import Clerk
+from certify.analysis.results import RoaResult
+from certify.analysis.simulated import simulated_region
+from certify.analysis.stages import simulation
+from certify.certificates import Certificate
+from certify.certificates.verdict import Verdict
+from certify.effort import UNIT, Effort
+from certify.errors import InputError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Expression, Number, Symbol
+from certify.loop.policies import load_policy
+from certify.lyapunov import Polynomial
+from certify.lyapunov.function import Quadratic
+from certify.report.rows import rows_of
+from certify.report.sections.simulated import drawn_of
+
+POLICIES = Path(__file__).parents[2] / "examples" / "policies"
+x, u = Symbol("x"), Symbol("u")
+RATE = x * (x - 1) * (x + 3) + u
+REST = PolicyNetwork.of_layers((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+
+
+def plant(rate: Expression = RATE, lo: float = -4, hi: float = 2, time: str = "continuous") -> System:
+    return System(
+        name="lopsided",
+        states=(x,),
+        inputs=(u,),
+        parameters={},
+        dynamics=(rate,),
+        u_eq=(Number(0),),
+        domain=((Fraction(lo), Fraction(hi)),),
+        input_bounds=((Fraction(-1), Fraction(1)),),
+        time=time,  # type: ignore[arg-type]
+    )
+
+
+STEPS = plant(x + RATE / 10, time="discrete")
+
+
+def proved(folder: Path, system: System | None = None, **options: object) -> RoaResult:
+    given: dict[str, object] = {"effort": 0.4} | options
+    result = certify_roa(system or plant(), REST, folder, **given)  # type: ignore[arg-type]
+    assert result.verdict is Verdict.PROVED
+    return result
+
+
+@pytest.fixture(scope="module")
+def by_default(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
+    return proved(tmp_path_factory.mktemp("default"))
+
+
+def test_states_that_converge_are_those_of_the_region(tmp_path: Path) -> None:
+    found = simulated_region(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 0.5, Effort(10 * UNIT))
+    assert found is not None and found.runs >= 1000
+    assert np.all((found.converging > -3.001) & (found.converging < 1.001))
+    share = len(found.converging) / found.runs
+    assert abs(share - 4 / 6) < 4 * (share * (1 - share) / found.runs) ** 0.5
+
+
+def test_runs_that_cannot_be_decided_tell_nothing() -> None:
+    assert simulated_region(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 0.5, Effort(1.0)) is None
+
+
+def test_the_default_goes_beyond_the_ellipsoid(by_default: RoaResult) -> None:
+    assert by_default.outer is not None and by_default.simulated is not None
+    assert np.array_equal(by_default.contains([[-2.0], [0.9], [-3.01], [1.01]]), [True, True, False, False])
+    share = by_default.simulated.share
+    assert share is not None and share > 0.85
+    stated = by_default.to_dict()["simulated"]
+    assert stated["proved"] <= stated["converging"] <= stated["runs"] and stated["share"] == share
+    said = dict(rows_of(by_default.to_dict(), True))["simulated"]
+    assert f"about {100 * share:.0f} % of what converges is proved" in said and "no part of the proof" in said
+
+
+def test_the_same_run_gives_the_same_bytes(by_default: RoaResult, tmp_path: Path) -> None:
+    again = proved(tmp_path)
+    assert again.raw is not None and by_default.raw == again.raw
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"candidate": "ellipsoid"},
+        {"candidate": "lyapunov"},
+        {"Q": (2.0,)},
+        {"P": [[1.0]]},
+        {"level": 0.1},
+        {"rate": 0.01},
+        {"enlarge": True},
+    ],
+)
+def test_what_asks_for_an_ellipsoid_gets_one(options: dict[str, object], tmp_path: Path) -> None:
+    result = proved(tmp_path, plant(), **options)
+    assert result.outer is None and result.simulated is not None
+    assert result.simulated.share is not None and result.simulated.share < 0.6
+    assert not result.contains([-2.0])
+
+
+def test_an_ellipsoid_alone_is_suggested_to_go_on(tmp_path: Path) -> None:
+    result = proved(tmp_path, candidate="ellipsoid")
+    assert result.diagnosis is not None and dict(result.diagnosis.next.options) == {"--candidate": "auto"}
+
+
+def test_constraints_exclude_an_outer_set(tmp_path: Path) -> None:
+    result = proved(tmp_path, keep="x <= 1.5")
+    assert result.outer is None and result.constraints
+
+
+def test_an_ellipsoid_that_is_most_of_it_is_enough(tmp_path: Path) -> None:
+    """The certificate is then the very one of the ellipsoid alone, and nothing is learned."""
+    network = load_policy(POLICIES / "pendulum.pt").network
+    found = [
+        certify_roa(get_system("pendulum"), network, tmp_path / name, candidate=name) for name in ("auto", "ellipsoid")
+    ]
+    assert found[0].raw == found[1].raw and found[0].outer is None
+    assert all(one.simulated is not None and 0.8 < (one.simulated.share or 0.0) < 0.9 for one in found)
+    assert "learn" not in found[0].seconds and found[0].simulated == found[1].simulated
+
+
+def test_the_ellipsoid_stays_where_nothing_is_learned(
+    by_default: RoaResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: object) -> None:
+        raise InputError("too little converges.")
+
+    monkeypatch.setattr("certify.lyapunov.learning.learn", failing)
+    result = proved(tmp_path)
+    assert result.outer is None and result.levels == by_default.levels
+    assert result.notice is not None and "no function is learned" in result.notice
+
+
+def test_the_ellipsoid_stays_where_no_level_is_proved(
+    by_default: RoaResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    falls_nowhere = Polynomial(np.array([[2]]), np.array([-1.0]))
+    monkeypatch.setattr("certify.analysis.stages.further.Beyond._learned", lambda *_: falls_nowhere)
+    result = proved(tmp_path)
+    assert result.outer is None and result.levels == by_default.levels
+    assert result.notice is not None and "no set of the learned function" in result.notice
+    assert result.diagnosis is not None and dict(result.diagnosis.next.options) == {"--candidate": "polynomial"}
+
+
+@pytest.mark.parametrize("system", [plant(), STEPS], ids=["outer", "ranks"])
+def test_the_ellipsoid_stays_where_the_checker_refuses_more(
+    system: System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ask = Clerk.ask
+
+    def wrong(clerk: Clerk, certificate: Certificate, **_: object) -> object:
+        claim = certificate.claim
+        if claim.outer is not None:
+            certificate = replace(certificate, claim=replace(claim, outer=replace(claim.outer, level=1e3)))
+        if claim.ranks is not None:
+            certificate = replace(certificate, claim=replace(claim, ranks=replace(claim.ranks, steps=1)))
+        return ask(clerk, certificate)
+
+    monkeypatch.setattr(Clerk, "ask", wrong)
+    result = proved(tmp_path, system)
+    assert result.outer is None and result.ranks is None
+    assert result.notice is not None and "left out" in result.notice
+    assert result.simulated is not None and (result.simulated.share or 0.0) < 0.7
+
+
+def test_a_ring_that_is_cut_for_more_is_resumed_without_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of the effort is kept for what lies beyond, which then is not wanted: the ring takes it after all."""
+    network = load_policy(POLICIES / "pendulum.pt").network
+    options = {"candidate": "auto", "effort": 0.2}
+    plain = certify_roa(get_system("pendulum"), network, tmp_path / "plain", **options)  # type: ignore[arg-type]
+    monkeypatch.setattr(simulation, "_FOR_MORE", 1.0)
+    monkeypatch.setattr(simulation, "_FOR_RING", 0.0)
+    cut = certify_roa(get_system("pendulum"), network, tmp_path / "cut", **options)  # type: ignore[arg-type]
+    assert cut.verdict is Verdict.PROVED and cut.volume == plain.volume
+
+
+def test_boxes_get_ranks_until_nearly_all_is_proved(tmp_path: Path) -> None:
+    result = proved(tmp_path / "default", STEPS)
+    every = proved(tmp_path / "all", STEPS, candidate="ellipsoid", ranks=True)
+    assert result.ranks is not None and result.simulated is not None and every.ranks is not None
+    assert (result.simulated.share or 0.0) > 0.9 and result.contains([-2.5])
+    assert result.ranks.leaves <= every.ranks.leaves and result.ranks.covered <= every.ranks.covered
+    alone = proved(tmp_path / "alone", STEPS, candidate="ellipsoid")
+    assert alone.ranks is None and alone.diagnosis is not None
+    assert dict(alone.diagnosis.next.options) == {"--ranks": ""}
+
+
+def test_a_wider_domain_that_is_suggested_gives_what_it_promises(tmp_path: Path) -> None:
+    """The domain cuts the region off at -2: beyond it lies a quarter."""
+    result = proved(tmp_path, plant(lo=-2))
+    assert result.outer is not None and result.diagnosis is not None
+    step = result.diagnosis.next
+    assert dict(step.options) == {"--domain": "x=3"}
+    promised = float(step.why.partition("simulation from ")[2].split()[0])
+    wider = proved(tmp_path / "wider", plant(lo=-3, hi=3))
+    assert wider.outer is not None and wider.contains([-2.5])
+    assert wider.outer.volume > 0.9 * promised * result.outer.volume
+
+
+def test_centring_is_suggested_only_where_it_gains(tmp_path: Path) -> None:
+    """From the plain policy's equilibrium as much converges as from the operating point of the centred one, and all of
+    it to one equilibrium; under the weaker claim alone centring gains the stronger one."""
+    network = load_policy(POLICIES / "without_gain" / "pendulum.pt").network
+    nearby = certify_roa(get_system("pendulum"), network, tmp_path / "nearby")
+    assert nearby.claim == "nearby" and nearby.diagnosis is not None
+    assert "--centre" not in dict(nearby.diagnosis.next.options)
+    weaker = certify_roa(get_system("pendulum"), network, tmp_path / "practical", claim="practical", candidate="lqr")
+    assert weaker.claim == "practical" and weaker.diagnosis is not None
+    assert dict(weaker.diagnosis.next.options) == {"--centre": "preactivation"}
+
+
+def test_a_share_is_that_of_the_accepted_set(by_default: RoaResult) -> None:
+    assert by_default.raw is not None and by_default.checker is not None
+    assert by_default.checker["certificate_sha256"] == hashlib.sha256(by_default.raw).hexdigest()
+    loop = ClosedLoop(by_default.system, by_default.network)
+    assert by_default.problem is not None and by_default.levels.roa is not None
+    found = simulated_region(loop, by_default.problem.V, by_default.levels.roa, Effort(10 * UNIT))
+    assert found is not None and by_default.simulated is not None
+    exact = np.asarray(by_default.contains(found.converging, deviations=True))
+    assert int(exact.sum()) == by_default.simulated.proved
+
+
+def test_the_page_says_the_share_where_there_is_no_grid(by_default: RoaResult) -> None:
+    said = drawn_of(by_default.to_dict())
+    assert said.startswith("about ") and "of what converges is proved" in said
+    assert drawn_of(None) == drawn_of({"simulated": None}) == ""
