@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .boxes import LEAF, is_whole
 from .case import Case, Failures
@@ -49,8 +50,8 @@ class Flows:
         self.y = np.concatenate([states for states, _ in data.runs])
         self.u = np.concatenate([inputs for _, inputs in data.runs])
 
-    def rows(self, box: Intervals, chosen: Array) -> Rows:
-        """What some transitions say, by their numbers, of parameters in a box."""
+    def rows(self, box: Intervals, chosen: NDArray[np.intp]) -> Rows:
+        """The rows of some transitions, by their numbers, for parameters in a box."""
         found = [self._rows(box, chosen[first : first + self._batch]) for first in range(0, len(chosen), self._batch)]
         alpha, wrong, slopes, slack = (np.concatenate(part, axis=-1) for part in zip(*found, strict=True))
         return Rows(Near(alpha, Above(wrong)), slopes, Above(slack))
@@ -60,7 +61,7 @@ class Flows:
         values = self.c.dynamics.size * (self.data.order + 1)
         return int(max(1, min(256, _BATCH_NUMBERS // (self.symbols**2 * (values + 4)))))
 
-    def _rows(self, box: Intervals, chosen: Array) -> tuple[Array, ...]:
+    def _rows(self, box: Intervals, chosen: NDArray[np.intp]) -> tuple[Array, ...]:
         """alpha, its errors, slopes and slack of a batch of transitions."""
         begin, (i, j), own, none = self.begin[chosen], pairs(self.symbols), self.n + self.k, np.zeros(len(chosen))
         found = []
@@ -76,17 +77,15 @@ class Flows:
         y, origin = self.y[number, state], self.data.origin[state]
         return all_near(Fraction(v) - origin for v in y.tolist()) if origin else Near(y)
 
-    def end(self, box: Intervals, chosen: Array) -> list[Taylor]:
+    def end(self, box: Intervals, chosen: NDArray[np.intp]) -> list[Taylor]:
         """Models of the states at the ends of transitions. Parameters are constant and keep their symbols throughout;
         other quantities may be another number of their range at each place and time."""
         batch = len(chosen)
         x = [self._symbol(self.measured(s, self.begin[chosen]), self.noise[s], s, batch) for s in range(self.n)]
         inputs = [affine(u, np.zeros((self.symbols, batch))) for u in self.u[chosen].T]
-        own = {name: (pair, self.n + k) for k, (name, pair) in enumerate(zip(self.data.parameters, box, strict=True))}
-        ranges = [
-            self._number(*own.get(name, (pair, None)), batch)
-            for name, pair in zip(self.c.uncertain, self.c.ranges, strict=True)
-        ]
+        ranges = [self._number(pair, None, batch) for pair in self.c.ranges]
+        for k, (name, pair) in enumerate(zip(self.data.parameters, box, strict=True)):
+            ranges[self.c.uncertain.index(name)] = self._number(pair, self.n + k, batch)
         return self._after(x, [*inputs, *ranges], batch)
 
     def _symbol(self, centre: Near, reach: Near, symbol: int | None, batch: int) -> Taylor:
@@ -117,7 +116,7 @@ class Flows:
             x = [v + h * g for v, g in zip(x, G, strict=True)]
         return x
 
-    def bounds(self, rows: Rows, chosen: Array, weights: Array, k: int) -> tuple[float, float]:
+    def bounds(self, rows: Rows, chosen: NDArray[np.intp], weights: Array, k: int) -> tuple[float, float]:
         """Between what the symbol of parameter k lies, by a sum of rows with weights (T, n): of rows within R of 0
         `e_k.z = (e_k - sum w slopes).z - sum w alpha + sum w R`."""
         w, samples = Near(weights.T), np.arange(len(self.y))
@@ -134,7 +133,7 @@ class Flows:
         total = Near(alpha.value.ravel(), alpha.error.shaped(-1)).sum()
         return (-total).wider(reach).ends
 
-    def after(self, box: Intervals, weights: Array, chosen: Array) -> Intervals:
+    def after(self, box: Intervals, weights: Array, chosen: NDArray[np.intp]) -> Intervals:
         """The box that weights (2, K, T, n) of some transitions leave of a box; lo > hi where that is nothing."""
         rows, found = self.rows(box, chosen), []
         for k, (lo, hi) in enumerate(box):

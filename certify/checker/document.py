@@ -155,7 +155,7 @@ class Ranks:
 
 @dataclass(frozen=True)
 class Round:
-    """What weights (2, K, T, n) of all transitions leave of a box of parameters lies in another."""
+    """Evidence of a smaller box: the rest of a box of parameters by weights (2, K, T, n) of all transitions lies in it."""
 
     box: Intervals
     weights: Array

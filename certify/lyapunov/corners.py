@@ -7,6 +7,9 @@ Feron, Balakrishnan, section 5.1: quadratic stability of a polytope of linear lo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -56,7 +59,7 @@ class Corners:
             return np.asarray(mean_rate(system, self.nominal, x, u, h))
         found = most = None
         for values in self.values:
-            G = np.asarray(mean_rate(system, lambda y, v, q=values: self.f(y, v, q), x, u, h))
+            G = np.asarray(mean_rate(system, partial(self._at, values), x, u, h))
             grows = ((x @ P) * (2 * G) + h * (G @ P) * G).sum(-1)
             grows = np.where(np.isfinite(grows), grows, np.inf)
             if found is None or most is None:
@@ -65,6 +68,9 @@ class Corners:
                 take = grows > most
                 found, most = np.where(take[..., None], G, found), np.where(take, grows, most)
         return found if found is not None else np.zeros_like(x)
+
+    def _at(self, values: Sequence[float], x: Array, u: Array) -> Array:
+        return np.asarray(self.f(x, u, values))
 
     def decrease(self, P: Array) -> bool:
         """True if x'Px decreases along all linearisations."""

@@ -206,7 +206,7 @@ class _Samples:
         u = self.loop.policy(x.reshape(-1, x.shape[-1])).reshape(*x.shape[:-1], self.loop.system.m)
         with np.errstate(all="ignore"):
             F = self.corners.worst(x, u, self.P)
-        outside = ~np.isfinite(F).all(-1)
+        outside: NDArray[np.bool_] = np.logical_not(np.all(np.isfinite(F), axis=-1))
         F = np.where(outside[..., None], 0.0, F)
         outside |= np.any((u < self.bounds[0]) | (u > self.bounds[1]), axis=-1)
         return F, outside if self.constraints is None else outside | np.any(self.constraints.at(x, u) >= 0, axis=-1)

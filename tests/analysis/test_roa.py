@@ -186,7 +186,8 @@ def test_the_shipped_policy(tmp_path: Path, pendulum: System) -> None:
     data = json.loads(json.dumps(result.to_dict()))
     assert data["checked"] == "ACCEPTED" and data["levels"]["roa"] == roa
     assert set(data["seconds"]) == {
-        "load", "data", "candidate", "local", "ring", "tube", "simulate", "learn", "outer", "ranks", "write", "check", "total"
+        "load", "data", "candidate", "local", "ring", "tube",
+        "simulate", "learn", "outer", "ranks", "write", "check", "total",
     }  # fmt: skip
     assert run_checker(tmp_path / "certificate.json")["policy_sha256"] == policy.network.sha256()
 

@@ -74,7 +74,7 @@ def _short(weights: Array) -> Array:
 
 
 def separate(rows: Rows, noise: Array) -> Program:
-    """The program of rows whose errors are their own: one row a state and transition, in the order (n, T)."""
+    """The program of rows whose errors are their own: a row for each state and transition, in the order (n, T)."""
     n = rows.alpha.shape[0]
     slack = rows.slack + np.abs(rows.slopes[:, :n]).sum(1) + noise[:, None]
     g = rows.slopes[:, n:].swapaxes(1, 2).reshape(rows.alpha.size, -1)

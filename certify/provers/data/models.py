@@ -34,7 +34,7 @@ class Rows:
     slack: Array
 
     def at(self, chosen: NDArray[np.intp]) -> Rows:
-        """Those of some transitions."""
+        """The rows of some transitions."""
         return Rows(self.alpha[:, chosen], self.slopes[..., chosen], self.slack[:, chosen])
 
     @property
@@ -66,7 +66,7 @@ class Flows:
 
     @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
     def rows(self, box: Box, chosen: NDArray[np.intp]) -> Rows:
-        """What some transitions say, by their numbers, of parameters in a box."""
+        """The rows of some transitions, by their numbers, for parameters in a box."""
         size = max(1, _BATCH // self.symbols**2 // (8 * self.order))
         parts = [self._rows(box, chosen[i : i + size]) for i in range(0, len(chosen), size)]
         return Rows(*(np.concatenate(each, axis=-1) for each in zip(*parts, strict=True)))
