@@ -155,7 +155,7 @@ class Ranks:
 
 @dataclass(frozen=True)
 class Round:
-    """Evidence of a smaller box: the rest of a box of parameters by weights (2, K, T, n) of all transitions lies in it."""
+    """A box that holds the rest of another, by weights (2, K, T, n) of all transitions."""
 
     box: Intervals
     weights: Array
