@@ -8,7 +8,18 @@ from fractions import Fraction
 from typing import Any, Self
 
 from certify.loop.plants import System
-from certify.report.words import Varying, below, inside, listed, pretty_unit, stated_for, symbol, varying, varying_in
+from certify.report.words import (
+    Varying,
+    below,
+    inside,
+    listed,
+    outside,
+    pretty_unit,
+    stated_for,
+    symbol,
+    varying,
+    varying_in,
+)
 
 Interval = tuple[Fraction, Fraction]
 
@@ -76,12 +87,12 @@ class Measured:
     @property
     def in_priors(self) -> str:
         """The parameters in their priors, never wider than they are."""
-        return listed([self._within(name, pair) for name, pair in self.priors.items()])
+        return listed([self._named(name, inside(*pair)) for name, pair in self.priors.items()])
 
     @property
     def in_ranges(self) -> str:
-        """The parameters in the ranges that are proved for, never wider than they are."""
-        return listed([self._within(name, pair) for name, pair in self.ranges.items()])
+        """The parameters in the ranges that are left, never narrower than they are."""
+        return listed([self._named(name, outside(*pair)) for name, pair in self.ranges.items()])
 
     @property
     def consistent(self) -> str:
@@ -104,8 +115,8 @@ class Measured:
         """The uncertain quantities that are no parameters of the data."""
         return [q for q in quantities if q.name not in self.priors]
 
-    def _within(self, name: str, pair: Interval) -> str:
-        return f"{symbol(name)} in {inside(*pair)} {pretty_unit(self.units.get(name, ''))}".rstrip()
+    def _named(self, name: str, ends: str) -> str:
+        return f"{symbol(name)} in {ends} {pretty_unit(self.units.get(name, ''))}".rstrip()
 
 
 def stated_of(system: System, statement: str, *, by_steps: bool = False) -> str:

@@ -127,6 +127,15 @@ def inside(lo: Fraction, hi: Fraction) -> str:
     return f"[{lo}, {hi}]"
 
 
+def outside(lo: Fraction, hi: Fraction) -> str:
+    """`[lo, hi]` rounded outwards.
+
+    >>> outside(Fraction(1, 3), Fraction(2, 3))
+    '[0.333333, 0.666667]'
+    """
+    return f"[{below(lo)}, {above(hi)}]"
+
+
 def _value(exact: Fraction, digits: int, direction: Callable[[Fraction], int]) -> Fraction:
     """The value that `_rounded` shows."""
     if exact == 0:
