@@ -179,6 +179,8 @@ def _next(
         return boxes
     if result.claim in ("practical", "nearby") and (centred := by_centring(result, asked, effort)) is not None:
         return centred
+    if (flatter := _flatter(result, options, proof)) is not None:
+        return flatter
     if (beyond := beyond_the_ellipsoid(result, options, effort)) is not None:
         return beyond
     if result.stop is Stop.DOMAIN and options.level is None:
@@ -190,14 +192,6 @@ def _next(
         kept = result.search is not None
         why = "what was done is kept" if kept else "the search was not kept"
         return Step((("--resume", ""),) if kept else (), f"{why}; see to the cluster first, or leave it out")
-    few = result.stop is Stop.BOXES and options.max_boxes < _TELLING
-    if result.stop in _ENDED and not few and _is_bent(result, proof):
-        share = number(_share_proved(result), 2)
-        why = (
-            f"proved is {share} % of the volume that sampling allows, and bounds see more of the hidden units' bends "
-            "than of the policy's linear part: a flatter policy that does the same may be proved on more"
-        )
-        return Step((), why, flattens=True)
     if result.stop.ran_out or result.stop is Stop.BOXES:
         step = _longer(result, options, proof, effort)
         return step if result.search is None else replace(step, options=(*step.options, ("--resume", "")))
@@ -219,6 +213,19 @@ def _next(
     if result.stop is Stop.REQUESTED and result.levels.roa is not None:
         return Step((), "the level that was asked for is proved; leave --level out for the largest")
     return Step((), result.reason)
+
+
+def _flatter(result: RoaResult, options: RoaOptions, proof: Proof | None) -> Step | None:
+    """The step where little is proved because the policy bends; None where that is not so, or not known yet."""
+    few = result.stop is Stop.BOXES and options.max_boxes < _TELLING
+    if result.stop not in _ENDED or few or not _is_bent(result, proof):
+        return None
+    share = number(_share_proved(result), 2)
+    why = (
+        f"proved is {share} % of the volume that sampling allows, and bounds see more of the hidden units' bends "
+        "than of the policy's linear part: a flatter policy that does the same may be proved on more"
+    )
+    return Step((), why, flattens=True)
 
 
 def _another_candidate(result: RoaResult, options: RoaOptions) -> Step:
