@@ -278,6 +278,39 @@ def test_the_true_parameters_lie_in_ranges_that_are_small(tmp_path: Path) -> Non
     assert "# friction by inertia" in (tmp_path / "known.toml").read_text()
 
 
+def test_an_operating_point_that_binary64_does_not_hold_moves_no_range(tmp_path: Path) -> None:
+    """Deviations are those from x_eq itself, which its nearest number is 0.875 beside; noise is 0.3."""
+    (tmp_path / "far.toml").write_text(
+        f"""name = "far"
+time = "discrete"
+states = ["x"]
+inputs = ["u"]
+[parameters]
+p = [-1, -0.8]
+x0 = "{2**56 + 7}/8"
+[dynamics]
+x = "x0 + p*(x - x0) + u"
+[x_eq]
+x = "x0"
+[u_eq]
+u = 0
+[domain]
+x = [{2**53 - 1000}, {2**53 + 1000}]
+[input_bounds]
+u = [-6, 6]
+"""
+    )
+    x0, p, chance, rows = 2**53 + Fraction(7, 8), Fraction(-9, 10), np.random.default_rng(0), []
+    for y in (2**53 + 2 * chance.integers(-20, 21, 60)).tolist():
+        after = x0 + p * (y + Fraction(int(chance.integers(-30, 31)), 100) - x0)
+        end = float(after)
+        rows.append((float(y), float(Fraction(round(64 * (Fraction(end) - after)), 64)), end))
+    write(tmp_path / "a.csv", np.array(rows), "x,u,x_next")
+    found = certify.identify(tmp_path / "a.csv", tmp_path / "far.toml", noise="0.31")
+    lo, hi = found.ranges["p"]
+    assert lo <= p <= hi and hi - lo < Fraction(1, 20)
+
+
 def test_runs_and_a_period_of_some_length(tmp_path: Path) -> None:
     """True periods lie in the range that is given, and so do the parameters in theirs."""
     draw, rows = np.random.default_rng(2), list[Array]()
