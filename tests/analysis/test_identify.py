@@ -256,6 +256,14 @@ def test_angles_are_unwrapped_and_other_states_are_not(tmp_path: Path, structure
     assert np.array_equal(read_data(path, system()).runs[0].states, turning[:, :2])  # it declares no angle
 
 
+def test_angles_that_are_not_wrapped_stay(tmp_path: Path, structure: Path) -> None:
+    """Four radians a row are not taken for a turn less."""
+    path = write(tmp_path / "a.csv", np.array([[4.0 * k, 9.0, 0.0] for k in range(4)]), "theta,theta_dot,u")
+    found = read_data(path, load_system(structure))
+    assert found.runs[0].states[:, 0].tolist() == [0.0, 4.0, 8.0, 12.0]
+    assert not any("unwrapped" in note for note in found.notes)
+
+
 def test_numbers_beyond_the_plants_bounds_are_told(tmp_path: Path) -> None:
     rows = transitions(4)
     rows[1, 2] = 7.0
@@ -564,6 +572,12 @@ def test_what_fails_in_the_ranges_refutes_no_claim_about_data(known: Path) -> No
         ]
         assert [one.verdict.value for one in found] == ["REFUTED", verdict]
         assert ("need not be consistent" in str(found[1].notice)) is (verdict == "UNKNOWN")
+
+
+def test_an_invariant_set_has_no_data(known: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [str(POLICY), "--system", str(known / "known.toml"), "--data", str(known / "data.csv")]
+    assert _run(["roa", *files, "--claim", "invariant", "--out", str(known / "out")], False) == 2
+    assert "must be for ranges as they stand" in " ".join(capsys.readouterr().err.split())
 
 
 def test_without_data_ranges_are_taken_as_they_stand(known: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -32,7 +32,9 @@ def residual_ranges(file: PlantFile, states: Sequence[str]) -> dict[str, Interva
     InputError : an entry is no state, or its disturbance's name is one of the table `disturbances`.
     """
     file.require_known("residual", list(states), "state")
-    twice = next((s for s in states if s in file.table("residual") and _residual(s) in file.table("disturbances")), None)
+    twice = next(
+        (s for s in states if s in file.table("residual") and _residual(s) in file.table("disturbances")), None
+    )
     if twice is not None:
         raise file.refuse(f"its disturbance is {_residual(twice)}, a name that stands for another.", "residual", twice)
     return {_residual(s): (Fraction(-1), Fraction(1)) for s in states if s in file.table("residual")}

@@ -128,7 +128,7 @@ class Flows:
 
 
 def _less(values: Array, at: Sequence[Fraction]) -> Array:
-    """Measured values (T, n) in deviations from a point, each rounded once: no more than models of it are charged for."""
+    """Measured values (T, n) in deviations from a point, each rounded once, for which models allow."""
     columns = [
         [float(Fraction(v) - q) for v in column] if q else column
         for column, q in zip(values.T.tolist(), at, strict=True)
