@@ -216,9 +216,9 @@ class Sizes:
         k, followed, a = len(data.parameters), rounds * data.transitions, self.c.dynamics.size
         times = 2 * data.order**3 + 8 if data.period else 1
         models = data.pieces * (a * times + 4 * self.n)
-        return self.boxes(followed, models, a * (data.order + 1), self.n + k, 0) + 2**6 * k * followed * self.n * (
-            self.n + k + 2**6
-        )
+        found = self.boxes(followed, models, a * (data.order + 1), self.n + k, 0)
+        found += 2**6 * k * followed * self.n * (self.n + k + 2**6)
+        return found + 2**17 * rounds * data.order * data.pieces * (a + 4 * self.n)  # however few transitions are left
 
     @property
     def ball(self) -> int:

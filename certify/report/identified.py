@@ -60,7 +60,7 @@ def noise_in_words(factor: float | None) -> str:
     if factor is None:
         return "no statement about the noise"
     if factor == 0:
-        return "any smaller noise, down to none"
+        return "no bound: no smaller noise is contradicted, as far as is shown here"
     return f"no noise smaller than {below(factor, 3)} times that, in all states at once: it is contradicted"
 
 

@@ -256,6 +256,14 @@ def test_angles_are_unwrapped_and_other_states_are_not(tmp_path: Path, structure
     assert np.array_equal(read_data(path, system()).runs[0].states, turning[:, :2])  # it declares no angle
 
 
+def test_angles_that_are_not_wrapped_stay(tmp_path: Path, structure: Path) -> None:
+    """Four radians a row are not taken for a turn less."""
+    path = write(tmp_path / "a.csv", np.array([[4.0 * k, 9.0, 0.0] for k in range(4)]), "theta,theta_dot,u")
+    found = read_data(path, load_system(structure))
+    assert found.runs[0].states[:, 0].tolist() == [0.0, 4.0, 8.0, 12.0]
+    assert not any("unwrapped" in note for note in found.notes)
+
+
 def test_numbers_beyond_the_plants_bounds_are_told(tmp_path: Path) -> None:
     rows = transitions(4)
     rows[1, 2] = 7.0
@@ -276,6 +284,39 @@ def test_the_true_parameters_lie_in_ranges_that_are_small(tmp_path: Path) -> Non
     assert known.dynamics == found.system.dynamics and known.ranges == found.system.ranges
     assert (tmp_path / "known.toml").read_text().startswith("# a pendulum whose numbers are not known\n")
     assert "# friction by inertia" in (tmp_path / "known.toml").read_text()
+
+
+def test_an_operating_point_that_binary64_does_not_hold_moves_no_range(tmp_path: Path) -> None:
+    """Deviations are those from x_eq itself, which its nearest number is 0.875 beside; noise is 0.3."""
+    (tmp_path / "far.toml").write_text(
+        f"""name = "far"
+time = "discrete"
+states = ["x"]
+inputs = ["u"]
+[parameters]
+p = [-1, -0.8]
+x0 = "{2**56 + 7}/8"
+[dynamics]
+x = "x0 + p*(x - x0) + u"
+[x_eq]
+x = "x0"
+[u_eq]
+u = 0
+[domain]
+x = [{2**53 - 1000}, {2**53 + 1000}]
+[input_bounds]
+u = [-6, 6]
+"""
+    )
+    x0, p, chance, rows = 2**53 + Fraction(7, 8), Fraction(-9, 10), np.random.default_rng(0), []
+    for y in (2**53 + 2 * chance.integers(-20, 21, 60)).tolist():
+        after = x0 + p * (y + Fraction(int(chance.integers(-30, 31)), 100) - x0)
+        end = float(after)
+        rows.append((float(y), float(Fraction(round(64 * (Fraction(end) - after)), 64)), end))
+    write(tmp_path / "a.csv", np.array(rows), "x,u,x_next")
+    found = certify.identify(tmp_path / "a.csv", tmp_path / "far.toml", noise="0.31")
+    lo, hi = found.ranges["p"]
+    assert lo <= p <= hi and hi - lo < Fraction(1, 20)
 
 
 def test_runs_and_a_period_of_some_length(tmp_path: Path) -> None:
@@ -531,6 +572,12 @@ def test_what_fails_in_the_ranges_refutes_no_claim_about_data(known: Path) -> No
         ]
         assert [one.verdict.value for one in found] == ["REFUTED", verdict]
         assert ("need not be consistent" in str(found[1].notice)) is (verdict == "UNKNOWN")
+
+
+def test_an_invariant_set_has_no_data(known: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [str(POLICY), "--system", str(known / "known.toml"), "--data", str(known / "data.csv")]
+    assert _run(["roa", *files, "--claim", "invariant", "--out", str(known / "out")], False) == 2
+    assert "must be for ranges as they stand" in " ".join(capsys.readouterr().err.split())
 
 
 def test_without_data_ranges_are_taken_as_they_stand(known: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from certify.checker import limits
 from certify.reference.__main__ import in_words
 from certify.reference.document import read
 from tests.checker.test_limits import counts
@@ -126,6 +127,14 @@ def test_both_programs_count_the_same(name: str, tmp_path: Path) -> None:
     for path in (f"{FIT}.rounds", f"{FIT}.leaves.0"):
         larger = counts(edited(data, path, lambda rounds: [*rounds, more]), tmp_path)
         assert larger[0] == numbers and larger[1] > work
+
+
+def test_many_rounds_of_few_transitions_are_counted(tmp_path: Path) -> None:
+    """A round has a cost of its own: 200,000 of them in 64 pieces each would take hours."""
+    data = with_data(of_scalar([("0", "1")]), replace(SCALAR, order=1, pieces=64, steps=1, starts=((1.0,),)))
+    each = {"box": encode([0.0, 1.0]), "weights": encode([1.0, 0.0])}
+    none, work = (counts(edited(data, f"{FIT}.rounds", [each] * k), tmp_path)[1] for k in (0, 64))
+    assert 3000 * (work - none) > limits.MOST_WORK
 
 
 def test_the_words() -> None:

@@ -106,6 +106,7 @@ def test_one_period_is_a_pair(tmp_path: Path) -> None:
         ('v = "0.1*abs(v)"', 'v = "0.1*q"', "'q' is no state, input, parameter or disturbance"),
         ('v = "0.1*abs(v)"', "v = [1, 2]", "must be an equation as text"),
         ("k = 2", "k = 2\nresidual_v = 1", "found 'residual_v' twice"),
+        ("[u_eq]", "[disturbances]\nresidual_v = 5\n\n[u_eq]", "its disturbance is residual_v"),
         ('file = "runs.csv"', "", "must have file"),
         ("period = [0.01, 0.02]", "", "must have period"),
         ("period = [0.01, 0.02]", "period = [0.02, 0.01]", "must be a positive time"),

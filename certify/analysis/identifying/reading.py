@@ -235,9 +235,11 @@ def _require_numbers(array: NDArray[Any], shape: tuple[int | None, ...], where: 
 def _unwrapped(runs: Sequence[Run], system: System) -> tuple[tuple[Run, ...], int]:
     """Runs in which no angle moves by more than half a turn in a transition, and the number of turns that were added.
 
-    To add turns in floats moves a value by a few units in its last place, which the noise has to cover.
+    An angle whose values span more than a turn and a half is not wrapped, and stays. To add turns in floats moves a
+    value by a few units in its last place, which the noise has to cover.
     """
-    at, count = [k for k, s in enumerate(system.states) if s.name in system.angles], 0
+    span, count = np.ptp(np.concatenate([run.states for run in runs]), axis=0), 0
+    at = [k for k, s in enumerate(system.states) if s.name in system.angles and span[k] <= 1.5 * _TURN]
     if not at:
         return tuple(runs), 0
     found = list[Run]()
@@ -253,7 +255,10 @@ def _unwrapped(runs: Sequence[Run], system: System) -> tuple[tuple[Run, ...], in
 def _notes(runs: Sequence[Run], turned: int, system: System) -> Iterator[str]:
     """Remarks on angles that were unwrapped, and on numbers beyond the plant's bounds."""
     if turned:
-        yield f"{turned:,} differences of {', '.join(system.angles)} were unwrapped to the nearest turn"
+        yield (
+            f"{turned:,} differences of {', '.join(system.angles)} were unwrapped to the nearest turn: it is assumed "
+            "that none moved by more than half a turn"
+        )
     x, u = np.concatenate([run.states for run in runs]), np.concatenate([run.inputs for run in runs])
     if not (np.all(np.isfinite(x)) and np.all(np.isfinite(u))):
         raise InputError("measured numbers must stay finite when angles are unwrapped.")

@@ -99,6 +99,10 @@ def certify_invariant(
             "`claim` invariant must be about a plant in continuous time whose input follows the state at once; the "
             f"time of {system.name} goes in steps."
         )
+    if system.measurements is not None and system.measurements.runs:
+        raise OptionError(
+            "`claim` invariant must be for ranges as they stand: no such claim has measurements yet; leave out `data`."
+        )
     limit = options.time_limit
     effort = Effort(options.effort * WHOLE, None if limit is None else max(0.0, limit - load_seconds))
     with one_thread(), sole_writer(out), earlier_aside(out, tell or (lambda _: None)):

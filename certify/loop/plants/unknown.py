@@ -25,8 +25,18 @@ def parameter(file: PlantFile, name: str) -> tuple[Fraction, Interval | None]:
 
 
 def residual_ranges(file: PlantFile, states: Sequence[str]) -> dict[str, Interval]:
-    """The disturbances in [-1, 1], one for each state of the table `residual`, by their names."""
+    """The disturbances in [-1, 1], one for each state of the table `residual`, by their names.
+
+    Raises
+    ------
+    InputError : an entry is no state, or its disturbance's name is one of the table `disturbances`.
+    """
     file.require_known("residual", list(states), "state")
+    twice = next(
+        (s for s in states if s in file.table("residual") and _residual(s) in file.table("disturbances")), None
+    )
+    if twice is not None:
+        raise file.refuse(f"its disturbance is {_residual(twice)}, a name that stands for another.", "residual", twice)
     return {_residual(s): (Fraction(-1), Fraction(1)) for s in states if s in file.table("residual")}
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,8 +53,7 @@ class Flows:
         self.dynamics = system.uncertain_dynamics()
         self.names = tuple(measurements.priors)
         self.symbols = system.n + len(self.names)
-        x_eq = np.array([float(q) for q in system.exact_x_eq()])
-        states = [run.states - x_eq for run in measurements.runs]
+        states = [_less(run.states, system.exact_x_eq()) for run in measurements.runs]
         self.begins = np.concatenate([x[:-1] for x in states]).T
         self.ends = np.concatenate([x[1:] for x in states]).T
         self.inputs = np.concatenate([run.inputs for run in measurements.runs]).T
@@ -125,3 +125,12 @@ class Flows:
                 for s, after in ((s, v + rise) for (s, v), rise in zip(x.items(), rises, strict=True))
             }
         return list(x.values())
+
+
+def _less(values: Array, at: Sequence[Fraction]) -> Array:
+    """Measured values (T, n) in deviations from a point, each rounded once, for which models allow."""
+    columns = [
+        [float(Fraction(v) - q) for v in column] if q else column
+        for column, q in zip(values.T.tolist(), at, strict=True)
+    ]
+    return np.array(columns).T
