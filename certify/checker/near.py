@@ -238,11 +238,11 @@ class Near:
 
     def __mul__(self, other: Near | float) -> Self:
         """Products with one number for all that share an error. |xy - XY| <= |x||y - Y| + |x - X||Y|, where |Y| is not
-        bounded roughly: x may be a range."""
+        bounded roughly alone, since x may be a range; nor by itself, whose squares may overflow."""
         x, y = other if isinstance(other, Near) else Near(other), self
         of_x, rough = size(x.value), y.roughly
         made = of_x * (y.error + rough.ulps(1))
-        made = made if x.error is ZERO else made + x.error * y.size
+        made = made if x.error is ZERO else made + x.error * y.size.least(rough + y.error)
         return type(self)(x.value * y.value, made, of_x * rough)
 
     __rmul__ = __mul__

@@ -20,13 +20,14 @@ from certify.lyapunov.candidates import increment_matrix, slowest_decay
 from certify.lyapunov.programs import smallest_trace
 
 Array = NDArray[np.float64]
-_ALIKE = 1e-9  # relative difference of linearisations that count as one
+_ALIKE, _AT_REST = 1e-9, 1e-9  # relative difference of linearisations that count as one; a rate that counts as none
 _SHARES = (0.5, 0.3, 0.2, 0.1, 0.05, 0.02, 0.005)  # of the slowest decay of all corners, that V is to have
 _TOLERANCE = 1e-8  # of the solver
 
 
 class Corners:
-    """A closed loop at the corners of its ranges, or as it stands if it has none.
+    """A closed loop at the corners of its ranges, or with nominal values alone if it has none, or does not rest at the
+    origin at every corner: near there no V decreases then.
 
     `rates` are its different linearisations L (n, n), G = L x to first order.
     """
@@ -34,8 +35,9 @@ class Corners:
     def __init__(self, loop: ClosedLoop) -> None:
         self.loop, self.step = loop, loop.step
         at = corners(loop.system) if loop.system.ranges else ()
-        self.values = [[float(q) for q in corner.values()] for corner in at]
         self.nominal, self.f = loop.system.function(), loop.system.uncertain_function()
+        at = at if all(self._rests(list(map(float, corner.values()))) for corner in at) else ()
+        self.values = [[float(q) for q in corner.values()] for corner in at]
         self.rates = [loop.mean_rate()]
         for corner in at:
             L = ClosedLoop(at_values(loop.system, corner), loop.network).mean_rate()
@@ -68,6 +70,12 @@ class Corners:
                 take = grows > most
                 found, most = np.where(take[..., None], G, found), np.where(take, grows, most)
         return found if found is not None else np.zeros_like(x)
+
+    def _rests(self, values: Sequence[float]) -> bool:
+        """True if the loop rests at the origin with these values, up to rounding."""
+        x = np.zeros(self.loop.system.n)
+        away = np.abs(mean_rate(self.loop.system, partial(self._at, values), x, self.loop.policy(x), self.step))
+        return bool(np.max(away) <= _AT_REST)
 
     def _at(self, values: Sequence[float], x: Array, u: Array) -> Array:
         return np.asarray(self.f(x, u, values))

@@ -270,12 +270,14 @@ class _Search:
         return found if len(positive) == len(self.periods) else [*found, (columns(1), 0.0)]
 
     @np.errstate(all="ignore")
-    def _worst_case(self, x: Array) -> tuple[Fraction | None, Mapping[str, Fraction]]:
-        """The period and the corner of the ranges at which D' is largest at a state (n,), in floats."""
+    def _worst_cases(self, x: Array) -> list[tuple[Fraction | None, Mapping[str, Fraction]]]:
+        """The periods and the corners of the ranges at which D' is not negative at a state (n,), in floats; the worst
+        first."""
         u = self._inputs(x[None])[0]
-        decrease = np.concatenate([self._decrease(x[None], u, values, step) for values, step in self.worst])
+        decrease = np.concatenate([self._decrease(x[None], u, values, step) for values, step in self.worst])[:, 0]
         later = sorted(self.periods, key=lambda period: period == 0)  # as `worst` has them
-        return list(itertools.product(later, self.corners))[int(np.argmax(decrease[:, 0]))]
+        every = list(itertools.product(later, self.corners))
+        return [every[k] for k in np.argsort(-decrease, kind="stable") if not decrease[k] < 0]
 
     def _decrease(self, x: Array, u: Array, values: list[Array], step: float | Array) -> Array:
         """D' (C, B) for constant values of what is uncertain, or (1, B) without any."""
@@ -327,8 +329,8 @@ class _Search:
 
     def _witnesses(self, x: Array, level: float) -> Iterator[Witness]:
         """All that may be violated at a state."""
-        period, values = self._worst_case(x)
-        yield Witness(x, level, "vdot", values, period)
+        for period, values in self._worst_cases(x):
+            yield Witness(x, level, "vdot", values, period)
         if self.check_inputs:
             yield Witness(x, level, "input", self.corners[0])
         for name in () if self.constraints is None else self.constraints.names:

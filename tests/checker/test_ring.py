@@ -195,5 +195,5 @@ def test_a_negative_multiplier_would_accept_what_is_false(monkeypatch: pytest.Mo
     false = scalar_claim(c2=2.2**2, bias=0.0)
     grown = grow(false, max_leaves=400, depth=12)
     assert verdict(grown) == "ring"
-    monkeypatch.setattr(checker_boxes, "multipliers", lambda a, b, c: np.full((1, *c.shape), -1e9))
+    monkeypatch.setattr(checker_boxes, "multipliers", lambda a, b, c, least=0.0: np.full((1, *c.shape), -1e9))
     assert verdict(grown) == "ACCEPTED"
