@@ -178,7 +178,8 @@ def _next(
     if (boxes := _boxes(result, options)) is not None:
         return boxes
     if result.claim in ("practical", "nearby") and (centred := by_centring(result, asked, effort)) is not None:
-        return centred
+        stronger = (("--claim", "auto"),) if options.claim == "practical" else ()
+        return replace(centred, options=(*centred.options, *stronger))
     if (flatter := _flatter(result, options, proof)) is not None:
         return flatter
     if (beyond := beyond_the_ellipsoid(result, options, effort)) is not None:

@@ -14,7 +14,7 @@ from certify.analysis.facts import Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
 from certify.analysis.simulated import FEW, MOST, NEARLY_ALL, simulated_region
-from certify.certificates.verdict import Verdict
+from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
@@ -76,6 +76,8 @@ def beyond_the_ellipsoid(result: RoaResult, options: RoaOptions, effort: Effort)
     if result.verdict is not Verdict.PROVED or simulated is None or simulated.share is None:
         return None
     if result.outer is None and result.ranks is None:
+        if result.stop in (Stop.BOXES, Stop.STALLED) or result.stop.ran_out:
+            return None
         other = "polynomial" if options.goes_on else "auto"  # auto has tried to learn a network
         return by_learning(result, options, other) if simulated.share < MOST else None
     if options.lyapunov_level is not None:

@@ -221,7 +221,7 @@ def test_centring_is_suggested_only_where_it_gains(tmp_path: Path) -> None:
     assert "--centre" not in dict(nearby.diagnosis.next.options)
     weaker = certify_roa(get_system("pendulum"), network, tmp_path / "practical", claim="practical", candidate="lqr")
     assert weaker.claim == "practical" and weaker.diagnosis is not None
-    assert dict(weaker.diagnosis.next.options) == {"--centre": "preactivation"}
+    assert dict(weaker.diagnosis.next.options) == {"--centre": "preactivation", "--claim": "auto"}
 
 
 def test_a_share_is_that_of_the_accepted_set(by_default: RoaResult) -> None:

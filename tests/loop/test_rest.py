@@ -121,9 +121,9 @@ def test_the_command_centres_on_request_and_says_what_that_changes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["roa", "--policy", str(PLAIN), "--candidate", "lqr", "--out", str(tmp_path), "--json"]
-    assert _run(command, True) == 0
+    assert _run([*command, "--claim", "practical"], True) == 0
     further = json.loads(capsys.readouterr().out)["diagnosis"]["next"]
-    assert further["options"] == {"--centre": "preactivation"}
+    assert further["options"] == {"--centre": "preactivation", "--claim": "auto"}
     assert _run(shlex.split(further["command"])[1:], True) == 0
     captured = capsys.readouterr()
     assert json.loads(captured.out)["claim"] == {"kind": "asymptotic"}
