@@ -120,7 +120,9 @@ class Function:
         return N
 
     def is_above(self, x: Form, level: float) -> Array:
-        """True on boxes on which N is certainly above the level."""
+        """True on boxes on which N is certainly above the level; nowhere if that is infinite."""
+        if not np.isfinite(level):
+            return np.zeros(x.value.shape[2], dtype=bool)
         return self._has(x, lambda N: upper_bound(constants(N)(Fraction(level)) + -N) < 0)
 
     def is_below(self, x: Form, level: float) -> Array:
