@@ -269,16 +269,6 @@ class _Search:
         found: list[tuple[list[Array], float | Array]] = [(columns(len(positive)), steps)]
         return found if len(positive) == len(self.periods) else [*found, (columns(1), 0.0)]
 
-    @np.errstate(all="ignore")
-    def _worst_cases(self, x: Array) -> list[tuple[Fraction | None, Mapping[str, Fraction]]]:
-        """The periods and the corners of the ranges at which D' is not negative at a state (n,), in floats; the worst
-        first."""
-        u = self._inputs(x[None])[0]
-        decrease = np.concatenate([self._decrease(x[None], u, values, step) for values, step in self.worst])[:, 0]
-        later = sorted(self.periods, key=lambda period: period == 0)  # as `worst` has them
-        every = list(itertools.product(later, self.corners))
-        return [every[k] for k in np.argsort(-decrease, kind="stable") if not decrease[k] < 0]
-
     def _decrease(self, x: Array, u: Array, values: list[Array], step: float | Array) -> Array:
         """D' (C, B) for constant values of what is uncertain, or (1, B) without any."""
         G = mean_rate(self.loop.system, lambda y, v: self.f(y, v, values), x[None], u, step)
@@ -329,7 +319,7 @@ class _Search:
 
     def _witnesses(self, x: Array, level: float) -> Iterator[Witness]:
         """All that may be violated at a state."""
-        for period, values in self._worst_cases(x):
+        for period, values in _worst_cases(self, x):
             yield Witness(x, level, "vdot", values, period)
         if self.check_inputs:
             yield Witness(x, level, "input", self.corners[0])
@@ -391,3 +381,14 @@ class _Search:
         z = z / np.linalg.norm(z, axis=-1, keepdims=True)
         tangent = gradient - (gradient * z).sum(-1, keepdims=True) * z
         return np.asarray(tangent / (np.linalg.norm(tangent, axis=-1, keepdims=True) + 1e-300))
+
+
+@np.errstate(all="ignore")
+def _worst_cases(search: _Search, x: Array) -> list[tuple[Fraction | None, Mapping[str, Fraction]]]:
+    """The periods and the corners of the ranges at which D' is not negative at a state (n,), in floats; the worst
+    first."""
+    u = search._inputs(x[None])[0]
+    decrease = np.concatenate([search._decrease(x[None], u, values, step) for values, step in search.worst])[:, 0]
+    later = sorted(search.periods, key=lambda period: period == 0)  # as `worst` has them
+    every = list(itertools.product(later, search.corners))
+    return [every[k] for k in np.argsort(-decrease, kind="stable") if not decrease[k] < 0]
