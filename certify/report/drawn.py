@@ -6,7 +6,7 @@ import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from certify.certificates import Certificate, InvariantCertificate, ReachCertificate, parse_any, parse_certificate
+from certify.certificates import Certificate, parse_any, parse_certificate
 from certify.errors import CertifyError
 
 if TYPE_CHECKING:
@@ -27,14 +27,11 @@ def page_of(
     `figures` are those of `figures_if_accepted` for the same bytes.
     """
     from certify.report.page import render_html
-    from certify.report.reach_page import render_reached
-    from certify.report.stay_page import render_stayed
+    from certify.report.short_page import render_short
 
     read, sha256 = parse_any(raw, str(path)), hashlib.sha256(raw).hexdigest()
-    if isinstance(read, InvariantCertificate):
-        return render_stayed(read, answer, data, path, sha256, len(raw))
-    if isinstance(read, ReachCertificate):
-        return render_reached(read, answer, data, path, sha256, len(raw))
+    if not isinstance(read, Certificate):
+        return render_short(read, answer, data, path, sha256, len(raw))
     return render_html(read, answer, data, path, sha256=sha256, size=len(raw), figures=figures)
 
 

@@ -1,80 +1,42 @@
-"""The page of a certificate that a region is reached: shorter than that of a set of attraction, of the same parts."""
+"""The parts of a page that only a certificate has by which a region is reached."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates import ReachCertificate
-from certify.errors import CertifyError, InputError
+from certify.errors import CertifyError
 from certify.report.figures.ranks import reach_maps
 from certify.report.figures.style import Picture
 from certify.report.mathml import comparison, inequality
 from certify.report.ranked import BOXES
 from certify.report.reached import box_of, steps_of
 from certify.report.sections.not_proved import not_reached_of
-from certify.report.sections.numbers import file_rows, ranked_rows, run_rows
-from certify.report.sections.plant import plant_of
+from certify.report.sections.numbers import ranked_rows
 from certify.report.sections.shared import timing_of
-from certify.report.sections.status import Status, status_of
-from certify.report.sheet import filled
+from certify.report.sections.status import Status
 from certify.report.words import listed, symbol, volume_name
 
-TEMPLATE = "certify.report", "reached.html"
 Array = NDArray[np.float64]
 
 
-def render_reached(
-    certificate: ReachCertificate,
-    answer: Mapping[str, Any] | None,
-    result: Mapping[str, Any] | None,
-    path: Path,
-    sha256: str,
-    size: int,
-) -> str:
-    """The report as one HTML document.
-
-    Parameters
-    ----------
-    answer : the checker's answer about these bytes; None if it was not run.
-    result : `ReachResult.to_dict()` of the run that made the certificate; None if there is none.
-    path : for its name only; nothing is read from it.
-    sha256, size : of the bytes that the certificate was parsed from.
-
-    Raises
-    ------
-    SoundnessError : the answer is not about these bytes.
-    InputError : the result is not of the run that made the certificate.
-    """
-    status = status_of(certificate, sha256, answer)
-    if result is not None and result["certificate_sha256"] != sha256:
-        raise InputError("`result` must be of the run that made the certificate; its hash is another.")
+def reached_parts(certificate: ReachCertificate, status: Status, result: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The values of `reached.html` that pages of other claims do not have, or have otherwise."""
     pictures, trouble = _pictures(certificate, status, result)
-    system = certificate.system
-    return filled(
-        *TEMPLATE,
-        one_plane=system.n <= 2,
-        status=status,
-        replayed=True,
-        file=path.name,
-        plant=plant_of(certificate),
-        timing=timing_of(certificate),
-        claim=_claim(certificate),
-        asked=_asked(result) if status.accepted else {},
-        pictures=pictures,
-        trouble=trouble,
-        ranked=ranked_rows(certificate, "the region"),
-        measure=volume_name(system.n),
-        evidence=file_rows(certificate, sha256, size),
-        run=run_rows(result),
-        provenance=sorted((str(k), str(v)) for k, v in certificate.provenance.items()),
-        not_proved=not_reached_of(certificate),
-    )
+    return {
+        "claim": _claim(certificate),
+        "asked": _asked(result) if status.accepted else {},
+        "pictures": pictures,
+        "trouble": trouble,
+        "ranked": ranked_rows(certificate, "the region"),
+        "measure": volume_name(certificate.system.n),
+        "not_proved": not_reached_of(certificate),
+    }
 
 
 def _claim(certificate: ReachCertificate) -> dict[str, Any]:
@@ -101,6 +63,7 @@ def _claim(certificate: ReachCertificate) -> dict[str, Any]:
     if claim.keep:
         parts.append(("Constraints", f"Each of them holds before each of these {steps}{meanwhile}", ""))
     return {
+        "own": "region",
         "target": [comparison(t) for t in claim.target],
         "constraints": [inequality(name, g) for name, g in certificate.constraints.items()],
         "steps": f"{claim.ranks.steps:,} {steps if claim.ranks.steps > 1 else steps[:-1]}",

@@ -1,76 +1,36 @@
-"""The page of a certificate that a set is never left: shorter than that of a set of attraction, of the same parts."""
+"""The parts of a page that only a certificate has by which a set is never left."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from certify.certificates import InvariantCertificate
-from certify.errors import CertifyError, InputError
+from certify.errors import CertifyError
 from certify.lyapunov import sampled_volume
 from certify.lyapunov.neural import Neural
 from certify.report.figures.staying import staying_pictures
 from certify.report.figures.style import Picture
 from certify.report.mathml import identifier, inequality, typeset
 from certify.report.sections.not_proved import not_staying_of
-from certify.report.sections.numbers import file_rows, run_rows
-from certify.report.sections.plant import plant_of
-from certify.report.sections.shared import timing_of
-from certify.report.sections.status import Status, status_of
-from certify.report.sheet import filled
+from certify.report.sections.status import Status
 from certify.report.words import network_name, volume_name
 
-TEMPLATE = "certify.report", "stayed.html"
 _LONGEST = 200  # letters of an expression that is shown
 
 
-def render_stayed(
-    certificate: InvariantCertificate,
-    answer: Mapping[str, Any] | None,
-    result: Mapping[str, Any] | None,
-    path: Path,
-    sha256: str,
-    size: int,
-) -> str:
-    """The report as one HTML document.
-
-    Parameters
-    ----------
-    answer : the checker's answer about these bytes; None if it was not run.
-    result : `InvariantResult.to_dict()` of the run that made the certificate; None if there is none.
-    path : for its name only; nothing is read from it.
-    sha256, size : of the bytes that the certificate was parsed from.
-
-    Raises
-    ------
-    SoundnessError : the answer is not about these bytes.
-    InputError : the result is not of the run that made the certificate.
-    """
-    status = status_of(certificate, sha256, answer)
-    if result is not None and result["certificate_sha256"] != sha256:
-        raise InputError("`result` must be of the run that made the certificate; its hash is another.")
+def stayed_parts(certificate: InvariantCertificate, status: Status, answer: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The values of `stayed.html` that pages of other claims do not have, or have otherwise."""
     pictures, trouble = _pictures(certificate, status)
-    system = certificate.system
-    return filled(
-        *TEMPLATE,
-        one_plane=system.n <= 2,
-        status=status,
-        replayed=True,
-        file=path.name,
-        plant=plant_of(certificate),
-        timing=timing_of(certificate),
-        claim=_claim(certificate),
-        pictures=pictures,
-        trouble=trouble,
-        numbers=_numbers(certificate, answer if status.accepted else None),
-        evidence=file_rows(certificate, sha256, size),
-        run=run_rows(result),
-        provenance=sorted((str(k), str(v)) for k, v in certificate.provenance.items()),
-        not_proved=not_staying_of(certificate),
-    )
+    return {
+        "claim": _claim(certificate),
+        "pictures": pictures,
+        "trouble": trouble,
+        "numbers": _numbers(certificate, answer if status.accepted else None),
+        "not_proved": not_staying_of(certificate),
+    }
 
 
 def _claim(certificate: InvariantCertificate) -> dict[str, Any]:
@@ -92,6 +52,7 @@ def _claim(certificate: InvariantCertificate) -> dict[str, Any]:
     )
     short = not isinstance(N, Neural) and len(str(N.expression)) <= _LONGEST
     return {
+        "own": "N",
         "level": repr(outer.level),
         "function": typeset(identifier("N"), N.expression) if short and not isinstance(N, Neural) else None,
         "words": f"{words} the certificate states.",
