@@ -177,9 +177,9 @@ def _next(
         return correction
     if (boxes := _boxes(result, options)) is not None:
         return boxes
-    if result.claim in ("practical", "nearby") and (centred := by_centring(result, asked, effort)) is not None:
-        stronger = (("--claim", "auto"),) if options.claim == "practical" else ()
-        return replace(centred, options=(*centred.options, *stronger))
+    weaker = result.claim in ("practical", "nearby")
+    if weaker and (centred := by_centring(result, options, asked, effort)) is not None:
+        return centred
     if (flatter := _flatter(result, options, proof)) is not None:
         return flatter
     if (beyond := beyond_the_ellipsoid(result, options, effort)) is not None:

@@ -10,25 +10,10 @@ from certify.loop.equilibrium import Rest
 from certify.loop.plants import Measurements, System, kind_of
 from certify.lyapunov import extents, semi_axes
 from certify.provers.falsify import Witness
+from certify.report.rows import STAGES
 
 if TYPE_CHECKING:
     from certify.analysis.results import RoaResult
-
-_STAGES = (
-    "load",
-    "data",
-    "candidate",
-    "local",
-    "ring",
-    "tube",
-    "simulate",
-    "learn",
-    "outer",
-    "ranks",
-    "write",
-    "check",
-    "total",
-)
 
 
 def to_dict(result: RoaResult) -> dict[str, Any]:
@@ -74,7 +59,7 @@ def to_dict(result: RoaResult) -> dict[str, Any]:
         "diagnosis": None if result.diagnosis is None else result.diagnosis.to_dict(),
         "boxes": result.boxes,
         "leaves": result.leaves,
-        "seconds": {name: result.seconds.get(name) for name in _STAGES},
+        "seconds": {name: result.seconds.get(name) for name in (*STAGES, "total")},
         "certificate": None if result.certificate is None else str(result.certificate),
         "search": None if result.search is None else str(result.search),
         "certificate_sha256": None if result.checker is None else result.checker.get("certificate_sha256"),

@@ -23,7 +23,8 @@ from certify.analysis.asked import require_one_that_knows
 from certify.analysis.facts import Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
-from certify.analysis.run import Report, certify_roa, effort_of
+from certify.analysis.run import Report, certify_roa
+from certify.analysis.stages.state import effort_of
 from certify.certificates import earlier_aside, sole_writer, write_atomically
 from certify.certificates.claims import Problem
 from certify.certificates.verdict import Stop, Verdict
@@ -78,7 +79,7 @@ def certify_largest(
         options = replace(options, candidate="ellipsoid")  # the set is that of a level
     plain = system.with_sample(None) if quantity == "period" else system
     _require_possible(quantity, plain, options)
-    effort = effort_of(options, load_seconds)
+    effort = effort_of(options.effort, options.time_limit, load_seconds)
     certify = partial(certify_roa, provenance=provenance, progress=progress, keep=False)
     with (
         sole_writer(out),

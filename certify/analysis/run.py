@@ -22,10 +22,10 @@ from certify.analysis.stages.further import Beyond, ByRanks, Equilibrium, Route,
 from certify.analysis.stages.ring import Ring
 from certify.analysis.stages.setting import Setting, setting_of
 from certify.analysis.stages.simulation import Onwards, Simulation, goes_on
-from certify.analysis.stages.state import Report, Stage, State, Tools
+from certify.analysis.stages.state import Report, Stage, State, Tools, effort_of
 from certify.certificates import PartitionTree, earlier_aside, sole_writer
 from certify.certificates.verdict import Stop, Verdict
-from certify.effort import WHOLE, Effort
+from certify.effort import Effort
 from certify.errors import InputError, SoundnessError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.composition import composed
@@ -92,7 +92,7 @@ def certify_roa(
         tools = Tools(
             out,
             runner,
-            effort or effort_of(options, load_seconds),
+            effort or effort_of(options.effort, options.time_limit, load_seconds),
             Keeper(out, can_keep, named),
             provenance or {},
             progress,
@@ -100,12 +100,6 @@ def certify_roa(
             load_seconds,
         )
         return _result(begin, tools)
-
-
-def effort_of(options: RoaOptions, load_seconds: float = 0.0) -> Effort:
-    """The counted work that the options allow, and the part of their time limit that reading has left."""
-    limit = options.time_limit
-    return Effort(options.effort * WHOLE, None if limit is None else max(0.0, limit - load_seconds))
 
 
 @contextmanager

@@ -45,7 +45,9 @@ def centring(system: System, network: PolicyNetwork) -> Centre | None:
     return None
 
 
-def by_centring(result: RoaResult, asked: tuple[System, PolicyNetwork], effort: Effort) -> Step | None:
+def by_centring(
+    result: RoaResult, options: RoaOptions, asked: tuple[System, PolicyNetwork], effort: Effort
+) -> Step | None:
     """The step of a policy that is not centred where centring gains: the stronger claim, of a loop that is stable and
     converges from as many states of the domain, or more of these."""
     system, network = asked
@@ -66,7 +68,8 @@ def by_centring(result: RoaResult, asked: tuple[System, PolicyNetwork], effort: 
             return None
         more = f"; in simulation {there / here:.3g} times as many states converge" if here and there > here else ""
     why = "shifted so that pi(0) = u_eq the operating point is the equilibrium, and the stronger claim can be tried"
-    return Step((("--centre", centre),), why + more)
+    stronger = (("--claim", "auto"),) if options.claim == "practical" else ()
+    return Step((("--centre", centre), *stronger), why + more)
 
 
 def beyond_the_ellipsoid(result: RoaResult, options: RoaOptions, effort: Effort) -> Step | None:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from certify.analysis.maximise import Quantity
     from certify.analysis.options import RoaOptions
     from certify.analysis.results import RoaResult
-    from certify.analysis.staying import InvariantResult
+    from certify.analysis.without_v import ResultWithoutV
     from certify.loop.plants import System
     from certify.loop.policies import Policy
 
@@ -134,7 +134,7 @@ def _with_next_command(data: dict[str, Any], context: typer.Context, policy: Pat
     return data
 
 
-def where_of(result: RoaResult | InvariantResult, asked: str) -> tuple[dict[str, Any], str]:
+def where_of(result: RoaResult | ResultWithoutV, asked: str) -> tuple[dict[str, Any], str]:
     """The answer if the proved set contains a box, for JSON and in words, from the very bytes that were checked.
 
     The box is read as of the result's plant, in whose deviations the set is: those of the plant that was asked about

@@ -14,8 +14,8 @@ from certify.analysis.inputs import plant_of, policy_in
 from certify.cli.certifying import certified
 from certify.cli.importing import import_options, kind_called
 from certify.cli.options import FIRST, changes_of_a_plant, options_of_a_run, takes
-from certify.cli.reaching import reached
 from certify.cli.shared import Json, PlantName, PolicyArgument, PolicyFile, Quiet, Results, noting, the_policy
+from certify.cli.without_v import concluded
 from certify.errors import OptionError
 
 if TYPE_CHECKING:
@@ -66,7 +66,8 @@ def reach(
     if target is None:
         certified(context, path, stored, plant, options_of(typed, plant, note), out, start, quiet, as_json)
         return
-    from certify.analysis.reaching import ReachOptions
+    from certify.analysis.reaching import ReachOptions, certify_reach
+    from certify.report.reached import summary
 
     asked = typed.pop("reach_from", None)
     options = ReachOptions(
@@ -75,7 +76,7 @@ def reach(
         within=within,
         **{name: read_option(name, text) for name, text in typed.items()},
     )
-    reached(path, stored, plant, options, out, start, quiet, as_json)
+    concluded(certify_reach, summary, path, stored, plant, options, out, start, quiet, as_json)
 
 
 def _require_one(target: list[str] | None, within: int | None, typed: dict[str, Any]) -> None:

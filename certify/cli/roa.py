@@ -15,8 +15,8 @@ from certify.cli.certifying import CONTAINS, certified
 from certify.cli.importing import import_options
 from certify.cli.options import FIRST, Bundle, changes_of_a_plant, options_of_a_run, takes
 from certify.cli.shared import Json, PlantName, PolicyArgument, PolicyFile, Quiet, Results, noting, the_policy
-from certify.cli.staying import stayed
 from certify.cli.terminal import tell
+from certify.cli.without_v import concluded
 from certify.errors import BackendError, InputError, OptionError
 
 if TYPE_CHECKING:
@@ -67,8 +67,10 @@ def roa(
     if options.claim == "invariant":
         if largest is not None:
             raise OptionError("`claim` invariant has neither a rate nor a period; leave out max.")
-        stayed(path, stored, plant, options, out, start, quiet, as_json, contains)
-        return
+        from certify.analysis.staying import certify_invariant
+        from certify.report.stayed import summary
+
+        concluded(certify_invariant, summary, path, stored, plant, options, out, start, quiet, as_json, contains)
     certified(context, path, stored, plant, options, out, start, quiet, as_json, contains, largest)
 
 

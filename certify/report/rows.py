@@ -36,7 +36,7 @@ from certify.report.words import (
     volume_unit,
 )
 
-_STAGES = (
+STAGES = (
     "load",
     "data",
     "candidate",
@@ -306,7 +306,7 @@ def _level(value: float | None) -> str:
 
 
 def _times(spent: Mapping[str, float | None]) -> str:
-    stages = [f"{stage} {seconds(spent[stage])}" for stage in _STAGES if spent.get(stage) is not None]
+    stages = [f"{stage} {seconds(spent[stage])}" for stage in STAGES if spent.get(stage) is not None]
     return f"{seconds(spent.get('total'))}  ({', '.join(stages)})" if stages else seconds(spent.get("total"))
 
 

@@ -2,49 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 from certify.analysis.facts import RankFacts
 from certify.analysis.reaching.options import ReachOptions, in_words
 from certify.analysis.reaching.runs import Run, Runs
-from certify.certificates.verdict import Verdict
-from certify.loop.plants import System
-from certify.loop.policies import PolicyNetwork
+from certify.analysis.without_v import ResultWithoutV
 
 
 @dataclass(frozen=True, slots=True)
-class ReachResult:
-    """The result of a run. `reason` says in words why it ends so.
+class ReachResult(ResultWithoutV):
+    """The result of a run.
 
     Parameters
     ----------
-    ranks : the boxes that are proved, if any are; `boxes` were looked at.
+    ranks : the boxes that are proved, if any are.
     steps : after so many every trajectory from the box `options.begin` has been in the region; None if that is not
         proved, or no box was named.
-    constraints : those that are kept until then, in words by their names.
     runs : simulated, from that box.
-    certificate, raw, checker : the file, its bytes, and the checker's answer about them; None where there is none.
     """
 
-    verdict: Verdict
-    reason: str
-    system: System
-    network: PolicyNetwork
     options: ReachOptions
     ranks: RankFacts | None = None
     steps: int | None = None
-    boxes: int = 0
-    constraints: Mapping[str, str] = field(default_factory=dict)
     runs: Runs | None = None
-    notice: str | None = None
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    certificate: Path | None = None
-    raw: bytes | None = field(default=None, repr=False)
-    checker: Mapping[str, Any] | None = None
 
     @property
     def begin(self) -> dict[str, tuple[Fraction, Fraction]] | None:
@@ -75,19 +59,7 @@ class ReachResult:
             "ranks": None if self.ranks is None else self.ranks.to_dict(),
             "constraints": dict(self.constraints),
             "simulated": None if self.runs is None else self._simulated(self.runs),
-            "time": system.time,
-            "system": system.name,
-            "parameters": {name: str(q) for name, q in system.parameters.items()},
-            "uncertain": {name: [str(lo), str(hi)] for name, (lo, hi) in system.ranges.items()},
-            "states": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.states],
-            "policy": {"sha256": self.network.sha256(), "layers": list(self.network.layers)},
-            "boxes": self.boxes,
-            "notice": self.notice,
-            "seconds": dict(self.seconds),
-            "certificate": None if self.certificate is None else str(self.certificate),
-            "certificate_sha256": None if self.checker is None else self.checker.get("certificate_sha256"),
-            "checked": None if self.checker is None else self.checker.get("result"),
-            "reference": None if self.checker is None else self.checker.get("reference", {}).get("result"),
+            **self.about_the_run(),
         }
 
     def _simulated(self, runs: Runs) -> dict[str, Any]:

@@ -8,8 +8,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -17,12 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.analysis.acceptance import Clerk, Desk
+from certify.analysis.acceptance import Clerk
 from certify.analysis.beyond import constraints_in_words, rank_facts
 from certify.analysis.reaching.options import ReachOptions, target_of
 from certify.analysis.reaching.results import ReachResult
 from certify.analysis.reaching.runs import Simulation, begins, is_refuted
-from certify.analysis.stages.state import Report, timed
+from certify.analysis.stages.state import Report, effort_of
+from certify.analysis.without_v import Tools, accepted
 from certify.certificates import (
     RanksAlone,
     RankTree,
@@ -36,8 +36,8 @@ from certify.certificates.membership import angles_in
 from certify.certificates.ranked import Ranked, steps_from
 from certify.certificates.tree import LEAF
 from certify.certificates.verdict import Verdict
-from certify.effort import WHOLE, Effort
-from certify.errors import InputError, OptionError, SoundnessError
+from certify.effort import Effort
+from certify.errors import InputError, OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.composition import composed
 from certify.loop.expressions import Expression
@@ -63,19 +63,6 @@ _RUNS = 1e10  # operations for simulated runs, a few seconds, which no effort is
 _FOR_SEARCH = 0.7  # share of the effort, the rest being for the check
 _DIRECT = 4000  # boxes that are looked at first where runs need few steps
 _MENDED = 20  # leaves that the checker may refuse
-
-
-@dataclass
-class _Tools:
-    """The stopwatch of a run, and those who are told of it."""
-
-    progress: Report | None
-    seconds: dict[str, float] = field(default_factory=dict)
-    remarks: list[str] = field(default_factory=list)
-
-    def timing(self, stage: str) -> AbstractContextManager[None]:
-        """Add the seconds of the block to those of a stage."""
-        return timed(self.seconds, stage)
 
 
 def certify_reach(
@@ -107,7 +94,7 @@ def certify_reach(
     """
     from certify.provers.execution.threads import one_thread
 
-    start, tools = time.perf_counter(), _Tools(progress)
+    start, tools = time.perf_counter(), Tools(progress)
     system, network = composed(system, network)
     loop = ClosedLoop(system, network)
     require_within_limits(system, network)
@@ -117,8 +104,7 @@ def certify_reach(
         )
     target = target_of(system, options.target)
     _require_inside(system, options)
-    limit = options.time_limit
-    effort = Effort(options.effort * WHOLE, None if limit is None else max(0.0, limit - load_seconds))
+    effort = effort_of(options.effort, options.time_limit, load_seconds)
     with one_thread(), sole_writer(out), earlier_aside(out, tell or (lambda _: None)):
         result = ReachResult(Verdict.UNKNOWN, "", system, network, options)
         result = _simulated(result, loop, target, tools)
@@ -144,7 +130,7 @@ def _require_inside(system: System, options: ReachOptions) -> None:
             )
 
 
-def _simulated(result: ReachResult, loop: ClosedLoop, target: tuple[Expression, ...], tools: _Tools) -> ReachResult:
+def _simulated(result: ReachResult, loop: ClosedLoop, target: tuple[Expression, ...], tools: Tools) -> ReachResult:
     """The result with simulated runs from the box; final if one of them does not get there."""
     options = result.options
     if options.begin is None:
@@ -167,7 +153,7 @@ def _proved(
     loop: ClosedLoop,
     target: tuple[Expression, ...],
     effort: Effort,
-    tools: _Tools,
+    tools: Tools,
     path: Path,
     provenance: Mapping[str, Any],
 ) -> ReachResult:
@@ -176,7 +162,7 @@ def _proved(
     keep, root = tuple(kept_constraints(system).values()), root_box(loop)
     question = Question(loop, Region(target, system.states), keep, root)
     question = with_order(question, begins(options.begin or tuple(zip(*map(_exactly, root), strict=True)))[:_PROBES].T)
-    clerk = _clerk(path, options, tools)
+    clerk = tools.clerk(path, options.jobs, True)
     _require_periodic(question, clerk)
     with tools.timing("ranks"):
         soon = result.runs is not None and (result.runs.longest or MOST_STEPS) < MOST_STEPS
@@ -186,7 +172,7 @@ def _proved(
         return replace(result, reason="no box of the domain is proved to lead into the region")
     claim = Reaches(target, Ranks(found.ranks.angles, max(1, evidence.most)), keep)
     certificate = ReachCertificate(system, loop.network, claim, RanksAlone(evidence, question.order), provenance)
-    certificate, raw, answer = _accepted(certificate, clerk)
+    certificate, raw, answer = accepted(certificate, clerk, _without_leaf, _MENDED)
     facts, kept = rank_facts(certificate, found), constraints_in_words(certificate)
     result = replace(result, ranks=facts, boxes=found.boxes, constraints=kept)
     result = replace(result, certificate=path, raw=raw, checker=answer)
@@ -199,15 +185,12 @@ def _proved(
     return replace(result, verdict=Verdict.PROVED, reason="requested", steps=steps)
 
 
-def _searched(
-    question: Question, options: ReachOptions, direct: int, effort: Effort, tools: _Tools
-) -> RankProof | None:
+def _searched(question: Question, options: ReachOptions, direct: int, effort: Effort, tools: Tools) -> RankProof | None:
     """Leaves from which the region is reached: those that the box needs, or else all that the effort finds; `direct`
     boxes are looked at in the hope of one jump."""
 
     def report(share: float, boxes: int, waiting: int) -> None:
-        if tools.progress is not None:
-            tools.progress("ranks", Progress(0.0, 0.0, boxes, waiting, share, effort.left))
+        tools.tell("ranks", Progress(0.0, 0.0, boxes, waiting, share, effort.left))
 
     wanted = None
     if options.begin is not None:
@@ -226,12 +209,6 @@ def _within(evidence: RankTree, most: int | None) -> RankTree | None:
     if most is not None:
         evidence = evidence.without(evidence.ranks > most)
     return evidence if np.any(evidence.proved) else None
-
-
-def _clerk(path: Path, options: ReachOptions, tools: _Tools) -> Clerk:
-    """Somebody who writes certificates and has them checked."""
-    told, desk = tools.progress or (lambda *_: None), Desk(options.jobs, True, tools.remarks)
-    return Clerk(path, lambda: 0.0, tools.timing, lambda: told("check", None), lambda _: None, desk.checked)
 
 
 def _require_periodic(question: Question, clerk: Clerk) -> None:
@@ -257,24 +234,11 @@ def _require_periodic(question: Question, clerk: Clerk) -> None:
         )
 
 
-def _accepted(certificate: ReachCertificate, clerk: Clerk) -> tuple[ReachCertificate, bytes, Mapping[str, Any]]:
-    """The certificate, or one without leaves that the checker refuses, its bytes and the checker's answer.
-
-    Raises
-    ------
-    InputError : the checker takes none of this size.
-    SoundnessError : the checker refuses what cannot be mended so.
-    """
-    for _ in range(_MENDED):
-        raw, answer = clerk.ask(certificate)
-        if answer["result"] == "ACCEPTED":
-            return certificate, raw, answer
-        refused = re.fullmatch(r"rank leaf (\d+)", str(answer.get("at", "")))
-        lower = None if refused is None else without_leaf(certificate.evidence.ranks, int(refused[1]))
-        if lower is None:
-            break
-        claim = replace(certificate.claim, ranks=Ranks(certificate.claim.ranks.angles, max(1, lower.most)))
-        certificate = replace(certificate, claim=claim, evidence=replace(certificate.evidence, ranks=lower))
-    if answer.get("rule") == "limits":
-        raise InputError(f"the checkers take no certificate of this size: {answer['detail']}. Try a smaller --effort.")
-    raise SoundnessError(f"the checker rejects what the engine proved: {answer}.")
+def _without_leaf(certificate: ReachCertificate, at: str) -> ReachCertificate | None:
+    """The certificate without the rank of the leaf that the checker refuses, and of those that need it."""
+    refused = re.fullmatch(r"rank leaf (\d+)", at)
+    lower = None if refused is None else without_leaf(certificate.evidence.ranks, int(refused[1]))
+    if lower is None:
+        return None
+    claim = replace(certificate.claim, ranks=Ranks(certificate.claim.ranks.angles, max(1, lower.most)))
+    return replace(certificate, claim=claim, evidence=replace(certificate.evidence, ranks=lower))

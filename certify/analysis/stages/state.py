@@ -20,7 +20,7 @@ from certify.certificates import PartitionTree, TrustedSolver
 from certify.certificates.claims import Claim
 from certify.certificates.claims.claim import Kind
 from certify.certificates.data import DataBounds
-from certify.effort import Effort
+from certify.effort import WHOLE, Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.provers.base import Progress, Proof
 from certify.provers.execution import Runner
@@ -109,6 +109,11 @@ class State:
     def finished(self, result: RoaResult) -> State:
         """The final state, with this result."""
         return replace(self, result=result, done=True)
+
+
+def effort_of(effort: float, time_limit: float | None, load_seconds: float) -> Effort:
+    """The counted work that the options allow, and the part of their time limit that reading has left."""
+    return Effort(effort * WHOLE, None if time_limit is None else max(0.0, time_limit - load_seconds))
 
 
 @contextmanager

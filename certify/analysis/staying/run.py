@@ -8,56 +8,38 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from certify.analysis.acceptance import Clerk, Desk
 from certify.analysis.beyond import constraints_in_words
 from certify.analysis.facts import OuterFacts
 from certify.analysis.options import RoaOptions
-from certify.analysis.stages.state import Report, StageName, timed
+from certify.analysis.stages.state import Report, effort_of
 from certify.analysis.staying.results import InvariantResult
+from certify.analysis.without_v import Tools, accepted
 from certify.certificates import InvariantCertificate, earlier_aside, require_within_limits, sole_writer
 from certify.certificates.claims import Invariant, Outer
 from certify.certificates.verdict import Verdict
-from certify.effort import WHOLE, Effort
-from certify.errors import InputError, OptionError, SoundnessError
+from certify.effort import Effort
+from certify.errors import OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.composition import composed
 from certify.loop.plants import System, kept_constraints
 from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import Neural, Polynomial, Symbolic, of_polynomial, sampled_volume
 from certify.lyapunov.sublevel import Sublevel
-from certify.provers.base import Budget, Progress
+from certify.provers.base import Budget
 from certify.provers.execution import ThreadRunner
 from certify.provers.outer import Nothing, StayProof, prove_staying, split_face_of, split_staying
 
 _FOR_LEARNING, _FOR_SEARCH = 0.5, 0.8  # shares of the effort that is left, the rest being for what follows
 _MENDED = 6  # leaves that the checker may refuse
 _SAMPLES = 200_000  # states among which one of the set is looked for
-
-
-@dataclass
-class _Tools:
-    """The stopwatch of a run, and those who are told of it."""
-
-    progress: Report | None
-    seconds: dict[str, float] = field(default_factory=dict)
-    remarks: list[str] = field(default_factory=list)
-
-    def timing(self, stage: str) -> AbstractContextManager[None]:
-        """Add the seconds of the block to those of a stage."""
-        return timed(self.seconds, stage)
-
-    def tell(self, stage: StageName, progress: Progress | None = None) -> None:
-        """Say which stage is at work, and where it stands."""
-        if self.progress is not None:
-            self.progress(stage, progress)
 
 
 def certify_invariant(
@@ -90,7 +72,7 @@ def certify_invariant(
     """
     from certify.provers.execution.threads import one_thread
 
-    start, tools = time.perf_counter(), _Tools(progress)
+    start, tools = time.perf_counter(), Tools(progress)
     system, network = composed(system, network)
     loop = ClosedLoop(system, network)
     require_within_limits(system, network)
@@ -103,8 +85,7 @@ def certify_invariant(
         raise OptionError(
             "`claim` invariant must be for ranges as they stand: no such claim has measurements yet; leave out `data`."
         )
-    limit = options.time_limit
-    effort = Effort(options.effort * WHOLE, None if limit is None else max(0.0, limit - load_seconds))
+    effort = effort_of(options.effort, options.time_limit, load_seconds)
     with one_thread(), sole_writer(out), earlier_aside(out, tell or (lambda _: None)):
         result = InvariantResult(Verdict.UNKNOWN, "", system, network, options)
         result = _proved(result, loop, effort, tools, out / "certificate.json", provenance or {})
@@ -116,7 +97,7 @@ def _proved(
     result: InvariantResult,
     loop: ClosedLoop,
     effort: Effort,
-    tools: _Tools,
+    tools: Tools,
     path: Path,
     provenance: Mapping[str, Any],
 ) -> InvariantResult:
@@ -137,7 +118,9 @@ def _proved(
         why = f"no state of the domain was found that certainly has N <= {found.outer.level:.6g}"
         return replace(result, reason=why, boxes=found.boxes, following=_following(options, False))
     certificate = InvariantCertificate(system, loop.network, Invariant(found.outer, keep), found.evidence, provenance)
-    certificate, raw, answer = _accepted(certificate, loop, _clerk(path, options, tools))
+    certificate, raw, answer = accepted(
+        certificate, tools.clerk(path, options.jobs, False), partial(_split, loop), _MENDED
+    )
     return replace(
         result,
         verdict=Verdict.PROVED,
@@ -152,7 +135,7 @@ def _proved(
     )
 
 
-def _function(loop: ClosedLoop, options: RoaOptions, effort: Effort, tools: _Tools) -> tuple[Neural | Symbolic, str]:
+def _function(loop: ClosedLoop, options: RoaOptions, effort: Effort, tools: Tools) -> tuple[Neural | Symbolic, str]:
     """N, and how it was learned, in words; empty if it is given."""
     given, states = options.lyapunov, loop.system.states
     if given is not None:
@@ -218,35 +201,13 @@ def _facts(found: StayProof, system: System) -> OuterFacts:
     )
 
 
-def _clerk(path: Path, options: RoaOptions, tools: _Tools) -> Clerk:
-    """Somebody who writes certificates and has them checked."""
-    desk = Desk(options.jobs, False, tools.remarks)
-    return Clerk(path, lambda: 0.0, tools.timing, lambda: tools.tell("check"), lambda _: None, desk.checked)
-
-
-def _accepted(
-    certificate: InvariantCertificate, loop: ClosedLoop, clerk: Clerk
-) -> tuple[InvariantCertificate, bytes, Mapping[str, Any]]:
-    """The certificate, or one with leaves split again that the checker refuses, its bytes and the checker's answer.
-
-    Raises
-    ------
-    InputError : the checker takes none of this size.
-    SoundnessError : the checker refuses what cannot be mended so.
-    """
-    for _ in range(_MENDED):
-        raw, answer = clerk.ask(certificate)
-        if answer["result"] == "ACCEPTED":
-            return certificate, raw, answer
-        at, claim, evidence = str(answer.get("at", "")), certificate.claim, certificate.evidence
-        leaf, face = re.fullmatch(r"outer leaf (\d+)", at), re.fullmatch(r"face (\d+) leaf (\d+)", at)
-        if leaf is not None:
-            evidence = split_staying(loop, claim, evidence, int(leaf[1]))
-        elif face is not None:
-            evidence = split_face_of(loop.system, claim.outer, evidence, int(face[1]), int(face[2]))
-        else:
-            break
-        certificate = replace(certificate, evidence=evidence)
-    if answer.get("rule") == "limits":
-        raise InputError(f"the checkers take no certificate of this size: {answer['detail']}. Try a smaller --effort.")
-    raise SoundnessError(f"the checker rejects what the engine proved: {answer}.")
+def _split(loop: ClosedLoop, certificate: InvariantCertificate, at: str) -> InvariantCertificate | None:
+    """The certificate with the leaf split again that the checker refuses."""
+    claim, evidence = certificate.claim, certificate.evidence
+    leaf, face = re.fullmatch(r"outer leaf (\d+)", at), re.fullmatch(r"face (\d+) leaf (\d+)", at)
+    if leaf is not None:
+        return replace(certificate, evidence=split_staying(loop, claim, evidence, int(leaf[1])))
+    if face is not None:
+        split = split_face_of(loop.system, claim.outer, evidence, int(face[1]), int(face[2]))
+        return replace(certificate, evidence=split)
+    return None

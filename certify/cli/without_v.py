@@ -1,11 +1,12 @@
-"""The run of `certify roa --claim invariant`: its files, its summary."""
+"""The run of a command whose claim has no V: its files, its summary."""
 
 from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
 
@@ -15,38 +16,41 @@ from certify.cli.terminal import ProgressLine, say, show
 
 if TYPE_CHECKING:
     from certify.analysis.options import RoaOptions
+    from certify.analysis.reaching import ReachOptions
+    from certify.analysis.without_v import ResultWithoutV
     from certify.loop.plants import System
     from certify.loop.policies import Policy
 
 
-def stayed(
+def concluded(
+    run: Callable[..., ResultWithoutV],
+    summary: Callable[[Mapping[str, Any]], Any],
     policy: Path,
     stored: Policy,
     plant: System,
-    options: RoaOptions,
+    options: ReachOptions | RoaOptions,
     out: Path | None,
     start: float,
     quiet: bool,
     as_json: bool,
     asked: str | None = None,
-) -> None:
+) -> NoReturn:
     """Run, write certificate and report, print the result; ends the command with the verdict's exit status.
 
     Parameters
     ----------
+    run, summary : proves, and says of the result's JSON object what is printed.
     stored, plant : the policy in the file `policy`, and the plant.
     out : folder for the results.
     start : when the command began, by `time.perf_counter`.
     asked : a state or a box, as people write it; the result says if the proved set contains it.
     """
     from certify.analysis.installation import versions
-    from certify.analysis.staying import certify_invariant
-    from certify.report.stayed import summary
 
     note, folder = noting(quiet), out if out is not None else Path("out") / policy.stem
     progress, later = None if quiet else ProgressLine(), list[str]()
     try:
-        result = certify_invariant(
+        result = run(
             plant,
             stored.network,
             folder,

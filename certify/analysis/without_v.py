@@ -1,0 +1,115 @@
+"""Shared by runs whose claims have no V: parts of their results, the stopwatch, the acceptance of a certificate."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from certify.analysis.acceptance import Clerk, Desk
+from certify.analysis.stages.state import Report, StageName, timed
+from certify.certificates import InvariantCertificate, ReachCertificate
+from certify.certificates.verdict import Verdict
+from certify.errors import InputError, SoundnessError
+from certify.loop.plants import System
+from certify.loop.policies import PolicyNetwork
+from certify.provers.base import Progress
+
+C = TypeVar("C", ReachCertificate, InvariantCertificate)
+
+
+@dataclass(frozen=True, slots=True)
+class ResultWithoutV(ABC):
+    """The part that results of these runs share. `reason` says in words why a run ends so.
+
+    Parameters
+    ----------
+    boxes : looked at.
+    constraints : those that are kept, in words by their names.
+    certificate, raw, checker : the file, its bytes, and the checker's answer about them; None where there is none.
+    """
+
+    verdict: Verdict
+    reason: str
+    system: System
+    network: PolicyNetwork
+    boxes: int = field(default=0, kw_only=True)
+    constraints: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+    notice: str | None = field(default=None, kw_only=True)
+    seconds: Mapping[str, float] = field(default_factory=dict, kw_only=True)
+    certificate: Path | None = field(default=None, kw_only=True)
+    raw: bytes | None = field(default=None, repr=False, kw_only=True)
+    checker: Mapping[str, Any] | None = field(default=None, kw_only=True)
+
+    @abstractmethod
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON object."""
+
+    def about_the_run(self) -> dict[str, Any]:
+        """The entries of the loop, the work and the certificate, at the end of the JSON object."""
+        system, checker = self.system, self.checker
+        return {
+            "time": system.time,
+            "system": system.name,
+            "parameters": {name: str(q) for name, q in system.parameters.items()},
+            "uncertain": {name: [str(lo), str(hi)] for name, (lo, hi) in system.ranges.items()},
+            "states": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.states],
+            "policy": {"sha256": self.network.sha256(), "layers": list(self.network.layers)},
+            "boxes": self.boxes,
+            "notice": self.notice,
+            "seconds": dict(self.seconds),
+            "certificate": None if self.certificate is None else str(self.certificate),
+            "certificate_sha256": None if checker is None else checker.get("certificate_sha256"),
+            "checked": None if checker is None else checker.get("result"),
+            "reference": None if checker is None else checker.get("reference", {}).get("result"),
+        }
+
+
+@dataclass
+class Tools:
+    """The stopwatch of a run, and those who are told of it."""
+
+    progress: Report | None
+    seconds: dict[str, float] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+
+    def timing(self, stage: str) -> AbstractContextManager[None]:
+        """Add the seconds of the block to those of a stage."""
+        return timed(self.seconds, stage)
+
+    def tell(self, stage: StageName, progress: Progress | None = None) -> None:
+        """Say which stage is at work, and where it stands."""
+        if self.progress is not None:
+            self.progress(stage, progress)
+
+    def clerk(self, path: Path, jobs: int | None, many: bool) -> Clerk:
+        """Somebody who writes certificates and has them checked; by several processes where leaves are `many`."""
+        desk = Desk(jobs, many, self.remarks)
+        return Clerk(path, lambda: 0.0, self.timing, lambda: self.tell("check"), lambda _: None, desk.checked)
+
+
+def accepted(
+    certificate: C, clerk: Clerk, mended: Callable[[C, str], C | None], most: int
+) -> tuple[C, bytes, Mapping[str, Any]]:
+    """The certificate, or one that is mended at most so many times where the checker refuses it, its bytes and the
+    checker's answer; `mended` gets the place, and gives None where nothing helps.
+
+    Raises
+    ------
+    InputError : the checker takes none of this size.
+    SoundnessError : the checker refuses what cannot be mended.
+    """
+    for _ in range(most):
+        raw, answer = clerk.ask(certificate)
+        if answer["result"] == "ACCEPTED":
+            return certificate, raw, answer
+        other = mended(certificate, str(answer.get("at", "")))
+        if other is None:
+            break
+        certificate = other
+    if answer.get("rule") == "limits":
+        raise InputError(f"the checkers take no certificate of this size: {answer['detail']}. Try a smaller --effort.")
+    raise SoundnessError(f"the checker rejects what the engine proved: {answer}.")
