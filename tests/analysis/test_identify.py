@@ -346,6 +346,24 @@ def test_noise_that_is_smaller_than_it_was_is_contradicted(tmp_path: Path) -> No
     assert axis is not None and max(axis.entries.values()) == 1 and 0 < axis.share <= 2
 
 
+def test_the_least_noise_does_not_depend_on_units(tmp_path: Path) -> None:
+    """Linear programs drop numbers below 1e-9, as noise in small units is."""
+    draw = np.random.default_rng(3)
+    x, u = draw.uniform(-1, 1, (2, 80, 1))
+    rows = np.hstack([x, u, 0.8 * x + u + 1e-2 * draw.uniform(-1, 1, (80, 1))])
+    least = []
+    for number, unit in enumerate((1.0, 1e-9)):
+        (tmp_path / f"{number}.toml").write_text(
+            'name = "one"\ntime = "discrete"\nstates = ["x"]\ninputs = ["u"]\nu_eq = {u = 0}\n'
+            "parameters = {a = [0.5, 0.95]}\ndomain = {x = [-3, 3]}\ninput_bounds = {u = [-1, 1]}\n"
+            '[dynamics]\nx = "a*x + u"\n'
+        )
+        path = write(tmp_path / f"{number}.csv", unit * rows, "x,u,x_next")
+        found = certify.identify(path, tmp_path / f"{number}.toml", noise=1e-2 * unit)
+        least.append(found.least_noise)
+    assert least[0] is not None and 0.3 < least[0] < 1 and least[1] == pytest.approx(least[0], rel=1e-3)
+
+
 @pytest.mark.parametrize(
     "text",
     [

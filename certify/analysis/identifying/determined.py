@@ -37,12 +37,12 @@ class Direction:
 
 @dataclass(frozen=True, slots=True)
 class Polytope:
-    """The parameters that rows leave: |alpha + g.d| <= slack + error, d in [-1, 1], for each row (M,).
+    """The parameters that rows leave: |alpha + g.d| <= 1, d in [-1, 1], for each row (M,), in units of its bound.
 
     Parameters
     ----------
     g : (M, K).
-    error : the part of the bound that grows with the noise, (M,).
+    error : the share of the bound that grows with the noise, (M,).
     transition : the number of each row's, (M,).
     scale : half-widths of the box relative to those of the priors, (K,).
     """
@@ -50,7 +50,6 @@ class Polytope:
     names: tuple[str, ...]
     alpha: Array
     g: Array
-    slack: Array
     error: Array
     transition: NDArray[np.intp]
     scale: Array
@@ -62,7 +61,8 @@ class Polytope:
             return None
         K = len(self.names)
         A = np.vstack([np.column_stack([self.g, -self.error]), np.column_stack([-self.g, -self.error])])
-        b = np.concatenate([self.slack - self.alpha, self.slack + self.alpha])
+        slack = 1 - self.error
+        b = np.concatenate([slack - self.alpha, slack + self.alpha])
         bounds = [(-1.0, 1.0)] * K + [(0.0, None)]
         answer = linprog(np.eye(K + 1)[-1], A_ub=A, b_ub=b, bounds=bounds, method="highs")
         return max(0.0, float(answer.fun) * (1 - _SAFE)) if answer.status == _DONE else None
@@ -77,7 +77,7 @@ class Polytope:
             return None
         direction = max(known, key=lambda one: float(np.linalg.norm(one)))
         axis = direction / np.linalg.norm(direction)
-        size = np.abs(self.g @ (axis / self.scale)) / (self.slack + self.error)
+        size = np.abs(self.g @ (axis / self.scale))
         entries = axis / axis[np.argmax(np.abs(axis))]
         share = float(np.linalg.norm(direction)) / 2
         telling = int(self.transition[np.argmax(size)])
@@ -99,10 +99,9 @@ class Polytope:
 
     def _farthest(self, axis: Array) -> Array | None:
         """The point farthest along an axis, in half-widths of priors."""
-        bound = self.slack + self.error
-        open_ = np.abs(self.alpha) + np.abs(self.g).sum(1) > bound  # others hold everywhere
-        g, alpha, bound = self.g[open_], self.alpha[open_], bound[open_]
-        A, b = np.vstack([g, -g]), np.concatenate([bound - alpha, bound + alpha])
+        open_ = np.abs(self.alpha) + np.abs(self.g).sum(1) > 1  # others hold everywhere
+        g, alpha = self.g[open_], self.alpha[open_]
+        A, b = np.vstack([g, -g]), np.concatenate([1 - alpha, 1 + alpha])
         answer = linprog(-axis * self.scale, A_ub=A, b_ub=b, bounds=(-1.0, 1.0), method="highs")
         return answer.x * self.scale if answer.status == _DONE else None
 
@@ -114,14 +113,14 @@ def polytope_of(found: Identified) -> Polytope:
     kept = rows.at(good)
     noise = np.array([float(w) for w in data.noise])
     error = np.abs(kept.slopes[:, :n]).sum(1) + noise[:, None]
+    unit = (kept.slack + error).ravel()
     widths = [float(hi - lo) for lo, hi in found.ranges.values()]
     priors = [float(hi - lo) for lo, hi in data.priors.values()]
     return Polytope(
         tuple(data.priors),
-        kept.alpha.ravel(),
-        kept.slopes[:, n:].swapaxes(1, 2).reshape(kept.alpha.size, len(data.priors)),
-        kept.slack.ravel(),
-        error.ravel(),
+        kept.alpha.ravel() / unit,
+        kept.slopes[:, n:].swapaxes(1, 2).reshape(kept.alpha.size, len(data.priors)) / unit[:, None],
+        error.ravel() / unit,
         np.tile(good, n),
         np.maximum(np.array(widths) / np.array(priors), np.finfo(np.float64).tiny),
     )

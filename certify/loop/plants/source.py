@@ -113,13 +113,22 @@ def interval_at(file: PlantFile, table: str, name: str) -> Interval:
     value = file.table(table).get(name)
     if name not in file.table(table):
         raise file.refuse(f"there must be bounds of {name}; none were found. Write {name} = [lo, hi].", table)
+    return interval_in(file, value, table, name)
+
+
+def interval_in(file: PlantFile, value: Any, *keys: str) -> Interval:
+    """The interval that a value [lo, hi] at this key of a file is.
+
+    Raises
+    ------
+    InputError : it is none, or lo is not below hi.
+    """
+    name = keys[-1]
     if not isinstance(value, list) or len(value) != 2:
-        raise file.refuse(f"the bounds of {name} must be a pair [lo, hi]; found {value!r}.", table, name)
-    lo, hi = (number_at(file, end, table, name) for end in value)
+        raise file.refuse(f"the bounds of {name} must be a pair [lo, hi]; found {value!r}.", *keys)
+    lo, hi = (number_at(file, end, *keys) for end in value)
     if not lo < hi:
-        raise file.refuse(
-            f"the bounds of {name} must satisfy lo < hi; found [{float(lo):g}, {float(hi):g}].", table, name
-        )
+        raise file.refuse(f"the bounds of {name} must satisfy lo < hi; found [{float(lo):g}, {float(hi):g}].", *keys)
     return lo, hi
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from certify.loop.expressions import Expression, Operation, Symbol
 from certify.loop.plants.measurements import Measurements
-from certify.loop.plants.source import PlantFile, interval_at, number_at
+from certify.loop.plants.source import PlantFile, interval_at, interval_in, number_at
 from certify.loop.plants.system import Interval
 
 _DATA = ("file", "sha256", "period", "noise", "priors")
@@ -101,7 +101,8 @@ def measurements_in(
     bounds = tuple(number_at(file, noise[s], "data", "noise", s) for s in states)
     if min(bounds) < 0:
         raise file.refuse("must be at least 0 in each state.", "data", "noise")
-    priors = {p: _pair(file, p, value) for p, value in _inner(file, "priors", list(ranges), "ranged parameter").items()}
+    stated = _inner(file, "priors", list(ranges), "ranged parameter")
+    priors = {p: interval_in(file, value, "data", "priors", p) for p, value in stated.items()}
     if not priors:
         raise file.refuse("there must be a range for a parameter at least.", "data", "priors")
     return Measurements(priors, _period(file) if time == "continuous" else None, bounds, (), sha256)
@@ -116,15 +117,6 @@ def _inner(file: PlantFile, key: str, known: list[str], what: str) -> Mapping[st
         if name not in known:
             raise file.refuse(f"{name!r} is no {what}; known are {', '.join(known) or 'none'}.", "data", key, name)
     return found
-
-
-def _pair(file: PlantFile, name: str, value: Any) -> Interval:
-    if not isinstance(value, list) or len(value) != 2:
-        raise file.refuse(f"must be a pair [lo, hi]; found {value!r:.80}.", "data", "priors", name)
-    lo, hi = (number_at(file, end, "data", "priors", name) for end in value)
-    if not lo < hi:
-        raise file.refuse(f"must satisfy lo < hi; found {value!r:.80}.", "data", "priors", name)
-    return lo, hi
 
 
 def _period(file: PlantFile) -> Interval:
