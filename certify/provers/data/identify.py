@@ -25,7 +25,7 @@ from certify.provers.data.models import Flows, Rows
 
 _LADDER = ((2, 1), (3, 1), (4, 1), (5, 2), (6, 4), (7, 8))  # orders of the series in time, and pieces
 _WORSE = 1.1  # slack of a cheaper pair, relative to the best
-_PROBES, _NARROW = 64, Fraction(1, 50)  # transitions, and the share of a box, with which pairs are compared
+_PROBES, _NARROW = 64, Fraction(1, 50)  # transitions, and the share of the priors, with which pairs are compared
 _ROUNDS, _JOINT_ROUNDS = 12, 4
 _SHRUNK = 0.97  # least shrinking of the best range in a round that pays for another
 _JOINT_ROWS = 1200  # of a program whose rows share errors
@@ -177,12 +177,11 @@ class _Data:
         self.against |= set(chosen[np.abs(weights).sum(0) > 0].tolist())
 
 
-def _fitting(data: _Data, box: Box) -> Flows:
-    """Flows with the cheapest order and pieces that do about as well as any, in a box that is a part of the priors."""
+def _fitting(data: _Data, narrow: Box) -> Flows:
+    """Flows with the cheapest order and pieces that do about as well as any, in a small part of the priors."""
     system, measurements, probes = data.system, data.measurements, data.spread(_PROBES)
     if system.time == "discrete":
         return Flows(system, measurements, 1, 1)
-    narrow = {name: _shrunk(pair) for name, pair in box.items()}
     found = list[tuple[float, Flows]]()
     for order, pieces in _LADDER:
         flows = Flows(system, measurements, order, pieces)
@@ -196,7 +195,7 @@ def _fitting(data: _Data, box: Box) -> Flows:
     return next(flows for slack, flows in found if slack <= _WORSE * least)
 
 
-def _parts(data: _Data, flows: Flows) -> tuple[bytes, list[_Box]]:
+def _parts(data: _Data, flows: Flows, narrow: Box) -> tuple[bytes, list[_Box]]:
     """A partition of the priors into boxes that are narrow enough, or that their rounds make narrow enough, for rows
     in which the box's width counts little beside the noise; as far as there may be so many.
 
@@ -205,7 +204,7 @@ def _parts(data: _Data, flows: Flows) -> tuple[bytes, list[_Box]]:
     InputError : most transitions have no enclosure in any of them.
     """
     tree, found, waiting, probes = bytearray(), list[_Box](), [dict(data.measurements.priors)], data.spread(_PROBES)
-    middle = flows.rows({name: _shrunk(pair) for name, pair in waiting[0].items()}, probes)
+    middle = flows.rows(narrow, probes)
     base = middle.slack + np.abs(middle.slopes[:, : data.system.n]).sum(1) + flows.noise[:, None]
     while waiting:
         box = waiting.pop()
@@ -242,13 +241,13 @@ def identify(system: System, measurements: Measurements) -> Identified:
     """
     require_measurable(system, measurements)
     data = _Data(system, measurements)
-    middle = {name: _shrunk(pair) for name, pair in measurements.priors.items()}
-    flows = _fitting(data, middle)
-    tree, parts = _parts(data, flows)
+    narrow = {name: _shrunk(pair) for name, pair in measurements.priors.items()}
+    flows = _fitting(data, narrow)
+    tree, parts = _parts(data, flows, narrow)
     left = [part.box for part in parts if not part.empty]
     if not left:
         raise Contradiction(tuple(sorted(data.against)))
-    hull = {name: (min(box[name][0] for box in left), max(box[name][1] for box in left)) for name in middle}
+    hull = {name: (min(box[name][0] for box in left), max(box[name][1] for box in left)) for name in narrow}
     whole = _Box(data, flows, hull)
     whole.separately(np.arange(data.count), _ROUNDS)
     if data.shares and not whole.empty:
