@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.analysis.candidates.economical import FEW_STATES, Forecast, economical_candidate
 from certify.analysis.candidates.peak import peak_candidate
 from certify.analysis.candidates.robust import robust_candidate
 from certify.analysis.options import RoaOptions
@@ -38,7 +39,8 @@ _BELOW = 1e-9  # relative distance from a limit that is itself out of reach (the
 _BELOW_WITNESS = 1e-3
 _SMALLEST = 1e-120  # the least level: squares of states and products of bounds must not underflow
 _BLENDS = (0.05, 0.15, 0.3)
-_MANY = 6  # states, beyond which there is next to nothing but the local set
+MANY = 6  # states, beyond which there is next to nothing but the local set
+_BOXES_SUFFICE = 0.1  # share of the largest volume within reach
 OPTIMISING = 0.2  # share of the effort that the optimised candidate may take
 SAMPLING = 0.25  # further share of that for sampling what a candidate could give
 FOR_PEAK = 0.4  # share of the effort for a candidate that may be the only one
@@ -191,13 +193,27 @@ def robust(loop: ClosedLoop, options: RoaOptions, effort: Effort) -> Trial | Non
         return None
 
 
+def economical(
+    loop: ClosedLoop, trials: Sequence[Trial], boxes: float, options: RoaOptions, effort: Effort
+) -> Trial | None:
+    """The candidate that these boxes are forecast to prove most with, or None if they prove most of what is within the
+    reach of one of the trials."""
+    forecast, most = Forecast(loop, effort, FEW_STATES), max(t.volume for t in trials)
+    for t in by_reach(trials):
+        level = t.task.target * min(1.0, _BOXES_SUFFICE * most / t.volume) ** (2 / loop.system.n)
+        if forecast.boxes(t.P, level) <= boxes:
+            return None
+    P = economical_candidate(loop, [t.P for t in trials], boxes, effort)
+    return trial(loop, P, "economical", options, effort)
+
+
 def share_of_robust(loop: ClosedLoop) -> float:
     """Share of the effort that it may take to be made.
 
     Where an input is held, in many states, it is twice as much as for the loop without a period, which comes first:
     there no ring can make up for what is left out.
     """
-    return OPTIMISING * (2 if loop.system.sample is not None and loop.system.n > _MANY else 1)
+    return OPTIMISING * (2 if loop.system.sample is not None and loop.system.n > MANY else 1)
 
 
 def peak(loop: ClosedLoop, options: RoaOptions, effort: Effort) -> Trial | None:

@@ -8,9 +8,11 @@ from functools import partial
 
 from certify.analysis.asked import ellipsoid_in
 from certify.analysis.candidates.converging import is_nearby
+from certify.analysis.candidates.economical import is_forecast
 from certify.analysis.candidates.robust import NoCandidateError
 from certify.analysis.candidates.trials import (
     FOR_PEAK,
+    MANY,
     OPTIMISING,
     SAMPLING,
     Trial,
@@ -18,6 +20,7 @@ from certify.analysis.candidates.trials import (
     blends,
     by_reach,
     corrected,
+    economical,
     named,
     optimised,
     peak,
@@ -30,6 +33,7 @@ from certify.analysis.options import RoaOptions
 from certify.analysis.outcome import refuted_at_once
 from certify.analysis.saved_search import NothingYetError, load
 from certify.analysis.selection import Contender, Race
+from certify.analysis.stages.acceptance import operations_of_check
 from certify.analysis.stages.state import State, Tools
 from certify.certificates.verdict import Stop
 from certify.effort import UNIT, Effort
@@ -37,6 +41,7 @@ from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov import volume
 from certify.provers.base import FEW, Attempt, Budget
+from certify.provers.boxes.rule import operations_of_box
 from certify.provers.falsify import Witness
 
 _HEAT = 0.04  # share of the effort for a candidate's first heat
@@ -170,6 +175,9 @@ class _Choice:
         if not self.effort.over or not race.proved:
             with self.tools.timing("candidate"):
                 trials = [*solved(loop, found, state.options, self._granted()), *trials]
+        thrifty = self._economical(trials) if state.interruptible else None
+        if thrifty is not None:
+            return race.enter([thrifty])
         if state.interruptible:
             return self._among(trials)
         race.enter(by_reach(trials)[:1])
@@ -189,6 +197,15 @@ class _Choice:
                 between = list(blends(loop, unproved[0].trial, best, self.state.options, self._granted()))
             race.enter(between, None if race.gained else 0.0)  # without a gain their local levels tell
         race.knock_out()
+
+    def _economical(self, trials: list[Trial]) -> Trial | None:
+        """The candidate for the boxes that the effort left can bound and check, if they limit what is proved."""
+        loop, effort = self.loop, self.effort
+        if not (FEW < loop.system.n <= MANY and is_forecast(loop)):
+            return None
+        each = operations_of_box(loop) + operations_of_check(loop)
+        boxes = (effort.left - OPTIMISING * self.tools.whole) / each
+        return None if boxes < 1 else self._made(partial(economical, loop, trials, boxes))
 
     def _around_a_level(self, trials: list[Trial]) -> None:
         """A practical claim in many states, where no tree of boxes can carry what a ball does not: the candidate made

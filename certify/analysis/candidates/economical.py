@@ -1,0 +1,183 @@
+"""The candidate `economical`: P for the largest set that a given number of boxes is forecast to prove.
+
+A policy that bends much is enclosed with an error that falls with the square of a box's size, and where V decreases
+little the boxes must be small. Let e_j be the error of input j on a box of the share r of its distance from the
+origin, in coordinates in which {V <= 1} is a ball. Of such a box `m = -Vdot / sum_j |dVdot/du_j| e_j` says how much
+larger the error could be, so that one of the share r sqrt(m) is proved, and {V <= c} takes about the integral of
+m^(-n/2) boxes, which samples estimate. Halvings that overshoot, boxes that stick out of the set, and those that are
+divided themselves multiply that by a factor, which is measured. For fixed states m is a quotient of a linear and of a
+convex function of P, and does not depend on P's scale: each round minimises the forecast over P in a trust region, and
+then takes the level that the boxes reach.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from certify.effort import UNLIMITED, Effort
+from certify.loop.closed_loop import ClosedLoop
+from certify.lyapunov import diagonalising_coordinates, domain_limit, volume
+from certify.provers.bounds import operations_of_policy, policy_enclosure
+
+Array = NDArray[np.float64]
+STATES, FEW_STATES = 2000, 500  # for a candidate, and for a comparison of some
+_SHARE = 0.1  # the size of their boxes
+_NEAREST = 0.1  # distance from the origin, of 1, from which on they are sampled
+_OVERHEAD = 8.0  # boxes for each that is forecast, times 2^(n/2)
+_LEAST = 1e-2  # m, of where nothing would be proved
+_ROUNDS, _TRUST, _MOST_TRUST, _LEAST_TRUST = 12, 0.15, 0.3, 0.01  # of the entries of X, P = L (1 + X) L'
+_STEPS = 60  # of a minimisation
+_SCALINGS, _CORRECTIONS = 6, 2  # of a level from the domain's limit, and from one near by
+_BELOW = 1 - 1e-9  # share of the domain's limit
+
+
+@dataclass(frozen=True)
+class _Sampled:
+    """States, F, and how much F changes with each input's error on their boxes: (N, n), (N, n), (N, m, n)."""
+
+    x: Array
+    F: Array
+    errors: Array
+
+    def margins(self, P: Array) -> Array:
+        """m of each state, (N,)."""
+        along = 2 * self.x @ P
+        asked = np.abs((self.errors * along[:, None]).sum(-1)).sum(-1)
+        with np.errstate(all="ignore"):
+            found = -(along * self.F).sum(-1) / asked
+        return np.asarray(np.where(np.isfinite(found), found, 0.0))
+
+
+class Forecast:
+    """A forecast of the boxes that {x'Px <= level} takes, from the same directions for every P.
+
+    Parameters
+    ----------
+    loop : in continuous time, its input follows at once, and nothing is uncertain.
+    effort : to which the samples are charged.
+    states, seed : how many are sampled, and the seed of their directions.
+    """
+
+    def __init__(self, loop: ClosedLoop, effort: Effort = UNLIMITED, states: int = STATES, seed: int = 0) -> None:
+        generator, self.loop, self.effort, n = np.random.default_rng(seed), loop, effort, loop.system.n
+        z = generator.standard_normal((states, n))
+        self.radii = np.exp(generator.uniform(math.log(_NEAREST), 0.0, states))
+        self.z = z / np.linalg.norm(z, axis=1, keepdims=True) * self.radii[:, None]
+        self.enclosure, self.f = policy_enclosure(loop), loop.system.function()
+        sphere = 2 * math.pi ** (n / 2) / math.gamma(n / 2)
+        alike = sphere * -math.log(_NEAREST) / (2 * _SHARE) ** n  # boxes of this share between the radii
+        self.unit = _OVERHEAD * 2 ** (n / 2) * alike
+
+    def sampled(self, P: Array, level: float) -> _Sampled:
+        """The states of {x'Px <= level}, each with the errors on its box."""
+        loop, n = self.loop, self.loop.system.n
+        self.effort.charge(len(self.z) * (operations_of_policy(loop.network) + (loop.system.m + 1) * loop.operations))
+        T = diagonalising_coordinates(P, loop.mean_rate(), loop.step)
+        T = T / np.sqrt(np.diag(T.T @ P @ T))
+        x = math.sqrt(level) * np.linalg.solve(np.linalg.cholesky(P).T, self.z.T).T
+        reach = math.sqrt(level) * _SHARE * self.radii
+        boxes = np.concatenate([x.T[:, None], T[:, :, None] * reach], 1)
+        wide = self.enclosure(boxes, np.zeros((n, len(self.z))))[2]
+        u = loop.policy(x)
+        F = self.f(x, u)
+        moved = [self.f(x, u + wide[j][:, None] * one) - F for j, one in enumerate(np.eye(loop.system.m))]
+        return _Sampled(x, F, np.stack(moved, 1))
+
+    def boxes(self, P: Array, level: float) -> float:
+        """The number of boxes."""
+        return self._count(self.sampled(P, level).margins(P))
+
+    def _count(self, margins: Array) -> float:
+        """The number of boxes by the samples' m."""
+        return float(self.unit * np.mean(np.maximum(margins, _LEAST) ** (-self.loop.system.n / 2)))
+
+    def level(self, P: Array, boxes: float, about: float = math.inf) -> float:
+        """The level inside the domain that about so many boxes prove, near that which it is `about`."""
+        most = domain_limit(P, self.loop.system.domain) * _BELOW
+        level = min(most, about)
+        for _ in range(_SCALINGS if about == math.inf else _CORRECTIONS):
+            factor = (boxes / self.boxes(P, level)) ** (2 / self.loop.system.n)
+            if factor >= 1 and level == most:
+                break
+            level = min(most, level * min(max(factor, 0.1), 4.0))
+        return level
+
+    def easier(self, P: Array, level: float, trust: float) -> Array:
+        """P (n, n) of the same determinant for which the present states need the fewest boxes, near the present one."""
+        n, found, L = len(P), self.sampled(P, level), np.linalg.cholesky(P)
+        rows = np.triu_indices(n)
+        z, F, errors = found.x @ L, found.F @ L, found.errors @ L
+        along, asked = _products(z, F), _products(z[:, None], errors)
+        often = np.where(rows[0] == rows[1], 1.0, 2.0)
+
+        def forecast(v: Array) -> tuple[float, Array]:
+            """The logarithm of the forecast and its gradient."""
+            M = _symmetric(v, rows, n)
+            fall, each = -np.einsum("kij,ij->k", along, M), np.einsum("kuij,ij->ku", asked, M)
+            size = np.abs(each).sum(1)
+            m = fall / size
+            inside = m > _LEAST
+            weight = np.maximum(m, _LEAST) ** (-n / 2)
+            total = weight.sum()
+            by = np.where(inside, -n / 2 * weight / np.maximum(m, _LEAST), 0.0) / total - ~inside
+            gradient = np.einsum("k,kij->ij", -by / size, along)
+            gradient -= np.einsum("ku,kuij->ij", (by * m / size)[:, None] * np.sign(each), asked)
+            return float(math.log(total) + np.maximum(_LEAST - m, 0.0).sum()), gradient[rows] * often
+
+        with np.errstate(all="ignore"):
+            start = np.eye(n)[rows]
+            bounds = [(v - trust, v + trust) for v in start]
+            options = {"maxiter": _STEPS}
+            v = minimize(forecast, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
+        values, vectors = np.linalg.eigh(_symmetric(np.asarray(v), rows, n))
+        M = (vectors * np.maximum(values, 1 - 2 * trust)) @ vectors.T
+        new = L @ M @ L.T / np.linalg.det(M) ** (1 / n)
+        return np.asarray((new + new.T) / 2)
+
+
+def is_forecast(loop: ClosedLoop) -> bool:
+    """True for loops that a forecast can be made of."""
+    system = loop.system
+    return system.time == "continuous" and system.sample is None and not system.uncertain
+
+
+def economical_candidate(loop: ClosedLoop, starts: Sequence[Array], boxes: float, effort: Effort = UNLIMITED) -> Array:
+    """P (n, n), scaled so that about {x'Px <= 1} is proved by this number of boxes, for the largest such set found.
+
+    Parameters
+    ----------
+    loop : a closed loop of which `is_forecast` is true.
+    starts : (n, n) each, of which the best is improved.
+    """
+    rough, forecast = Forecast(loop, effort, FEW_STATES), Forecast(loop, effort)
+    levels = [rough.level(P, boxes) for P in starts]
+    P, level = max(zip(starts, levels, strict=True), key=lambda one: volume(*one))
+    level = forecast.level(P, boxes, level)
+    trust = _TRUST
+    for _ in range(_ROUNDS):
+        if effort.over or trust < _LEAST_TRUST:
+            break
+        new = forecast.easier(P, level, trust)
+        reached = forecast.level(new, boxes, level)
+        trust = min(_MOST_TRUST, 1.3 * trust) if reached > level else trust / 2
+        if reached > level:
+            P, level = new, reached
+    return P / level
+
+
+def _products(x: Array, y: Array) -> Array:
+    """x y' + y x' of vectors (..., n), (..., n, n)."""
+    return np.asarray(x[..., :, None] * y[..., None, :] + y[..., :, None] * x[..., None, :])
+
+
+def _symmetric(v: Array, rows: Any, n: int) -> Array:
+    M = np.zeros((n, n))
+    M[rows] = v
+    return np.asarray(M + M.T - np.diag(np.diag(M)))
