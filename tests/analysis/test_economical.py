@@ -1,0 +1,83 @@
+"""The candidate for which few boxes are forecast: what a round gains, and where it is asked for at all."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from certify.analysis.candidates.economical import Forecast, economical_candidate, is_forecast
+from certify.analysis.candidates.trials import economical, trial
+from certify.analysis.options import RoaOptions
+from certify.effort import UNIT, UNLIMITED, Effort
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import get_system
+from certify.loop.policies import PolicyNetwork, load_policy
+from certify.lyapunov import choose_candidate, volume
+from tests.support.mutants import POLICIES
+
+BOXES = 30_000
+
+
+@pytest.fixture(scope="module")
+def curved() -> ClosedLoop:
+    """The planar quadrotor under one layer of 24 units, whose slope at the origin is a gain, and which saturate."""
+    system, generator = get_system("quadrotor2d"), np.random.default_rng(0)
+    shipped = ClosedLoop(system, load_policy(POLICIES / "quadrotor2d.pt").network)
+    first = 3 * generator.standard_normal((24, 6)) / np.array([3, 3, 1.2, 8, 8, 8])
+    second = -shipped.linearise()[2] @ np.linalg.pinv(first)
+    return ClosedLoop(
+        system,
+        PolicyNetwork.of_layers(
+            [first, second], [np.zeros(24), np.zeros(2)], np.ones(2), shipped.u_eq, "identity", "output"
+        ),
+    )
+
+
+def starts(loop: ClosedLoop) -> list[np.ndarray]:
+    return [choose_candidate(loop, name).P for name in ("lyapunov", "scaled")]
+
+
+def test_a_round_needs_fewer_boxes_for_a_set_as_large(curved: ClosedLoop) -> None:
+    forecast, (P, _) = Forecast(curved, states=400), starts(curved)
+    level = forecast.level(P, BOXES)
+    new = forecast.easier(P, level, 0.1)
+    assert np.linalg.det(new) == pytest.approx(np.linalg.det(P))
+    assert np.all(np.linalg.eigvalsh(new) > 0) and np.array_equal(new, new.T)
+    assert forecast.boxes(new, level) < 0.9 * forecast.boxes(P, level)
+
+
+def test_the_candidate_is_larger_for_the_same_boxes_by_states_that_it_has_not_seen(curved: ClosedLoop) -> None:
+    P = economical_candidate(curved, starts(curved), BOXES)
+    unseen = Forecast(curved, states=1000, seed=1)
+    assert unseen.boxes(P, 1.0) < 2 * BOXES
+    before = max(volume(start, unseen.level(start, BOXES)) for start in starts(curved))
+    assert volume(P, unseen.level(P, BOXES)) > 1.5 * before
+
+
+def test_a_larger_set_needs_more_boxes_and_the_error_counts(curved: ClosedLoop) -> None:
+    forecast, (P, _) = Forecast(curved, states=400), starts(curved)
+    level = forecast.level(P, BOXES)
+    assert forecast.boxes(P, level) == pytest.approx(BOXES, rel=0.4)
+    assert forecast.boxes(P, 2 * level) > 2 * forecast.boxes(P, level) > 8 * forecast.boxes(P, level / 2)
+
+
+def test_where_no_effort_is_left_the_best_start_is_taken(curved: ClosedLoop) -> None:
+    P = economical_candidate(curved, starts(curved), BOXES, Effort(1.0))
+    assert any(np.allclose(P / P[0, 0], start / start[0, 0]) for start in starts(curved))
+
+
+def test_it_is_asked_for_where_boxes_limit_the_proof_alone(curved: ClosedLoop) -> None:
+    options, (P, _) = RoaOptions(), starts(curved)
+    one = trial(curved, P, "lyapunov", options, Effort(UNIT))
+    asked = economical(curved, [one], 20, options, UNLIMITED)
+    assert asked is not None and asked.name == "economical"
+    assert economical(curved, [one], 1e12, options, UNLIMITED) is None
+
+
+def test_no_forecast_is_made_of_loops_whose_boxes_it_does_not_know(curved: ClosedLoop) -> None:
+    system = curved.system
+    assert is_forecast(curved)
+    assert not is_forecast(ClosedLoop(system.with_sample((Fraction(1, 50), Fraction(1, 50))), curved.network))
+    assert not is_forecast(ClosedLoop(system.with_ranges({"m": (Fraction(45, 100), Fraction(5, 10))}), curved.network))
