@@ -129,7 +129,7 @@ READ = {"format": 1, "hash": 1}  # rules of document.py, which have held
 RULES = (
     *READ,
     *dict.fromkeys(name for table in (STATED, ON_THE_BALL, OF_THE_TREE, ON_LEAVES) for name, _ in table),
-    *("handover", "data", "tube", "contraction", "outer", "faces", "angles", "ranks"),  # of features: their modules have the tables
+    *("handover", "data", "tube", "contraction", "outer", "faces", "angles", "ranks"),  # in their own modules
 )
 
 

@@ -30,6 +30,7 @@ _COMMANDS: dict[str, type[TyperCommand] | None] = {
     "roa": Grouped,
     "reach": Grouped,
     "identify": Grouped,
+    "compose": Grouped,
     "sweep": None,
     "check": None,
     "contains": None,

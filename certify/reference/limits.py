@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 from .document import Certificate
 from .evidence import Covering, Ranked, Tree, Trusted
-from .handover import gap
 from .expressions import Equations
+from .handover import gap
 from .networks import Affine, Clip, Map, Network, Observe, Product, Step
 from .rational import bits
 from .refusal import require
