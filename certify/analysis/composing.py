@@ -53,6 +53,7 @@ class ComposeResult:
             "system": self.outer.system.name,
             "then": {"system": self.inner.system.name, "levels": dict(self.inner.claim.levels)},
             "levels": dict(self.outer.claim.levels),
+            "states": [s.name for s in self.outer.system.states],
             "volume": volume(self.outer.P, self.outer.roa),
             "share": self.share,
             "policy": {"sha256": self.outer.network.sha256()},

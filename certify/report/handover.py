@@ -63,7 +63,7 @@ def summary_lines(result: Mapping[str, Any]) -> list[str]:
         f"PROVED  {pair}: of every plant that is one of both, every trajectory from {{V <= {below(levels['roa'])}}} "
         f"enters {{V <= {above(levels['floor'])}}}, which lies in {{V' <= {below(then['levels']['roa'])}}} of the "
         f"second, and {ends}",
-        f"volume       {below(result['volume'])}",
+        f"{['length', 'area', 'volume'][min(len(result['states']), 3) - 1]:<13}{below(result['volume'])}",
         f"handover     on the floor V' is at most {above(100 * result['share'], 3)} % of its level",
         f"checker      {result['checked']}"
         + (f", reference {result['reference']}" if result["reference"] is not None else ""),
