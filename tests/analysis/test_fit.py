@@ -10,11 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from certify import certify_roa, compose
 from certify.analysis.fitting.linear import Contradicted, beyond, slopes
 from certify.analysis.fitting.polynomial import bounded, errors, fitted
+from certify.analysis.fitting.run import fit_plant
 from certify.analysis.fitting.samples import Grid, Unknown
 from certify.cli.main import _run
 from certify.loop.plants import load_system
+from certify.loop.policies import Policy, PolicyNetwork, save_policy
 
 STRUCTURE = """
 name = "box"
@@ -226,3 +229,40 @@ def test_samples_that_refute_the_bounds(
     assert _run(asked, False) == 1
     assert capsys.readouterr().out.startswith("REFUTED  these samples refute the bounds of second derivatives")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_three_states_from_samples_to_one_claim(tmp_path: Path) -> None:
+    """x' = y, y' = v, v' = 3 sin x - y - v + u, of which |g_xx| <= 3 is declared and that all else is linear."""
+    text = STRUCTURE.replace('["x", "v"]', '["x", "y", "v"]').replace('x = "v"', 'x = "y"\ny = "v"')
+    text = text.replace('"x*x" = 2', '"x*x" = 3\n' + "".join(f'"{a}*y" = 0\n' for a in "xyvu"))
+    text = text.replace("x = [-1, 1]\nv = [-1, 1]", "x = [-1.5, 1.5]\ny = [-2, 2]\nv = [-4, 4]").replace(
+        "u = [-1, 1]", "u = [-30, 30]"
+    )
+    (tmp_path / "box.toml").write_text(text)
+
+    def g(z: np.ndarray) -> np.ndarray:
+        return 3 * np.sin(z[:, 0]) - z[:, 1] - z[:, 2] + z[:, 3]
+
+    axis = [-1.5, -1.2, -0.9, -0.6, -0.3, -0.05, 0, 0.05, 0.3, 0.6, 0.9, 1.2, 1.5]
+    points = np.array(list(product(axis, (-2, 2), (-4, 4), (-30, 30))))
+    rows = [",".join(map(repr, row)) for row in np.column_stack([points, g(points)]).tolist()]
+    (tmp_path / "samples.csv").write_text("\n".join(["x,y,v,u,v_rate", *rows]))
+    fit_plant(tmp_path / "samples.csv", tmp_path / "box.toml", lambda _: Fraction(1, 10**9), tmp_path)
+    W = -np.array([[11.0, 10.0, 5.0]]) / 30
+    policy = Policy(PolicyNetwork.of_layers([W], [np.zeros(1)], [30.0], [0.0], centre="none"), "box", {})
+    save_policy(tmp_path / "box.pt", policy)
+    kinds = {"far": "practical", "near": "asymptotic"}
+    for name, claim in kinds.items():
+        result = certify_roa(tmp_path / f"{name}.toml", tmp_path / "box.pt", tmp_path / name, claim=claim,
+                             candidate="lyapunov")  # fmt: skip
+        assert result.verdict == "PROVED", result.reason
+    both = compose(*(tmp_path / name / "certificate.json" for name in kinds), tmp_path / "both")
+    assert both.verdict == "PROVED" and (both.checker or {})["result"] == "ACCEPTED", both.reason
+    assert both.outer.roa > 2 * both.outer.claim.levels["floor"]
+    draw = np.random.default_rng(0).normal(size=(200, 3))
+    x = draw * np.sqrt(both.outer.roa / np.einsum("ki,ij,kj->k", draw, both.outer.P, draw))[:, None]
+    for _ in range(6000):
+        u = 30 * np.tanh(x @ W.T)
+        x = x + 0.005 * np.column_stack([x[:, 1], x[:, 2], g(np.hstack([x, u]))])
+    assert np.abs(x).max() < 1e-3

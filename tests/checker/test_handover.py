@@ -245,6 +245,22 @@ def test_all_rules_are_about_both(name: str) -> None:
     assert verdicts(edit(plain())) == (rule, rule)
 
 
+def leaves_of(value: Any, path: str) -> list[str]:
+    """The places of all numbers, words and empty lists."""
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [leaf for k, v in inner for leaf in leaves_of(v, f"{path}.{k}")] or [path]
+
+
+@pytest.mark.parametrize("wrong", ["", {}, 7])
+def test_each_field_of_the_second_is_read(wrong: Any) -> None:
+    places = [path for path in leaves_of(plain()["then"], "then") if not path.startswith("then.provenance")]
+    assert len(places) > 40
+    for path in places:
+        if not (wrong == 7 and path.endswith((".order", ".cells.0", ".shape.0", ".shape.1", ".of.0", ".reads"))):
+            found = verdicts(edited(plain(), path, wrong))
+            assert None not in found and set(found) <= {"format", "hash", "tree"}, (path, found)
+
+
 def test_the_same_edit_is_refused_at_a_place_of_the_second() -> None:
     raw = dumped(OF_THE_SECOND["a domain too small"][1](plain()))
     with pytest.raises(Rejected) as no:
