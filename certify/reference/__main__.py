@@ -262,12 +262,19 @@ def as_json(verdict: Verdict, seconds: float) -> dict[str, Any]:
         "levels": c and {key: value for key, _, value in level_names(c)},
         "start": c and start_rows(c),
         "centre": c and centre_numbers(c),
-        "then": c and c.then and {"claim": c.then.claim, "levels": {k: v for k, _, v in level_names(c.then)}},
+        **taken_over(c),
         "time": c and time_of_tube(c),
         "leaves": verdict.leaves,
         "seconds": {"check": seconds},
         "text": [*([in_words(c)] if c and verdict.result != "REJECTED" else []), line(verdict)],
     }
+
+
+def taken_over(c: Certificate | None) -> dict[str, Any]:
+    """The claim and the levels of the certificate that takes over; nothing where there is none."""
+    if c is None or c.then is None:
+        return {}
+    return {"then": {"claim": c.then.claim, "levels": {key: value for key, _, value in level_names(c.then)}}}
 
 
 def say(text: str) -> None:

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 
 from certify import certify_roa, compose
+from certify.analysis.fitting import linear
 from certify.analysis.fitting.linear import Contradicted, beyond, slopes
 from certify.analysis.fitting.polynomial import bounded, errors, fitted
 from certify.analysis.fitting.run import fit_plant
 from certify.analysis.fitting.samples import Grid, Unknown
 from certify.cli.main import _run
+from certify.errors import InputError
 from certify.loop.plants import load_system
 from certify.loop.policies import Policy, PolicyNetwork, save_policy
 
@@ -266,3 +268,23 @@ def test_three_states_from_samples_to_one_claim(tmp_path: Path) -> None:
         u = 30 * np.tanh(x @ W.T)
         x = x + 0.005 * np.column_stack([x[:, 1], x[:, 2], g(np.hstack([x, u]))])
     assert np.abs(x).max() < 1e-3
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_contradiction_is_shown_in_rationals(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samples of a function that bends more than is said are refuted; those that a slip of the linear program refutes,
+    here one that is feigned, are not."""
+    truth = Truth(seed, noise=1e-6)
+    one, grid = truth.unknown(1e-4), truth.grid()
+    with pytest.raises(Contradicted):
+        slopes(one, grid, Fraction(1, 10**6))
+    solve = linear.linprog
+
+    def slips(cost: np.ndarray, **given: object) -> object:
+        found = solve(cost, **given)
+        found.status = 2 if np.abs(cost[:-1]).any() or len(cost) == truth.d else found.status
+        return found
+
+    monkeypatch.setattr(linear, "linprog", slips)
+    with pytest.raises(InputError, match="cannot be bounded"):
+        slopes(truth.unknown(), grid, Fraction(1, 10**6) + Fraction(1, 10**12))

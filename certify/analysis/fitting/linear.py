@@ -47,7 +47,7 @@ def slopes(one: Unknown, grid: Grid, noise: Fraction) -> tuple[tuple[Fraction, F
     near = _widest(near)
     size = [max(abs(axis[0]), abs(axis[-1])) for axis in grid.axes]
     Z = np.array([[float(v / s) for v, s in zip(z, size, strict=True)] for _, z, _ in near])
-    y, e = (np.array([float(row[k]) for row in near]) for k in (2, 0))
+    y, e = np.array([float(row[2]) for row in near]), np.array([float(row[0]) for row in near])
     found = []
     for j in range(len(size)):
         unit = [Fraction(int(i == j)) for i in range(len(size))]
@@ -78,7 +78,7 @@ def _end(
     cost[j] = sign
     solved = linprog(cost, A_ub=np.vstack([Z, -Z]), b_ub=np.concatenate([y + e, e - y]), bounds=(None, None))
     if solved.status == 2:
-        raise Contradicted("no slopes at the origin are consistent with all samples")
+        raise _contradiction(Z, y, e, rows)
     if solved.status != 0:
         raise InputError("the samples do not bound the slopes at the origin: take some near it along each variable.")
     active = np.argsort(-np.abs(solved.ineqlin.marginals), kind="stable") % len(rows)
@@ -87,6 +87,27 @@ def _end(
     middle = sum((w * rows[k][2] for k, w in weights.items()), Fraction(0))
     doubt = sum((abs(w) * rows[k][0] for k, w in weights.items()), Fraction(0))
     return middle - sign * doubt
+
+
+def _contradiction(Z: np.ndarray, y: np.ndarray, e: np.ndarray, rows: Sequence[Row]) -> CertifyError:
+    """The finding that samples contradict one another, if rationals show it: w with sum_k w_k z_k = 0 for which
+    |sum_k w_k y_k| is larger than the errors allow."""
+    ones = np.ones((len(Z), 1))
+    cost = np.append(np.zeros(Z.shape[1]), 1.0)
+    left = np.vstack([np.hstack([Z, -ones]), np.hstack([-Z, -ones])])
+    solved = linprog(cost, A_ub=left, b_ub=np.concatenate([y + e, e - y]), bounds=(None, None))
+    if solved.status == 0:
+        active = np.argsort(-np.abs(solved.ineqlin.marginals), kind="stable") % len(rows)
+        chosen = list(dict.fromkeys(active.tolist()))[: Z.shape[1] + 1]
+        null, rank = (
+            fmpq_mat([[_exact(rows[k][1][i]) for k in chosen] for i in range(Z.shape[1])]).numer_denom()[0].nullspace()
+        )
+        for column in range(rank):
+            w = [Fraction(int(null[i, column])) for i in range(len(chosen))]
+            off = abs(sum((v * rows[k][2] for v, k in zip(w, chosen, strict=True)), Fraction(0)))
+            if off > sum((abs(v) * rows[k][0] for v, k in zip(w, chosen, strict=True)), Fraction(0)):
+                return Contradicted(f"no slopes at the origin are consistent with {len(chosen)} of the samples")
+    return InputError("the slopes at the origin cannot be bounded: the samples are nearly a contradiction.")
 
 
 def _weights(rows: Sequence[Row], order: Sequence[int], unit: Sequence[Fraction]) -> dict[int, Fraction]:

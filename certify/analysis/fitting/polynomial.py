@@ -79,7 +79,7 @@ def _power(t: Sequence[Fraction], p: Sequence[int]) -> Fraction:
 
 
 def _moved(terms: Mapping[tuple[int, ...], Fraction], i: int, by: Fraction) -> dict[tuple[int, ...], Fraction]:
-    """The polynomial of t with t_i + by in the place of t_i."""
+    """The polynomial of t with t_i + by instead of t_i."""
     found = dict[tuple[int, ...], Fraction]()
     for p, c in terms.items():
         for k in range(p[i] + 1):

@@ -126,7 +126,7 @@ def _fitted(one: Unknown, grid: Grid, noise: Fraction, system: System, degree: i
     bounds |= {u.name: pair for u, pair in zip(system.inputs, system.input_bounds, strict=True)}
     for name, axis in zip(one.variables, grid.axes, strict=True):
         lo, hi = bounds[name]
-        if not (axis[0] <= min(lo, 0) and max(hi, 0) <= axis[-1]):
+        if not (axis[0] <= min(lo, Fraction(0)) and max(hi, Fraction(0)) <= axis[-1]):
             raise InputError(
                 f"samples {samples} must reach over all of {name} in [{float(lo):g}, {float(hi):g}]; they reach over "
                 f"[{float(axis[0]):g}, {float(axis[-1]):g}]. Take more, or make the domain smaller."
