@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from certify.analysis.api import certify_roa
+    from certify.analysis.composing import compose
     from certify.analysis.identifying.api import identify
     from certify.analysis.identifying.run import IdentifyResult
     from certify.analysis.options import RoaOptions
@@ -64,6 +65,7 @@ _PUBLIC = {
     "save_lyapunov": "certify.lyapunov",
     "ClosedLoop": "certify.loop.closed_loop",
     "certify_roa": "certify.analysis.api",
+    "compose": "certify.analysis.composing",
     "identify": "certify.analysis.identifying.api",
     "IdentifyResult": "certify.analysis.identifying.run",
     "RoaResult": "certify.analysis.results",
@@ -90,6 +92,7 @@ __all__ = [
     "atan",
     "certify_roa",
     "clip",
+    "compose",
     "cos",
     "exp",
     "from_sympy",

@@ -56,9 +56,14 @@ class _Stated(ABC):
 
     def to_json(self) -> str:
         """The file's text: sorted by section, one line per section, the same bytes for the same certificate."""
+        lines = [f"{json.dumps(k)}: {json.dumps(v)}" for k, v in self.document().items()]
+        return "{\n" + ",\n".join(lines) + "\n}\n"
+
+    def document(self) -> dict[str, Any]:
+        """The file's JSON object."""
         own = self.sections()
         people = _for_people(self.system) | _names_of(list(self.constraints))
-        sections: dict[str, Any] = {
+        return {
             "schema": SCHEMA,
             "claim": own["claim"],
             "networks": [network_section(POLICY, self.network.network), *own["networks"]],
@@ -67,9 +72,8 @@ class _Stated(ABC):
             "levels": own["levels"],
             "evidence": own["evidence"],
             "provenance": {k: str(v) for k, v in self.provenance.items()} | people,
+            **own.get("after", {}),
         }
-        lines = [f"{json.dumps(k)}: {json.dumps(v)}" for k, v in sections.items()]
-        return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +87,7 @@ class Certificate(_Stated):
     claim : the claim about them, with its levels.
     provenance : anything that helps people; the checker ignores it.
     data : the evidence that the plant's measurements bound its parameters; None if ranges are assumed.
+    then : the certificate that takes over where a practical claim ends; None if nothing is said of that.
 
     Raises
     ------
@@ -97,6 +102,7 @@ class Certificate(_Stated):
     evidence: PartitionTree | TrustedSolver
     provenance: Mapping[str, Any] = field(default_factory=dict)
     data: DataBounds | None = None
+    then: Certificate | None = None
 
     def __post_init__(self) -> None:
         if self.network.is_moved and (self.claim.at_rest or self.network.centre != "none"):
@@ -152,6 +158,7 @@ class Certificate(_Stated):
             "lyapunov": {"kind": "quadratic", "P": encode(self.V.P)},
             "levels": {name: float(level).hex() for name, level in claim.levels.items()},
             "evidence": evidence_section(self.evidence) | shown,
+            "after": {} if self.then is None else {"then": self.then.document()},
         }
 
     def _of_data(self) -> tuple[dict[str, Any], dict[str, Any]]:

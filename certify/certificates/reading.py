@@ -136,6 +136,7 @@ def parse_any(raw: bytes, name: str) -> AnyCertificate:
             measured = read_measurements(data["claim"]["data"], n, system.m)
             bounds = read_data_bounds(data["evidence"]["data"], measured)
         return Certificate(
+            then=None if "then" not in data else parse_certificate(json.dumps(data["then"]).encode(), name),
             system=replace(_with_constraints(system, claim, names), measurements=measured),
             network=network,
             V=Quadratic(decode(data["lyapunov"]["P"], (n, n))),

@@ -88,6 +88,10 @@ def _examine(path: str, jobs: int, patient: bool) -> tuple[int, dict[str, Any]]:
         answer["outer"] = {"level": c.outer.level, **leaves}
     if c.ranks is not None:
         answer["ranks"] = {"leaves": len(c.ranks.steps), "steps": c.ranks.most, "of": sum(map(bool, c.ranks.steps))}
+    if c.then is not None and tally.then is not None:
+        margins = {"local": tally.then.local_margin, "ring": tally.then.ring_margin, "outer": tally.then.outer_margin}
+        stated = {"claim": c.then.claim, "levels": c.then.levels, "rules": tally.then.rules, "margins": margins}
+        answer["then"] = {"plant": c.then.name, **stated, "leaves": tally.then.rules["tree"]}
     if c.start is not None:
         centre, longest = None if c.centre is None else c.centre.tolist(), words.duration(c)
         answer |= {"start": c.start.tolist(), "centre": centre, "time": longest if math.isfinite(longest) else None}

@@ -34,6 +34,13 @@ class Case:
         return self.c.evidence
 
     @property
+    def then(self) -> Certificate:
+        """The certificate that takes over, of one that has such."""
+        if self.c.then is None:
+            raise TypeError("this rule is about a certificate that takes over")
+        return self.c.then
+
+    @property
     def order(self) -> int:
         """The order of the series in time on leaves."""
         if isinstance(self.c.evidence, Trusted | OuterTree):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -27,6 +27,7 @@ MAX_TRANSITIONS, MAX_ROUNDS, MAX_PARTS = 2**16, 64, 4096  # of data; rounds of a
 CLAIMS = ("asymptotic", "practical", "nearby", "enlarged", "reached", "reaches", "invariant")
 WITHOUT_V = ("reaches", "invariant")
 PRACTICAL = ("practical", "nearby")
+TAKING_OVER = ("asymptotic", "nearby")
 WITH_TUBE = ("enlarged", "reached")
 Array = NDArray[np.float64]
 Intervals = tuple[tuple[Fraction, Fraction], ...]
@@ -239,6 +240,7 @@ class Certificate:
     target: Tape | None = None  # whose outputs are at most 0 there; None if the target is {V <= c2}
     keep: Tape | None = None  # whose outputs stay negative
     data: Data | None = None  # with which the uncertain parameters are consistent
+    then: Certificate | None = None  # that takes over where a practical claim ends
 
     @property
     def practical(self) -> bool:
@@ -273,14 +275,16 @@ def read(path: str) -> Certificate:
     return certificate(*load(path))
 
 
-def certificate(data: Any, sha256: str) -> Certificate:
-    """A JSON value as a certificate."""
-    keys = "schema claim networks plant policy lyapunov levels evidence provenance"
-    schema, claim, functions, plant, policy, lyapunov, levels, evidence, provenance = Value(data).keys(keys)
+def certificate(data: Any, sha256: str, at: str = "", kinds: tuple[str, ...] = CLAIMS) -> Certificate:
+    """A JSON value at a place of the file as a certificate, whose claim is of one of these kinds."""
+    whole = Value(data, at)
+    keys = f"schema claim networks plant policy lyapunov levels evidence provenance{whole.maybe('then')}"
+    schema, claim, functions, plant, policy, lyapunov, levels, evidence, provenance, *then = whole.keys(keys)
     schema.choice("certify-certificate/9")
-    known = isinstance(claim.raw, dict) and claim.raw.get("kind") in CLAIMS
-    claim.must(known, f"an object of kind {' or '.join(CLAIMS)}")
+    known = isinstance(claim.raw, dict) and claim.raw.get("kind") in kinds
+    claim.must(known, f"an object of kind {' or '.join(kinds)}")
     kind = claim.raw["kind"]
+    whole.must(not then or kind == "practical", "without `then` under this claim")
     networks = read_networks(functions)
     stated = _plant(plant, networks)
     n, m = len(stated["states"]), len(stated["inputs"])
@@ -288,7 +292,17 @@ def certificate(data: Any, sha256: str) -> Certificate:
     stated["networks"], stated["sha256"] = tuple(networks.values()), sha256
     provenance.must(isinstance(provenance.raw, dict), "an object")
     read_rest = {"reaches": _reaching, "invariant": _staying}.get(kind, _attracting)
-    return read_rest(stated, claim, lyapunov, levels, evidence)
+    c = read_rest(stated, claim, lyapunov, levels, evidence)
+    return replace(c, then=_taking_over(c, then[0])) if then else c
+
+
+def _taking_over(c: Certificate, value: Value) -> Certificate:
+    """The certificate that takes over: by induction on the claim's kind it has none of its own."""
+    then = certificate(value.raw, c.sha256, value.at, TAKING_OVER)
+    for one in (c, then):
+        value.must(one.ranks is None, "missing, and without ranks, where a claim has ranks")
+        value.must(isinstance(one.evidence, Partition), "missing where evidence is not replayed, and replayed itself")
+    return then
 
 
 def _staying(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: Value, evidence: Value) -> Certificate:

@@ -21,8 +21,10 @@ LEAF = 255
 
 def is_bearable(case: Case) -> Failures:
     """`limits`: neither too many numbers at once, nor too many operations in all."""
-    sizes = Sizes(case.c)
-    count, work, most = sizes.numbers(), sizes.work(), MOST_IN_PATIENCE if case.patient else MOST_WORK
+    both = [Sizes(c) for c in (case.c, case.c.then) if c is not None]
+    count, work = sum(sizes.numbers() for sizes in both), sum(sizes.work() for sizes in both)
+    work += both[0].of_handover()
+    most = MOST_IN_PATIENCE if case.patient else MOST_WORK
     if count > MOST_NUMBERS:
         yield "numbers", f"the file asks for {in_short(count)} at once; the checker allows {in_short(MOST_NUMBERS)}"
     if work > most:
@@ -219,6 +221,16 @@ class Sizes:
         found = self.boxes(followed, models, a * (data.order + 1), self.n + k, 0)
         found += 2**6 * k * followed * self.n * (self.n + k + 2**6)
         return found + 2**17 * rounds * data.order * data.pieces * (a + 4 * self.n)  # however few transitions are left
+
+    def of_handover(self) -> int:
+        """The inequality of two matrices."""
+        c, then = self.c, self.c.then
+        if then is None or len(then.states) != self.n:
+            return 0
+        from .handover import difference
+
+        numerators, _ = difference(c, then).numer_denom()
+        return self.inverse(min(max(v.height_bits() for v in numerators.entries()), 2**16 // self.n))
 
     @property
     def ball(self) -> int:

@@ -129,7 +129,7 @@ READ = {"format": 1, "hash": 1}  # rules of document.py, which have held
 RULES = (
     *READ,
     *dict.fromkeys(name for table in (STATED, ON_THE_BALL, OF_THE_TREE, ON_LEAVES) for name, _ in table),
-    *("data", "tube", "contraction", "outer", "faces", "angles", "ranks"),  # of features: their modules have the tables
+    *("handover", "data", "tube", "contraction", "outer", "faces", "angles", "ranks"),  # in their own modules
 )
 
 
@@ -141,6 +141,7 @@ class Tally:
     ring_margin: float | None = None  # smallest -Vdot bound over the ring's leaves
     outer_margin: float | None = None  # smallest -N'F bound over the leaves of which it is asked
     local_margin: float | None = None  # 1 - the remainder's largest part of the decay
+    then: Tally | None = None  # of the certificate that takes over
 
     def hold(self, table: Table[Subject], subject: Subject) -> None:
         """Raise `Rejected` at the first failure of the first rule that fails; count what the rules have looked at."""
@@ -186,6 +187,10 @@ def check(c: Certificate, jobs: int = 1, patient: bool = False) -> Tally:
     with np.errstate(all="ignore"):  # overflow becomes infinity or NaN, and every test then fails
         tally, case = Tally(), Case(c, jobs, patient)
         tally.hold([(name, rule) for name, rule in STATED if not spared.get(name)], case)
+        if c.then is not None:
+            from . import handover
+
+            tally.hold(handover.OF_HANDOVER, case)
         if c.data is not None:
             from . import data
 
@@ -200,6 +205,11 @@ def check(c: Certificate, jobs: int = 1, patient: bool = False) -> Tally:
             tally.hold(ranks.OF_RANKS, case)
             steps = ranks.Steps(case)
             tally.hold_on_leaves(ranks.ON_RANK_LEAVES, steps, c.ranks.tree, lambda _: np.zeros(0))
+    if c.then is not None:
+        try:
+            tally.then = check(c.then, jobs, patient)
+        except Rejected as no:
+            raise Rejected(no.rule, f"then.{no.at}", no.detail) from None
     return tally
 
 

@@ -144,7 +144,6 @@ def _falling(c: Certificate) -> str:
 
 def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
     """The plant, the policy, V, what is claimed of them, what held, and the verdict, line by line."""
-    inputs = zip(c.inputs, c.input_bounds, c.u_eq, strict=True)
     if c.claim == "reaches":
         rest, verdict = f"leaves {answer['ranks']['leaves']}", answer["result"]
     elif c.claim == "invariant":
@@ -161,6 +160,21 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         outer = None if c.outer is None else answer["margins"]["outer"]
         margins += [] if outer is None else [f"smallest bound of -N'F on a leaf of the outer set {outer:.3g}"]
         rest, verdict = f"margins: {'; '.join(margins)}", answer["result"]
+    takes_over = [] if c.then is None else [*_handed_over(c, c.then), *stated(c.then)]
+    return [
+        *stated(c),
+        *takes_over,
+        "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items()),
+        *([] if c.then is None else [_counted(answer["then"]["rules"])]),
+        "modules that were used: " + ", ".join(answer["modules"]),
+        rest,
+        f"{verdict} {_levels(c)}sha256={c.sha256}",
+    ]
+
+
+def stated(c: Certificate) -> list[str]:
+    """The plant, the policy, V, and what is claimed of them, line by line."""
+    inputs = zip(c.inputs, c.input_bounds, c.u_eq, strict=True)
     after = "+" if c.discrete else "'"
     left = "x+" if c.discrete else "xdot"
     return [
@@ -183,11 +197,24 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         *([] if c.centre is None else [f"c = {' '.join(map(repr, c.centre.tolist()))}"]),
         *([] if c.outer is None else [f"N(x) = {expression(c.outer.function.trees[0])}"]),
         *claim(c),
-        "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items()),
-        "modules that were used: " + ", ".join(answer["modules"]),
-        rest,
-        f"{verdict} {_levels(c)}sha256={c.sha256}",
     ]
+
+
+def _handed_over(c: Certificate, then: Certificate) -> list[str]:
+    """The statement of chapter handover; what is stated of the second certificate follows."""
+    left, each = ("x+ = g(k, x, u)", "step") if c.discrete else ("xdot = g(t, x, u)", "time")
+    return [
+        f"handover: a plant {left} is one of a certificate if at every {each}, state in its domain and input in its "
+        "bounds g is a value of its f, for some of what is uncertain, of which measured parameters are constant and "
+        "consistent with the measurements",
+        "  of every plant that is one of the certificate above and of the one below, every trajectory above enters "
+        f"V <= {c.c0!r}, which lies in V <= {then.c2!r} of the one below, and from then on is one of those below",
+        "certificate that takes over:",
+    ]
+
+
+def _counted(rules: dict[str, int]) -> str:
+    return "of the certificate that takes over: " + ", ".join(f"{rule} {count}" for rule, count in rules.items())
 
 
 def _target(target: Tape) -> list[str]:

@@ -30,6 +30,8 @@ _COMMANDS: dict[str, type[TyperCommand] | None] = {
     "roa": Grouped,
     "reach": Grouped,
     "identify": Grouped,
+    "fit": Grouped,
+    "compose": Grouped,
     "sweep": None,
     "check": None,
     "contains": None,

@@ -39,7 +39,7 @@ def in_words(c: Certificate) -> str:
     if c.claim == INVARIANT:
         return of_staying(c) + kept(c)
     said = of_ranks(c) if c.target is not None else of_trajectories(c) + further(c) + in_ranks(c)
-    return said + kept(c) + measured(c)
+    return said + kept(c) + measured(c) + handed_over(c)
 
 
 def of_trajectories(c: Certificate) -> str:
@@ -156,6 +156,20 @@ def measured(c: Certificate) -> str:
     )
 
 
+def handed_over(c: Certificate) -> str:
+    """The words for the certificate that takes over."""
+    then = c.then
+    if then is None:
+        return ""
+    right = "x+ = g(k, x, u)" if c.plant.discrete else "x' = g(t, x, u)"
+    return (
+        f"; and of every plant {right} whose right side, at any time and wherever x and u are in domain and input "
+        "bounds, is one that the equations of this certificate have, and also one that those of the next have (for "
+        "some of what is uncertain, what was measured being constant and consistent), each of these trajectories is, "
+        f"once in V <= {c.floor!r}, one from V <= {then.outer!r} of the next, which says: {in_words(then)}"
+    )
+
+
 def stepping(c: Certificate) -> str:
     """The words for held inputs or discrete time; empty in continuous time."""
     if c.sample is not None:
@@ -248,11 +262,19 @@ def as_json(verdict: Verdict, seconds: float) -> dict[str, Any]:
         "levels": c and {key: value for key, _, value in level_names(c)},
         "start": c and start_rows(c),
         "centre": c and centre_numbers(c),
+        **taken_over(c),
         "time": c and time_of_tube(c),
         "leaves": verdict.leaves,
         "seconds": {"check": seconds},
         "text": [*([in_words(c)] if c and verdict.result != "REJECTED" else []), line(verdict)],
     }
+
+
+def taken_over(c: Certificate | None) -> dict[str, Any]:
+    """The claim and the levels of the certificate that takes over; nothing where there is none."""
+    if c is None or c.then is None:
+        return {}
+    return {"then": {"claim": c.then.claim, "levels": {key: value for key, _, value in level_names(c.then)}}}
 
 
 def say(text: str) -> None:

@@ -8,7 +8,7 @@ import math
 import re
 from array import array
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from flint import fmpq, fmpq_mat
@@ -35,6 +35,7 @@ MAX_BYTES, MAX_BYTES_BEYOND_ASCII = 256 * 2**20, 16 * 2**20
 MAX_TOKENS = 10**6  # commas and opening brackets
 MAX_EXPRESSIONS, MAX_RANK = 64, 65_534  # of `keep` or of `target`; of a leaf that is claimed
 MAX_STEPS, SHA256 = 2**16, re.compile(r"[0-9a-f]{64}")  # of all measured runs; of a file of measurements
+TAKE_OVER = ("asymptotic", "nearby")
 SCHEMA, CLAIMS = "certify-certificate/9", ("asymptotic", *WITH_FLOOR, *WITH_TUBE, *WITHOUT_V)
 
 Interval = tuple[fmpq, fmpq]
@@ -154,6 +155,7 @@ class Certificate:
     inner: float
     outer: float
     evidence: Tree | Ranked | Covering | Trusted
+    then: Certificate | None = None  # which takes over where this one ends
 
     @property
     def n(self) -> int:
@@ -187,13 +189,32 @@ class Certificate:
 
 
 def read(raw: bytes) -> Certificate:
-    """The certificate in the bytes of a file, in the order of FORMAT.md's sections."""
+    """The certificate in the bytes of a file, with the one that takes over, if there is one."""
+    data = parsed(raw)
+    if not (isinstance(data, dict) and "then" in data):
+        return read_sections(data, CLAIMS)
+    data = dict(data)
+    after = data.pop("then")
+    c = read_sections(data, ("practical",))
+    try:
+        then = read_sections(after, TAKE_OVER)
+    except Refused as no:
+        raise Refused(no.rule, f"then.{no.at}", no.detail) from None
+    for one in (c, then):
+        plain = isinstance(one.evidence, Tree) and one.ranks is None
+        require(plain, "format", "then", "partition trees without ranks were expected on both sides")
+    return replace(c, then=then)
+
+
+def read_sections(value: Any, claims: tuple[str, ...]) -> Certificate:
+    """One certificate, in the order of FORMAT.md's sections, with a claim of one of these kinds."""
     sections = ("schema", "claim", "networks", "plant", "policy", "lyapunov", "levels", "evidence", "provenance")
-    data = keys(parsed(raw), "file", *sections)
+    data = keys(value, "file", *sections)
     require(data["schema"] == SCHEMA, "format", "schema", f"'{SCHEMA}' was expected")
     require(isinstance(data["provenance"], dict), "format", "provenance", "an object was expected")
     said = read_claim(data["claim"])
     claim = str(said["kind"])
+    require(claim in claims, "format", "claim.kind", f"one of {', '.join(claims)} was expected with `then`")
     rate, sample = read_rate(said["rate"], claim), read_sample(said["sample"])
     networks = read_networks(data["networks"], "networks")
     plant = read_plant(data["plant"], networks)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from .document import Certificate
 from .evidence import Covering, Ranked, Tree, Trusted
 from .expressions import Equations
+from .handover import gap
 from .networks import Affine, Clip, Map, Network, Observe, Product, Step
 from .rational import bits
 from .refusal import require
@@ -26,6 +27,8 @@ LEAF = 255
 def limits(c: Certificate, most: int | None = None) -> None:
     """Neither too many numbers at once, nor more operations than these (None: than this program takes)."""
     count, work = numbers(c), operations(c)
+    if c.then is not None:
+        count, work = count + numbers(c.then), work + operations(c.then) + handing_over(c)
     most = MAX_OPERATIONS if most is None else most
     require(count <= MAX_NUMBERS, "limits", "numbers", f"{count} numbers at once; the reference allows {MAX_NUMBERS}")
     more = f"; with --patient {MAX_IN_PATIENCE}" if most < work <= MAX_IN_PATIENCE else ""
@@ -259,6 +262,12 @@ def of_data(c: Certificate, z: Sizes, evidence: Tree) -> int:
     work = on_boxes(transitions, z.n, fit.pieces * (a * series + 4 * z.n), a * (fit.order + 1), symbols, 0)
     work += 2**17 * rounds * fit.order * fit.pieces * (a + 4 * z.n)
     return work + 2**6 * count * transitions * z.n * (symbols + 2**6)
+
+
+def handing_over(c: Certificate) -> int:
+    """Operations to decide that one ellipsoid lies in another; none where they do not have the same axes."""
+    same = c.then is not None and c.then.n == c.n
+    return inverting(c.n, min(bits(gap(c)), 2**16 // c.n)) if same else 0
 
 
 def inverting(n: int, length: int) -> int:

@@ -13,6 +13,7 @@ from .contraction import contraction
 from .data import data
 from .document import Certificate, read
 from .evidence import WITH_TUBE, Covering, Ranked, Tree, Trusted
+from .handover import handover
 from .invariant import invariant
 from .leaves import Leaves, check_leaves, structure
 from .limits import limits
@@ -46,12 +47,22 @@ def judge(raw: bytes, operations: int | None = None) -> Verdict:
             c = read(raw)
             limits(c, operations)
             leaves = check(c)
+            if c.then is not None:
+                check_after(c.then)
     except Refused as no:
         return Verdict("REJECTED", sha256, no.rule, no.at, no.detail, c)
     if isinstance(c.evidence, Trusted):
         detail = f"the word of {c.evidence.solver} {c.evidence.version}"
         return Verdict("TRUSTED", sha256, detail=detail, certificate=c)
     return Verdict("ACCEPTED", sha256, certificate=c, leaves=leaves)
+
+
+def check_after(c: Certificate) -> None:
+    """Every rule for the certificate that takes over."""
+    try:
+        check(c)
+    except Refused as no:
+        raise Refused(no.rule, f"then.{no.at}", no.detail) from None
 
 
 def check(c: Certificate) -> int | None:
@@ -75,6 +86,7 @@ def check(c: Certificate) -> int | None:
     S, inverse = rational.coordinates(c, evidence)
     rational.root(c, evidence, inverse)
     rational.centring(c)
+    handover(c)
     if evidence.fit is not None:
         with ctx.workprec(ON_LEAVES):
             data(c, evidence.fit)

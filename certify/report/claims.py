@@ -13,6 +13,7 @@ from string import Template
 from typing import Any
 
 from certify.errors import CertificateFormatError
+from certify.report.handover import TakingOver, with_handover
 from certify.report.phrases import phrases_of
 from certify.report.ranked import with_constraints, with_ranks
 from certify.report.timing import PLAIN, TimingInWords
@@ -320,13 +321,14 @@ def _with_outer(words: Words) -> Words:
 @dataclass(frozen=True, slots=True)
 class Additions:
     """The parts that a claim may have: `ball` in its evidence, a set `beyond` {V <= c2}, boxes that are `ranked`, with
-    names of `angles`, and constraints that are `kept`."""
+    names of `angles`, constraints that are `kept`, and a claim that takes over at the floor, `then`."""
 
     ball: bool = False
     beyond: bool = False
     ranked: bool = False
     angles: tuple[str, ...] = ()
     kept: bool = False
+    then: TakingOver | None = None
 
 
 NONE = Additions()
@@ -345,6 +347,7 @@ def words_for(kind: str, timing: TimingInWords = PLAIN, has: Additions = NONE) -
     words = replace(words, parts=tuple(_in_steps(kind, _with_ball(kind, words.parts, has.ball), timing)))
     words = with_ranks(words, has.angles) if has.ranked else words
     words = with_constraints(words, ranked=has.ranked) if has.kept else words
+    words = words if has.then is None else with_handover(words, has.then)
     phrases = phrases_of(timing)
     return Words(**{f.name: _filled(getattr(words, f.name), phrases) for f in fields(Words)})
 

@@ -104,6 +104,7 @@ def render_html(
         claim=claim_of(certificate, answer if status.accepted else None),
         missed=missed_of(result, status),
         plant=plant_of(certificate),
+        then=None if certificate.then is None else _then_of(certificate.then),
         tables=tables_of(certificate, status, answer, result, sha256, size),
         matrices=matrices_of(certificate),
         roa=None if roa is None else simulated_of(roa, certificate),
@@ -113,6 +114,12 @@ def render_html(
         file=certificate_path.name,
         not_proved=not_proved_of(certificate, words),
     )
+
+
+def _then_of(certificate: Certificate) -> dict[str, Any]:
+    """The claim that takes over, by its names in the template."""
+    claim = claim_of(certificate, None)
+    return {"level": claim["level"], "statement": claim["statement"], "plant": plant_of(certificate)}
 
 
 def _contents(status: Status, limits: Mapping[str, Any] | None) -> list[tuple[str, str]]:

@@ -11,7 +11,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -19,10 +19,11 @@ import torch
 
 from certify.analysis.arguments import changes_of
 from certify.analysis.options import RoaOptions
+from certify.analysis.stages.state import StageName
 from certify.certificates import checking, reading
 from certify.cli.main import _run, command_line
 from certify.cli.options import options_of
-from certify.cli.terminal import ring_line
+from certify.cli.terminal import ProgressLine, ring_line
 from certify.loop.plants import get_system
 from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_policy
 from certify.provers.base import Progress
@@ -892,3 +893,13 @@ def test_the_line_of_progress_is_true_of_a_pass_inwards_and_of_nearly_all() -> N
     assert "to V = 0.5 of 1 (50.0 % of the volume)" in ring_line("ring", Progress(0.5, 1.0, 9, 3, 0.5, None, "x"))
     assert "100.0 %" in ring_line("ring", Progress(1.0, 1.0, 9, 0, 1.0, None, "x"))
     assert "beyond the ellipsoid: proved to N = 0.5 of 1" in ring_line("outer", Progress(0.5, 1.0, 9, 3, 0.5, None))
+
+
+def test_every_stage_has_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    """A stage that a slow machine leaves waiting is named, whichever it is."""
+    for stage in get_args(StageName):
+        line = ProgressLine()
+        line.last -= 60
+        line(stage, None)
+        line.close()
+        assert capsys.readouterr().err.strip()

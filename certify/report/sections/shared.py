@@ -18,8 +18,9 @@ from certify.certificates.ranked import Count, count
 from certify.errors import CertificateFormatError
 from certify.report.claims import Additions, Words, words_for
 from certify.report.figures.sets import centre_of, slabs_of, start_of, tree_of
+from certify.report.handover import TakingOver
 from certify.report.timing import TimingInWords
-from certify.report.words import ABSENT, above, number, point, symbol
+from certify.report.words import ABSENT, above, below, number, point, symbol
 
 
 def timing_of(certificate: AnyCertificate) -> TimingInWords:
@@ -42,6 +43,7 @@ def additions_of(certificate: Certificate) -> Additions:
         ranked=claim.ranks is not None,
         angles=() if claim.ranks is None else claim.ranks.angles,
         kept=bool(claim.keep),
+        then=None if certificate.then is None else TakingOver(certificate.then.kind, below(certificate.then.roa)),
     )
 
 

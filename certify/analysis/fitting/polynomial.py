@@ -1,0 +1,160 @@
+"""A polynomial through samples on a grid, and a bound of how far the sampled function may be from it.
+
+Let g be sampled within `noise` at the points of a grid, |g_jj| <= H_j, p a polynomial and r = g - p. On a cell of the
+grid with the widths s the multilinear interpolation I r of r at the cell's corners has
+
+    |r - I r| <= sum_j s_j^2/8 sup|r_jj| <= sum_j s_j^2/8 (H_j + sup|p_jj|),
+
+for interpolation along one axis errs by at most s^2/8 sup|r_jj| (Davis, *Interpolation and Approximation*, theorem
+3.1.1), and interpolation along the others takes means. |I r| is at most the largest |r| at the corners, which is known
+within the noise. p is any polynomial: how it is found decides how small the bound is, not whether it is true.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import pairwise, product
+from math import comb
+
+import numpy as np
+from scipy.optimize import linprog
+
+from certify.analysis.fitting.samples import Grid, Point, Unknown
+
+_DIGITS = 12  # of a coefficient after the point, as a share of the largest sampled value
+_HELD = 10**12  # denominators of bounds that stand in files
+Cell = tuple[tuple[Fraction, Fraction], ...]
+"""The interval of each variable."""
+
+
+@dataclass(frozen=True, slots=True)
+class Polynomial:
+    """sum_k c_k prod_j (z_j/scale_j)^(powers_kj), by exact numbers."""
+
+    variables: tuple[str, ...]
+    scale: Point
+    powers: tuple[tuple[int, ...], ...]
+    coefficients: Point
+
+    def at(self, z: Point) -> Fraction:
+        """The value at a point."""
+        t = [v / s for v, s in zip(z, self.scale, strict=True)]
+        return sum((c * _power(t, p) for c, p in zip(self.coefficients, self.powers, strict=True)), Fraction(0))
+
+    def bent(self, j: int, cell: Sequence[tuple[Fraction, Fraction]]) -> Fraction:
+        """A bound of the absolute second derivative along axis j on a cell: its terms around the cell's middle, whose
+        sizes are added."""
+        terms = dict[tuple[int, ...], Fraction]()
+        for c, p in zip(self.coefficients, self.powers, strict=True):
+            if p[j] >= 2:
+                lower = tuple(k - 2 * (i == j) for i, k in enumerate(p))
+                terms[lower] = terms.get(lower, Fraction(0)) + c * p[j] * (p[j] - 1)
+        halves = []
+        for i, ((lo, hi), s) in enumerate(zip(cell, self.scale, strict=True)):
+            terms = _moved(terms, i, (lo + hi) / 2 / s)
+            halves.append((hi - lo) / 2 / s)
+        return sum((abs(c) * _power(halves, p) for p, c in terms.items()), Fraction(0)) / self.scale[j] ** 2
+
+    def text(self) -> str:
+        """The polynomial as an equation of a plant's file."""
+        terms = []
+        for c, p in zip(self.coefficients, self.powers, strict=True):
+            factors = [
+                f"({v}/({_shown(s)}))" + (f"**{k}" if k > 1 else "")
+                for v, s, k in zip(self.variables, self.scale, p, strict=True)
+                if k
+            ]
+            if c:
+                terms.append("*".join([f"({_shown(c)})", *factors]))
+        return " + ".join(terms) or "0"
+
+
+def _power(t: Sequence[Fraction], p: Sequence[int]) -> Fraction:
+    found = Fraction(1)
+    for v, k in zip(t, p, strict=True):
+        found *= v**k
+    return found
+
+
+def _moved(terms: Mapping[tuple[int, ...], Fraction], i: int, by: Fraction) -> dict[tuple[int, ...], Fraction]:
+    """The polynomial of t with t_i + by instead of t_i."""
+    found = dict[tuple[int, ...], Fraction]()
+    for p, c in terms.items():
+        for k in range(p[i] + 1):
+            lower = (*p[:i], k, *p[i + 1 :])
+            found[lower] = found.get(lower, Fraction(0)) + c * comb(p[i], k) * by ** (p[i] - k)
+    return found
+
+
+def _shown(q: Fraction) -> str:
+    """A decimal or a quotient that is exactly this number."""
+    return str(q)
+
+
+def fitted(one: Unknown, grid: Grid, degree: int) -> Polynomial:
+    """The polynomial without a constant term, of least squares at the samples; its degree in a variable of bounded
+    second derivative 0 is 1, and terms of several variables are of degree 3 at most."""
+    curved = [max(row) > 0 for row in one.curvature]
+    most = [min(degree if bent else 1, len(axis) - 1) for bent, axis in zip(curved, grid.axes, strict=True)]
+    powers = [
+        p for p in product(*(range(k + 1) for k in most)) if 0 < sum(p) <= (3 if sum(map(bool, p)) > 1 else degree)
+    ]
+    scale = tuple(max(abs(axis[0]), abs(axis[-1])) for axis in grid.axes)
+    points = np.array([[float(v / s) for v, s in zip(z, scale, strict=True)] for z in grid.values])
+    values = np.array([float(y) for y in grid.values.values()])
+    columns = np.stack([np.prod(points ** np.array(p), axis=1) for p in powers], axis=1)
+    found = np.linalg.lstsq(columns, values, rcond=None)[0]
+    unit = Fraction(10) ** (len(str(int(max(1.0, float(np.abs(values).max()))))) - _DIGITS)
+    return Polynomial(
+        one.variables, scale, tuple(powers), tuple(round(Fraction(float(c)) / unit) * unit for c in found)
+    )
+
+
+def cells(grid: Grid) -> Iterator[Cell]:
+    """The cells of a grid, each by its interval along each axis."""
+    return product(*(tuple(pairwise(axis)) for axis in grid.axes))
+
+
+def errors(p: Polynomial, one: Unknown, grid: Grid, noise: Fraction) -> dict[Cell, Fraction]:
+    """A bound of |g - p| on each cell of the grid."""
+    off = {z: abs(y - p.at(z)) for z, y in grid.values.items()}
+    found = {}
+    for cell in cells(grid):
+        each = max(off[corner] for corner in product(*cell)) + noise
+        for j, (lo, hi) in enumerate(cell):
+            each += (hi - lo) ** 2 / 8 * (one.curvature[j][j] + p.bent(j, cell))
+        found[cell] = each
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """constant + sum_j slope_j z_j^2, a bound of |g - p| everywhere on the grid."""
+
+    variables: tuple[str, ...]
+    constant: Fraction
+    rise: Point
+
+    def text(self) -> str:
+        """The bound as an equation of a plant's file."""
+        each = zip(self.variables, self.rise, strict=True)
+        return " + ".join([f"({self.constant})", *(f"({k})*{v}**2" for v, k in each if k)])
+
+
+def bounded(variables: tuple[str, ...], each: Mapping[Cell, Fraction], flat: bool = False) -> Bound:
+    """A bound of so simple a form of what is known cell by cell, `flat` a constant: by a linear program that asks for
+    the least mean of its ratios to these, then raised by as much as it misses in rationals."""
+    rise = [Fraction(0)] * len(variables)
+    least = {cell: [Fraction(0) if lo <= 0 <= hi else min(lo * lo, hi * hi) for lo, hi in cell] for cell in each}
+    if not flat:
+        rows = np.array([[1.0, *map(float, squares)] for squares in least.values()])
+        sizes = np.array([float(e) for e in each.values()])
+        solved = linprog((rows / sizes[:, None]).mean(axis=0), A_ub=-rows, b_ub=-sizes)
+        if solved.status == 0:
+            rise = [max(Fraction(0), round(Fraction(float(k)) * _HELD) / Fraction(_HELD)) for k in solved.x[1:]]
+    missed = max(
+        e - sum((k * q for k, q in zip(rise, least[cell], strict=True)), Fraction(0)) for cell, e in each.items()
+    )
+    return Bound(variables, Fraction(-(-max(missed, Fraction(0)) * _HELD // 1), _HELD), tuple(rise))

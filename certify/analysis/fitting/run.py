@@ -1,0 +1,189 @@
+"""From samples of what nobody wrote down to two plants: far from the origin a polynomial within a constant error, near
+it the linear part within an error that vanishes there.
+
+Each is a plant of which `certify roa` proves a claim; `certify compose` joins the two. What the claims say is about
+every plant within these errors. That the sampled plant is one of them follows from the samples, their noise and the
+declared bounds of second derivatives by what stands in `polynomial.py` and `linear.py`; the certificates do not have
+this step, which `certify fit` says of its own.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from certify.analysis.fitting.linear import residual_text, slopes
+from certify.analysis.fitting.polynomial import Bound, Polynomial, bounded, errors, fitted
+from certify.analysis.fitting.samples import Grid, Unknown, read_samples, unknowns_in
+from certify.certificates import write_atomically
+from certify.errors import InputError
+from certify.loop.plants import System, load_system
+from certify.loop.plants.source import PlantFile, read_plant_file
+from certify.loop.plants.toml import build_system
+
+Interval = tuple[Fraction, Fraction]
+_SECTION, _OURS = re.compile(r"\s*\[+\s*([A-Za-z_]+)"), re.compile(r"\s*\[+\s*unknown\b")
+
+
+@dataclass(frozen=True, slots=True)
+class Fitted:
+    """One unknown: the polynomial, a bound of its error and the largest one on a cell, slopes at the origin, and the
+    bound of what lies beyond them."""
+
+    unknown: Unknown
+    samples: int
+    polynomial: Polynomial
+    error: Bound
+    largest: Fraction
+    slopes: tuple[Interval, ...]
+    beyond: str
+
+
+@dataclass(frozen=True, slots=True)
+class FitResult:
+    """The two plants, and what was found of each unknown."""
+
+    found: tuple[Fitted, ...]
+    far: Path
+    near: Path
+    sha256: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON object."""
+        return {
+            "far": str(self.far),
+            "near": str(self.near),
+            "data": {"sha256": self.sha256},
+            "unknown": {
+                one.unknown.state: {
+                    "samples": one.samples,
+                    "terms": len(one.polynomial.powers),
+                    "error": one.error.text(),
+                    "largest_error": str(one.largest),
+                    "slopes": {
+                        v: [str(lo), str(hi)] for v, (lo, hi) in zip(one.unknown.variables, one.slopes, strict=True)
+                    },
+                    "beyond": one.beyond,
+                }
+                for one in self.found
+            },
+        }
+
+
+def fit_plant(
+    samples: Path, structure: Path, noise: Callable[[str], Fraction], out: Path, degree: int = 9
+) -> FitResult:
+    """Fit the unknown functions of a structure, and write `far.toml` and `near.toml` into a folder.
+
+    Parameters
+    ----------
+    samples : CSV with the columns of variables, and `NAME_rate` (in discrete time `NAME_next`) of each unknown.
+    structure : a plant's file in which some states have a table `unknown.STATE` instead of an equation.
+    noise : the bound of the error of a sampled value, by the state's name.
+    degree : of the polynomial in each variable.
+
+    Raises
+    ------
+    InputError : a file cannot be read, or samples are no grid over domain and input bounds.
+    Contradicted : no function with the bounds has these samples.
+    """
+    file = read_plant_file(structure)
+    table = file.table("dynamics")
+    states = [str(name) for name in file.data.get("states", ())]
+    unknowns = unknowns_in(file, [*states, *map(str, file.data.get("inputs", ()))], states)
+    twice = next((one.state for one in unknowns if one.state in table), None)
+    if twice is not None:
+        raise file.refuse("must have an equation or a table [unknown], not both.", "dynamics", twice)
+    known = {key: value for key, value in file.data.items() if key != "unknown"}
+    zeros = {**known, "dynamics": {**table, **{one.state: "0" for one in unknowns}}}
+    system = build_system(replace(file, data=zeros))
+    _require_at_rest(system, file)
+    grids, sha256 = read_samples(samples, unknowns, "_next" if system.time == "discrete" else "_rate")
+    found = tuple(_fitted(one, grids[one.state], noise(one.state), system, degree, samples) for one in unknowns)
+    text = structure.read_text(encoding="utf-8")
+    out.mkdir(parents=True, exist_ok=True)
+    far = {one.unknown.state: (one.polynomial.text(), one.error.text()) for one in found}
+    near = {one.unknown.state: (_sum(one), one.beyond) for one in found}
+    ranges = {_slope(one, v): pair for one in found for v, pair in zip(one.unknown.variables, one.slopes, strict=True)}
+    _write(out / "far.toml", _text(text, far, {}, f"fitted to {samples.name} (sha256 {sha256})"))
+    _write(out / "near.toml", _text(text, near, ranges, f"from {samples.name} (sha256 {sha256}), around the origin"))
+    return FitResult(found, out / "far.toml", out / "near.toml", sha256)
+
+
+def _require_at_rest(system: System, file: PlantFile) -> None:
+    """The functions are 0 at the origin, which is 0 in the states' and inputs' values."""
+    if any(system.exact_x_eq()) or any(system.exact_u_eq()):
+        raise file.refuse("a structure with unknown functions must have x_eq and u_eq 0; found another.", "x_eq")
+
+
+def _fitted(one: Unknown, grid: Grid, noise: Fraction, system: System, degree: int, samples: Path) -> Fitted:
+    bounds = {s.name: pair for s, pair in zip(system.states, system.domain, strict=True)}
+    bounds |= {u.name: pair for u, pair in zip(system.inputs, system.input_bounds, strict=True)}
+    for name, axis in zip(one.variables, grid.axes, strict=True):
+        lo, hi = bounds[name]
+        if not (axis[0] <= min(lo, Fraction(0)) and max(hi, Fraction(0)) <= axis[-1]):
+            raise InputError(
+                f"samples {samples} must reach over all of {name} in [{float(lo):g}, {float(hi):g}]; they reach over "
+                f"[{float(axis[0]):g}, {float(axis[-1]):g}]. Take more, or make the domain smaller."
+            )
+    if noise < 0:
+        raise InputError(f"the bound of the noise must be at least 0; found {float(noise):g} for {one.state}.")
+    p = fitted(one, grid, degree)
+    sizes = [max(abs(lo), abs(hi)) for lo, hi in (bounds[name] for name in one.variables)]
+    each = errors(p, one, grid, noise)
+    error = bounded(one.variables, each)
+    a, beyond = slopes(one, grid, noise), residual_text(one, sizes)
+    return Fitted(one, len(grid.values), p, error, max(each.values()), a, beyond)
+
+
+def _slope(one: Fitted, variable: str) -> str:
+    return f"slope_{one.unknown.state}_{variable}"
+
+
+def _sum(one: Fitted) -> str:
+    """The linear part as an equation."""
+    return " + ".join(f"{_slope(one, v)}*{v}" for v in one.unknown.variables)
+
+
+def _text(text: str, equations: Mapping[str, tuple[str, str]], ranges: Mapping[str, Interval], source: str) -> str:
+    """The structure's text without its tables `unknown`, with these equations, residuals and ranges."""
+    kept, ours = list[str](), False
+    for line in text.splitlines():
+        if _SECTION.match(line):
+            ours = _OURS.match(line) is not None
+        if not ours:
+            kept.append(line)
+    kept = _into(kept, "dynamics", [f'{state} = "{e}" # {source}' for state, (e, _) in equations.items()])
+    if ranges:
+        kept = _into(kept, "parameters", [f"{name} = {_decimals(pair)}" for name, pair in ranges.items()])
+    lacking = [f'{state} = "{bound}"' for state, (_, bound) in equations.items() if bound != "0"]
+    return "\n".join([*_into(kept, "residual", lacking), ""])
+
+
+def _into(lines: Sequence[str], section: str, entries: Sequence[str]) -> list[str]:
+    """The lines with entries at the beginning of a table, which is made at the end if there is none."""
+    at = next((k for k, line in enumerate(lines) if re.fullmatch(rf"\s*\[{section}\]\s*(#.*)?", line)), None)
+    if at is None:
+        return [*lines, "", f"[{section}]", *entries]
+    return [*lines[: at + 1], *entries, *lines[at + 1 :]]
+
+
+def _decimals(pair: Interval) -> str:
+    """A range that holds this one, of decimals."""
+    lo, hi = pair[0] * 10**9 // 1, -(-pair[1] * 10**9 // 1)
+    hi = hi if hi > lo else lo + 1
+    return "[" + ", ".join(f"{'-' if q < 0 else ''}{abs(q) // 10**9}.{abs(q) % 10**9:09d}" for q in (lo, hi)) + "]"
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a plant's file, after it has been read again."""
+    with tempfile.TemporaryDirectory(prefix="certify-") as folder:
+        copy = Path(folder) / path.name
+        copy.write_text(text, encoding="utf-8")
+        load_system(copy)
+    write_atomically(path, text.encode())

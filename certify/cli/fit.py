@@ -1,0 +1,73 @@
+"""`certify fit`: from samples of an unknown right-hand side to two plants with bounds of what they may be off by."""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from certify.analysis.arguments import bound_or_bounds
+from certify.cli.shared import Json
+from certify.cli.terminal import say
+from certify.errors import InputError
+
+if TYPE_CHECKING:
+    from certify.analysis.fitting.run import FitResult
+
+
+def fit(
+    samples: Annotated[Path, typer.Argument(help="Samples on a grid: .csv.")],
+    structure: Annotated[
+        Path, typer.Option(metavar="PLANT.toml", help="The plant, with a table [unknown.STATE] for each unknown.")
+    ],
+    noise: Annotated[
+        str, typer.Option(metavar="E", help="Bound of each sampled value's error: one, or NAME=E,NAME=E.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of far.toml and near.toml.")] = Path("out/fitted"),
+    degree: Annotated[int, typer.Option(min=1, max=20, help="Degree of the polynomial in a variable.")] = 9,
+    as_json: Json = False,
+) -> None:
+    """Fit functions that nobody wrote down, with bounds of what they may be off by.
+
+    The bounds of second derivatives in the structure are what is assumed. The exit status is 1 if the samples refute
+    them.
+    """
+    from certify.analysis.fitting.linear import Contradicted
+    from certify.analysis.fitting.run import fit_plant
+
+    said = bound_or_bounds(noise, "noise")
+
+    def of(state: str) -> Fraction:
+        bound = said.get(state) if isinstance(said, dict) else said
+        if bound is None:
+            raise InputError(f"--noise must have a bound for {state}; found {noise}.")
+        return Fraction(str(bound))
+
+    try:
+        result = fit_plant(samples, structure, of, out, degree)
+    except Contradicted as error:
+        what = "these samples refute the bounds of second derivatives and of the noise, or that 0 is an equilibrium"
+        found = {"verdict": "REFUTED", "reason": f"{what}: {error}"}
+        say(json.dumps(found) if as_json else f"REFUTED  {found['reason']}")
+        raise typer.Exit(1) from None
+    say(json.dumps(result.to_dict()) if as_json else "\n".join(_lines(result)))
+
+
+def _lines(result: FitResult) -> list[str]:
+    from certify.report.words import above, below
+
+    lines = []
+    for one in result.found:
+        state = one.unknown.state
+        lines.append(f"FITTED  {state}: {one.samples:,} samples, {len(one.polynomial.powers)} terms")
+        bound, rise = one.error, zip(one.unknown.variables, one.error.rise, strict=True)
+        more = "".join(f" + {above(k)} {v}^2" for v, k in rise if k)
+        lines.append(f"error        at most {above(bound.constant)}{more}, on every cell at most {above(one.largest)}")
+        for v, (lo, hi) in zip(one.unknown.variables, one.slopes, strict=True):
+            lines.append(f"slope        {v}: {below(lo)} to {above(hi)}")
+        lines.append(f"beyond       at most {one.beyond}")
+    lines.append("assumed      the bounds of second derivatives and of the noise, and that 0 is an equilibrium")
+    return [*lines, f"far          {result.far}", f"near         {result.near}"]
