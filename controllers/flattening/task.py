@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from certify.errors import InputError, OptionError
 from certify.loop.plants import System
 from certify.loop.policies import Policy, PolicyNetwork, require_centred
+from controllers.evaluation.curvature import nonlinearity_on
 from controllers.evaluation.settling import MONITORING, settle
-from controllers.flattening.bend import bend
 from controllers.flattening.contraction import with_value_at_origin
 from controllers.flattening.gain_change import regained
 from controllers.flattening.options import FlattenOptions
@@ -101,7 +101,7 @@ class Task:
         found = settle(network, self.system, self.dt, self.Q, self.R, judged, self.plant)
         return Figures(
             departure=departure_of(network, self.box.tolist()),
-            bend=bend(network, self.box),
+            bend=nonlinearity_on(network, self.u_eq, self.box).bend,
             settled=found.settled,
             states=found.states,
             cost=found.cost,

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -19,10 +20,11 @@ import torch
 
 from certify.analysis.arguments import changes_of
 from certify.analysis.options import RoaOptions
+from certify.analysis.stages.state import StageName
 from certify.certificates import checking, reading
 from certify.cli.main import _run, command_line
 from certify.cli.options import options_of
-from certify.cli.terminal import ring_line
+from certify.cli.terminal import ProgressLine, ring_line
 from certify.loop.plants import get_system
 from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_policy
 from certify.provers.base import Progress
@@ -882,6 +884,14 @@ def test_a_closed_pipe_is_no_verdict_whatever_was_to_be_said(command: str, both:
     done = subprocess.run([sys.executable, "-c", code, *arguments], stdout=out, stderr=writing, check=False)
     os.close(writing)
     assert done.returncode == 141
+
+
+def test_every_stage_has_a_line_of_progress():
+    """One without ended a run with an internal error, if it began when a line was due."""
+    for stage in get_args(StageName):
+        line = ProgressLine()
+        line.last = -math.inf
+        line(stage, None)
 
 
 def test_the_line_of_progress_is_true_of_a_pass_inwards_and_of_nearly_all() -> None:

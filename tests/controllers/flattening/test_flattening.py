@@ -21,7 +21,7 @@ from controllers.evaluation.curvature import curvature
 from controllers.evaluation.evaluation import evaluate
 from controllers.evaluation.settling import EvaluationOptions
 from controllers.flattening import task as module
-from controllers.flattening.bend import bend
+from controllers.evaluation.curvature import nonlinearity_on
 from controllers.flattening.flattening import FACTORS, flatten
 from controllers.flattening.options import FlattenOptions
 from controllers.identification.linearisation import discrete_linearisation
@@ -100,7 +100,7 @@ def test_its_figures_are_those_of_the_two_policies(result):
     x0 = initial_states(PENDULUM, 64, 0)  # the first states that were visited
     change = np.abs(new(x0, u_eq) - old(x0, u_eq)).max()
     assert 0 < change <= result.largest[0] * (1 + 1e-9) and result.rms[0] < result.largest[0]
-    assert result.before.bend == pytest.approx(bend(old, box))
+    assert result.before.bend == pytest.approx(nonlinearity_on(old, u_eq, box).bend)
 
 
 def test_the_record_says_how_and_the_old_one_stays(result):
