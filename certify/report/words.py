@@ -232,8 +232,8 @@ sampled at 1,000 states, no part of the proof'
     if found["rms"] is not None:
         does = next((words for most, words in _A_GAIN if found["rms"] <= most), _NO_GAIN)
     return (
-        f"the policy is within {largest} of {part} on the set, {rms} rms (bend {bend}, saturated at {saturated}){does}; "
-        f"sampled at {found['states']:,} states, no part of the proof"
+        f"the policy is within {largest} of {part} on the set, {rms} rms (bend {bend}, saturated at {saturated}){does}"
+        f"; sampled at {found['states']:,} states, no part of the proof"
     )
 
 
