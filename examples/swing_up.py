@@ -11,12 +11,12 @@ from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
-import scipy.linalg
 
 from certify import RoaResult, certify_roa, load_policy
 from certify.certificates.membership import proved_set
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import in_floats, linearise, load_system
+from controllers.identification.riccati import riccati_gain
 
 HERE = Path(__file__).parent
 BOX = ((2.75, 3.55), (2.5, 3.8))  # theta in rad and its rate in rad/s: hanging is pi, upright takes 7.7 rad/s there
@@ -41,8 +41,7 @@ def settled(law: Law, x: np.ndarray) -> np.ndarray:
 
 def laws(K: np.ndarray) -> dict[str, Law]:
     A, B = map(in_floats, linearise(PLANT))
-    P = scipy.linalg.solve_discrete_are(A, B, np.eye(2), np.eye(1))
-    gains = {"its own gain": K, "the LQR": np.linalg.solve(np.eye(1) + B.T @ P @ B, B.T @ P @ A)}
+    gains = {"its own gain": K, "the LQR": riccati_gain(A, B, np.eye(2), np.eye(1))}
     return {name: lambda x, K=K: np.clip(-x @ K.T, -2, 2) for name, K in gains.items()}
 
 
