@@ -223,11 +223,11 @@ def nonlinearity_in_words(found: Mapping[str, Any]) -> str:
     >>> nonlinearity_in_words(
     ...     {"rms": 0.0312, "largest": 0.121, "bend": 0.2, "saturated": 0.0, "states": 1000, "fitted": False}
     ... )
-    'the policy is within 12 % of it on the set, 3.1 % rms (bend 20 %, saturated at 0 %): a gain does nearly the same; \
-sampled at 1,000 states, no part of the proof'
+    'the policy is within 12 % of its saturated linear part on the set, 3.1 % rms (bend 20 %, saturated at 0 %): \
+a gain does nearly the same; sampled at 1,000 states, no part of the proof'
     """
     rms, largest, bend, saturated = (_percent(found[name]) for name in ("rms", "largest", "bend", "saturated"))
-    part = "the nearest saturated linear feedback" if found["fitted"] else "it"
+    part = "the nearest saturated linear feedback" if found["fitted"] else "its saturated linear part"
     does = ""
     if found["rms"] is not None:
         does = next((words for most, words in _A_GAIN if found["rms"] <= most), _NO_GAIN)
