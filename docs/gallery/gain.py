@@ -34,14 +34,13 @@ Array = NDArray[np.float64]
 
 
 def proved() -> Certificate:
-    """The certificate of the example, accepted by the checker, and its box in the proved set."""
+    """The certificate of the example, accepted by both checkers, with its box in the proved set."""
     path = FOLDER / "certificate.json"
     if not path.exists():
         SCRIPT["main"](FOLDER)
-    if (
-        run_checker(path)["result"] != "ACCEPTED"
-        or proved_set(path).locate([(Fraction(lo), Fraction(hi)) for lo, hi in BOX]).answer.value != "contained"
-    ):
+    answers = {run_checker(path, program)["result"] for program in ("checker", "reference")}
+    box = [(Fraction(lo), Fraction(hi)) for lo, hi in BOX]
+    if answers != {"ACCEPTED"} or proved_set(path).locate(box).answer.value != "contained":
         raise SystemExit(f"{path} must be accepted, and hold the box. Remove the file and run this again.")
     return read_certificate(path)
 

@@ -15,7 +15,7 @@ from certify.errors import InputError
 from certify.loop.plants import get_system
 from certify.loop.policies import PolicyNetwork, load_policy
 from controllers.cli import app
-from controllers.options import preset
+from controllers.options import get_plant, preset
 from controllers.training.departure import departure, departure_of, linearised
 from controllers.training.interface import Interface
 from controllers.training.sac import SAC
