@@ -29,7 +29,7 @@ PRACTICAL = frozenset({"practical", "nearby"})
 """The claims whose inner set is the one in which trajectories end."""
 _A_GAIN = ((0.05, ": a gain does nearly the same"), (0.2, ""))
 _NO_GAIN = ": its own gain does not do the same"
-"""What a reader may conclude, by the rms."""
+"""Conclusions for a reader, by the rms."""
 
 
 def symbol(name: str) -> str:

@@ -210,7 +210,7 @@ def _summary(policy: Policy, out: Path) -> dict[str, Any]:
 
 
 def _prospects(policy: Policy, out: Path, system: System, named: str, plant: Plant, as_json: bool) -> dict[str, Any]:
-    """What a proof has to absorb of the policy on its box of initial states, and the command to type next."""
+    """The departure and nonlinearity of the policy on its box of initial states, and the command to type next."""
     from controllers.evaluation.curvature import nonlinearity_on
     from controllers.training.departure import WORTH_FLATTENING, departure_of
 

@@ -98,7 +98,7 @@ class Task:
         return float(np.linalg.norm((network.jacobian_at_origin(self.u_eq) - J) * self.box)) / size
 
     def rest_of(self, network: PolicyNetwork) -> Array:
-        """Where the loop of a policy rests (n,): the origin, or beside it if nothing centres the policy."""
+        """The state (n,) where the loop of a policy rests: the origin, or beside it if nothing centres the policy."""
         if network.centre != "none" or self.exactly_centred:
             return np.zeros(self.system.n)
         rest = find_rest(ClosedLoop(self.system, network))

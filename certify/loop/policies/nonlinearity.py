@@ -1,6 +1,6 @@
 """A policy beside the saturated linear feedback of its own gain: how much of it a gain cannot do, at given states.
 
-The linear feedback is the policy with `net(0) + J x` in the place of net(x), J the Jacobian of net at 0: the same
+The linear feedback is the policy with `net(0) + J x` instead of net(x), J the Jacobian of net at 0: the same
 gain at the origin, the same squash, centring, scale, offset and clip. So saturation counts for neither of the two.
 Floats and sampled states: nothing here is part of a proof.
 """
@@ -25,7 +25,7 @@ _END = 0.01  # of the width of an input's range: nearer to an end it counts as s
 
 @dataclass(frozen=True, slots=True)
 class Nonlinearity:
-    """How far a policy is from the saturated linear feedback of its own gain, at sampled states.
+    """Distance of a policy from the saturated linear feedback of its own gain, at sampled states.
 
     Parameters
     ----------
