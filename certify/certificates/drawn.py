@@ -24,10 +24,10 @@ def nonlinearity_of(read: AnyCertificate) -> Nonlinearity | None:
     without V need no equilibrium: their linear part is a fit.
     """
     try:
-        states = states_in(region_of(read), _box_of(read))
-        if states is None:
-            return None
         with np.errstate(all="ignore"):
+            states = states_in(region_of(read), _box_of(read))
+            if states is None or not np.all(np.isfinite(states)):
+                return None
             u_eq = read.system.exact_u_eq()
             return nonlinearity(read.network, u_eq, states, fitted=not isinstance(read, Certificate))
     except (CertifyError, ValueError, ArithmeticError):  # a rejected file need not make sense
