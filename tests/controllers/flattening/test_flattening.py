@@ -170,7 +170,8 @@ def test_exact_centring_by_zero_biases_is_kept():
 
 
 def test_a_policy_without_centring_keeps_its_value_at_the_origin():
-    teacher = curved("none").with_layers(biases=(*curved().biases[:-1], np.array([-0.125])))
+    *others, last = curved("none").biases
+    teacher = curved("none").with_layers(biases=(*others, last - 0.125))  # it rests beside the origin
     found = flatten(Policy(teacher, "pendulum", training=_record()), replace(QUICK, max_cost_change=1.0))
     zero, u_eq = np.zeros((1, 2)), PENDULUM.exact_u_eq()
     np.testing.assert_allclose(found.policy.network(zero, u_eq), teacher(zero, u_eq), atol=1e-5)
