@@ -45,8 +45,8 @@ class Selection:
             raise OptionError(
                 f"some runs must settle before flattening, for it is by them that the result is judged: none of "
                 f"{self.before.states} runs of {task.system.name} does, from its box of initial states towards where "
-                "the loop rests. If it is the gain at the origin that lets none settle, ask for another with `gain` "
-                '"lqr"; else train the policy further, or choose smaller `initial_states`.'
+                "the loop rests. If it is the gain at the origin that lets none settle, ask for another with `gain` lqr"
+                "; else train the policy further, or choose smaller `initial_states`."
             )
         self.corner = min(1.0, nearest_corner(task.old, task.system))  # no unit may have its corner nearer
         self.best: tuple[PolicyNetwork, Figures] | None = None

@@ -220,7 +220,7 @@ def test_what_changed_is_said_beside_the_old_policy_and_not_beside_the_goal():
 
 def test_without_a_run_that_settles_nothing_is_judged_and_nothing_flattened():
     """0 of 20 before would allow 0 of 20 after: the gain is changed if that is asked for, else the policy refused."""
-    with pytest.raises(OptionError, match=r'none of 20 runs of pendulum does.*`gain` "lqr"'):
+    with pytest.raises(OptionError, match=r"none of 20 runs of pendulum does.*`gain` lqr"):
         flatten(Policy(_chattering(), "pendulum", training=_record()), QUICK)
 
 
