@@ -33,6 +33,7 @@ dist: setup
 
 gallery: setup
 	$(BIN)/python docs/gallery/draw.py
+	$(BIN)/python docs/gallery/gain.py
 
 shares: setup
 	$(BIN)/python docs/gallery/shares.py

@@ -49,6 +49,7 @@ def to_dict(result: RoaResult) -> dict[str, Any]:
         "ranks": None if result.ranks is None else result.ranks.to_dict(),
         "constraints": dict(result.constraints),
         "simulated": None if result.simulated is None else result.simulated.to_dict(),
+        "nonlinearity": None if result.nonlinearity is None else result.nonlinearity.to_dict(),
         "witness": None if result.witness is None else _witness(result.witness),
         "eigenvalues": list(result.eigenvalues),
         "rest": None if result.rest is None else _rest(result, result.rest),

@@ -32,6 +32,7 @@ from certify.errors import InputError
 from certify.loop.equilibrium import Rest
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
+from certify.loop.policies.nonlinearity import Nonlinearity
 from certify.lyapunov import volume
 from certify.lyapunov.sublevel import Sublevel
 from certify.provers.falsify import Witness
@@ -54,11 +55,10 @@ class RoaResult:
     values; if the verdict on it is UNKNOWN by `Stop.PATH`, `certificate` and `levels` are of a proved set without it.
     If the verdict is UNKNOWN by `Stop.BEYOND` they, and `outer`, are of a smaller set than was asked for. `constraints`
     are those that trajectories are to keep, in words by their names; with a certificate they are proved. `simulated`
-    counts simulated runs, in up to three states. `checker` is the checker's answer, None if it was not reached, about
-    `raw`, the certificate's bytes; `solver` has dReal's version and every query with its answer, None if it was not
-    asked. `notices` are facts known before the run, such as a domain that was cut; `folder` keeps a temporary folder
-    of the certificate alive. `search` is a file that `resume` continues.
-
+    counts runs, in up to three states, and `nonlinearity` is sampled on the set. `checker` is the checker's answer,
+    None if it was not reached, about `raw`, the certificate's bytes; `solver` has dReal's version and every query with
+    its answer, None if it was not asked. `notices` are facts known before the run; `folder` keeps a temporary folder of
+    the certificate alive. `search` is a file that `resume` continues.
     In Python: `contains`, `volume`, `plot`, `report`, `certificate` (the file's path), `to_dict`."""
 
     verdict: Verdict
@@ -76,6 +76,7 @@ class RoaResult:
     outer: OuterFacts | None = None
     ranks: RankFacts | None = None
     simulated: SimulatedFacts | None = None
+    nonlinearity: Nonlinearity | None = None
     constraints: Mapping[str, str] = field(default_factory=dict)
     reach_from: tuple[Fraction, ...] | None = None
     witness: Witness | None = None

@@ -50,7 +50,7 @@ class SimulatedRegion:
 
     def facts(self, region: Region) -> SimulatedFacts:
         """The counts, with those of the converging runs that start in a proved set."""
-        return SimulatedFacts(self.runs, len(self.converging), int(_are_in(region, self.converging).sum()))
+        return SimulatedFacts(self.runs, len(self.converging), int(region.holds_in_floats(self.converging).sum()))
 
 
 def simulated_region(loop: ClosedLoop, V: Quadratic, level: float, effort: Effort) -> SimulatedRegion | None:
@@ -86,16 +86,3 @@ def simulated_region(loop: ClosedLoop, V: Quadratic, level: float, effort: Effor
         runs += batch
     effort.charge(left.spent / _QUICK)
     return SimulatedRegion(np.concatenate(found), runs) if runs else None
-
-
-def _are_in(region: Region, x: Array) -> NDArray[np.bool_]:
-    """True for states (N, n) in a proved set, in floats."""
-    inside = np.zeros(len(x), dtype=np.bool_)
-    for one in region.ellipsoids:
-        y = x if not one.centre else x - np.array(one.centre)
-        inside |= np.einsum("bi,ij,bj->b", y, one.P, y) <= one.level
-    if region.outer is not None:
-        inside |= region.outer.function(x) <= region.outer.level
-    if region.ranked is not None:
-        inside |= np.isfinite(region.ranked.ranks_at(x))
-    return inside

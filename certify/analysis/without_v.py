@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 
 from certify.analysis.acceptance import Clerk, Desk
 from certify.analysis.stages.state import Report, StageName, timed
-from certify.certificates import InvariantCertificate, ReachCertificate
+from certify.certificates import InvariantCertificate, ReachCertificate, parse_any
+from certify.certificates.drawn import nonlinearity_of
 from certify.certificates.verdict import Verdict
 from certify.errors import InputError, SoundnessError
 from certify.loop.plants import System
@@ -58,6 +59,7 @@ class ResultWithoutV(ABC):
             "uncertain": {name: [str(lo), str(hi)] for name, (lo, hi) in system.ranges.items()},
             "states": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.states],
             "policy": {"sha256": self.network.sha256(), "layers": list(self.network.layers)},
+            "nonlinearity": self._nonlinearity(),
             "boxes": self.boxes,
             "notice": self.notice,
             "seconds": dict(self.seconds),
@@ -66,6 +68,11 @@ class ResultWithoutV(ABC):
             "checked": None if checker is None else checker.get("result"),
             "reference": None if checker is None else checker.get("reference", {}).get("result"),
         }
+
+    def _nonlinearity(self) -> dict[str, Any] | None:
+        """The policy's nonlinearity, sampled on the set; None without a certificate."""
+        found = None if self.raw is None else nonlinearity_of(parse_any(self.raw, str(self.certificate)))
+        return None if found is None else found.to_dict()
 
 
 @dataclass

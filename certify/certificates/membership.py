@@ -84,6 +84,18 @@ class Region:
         beyond = iter(more.holds(x for x, known in zip(points, inside, strict=True) if not known))
         return [known or next(beyond) for known in inside]
 
+    def holds_in_floats(self, x: Array) -> NDArray[np.bool_]:
+        """True for states (N, n), as deviations from x_eq, that lie in the set up to rounding: for estimates."""
+        inside = np.zeros(len(x), dtype=np.bool_)
+        for one in self.ellipsoids:
+            y = x if not one.centre else x - np.array(one.centre)
+            inside |= np.einsum("bi,ij,bj->b", y, one.P, y) <= one.level
+        if self.outer is not None:
+            inside |= self.outer.function(x) <= self.outer.level
+        if self.ranked is not None:
+            inside |= np.isfinite(self.ranked.ranks_at(x))
+        return inside
+
     def excludes(self, states: Iterable[Sequence[Fraction | float]]) -> list[bool]:
         """True for each state, as a deviation from x_eq, that is shown to lie outside the set."""
         points = list(states)

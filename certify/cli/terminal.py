@@ -64,7 +64,7 @@ _STAGES = {
     "candidate": "choosing candidates",
     "ring": "proving",
     "tube": "looking for a tube",
-    "simulate": "simulating",
+    "simulate": "simulating runs",
     "learn": "learning beyond the ellipsoid",
     "outer": "proving beyond the ellipsoid",
     "function": "learning a function",

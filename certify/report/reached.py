@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
-from certify.report.words import below, pretty_unit
+from certify.report.words import below, nonlinearity_in_words, pretty_unit
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -77,6 +77,8 @@ def _rows(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if simulated is not None and simulated["longest"] is not None:
         longest = f"{steps_of(result, simulated['longest'])} at most of those that get there"
         yield "simulated", f"{simulated['runs']} runs from the box, {longest}"
+    if result["nonlinearity"] is not None:
+        yield "linear part", nonlinearity_in_words(result["nonlinearity"])
     if result["checked"] is not None:
         both = ", and by the reference" if result["reference"] == "ACCEPTED" else ""
         yield "checked", f"{result['checked']}{both}"

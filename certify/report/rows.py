@@ -24,6 +24,7 @@ from certify.report.words import (
     inner_level,
     modes,
     network_name,
+    nonlinearity_in_words,
     number,
     point,
     pretty_unit,
@@ -163,6 +164,8 @@ def _operating_point(result: Mapping[str, Any]) -> tuple[str, str]:
 def _policy_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     policy = result["policy"]
     rows = [("policy", "-".join(map(str, policy["layers"]))), ("its sha256", str(policy["sha256"]))]
+    if result.get("nonlinearity"):
+        rows.append(("linear part", nonlinearity_in_words(result["nonlinearity"])))
     if result.get("eigenvalues"):
         held = " (at the nominal values)" if result.get("uncertain") else ""
         rows.append(("eigenvalues", ", ".join(map(str, result["eigenvalues"])) + held))

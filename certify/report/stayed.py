@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from certify.report.words import volume_name
+from certify.report.words import nonlinearity_in_words, volume_name
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -62,6 +62,8 @@ def _rows(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield "kept", f"{name}: {words}, at all times"
     if result["uncertain"]:
         yield "for every", ", ".join(f"{name} in [{lo}, {hi}]" for name, (lo, hi) in result["uncertain"].items())
+    if result["nonlinearity"] is not None:
+        yield "linear part", nonlinearity_in_words(result["nonlinearity"])
     if result["next"]:
         yield "try", " or ".join(result["next"])
     if result["checked"] is not None:

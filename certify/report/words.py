@@ -27,6 +27,9 @@ _SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _DOT = "\u0307"
 PRACTICAL = frozenset({"practical", "nearby"})
 """The claims whose inner set is the one in which trajectories end."""
+_A_GAIN = ((0.05, ": a gain does nearly the same"), (0.2, ""))
+_NO_GAIN = ": its own gain does not do the same"
+"""Conclusions for a reader, by the rms."""
 
 
 def symbol(name: str) -> str:
@@ -212,6 +215,30 @@ def share_of_runs(found: Mapping[str, Any]) -> str:
     proved, converging, runs = (f"{found[name]:,}" for name in ("proved", "converging", "runs"))
     about = f"about {100 * found['share']:.0f} % of what converges is proved"
     return f"{about}: {proved} of the {converging} states that do so in the domain, of {runs} drawn"
+
+
+def nonlinearity_in_words(found: Mapping[str, Any]) -> str:
+    """The distance of a policy from the saturated linear feedback of its own gain, from a result's entry on it.
+
+    >>> nonlinearity_in_words(
+    ...     {"rms": 0.0312, "largest": 0.121, "bend": 0.2, "saturated": 0.0, "states": 1000, "fitted": False}
+    ... )
+    'the policy is within 12 % of its saturated linear part on the set, 3.1 % rms (bend 20 %, saturated at 0 %): \
+a gain does nearly the same; sampled at 1,000 states, no part of the proof'
+    """
+    rms, largest, bend, saturated = (_percent(found[name]) for name in ("rms", "largest", "bend", "saturated"))
+    part = "the nearest saturated linear feedback" if found["fitted"] else "its saturated linear part"
+    does = ""
+    if found["rms"] is not None:
+        does = next((words for most, words in _A_GAIN if found["rms"] <= most), _NO_GAIN)
+    return (
+        f"the policy is within {largest} of {part} on the set, {rms} rms (bend {bend}, saturated at {saturated}){does}"
+        f"; sampled at {found['states']:,} states, no part of the proof"
+    )
+
+
+def _percent(share: float | None) -> str:
+    return "any share" if share is None else f"{100 * share:.2g} %" if share < 1 else f"{100 * share:.0f} %"
 
 
 def estimated(volume: float, deviation: float, unit: str) -> str:

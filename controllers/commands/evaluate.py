@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from controllers.commands.shared import ChosenPlant, Json, PolicyFile, emit, errors
+from controllers.commands.shared import ChosenPlant, Json, PolicyFile, beside_a_gain, emit, errors
 
 if TYPE_CHECKING:
     from controllers.evaluation.evaluation import Evaluation
@@ -74,6 +74,7 @@ def _table(result: Evaluation, options: EvaluationOptions) -> dict[str, Any]:
         "||J+K||/||K||": f"{100 * result.gain_relative:.3g} %" if learned else None,
         "learned A, B, K": f"off by {A_error}, {B_error} and {K_error}" if learned else None,
         "curvature": None if math.isnan(result.curvature) else f"{result.curvature:.4g}",
+        "linear part": None if result.nonlinearity is None else beside_a_gain(result.nonlinearity),
         **({} if math.isinf(result.corner) else {"nearest corner": f"at {result.corner:.3g} of the domain"}),
         **runs,
     } | ({} if covered is None else {"in the proved set": _share(covered)})

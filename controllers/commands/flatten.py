@@ -90,7 +90,7 @@ def flatten(
             set_aside(out)
             result = run(given, options, plant, report)
         save_policy(out, result.policy)
-        emit({"policy": str(out), **(result.as_json() if as_json else _table(result, options))}, as_json)
+        emit({"policy": str(out), **(result.as_json() if as_json else _table(result))}, as_json)
 
 
 def _half_widths(text: str, system: System, plant: Plant) -> tuple[float, ...]:
@@ -139,13 +139,13 @@ def _progress(options: FlattenOptions) -> Iterator[Callable[[int, float, float],
         yield report
 
 
-def _table(result: Flattened, options: FlattenOptions) -> dict[str, Any]:
+def _table(result: Flattened) -> dict[str, Any]:
     def runs(found: Figures) -> str:
         return f"{found.settled} of {found.states} settled, median cost {found.cost:.4g}"
 
     before, after = result.before, result.after
     rms, largest = (", ".join(f"{v:.3g}" for v in values) for values in (result.rms, result.largest))
-    table = {
+    return {
         "system": result.policy.system,
         "sha256": result.policy.network.sha256(),
         "departure": f"{before.departure:.3g} before, {after.departure:.3g} after",
@@ -156,6 +156,3 @@ def _table(result: Flattened, options: FlattenOptions) -> dict[str, Any]:
         "change of J(0)": f"{100 * result.gain_change:.2g} %",
         "trained": f"from factor {result.factor:g}, {result.steps} steps in {result.seconds:.0f} s ({result.ended})",
     }
-    if options.gain == "kept" and not after.settled:
-        table["what to try"] = "--gain lqr, if it is the gain at the origin that lets no run settle"
-    return table

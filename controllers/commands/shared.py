@@ -6,13 +6,16 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from certify.cli.options import as_typed, options_of
 from certify.errors import CertifyError, OptionError
 from controllers.options import TrainingOptions, overridden, preset
+
+if TYPE_CHECKING:
+    from certify.loop.policies.nonlinearity import Nonlinearity
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
 PlantName = Annotated[str, typer.Argument(help="The plant, for instance pendulum.")]
@@ -73,3 +76,11 @@ def emit(result: dict[str, Any], as_json: bool) -> None:
     width = max(map(len, result))
     for name, value in result.items():
         typer.echo(f"{name:<{width}}  {'-' if value is None else value}")
+
+
+def beside_a_gain(found: Nonlinearity) -> str:
+    """The distance of a policy from the saturated linear feedback of its own gain on a box, in words."""
+    rms, largest, bend, saturated = (
+        f"{100 * share:.2g} %" for share in (found.rms, found.largest, found.bend, found.saturated)
+    )
+    return f"{rms} from it on the box of initial states, rms, {largest} at most; bend {bend}, saturated at {saturated}"

@@ -14,11 +14,12 @@ import typer
 
 from certify.cli.options import parameter
 from certify.errors import OptionError
-from controllers.commands.shared import Json, emit, errors
-from controllers.options import TrainingOptions, overridden
+from controllers.commands.shared import Json, beside_a_gain, emit, errors
+from controllers.options import Plant, TrainingOptions, overridden
 from controllers.storage import make_folder, read, require_writable, set_aside
 
 if TYPE_CHECKING:
+    from certify.loop.plants import System
     from certify.loop.policies import Policy
     from controllers.history.policies import PolicyWriter
     from controllers.training.trainer import Trainer
@@ -86,7 +87,7 @@ def train(
         set_aside(out)
         policy = _run(trainer, log, evaluations, writer, (checkpoint, checkpoint_every, evaluate_every))
         save_policy(out, policy)
-        emit(_summary(policy, out), as_json)
+        emit(_summary(policy, out) | _prospects(policy, out, system, plant, plant_options, as_json), as_json)
 
 
 def _run(
@@ -206,6 +207,24 @@ def _summary(policy: Policy, out: Path) -> dict[str, Any]:
         "distance": training.get("distance"),
         "curvature": training["curvature"],
     } | {name: training[name] for name in ("nearest_corner",) if name in training}
+
+
+def _prospects(policy: Policy, out: Path, system: System, named: str, plant: Plant, as_json: bool) -> dict[str, Any]:
+    """The departure and nonlinearity of the policy on its box of initial states, and the command to type next."""
+    from controllers.evaluation.curvature import nonlinearity_on
+    from controllers.training.departure import WORTH_FLATTENING, departure_of
+
+    departure = departure_of(policy.network, plant.initial_states)
+    found = nonlinearity_on(policy.network, system.exact_u_eq(), plant.initial_states)
+    prove = f"certify roa --policy {out}" + ("" if named == system.name else f" --system {named}")
+    if departure > WORTH_FLATTENING:
+        flat = out.with_name(f"{out.stem}_flat.pt")
+        prove = (
+            f"controllers flatten {out} --out {flat}, since hidden units may add {departure:.2g} times its linear part "
+            "on its box, and bounds add up all of that: it says what this costs; or train with a larger --proof-weight"
+        )
+    shown = {"nonlinearity": found.to_dict()} if as_json else {"linear part": beside_a_gain(found)}
+    return {"departure": departure, **shown, "next": prove}
 
 
 train.__signature__ = _signature()  # type: ignore[attr-defined]

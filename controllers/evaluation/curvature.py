@@ -1,13 +1,18 @@
-"""The curvature of a policy near the origin, which a proof has to absorb."""
+"""The curvature of a policy near the origin, which a proof has to absorb, and its nonlinearity on a box."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from fractions import Fraction
+
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from certify.errors import InputError
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
+from certify.loop.policies.nonlinearity import Nonlinearity, nonlinearity
 
 
 def curvature(network: PolicyNetwork, system: System, radius: float, points: int = 256) -> float:
@@ -32,3 +37,22 @@ def curvature(network: PolicyNetwork, system: System, radius: float, points: int
     jacobians = torch.func.vmap(torch.func.jacrev(lambda y: folded(y, u_eq)))(torch.from_numpy(x)).numpy()
     change = np.linalg.norm(jacobians - network.jacobian_at_origin(u_eq), axis=(1, 2))
     return float((change / length[:, 0]).max())
+
+
+def nonlinearity_on(
+    network: PolicyNetwork,
+    u_eq: Sequence[Fraction],
+    box: Sequence[float] | NDArray[np.float64],
+    states: int = 1000,
+) -> Nonlinearity:
+    """The policy beside the saturated linear feedback of its own gain, at states uniform in a box, always the same.
+
+    `departure` adds up magnitudes of single hidden units, `bend` here the units themselves, signs and all.
+
+    Parameters
+    ----------
+    box : half-widths (n,), in the states' units.
+    """
+    half_widths = np.asarray(box, dtype=np.float64)
+    x = np.random.default_rng(0).uniform(-half_widths, half_widths, (states, network.n))
+    return nonlinearity(network, u_eq, x)

@@ -20,8 +20,9 @@ from certify.errors import InputError
 from certify.loop.plants import System
 from certify.loop.plants.system import Time
 from certify.loop.policies import Policy
+from certify.loop.policies.nonlinearity import Nonlinearity
 from controllers.evaluation.corners import nearest_corner
-from controllers.evaluation.curvature import curvature
+from controllers.evaluation.curvature import curvature, nonlinearity_on
 from controllers.evaluation.proved_set import Covered, count_covered
 from controllers.evaluation.record import recorded, recorded_step
 from controllers.evaluation.settling import EvaluationOptions, Settling, settle, settling_of
@@ -42,7 +43,7 @@ class Evaluation:
 
     `K_relative_error` is against the gain of the true plant, for the weights that the record says K was made for.
     `curvature` is that of `curvature()` in the ball in which the plant was identified; NaN without `training.eta`.
-    `corner` is that of `nearest_corner()`, infinite for smooth units.
+    `corner` is that of `nearest_corner()`, infinite for smooth units; `nonlinearity` is on the box of initial states.
     `eigenvalues` are those of the closed loop's Jacobian at the origin: of the rate of change, or, where `time` is
     discrete, of a step. `continuous` is None in discrete time. `covered` is None without a certificate.
     """
@@ -61,6 +62,7 @@ class Evaluation:
     held: Settling
     covered: Covered | None = None
     corner: float = math.inf
+    nonlinearity: Nonlinearity | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; NaN and infinity become None."""
@@ -82,6 +84,7 @@ class Evaluation:
             "gain": {"distance": _finite(self.gain_distance), "relative": _finite(self.gain_relative)},
             "curvature": _finite(self.curvature),
             "nearest_corner": _finite(self.corner),
+            "nonlinearity": None if self.nonlinearity is None else self.nonlinearity.to_dict(),
             "identification": {
                 "A": _finite(self.A_relative_error),
                 "B": _finite(self.B_relative_error),
@@ -151,6 +154,7 @@ def evaluate(
         held=held,
         covered=covered,
         corner=nearest_corner(network, system),
+        nonlinearity=nonlinearity_on(network, system.exact_u_eq(), plant.initial_states),
     )
 
 

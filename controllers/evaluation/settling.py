@@ -68,9 +68,9 @@ MONITORING = EvaluationOptions(states=100, duration=20.0, duration_steps=1000, t
 class Settling:
     """One simulation of all initial states.
 
-    `largest` is the largest ||x|| of any run in the window; `left_domain` counts runs that were outside the
-    domain at some step. `cost` is the integral of `x'Q x + (u - u_eq)'R (u - u_eq)`, in discrete time its sum, median
-    over the runs. `step` is in seconds, and 1 in discrete time.
+    `largest` is the largest ||x||, from where runs are to settle, of any run in the window; `left_domain` counts runs
+    that were outside the domain at some step. `cost` is the integral of `x'Q x + (u - u_eq)'R (u - u_eq)`, in discrete
+    time its sum, median over the runs. `step` is in seconds, and 1 in discrete time.
     """
 
     settled: int
@@ -89,6 +89,7 @@ def settle(
     R: Array,
     options: EvaluationOptions = MONITORING,
     plant: Plant | None = None,
+    rest: Array | None = None,
 ) -> Settling:
     """Simulate `network` with its input held over dt, or in discrete time a step, from the plant's initial states.
 
@@ -96,23 +97,26 @@ def settle(
     ----------
     Q, R : diagonals of the cost's weights, shapes (n,) and (m,).
     plant : whose box the initial states come from; default: the plant that ships under the system's name.
+    rest : the state (n,) towards which runs settle; default: the origin.
 
     Raises
     ------
     InputError : the plant has no box of initial states.
     """
     loop = held_loop(system, dt, mean_action(network, system), Q, R)
-    return settling_of(loop, system, initial_states(system, options.states, options.seed, plant), options)
+    return settling_of(loop, system, initial_states(system, options.states, options.seed, plant), options, rest)
 
 
-def settling_of(loop: Loop, system: System, x0: Array, options: EvaluationOptions) -> Settling:
+def settling_of(
+    loop: Loop, system: System, x0: Array, options: EvaluationOptions, rest: Array | None = None
+) -> Settling:
     domain = np.array(system.domain, dtype=np.float64)
     duration, window = options.span(system)
     window_begins = loop.count(duration) - loop.count(window)
     largest, outside, cost = np.zeros(len(x0)), np.zeros(len(x0), dtype=bool), np.zeros(len(x0))
     for k, (x, total) in enumerate(loop.run(x0, duration)):
         if k >= window_begins:
-            norm = np.linalg.norm(x, axis=1)
+            norm = np.linalg.norm(x if rest is None else x - rest, axis=1)
             largest = np.maximum(largest, np.where(np.isnan(norm), math.inf, norm))
         outside |= ~((x >= domain[:, 0]) & (x <= domain[:, 1])).all(axis=1)
         cost = total

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.errors import InputError
+from certify.errors import InputError, OptionError
 from certify.loop.policies import PolicyNetwork, require_centred
 from controllers.evaluation.corners import nearest_corner
 from controllers.flattening.result import Figures
@@ -21,7 +21,7 @@ GAIN = 100.0
 
 
 class Selection:
-    """The best policy so far whose runs settle as often as before, at a median cost that is allowed.
+    """The best policy so far whose runs settle as often as before, and at least once, at a median cost that is allowed.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ class Selection:
 
     Raises
     ------
-    InputError : the old policy has no finite median cost.
+    InputError : the old policy has no finite median cost, or none of its runs settles and its gain is to be kept.
     """
 
     def __init__(self, task: Task, states: Array) -> None:
@@ -40,6 +40,13 @@ class Selection:
             raise InputError(
                 f"the policy must have a finite median cost to compare with; half of {task.options.states} runs of "
                 f"{task.system.name} or more diverge. Choose smaller `initial_states`, or train it further."
+            )
+        if not self.before.settled and task.options.gain == "kept":
+            raise OptionError(
+                f"some runs must settle before flattening, for it is by them that the result is judged: none of "
+                f"{self.before.states} runs of {task.system.name} does, from its box of initial states towards where "
+                "the loop rests. If it is the gain at the origin that lets none settle, ask for another with `gain` lqr"
+                "; else train the policy further, or choose smaller `initial_states`."
             )
         self.corner = min(1.0, nearest_corner(task.old, task.system))  # no unit may have its corner nearer
         self.best: tuple[PolicyNetwork, Figures] | None = None
@@ -58,7 +65,7 @@ class Selection:
         allowed = (1 + task.options.max_cost_change) * self.before.cost
         if not (
             figures.departure < self.before.departure
-            and figures.settled >= self.before.settled
+            and figures.settled >= max(1, self.before.settled)
             and figures.cost <= allowed
         ):
             return False

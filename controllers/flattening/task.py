@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError, OptionError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.equilibrium import find_rest
 from certify.loop.plants import System
 from certify.loop.policies import Policy, PolicyNetwork, require_centred
+from controllers.evaluation.curvature import nonlinearity_on
 from controllers.evaluation.settling import MONITORING, settle
-from controllers.flattening.bend import bend
 from controllers.flattening.contraction import with_value_at_origin
 from controllers.flattening.gain_change import regained
 from controllers.flattening.options import FlattenOptions
@@ -95,13 +97,20 @@ class Task:
         size = max(float(np.linalg.norm(J * self.box)), SMALLEST)
         return float(np.linalg.norm((network.jacobian_at_origin(self.u_eq) - J) * self.box)) / size
 
+    def rest_of(self, network: PolicyNetwork) -> Array:
+        """The state (n,) where the loop of a policy rests: the origin, or beside it if nothing centres the policy."""
+        if network.centre != "none" or self.exactly_centred:
+            return np.zeros(self.system.n)
+        rest = find_rest(ClosedLoop(self.system, network))
+        return np.array(rest.x, dtype=np.float64) if rest is not None and rest.stable else np.zeros(self.system.n)
+
     def figures(self, network: PolicyNetwork) -> Figures:
-        """The figures of a policy, by the runs that judge."""
+        """The figures of a policy, by the runs that judge: they settle towards where its loop rests."""
         judged = replace(MONITORING, states=self.options.states, seed=self.options.seed)
-        found = settle(network, self.system, self.dt, self.Q, self.R, judged, self.plant)
+        found = settle(network, self.system, self.dt, self.Q, self.R, judged, self.plant, self.rest_of(network))
         return Figures(
             departure=departure_of(network, self.box.tolist()),
-            bend=bend(network, self.box),
+            bend=nonlinearity_on(network, self.u_eq, self.box).bend,
             settled=found.settled,
             states=found.states,
             cost=found.cost,

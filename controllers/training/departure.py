@@ -20,6 +20,7 @@ from certify.loop.policies import PolicyNetwork
 from controllers.training.units import Units
 
 _TANH = Units()
+WORTH_FLATTENING = 1.0  # departure on the box, above which a proof of the box is hardly in reach (docs/how-to)
 _LEAST = 1e-30  # below any range that counts: a network that ignores the state has no scale of its own
 
 

@@ -15,9 +15,10 @@ from pathlib import Path
 
 from certify.certificates import Certificate, read_certificate, run_checker
 from certify.certificates.claims import Enlarged, Practical
+from certify.certificates.drawn import nonlinearity_of
 from certify.lyapunov import semi_axes, volume
 from certify.report.figures import draw
-from certify.report.words import above, below, pretty_unit, symbol
+from certify.report.words import above, below, nonlinearity_in_words, pretty_unit, symbol
 
 ROOT = Path(__file__).parents[2]
 PAGE = Path(__file__).parent
@@ -118,12 +119,20 @@ def section(entry: Entry, certificate: Certificate) -> str:
             "",
             f"On the axes ± {axes}; {kind} {size}{whose}; {inner}, c₂ = {below(certificate.roa)}.",
             "",
+            f"Linear part *: {beside_a_gain(certificate)}.",
+            "",
             "<!-- shown: by make gallery -->",
             "```sh",
             " ".join(entry.command),
             "```",
         ]
     )
+
+
+def beside_a_gain(certificate: Certificate) -> str:
+    """Whether the policy does more on the set than a gain, sampled."""
+    found = nonlinearity_of(certificate)
+    return "not compared" if found is None else nonlinearity_in_words(found.to_dict())
 
 
 def main() -> None:

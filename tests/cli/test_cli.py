@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import os
 import signal
 import subprocess
@@ -883,6 +884,14 @@ def test_a_closed_pipe_is_no_verdict_whatever_was_to_be_said(command: str, both:
     done = subprocess.run([sys.executable, "-c", code, *arguments], stdout=out, stderr=writing, check=False)
     os.close(writing)
     assert done.returncode == 141
+
+
+def test_every_stage_has_a_line_of_progress():
+    """One without ended a run with an internal error, if it began when a line was due."""
+    for stage in get_args(StageName):
+        line = ProgressLine()
+        line.last = -math.inf
+        line(stage, None)
 
 
 def test_the_line_of_progress_is_true_of_a_pass_inwards_and_of_nearly_all() -> None:

@@ -14,6 +14,7 @@ from certify.analysis.results import RoaResult
 from certify.analysis.stages.state import State, Tools
 from certify.certificates import Certificate, TrustedSolver
 from certify.certificates.claims import Claim, Problem
+from certify.certificates.drawn import nonlinearity_of
 from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT, Effort
 from certify.errors import BackendError, SoundnessError
@@ -82,6 +83,7 @@ def _with_facts(state: State, accepted: Accepted) -> State:
     if claim.start is None:
         result = replace(result, tube=None)
     constraints = constraints_in_words(accepted.certificate)
+    result = replace(result, nonlinearity=nonlinearity_of(accepted.certificate))
     result = replace(result, ranks=rank_facts(accepted.certificate, state.ranked), constraints=constraints)
     if state.beyond is not None:
         if claim.outer is not None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from certify.certificates import AnyCertificate, Certificate, TrustedSolver
 from certify.certificates.claims import Outer
+from certify.certificates.drawn import nonlinearity_of
 from certify.errors import CertifyError
 from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov import Neural, domain_limit, extents, sampled_volume, semi_axes, volume
@@ -38,6 +39,7 @@ from certify.report.words import (
     held_at,
     is_free,
     network_name,
+    nonlinearity_in_words,
     number,
     pretty_unit,
     seconds,
@@ -198,10 +200,17 @@ def file_rows(certificate: AnyCertificate, sha256: str, size: int | None) -> Row
         ("policy", f"{network.words}, squash {network.squash}, centre {network.centre}"),
         *(() if network.clip is None else (("clipped to", _clip(certificate)),)),
         *((("its layers read", read_in_words(certificate)),) if network.is_moved else ()),
+        *_nonlinear(certificate),
         ("policy sha256", network.sha256()),
         ("certificate sha256", sha256),
         *(() if size is None else (("certificate size", f"{size:,} bytes"),)),
     ]
+
+
+def _nonlinear(certificate: AnyCertificate) -> Rows:
+    """The policy's distance from its linear part, sampled on the set."""
+    found = nonlinearity_of(certificate)
+    return [] if found is None else [("linear part *", nonlinearity_in_words(found.to_dict()))]
 
 
 def run_rows(result: Mapping[str, Any] | None) -> Rows:

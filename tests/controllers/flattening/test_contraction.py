@@ -11,7 +11,7 @@ import pytest
 
 from certify.errors import InputError
 from certify.loop.policies import PolicyNetwork, load_policy, require_centred
-from controllers.flattening.bend import bend
+from controllers.evaluation.curvature import nonlinearity_on
 from controllers.flattening.contraction import contracted, with_value_at_origin
 from controllers.training.departure import departure_of
 
@@ -48,7 +48,8 @@ def test_factor_one_is_the_policy_and_small_ones_are_its_linearisation():
     network, x = _network(), np.random.default_rng(0).uniform(-1, 1, (50, 3))
     np.testing.assert_allclose(contracted(network, 1.0)(x, U_EQ), network(x, U_EQ), atol=1e-5)
     flat = contracted(network, 2.0**-10)
-    assert bend(flat, np.ones(3)) < 1e-2 * bend(network, np.ones(3))
+    new, old = (nonlinearity_on(each, U_EQ, np.ones(3)) for each in (flat, network))
+    assert new.bend < 1e-2 * old.bend and new.rms < 1e-2 * old.rms and new.largest < 1e-2 * old.largest
 
 
 def test_what_is_left_falls_with_the_square_at_rest_and_linearly_elsewhere():

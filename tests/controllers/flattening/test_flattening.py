@@ -13,15 +13,16 @@ from click.testing import CliRunner as ClickRunner
 from typer.testing import CliRunner
 
 from certify.cli.main import command_line
-from certify.errors import InputError
+from certify.errors import InputError, OptionError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.equilibrium import find_rest
 from certify.loop.plants import get_system
 from certify.loop.policies import Policy, PolicyNetwork, load_policy, require_centred, save_policy
 from controllers.cli import app
-from controllers.evaluation.curvature import curvature
+from controllers.evaluation.curvature import curvature, nonlinearity_on
 from controllers.evaluation.evaluation import evaluate
 from controllers.evaluation.settling import EvaluationOptions
 from controllers.flattening import task as module
-from controllers.flattening.bend import bend
 from controllers.flattening.flattening import FACTORS, flatten
 from controllers.flattening.options import FlattenOptions
 from controllers.identification.linearisation import discrete_linearisation
@@ -100,7 +101,7 @@ def test_its_figures_are_those_of_the_two_policies(result):
     x0 = initial_states(PENDULUM, 64, 0)  # the first states that were visited
     change = np.abs(new(x0, u_eq) - old(x0, u_eq)).max()
     assert 0 < change <= result.largest[0] * (1 + 1e-9) and result.rms[0] < result.largest[0]
-    assert result.before.bend == pytest.approx(bend(old, box))
+    assert result.before.bend == pytest.approx(nonlinearity_on(old, u_eq, box).bend)
 
 
 def test_the_record_says_how_and_the_old_one_stays(result):
@@ -169,7 +170,8 @@ def test_exact_centring_by_zero_biases_is_kept():
 
 
 def test_a_policy_without_centring_keeps_its_value_at_the_origin():
-    teacher = curved("none").with_layers(biases=(*curved().biases[:-1], np.array([-0.125])))
+    *others, last = curved("none").biases
+    teacher = curved("none").with_layers(biases=(*others, last - 0.125))  # it rests beside the origin
     found = flatten(Policy(teacher, "pendulum", training=_record()), replace(QUICK, max_cost_change=1.0))
     zero, u_eq = np.zeros((1, 2)), PENDULUM.exact_u_eq()
     np.testing.assert_allclose(found.policy.network(zero, u_eq), teacher(zero, u_eq), atol=1e-5)
@@ -216,11 +218,20 @@ def test_what_changed_is_said_beside_the_old_policy_and_not_beside_the_goal():
     assert found.largest[0] * (1 + 1e-9) >= change > 1
 
 
-@pytest.mark.slow
-def test_the_gain_stays_unless_it_is_asked_for():
-    found = flatten(Policy(_chattering(), "pendulum", training=_record()), QUICK)
-    assert found.gain_change < 0.05 and found.after.settled == found.before.settled == 0
-    assert found.policy.training["flattened"]["gain"] == "kept" and "K" not in found.policy.training["flattened"]
+def test_without_a_run_that_settles_nothing_is_judged_and_nothing_flattened():
+    """0 of 20 before would allow 0 of 20 after: the gain is changed if that is asked for, else the policy refused."""
+    with pytest.raises(OptionError, match=r"none of 20 runs of pendulum does.*`gain` lqr"):
+        flatten(Policy(_chattering(), "pendulum", training=_record()), QUICK)
+
+
+def test_runs_settle_towards_where_the_loop_rests():
+    """A policy without centring rests beside the origin: there its runs settle, and do after flattening."""
+    old = curved("none", bias=0.5)
+    off = old.with_layers(biases=(*old.biases[:-1], old.biases[-1] + 0.05))
+    rest = find_rest(ClosedLoop(PENDULUM, off))
+    assert rest.stable and np.linalg.norm(np.array(rest.x, dtype=float)) > 1e-2
+    found = flatten(Policy(off, "pendulum", training=_record()), QUICK)
+    assert found.before.settled == found.after.settled == 20 and found.after.departure < found.before.departure
 
 
 def test_another_gain_is_bound_by_what_the_old_policy_costs(monkeypatch):
@@ -409,16 +420,17 @@ def test_the_command_writes_the_policy_and_one_json_object(tmp_path):
     assert new.training["flattened"]["box"] == [0.5, get_plant("pendulum").initial_states[1]]
     assert new.training["flattened"]["seed"] == 3
     text = _flatten(tmp_path / "p.pt", "--out", tmp_path / "r.pt")
-    assert text.exit_code == 0 and "10 of 10 settled" in text.stdout and "what to try" not in text.stdout
+    assert text.exit_code == 0 and "10 of 10 settled" in text.stdout
 
 
 @pytest.mark.slow
 def test_the_command_says_what_to_try_where_no_run_settles(tmp_path):
     save_policy(tmp_path / "p.pt", Policy(_chattering(), "pendulum", training=_record()))
     kept = _flatten(tmp_path / "p.pt", "--out", tmp_path / "q.pt")
-    assert kept.exit_code == 0 and "0 of 10 settled" in kept.stdout and "what to try" in kept.stdout
+    assert kept.exit_code == 2 and "none of 10 runs of pendulum does" in kept.stderr and "--gain lqr" in kept.stderr
+    assert not (tmp_path / "q.pt").exists()
     lqr = _flatten(tmp_path / "p.pt", "--out", tmp_path / "q.pt", "--gain", "lqr")
-    assert lqr.exit_code == 0 and "10 of 10 settled" in lqr.stdout and "what to try" not in lqr.stdout
+    assert lqr.exit_code == 0 and "10 of 10 settled" in lqr.stdout
 
 
 @pytest.mark.parametrize(
