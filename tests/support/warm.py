@@ -60,7 +60,8 @@ class WarmCheckers:
     DEVNULL = subprocess.DEVNULL
 
     def __init__(self) -> None:
-        self._lock, self._server = Lock(), None  # type: tuple[Any, subprocess.Popen[str] | None]
+        self._lock = Lock()
+        self._server: subprocess.Popen[str] | None = None
         room = Path(checking.__file__).resolve().parent.parent
         self._folders = {f"certify_{name}": str(room / name) for name in ("checker", "reference")}
 
@@ -70,17 +71,19 @@ class WarmCheckers:
         if list(line[:4]) != [sys.executable, "-I", "-c", checking._LAUNCH] or self._folders.get(name) != folder:
             return subprocess.run(line, **options)
         with self._lock:
-            server = self._started()
-            print(json.dumps((name, os.getcwd(), line[6:])), file=server.stdin, flush=True)
-            status, out, err = json.loads(server.stdout.readline())  # type: ignore[union-attr]
+            ask, answer = self._streams()
+            ask.write(json.dumps((name, os.getcwd(), line[6:])) + "\n")
+            ask.flush()
+            status, out, err = json.loads(answer.readline())
         return subprocess.CompletedProcess(line, status, out, err)
 
-    def _started(self) -> subprocess.Popen[str]:
+    def _streams(self) -> tuple[Any, Any]:
+        """The input and output of the process, which is started if it does not run."""
         if self._server is None:
             programs = json.dumps([(name, folder, _LOADED[name]) for name, folder in self._folders.items()])
             line = [sys.executable, "-I", "-c", _SERVE, programs]
             self._server = subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        return self._server
+        return self._server.stdin, self._server.stdout
 
     def close(self) -> None:
         """End the process."""
