@@ -65,11 +65,11 @@ class WarmCheckers:
         room = Path(checking.__file__).resolve().parent.parent
         self._folders = {f"certify_{name}": str(room / name) for name in ("checker", "reference")}
 
-    def run(self, line: Sequence[str], **options: Any) -> subprocess.CompletedProcess[str]:
+    def run(self, line: Sequence[str], *, check: bool, **options: Any) -> subprocess.CompletedProcess[str]:
         """The result of a command line, in a fork if it is that of a checker."""
         name, folder = (*line, "", "")[4:6]
         if list(line[:4]) != [sys.executable, "-I", "-c", checking._LAUNCH] or self._folders.get(name) != folder:
-            return subprocess.run(line, **options)
+            return subprocess.run(line, check=check, **options)
         with self._lock:
             ask, answer = self._streams()
             ask.write(json.dumps((name, os.getcwd(), line[6:])) + "\n")
