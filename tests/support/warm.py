@@ -51,6 +51,7 @@ for line in sys.stdin:
             stream.seek(0)
         print(json.dumps((status, out.read(), err.read())), flush=True)
 """
+_PYTHON = sys.executable  # a test may name another one later
 _LOADED = {"certify_checker": ("document", "words", "rules", "boxes"), "certify_reference": ()}
 
 
@@ -68,7 +69,7 @@ class WarmCheckers:
     def run(self, line: Sequence[str], *, check: bool, **options: Any) -> subprocess.CompletedProcess[str]:
         """The result of a command line, in a fork if it is that of a checker."""
         name, folder = (*line, "", "")[4:6]
-        if list(line[:4]) != [sys.executable, "-I", "-c", checking._LAUNCH] or self._folders.get(name) != folder:
+        if list(line[:4]) != [_PYTHON, "-I", "-c", checking._LAUNCH] or self._folders.get(name) != folder:
             return subprocess.run(line, check=check, **options)
         with self._lock:
             ask, answer = self._streams()
@@ -81,7 +82,7 @@ class WarmCheckers:
         """The input and output of the process, which is started if it does not run."""
         if self._server is None:
             programs = json.dumps([(name, folder, _LOADED[name]) for name, folder in self._folders.items()])
-            line = [sys.executable, "-I", "-c", _SERVE, programs]
+            line = [_PYTHON, "-I", "-c", _SERVE, programs]
             self._server = subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         return self._server.stdin, self._server.stdout
 
