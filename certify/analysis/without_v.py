@@ -19,6 +19,9 @@ from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
 from certify.provers.base import Progress
 
+AS_THEY_STAND = (
+    "the plant's ranges are taken as they stand: no claim of this kind has the measurements on which they rest yet"
+)
 C = TypeVar("C", ReachCertificate, InvariantCertificate)
 
 
@@ -91,6 +94,11 @@ class Tools:
         """Say which stage is at work, and where it stands."""
         if self.progress is not None:
             self.progress(stage, progress)
+
+    def notice(self, system: System) -> str | None:
+        """The notice about a run for a plant."""
+        rests = [] if system.measurements is None else [AS_THEY_STAND]
+        return "; ".join([*rests, *self.remarks]) or None
 
     def clerk(self, path: Path, jobs: int | None, many: bool) -> Clerk:
         """Somebody who writes certificates and has them checked; by several processes where leaves are `many`."""

@@ -18,7 +18,7 @@ Sums and matrix products are bounded for any order of summation and with or with
 Overflow never helps: it makes a bound infinite or NaN, and a comparison that has to hold is then False. NaN means that
 nothing is known.
 
-tanh, sin, cos, exp and atan use a table of values on a grid of step h = 2^-5, which Arb computes at start-up, an
+tanh, sin, cos, exp and atan use a table of values on a grid of step h = 2^-5, which Arb computes at first use, an
 addition theorem, and Taylor polynomials on |d| <= h/2 = 2^-6. No libm value is trusted; the square root is IEEE's own.
 """
 
@@ -524,21 +524,23 @@ def lower(x: Near) -> Any:
 # ----------------------------------------------------------------------------------------------------------- functions
 
 
-def _table(values: Iterable[arb]) -> Array:
-    """The binary64 numbers nearest to these values."""
-    pairs = [near_ball(x) for x in values]
+@cache
+def _table(function: Callable[[arb], arb], end: float) -> Array:
+    """The binary64 numbers nearest to a function at 0, h, 2h, ..., end."""
+    with ctx.workprec(128):
+        pairs = [near_ball(function(arb(k) * _STEP)) for k in range(int(end / _STEP) + 1)]
     # At 128 bits the midpoint rounds to within u |value| (1 + 2^-50) of the ball.
     if not all(x.error.top <= U * abs(x.value) * (1 + 2.0**-20) + 4 * LEAST for x in pairs):
         raise ArithmeticError("a table entry is not accurate to one rounding")
     return np.array([x.value for x in pairs])
 
 
+def _sech2(x: arb) -> arb:
+    t = x.tanh()
+    return 1 - t * t
+
+
 ctx.prec = 128
-_GRID = [arb(k) * _STEP for k in range(int(_ANGLE_END / _STEP) + 1)]
-_TANHS = [x.tanh() for x in _GRID[: int(_TANH_END / _STEP) + 1]]
-_TANH, _SECH2 = _table(_TANHS), _table(1 - t * t for t in _TANHS)
-_SIN, _COS = _table(x.sin() for x in _GRID), _table(x.cos() for x in _GRID)
-_EXP, _ATAN = _table(x.exp() for x in _GRID), _table(x.atan() for x in _GRID[: int(1 / _STEP) + 1])
 _RIGHT_ANGLE = near_ball(arb.pi() / 2).value
 TURN = near_ball(2 * arb.pi())
 
@@ -569,8 +571,8 @@ def _tanh(y: Array) -> tuple[Array, Above]:
     k, d = _split(np.fmin(np.abs(y), _TANH_END), _TANH_END)
     w = d * d
     s = d + d * (w * (-1 / 3 + w * (2 / 15 + w * (-17 / 315 + w * (62 / 2835)))))
-    T = _TANH[k]
-    t = np.where(finite, np.copysign(T + _SECH2[k] * s / (1 + T * s), y), np.nan)
+    T = _table(arb.tanh, _TANH_END)[k]
+    t = np.where(finite, np.copysign(T + _table(_sech2, _TANH_END)[k] * s / (1 + T * s), y), np.nan)
     return t, size(t) * (7 * U)
 
 
@@ -587,7 +589,7 @@ def _sin_cos(y: Array) -> tuple[Near, Near]:
     w = d * d
     sd = d + d * (w * (-1 / 6 + w * (1 / 120 + w * (-1 / 5040 + w * (1 / 362880)))))
     cd = 1 + w * (-1 / 2 + w * (1 / 24 + w * (-1 / 720 + w * (1 / 40320))))
-    S, C = _SIN[k], _COS[k]
+    S, C = (_table(function, _ANGLE_END)[k] for function in (arb.sin, arb.cos))
 
     def known(value: Array, large: Array, small: Array) -> Near:
         error = (size(large) + size(small)) * (5 * U)
@@ -613,7 +615,7 @@ def _exp(y: Array) -> Near:
     p = 1 / 5040 + d * (1 / 40320)
     for coefficient in (1 / 720, 1 / 120, 1 / 24, 1 / 6, 1 / 2, 1.0, 1.0):
         p = coefficient + d * p
-    v = _EXP[k] * p
+    v = _table(arb.exp, _EXP_END)[k] * p
     v = np.where(y < 0, 1 / v, v)
     beyond = np.isfinite(y) & (y < 0)
     error = size(v) * (6 * U)
@@ -637,7 +639,7 @@ def _atan(y: Array) -> Near:
     q = d / (1 + k * _STEP * w)
     s = q * q
     v = q + q * (s * (-1 / 3 + s * (1 / 5 + s * (-1 / 7 + s * (1 / 9 + s * (-1 / 11))))))
-    A = _ATAN[k]
+    A = _table(arb.atan, 1.0)[k]
     v, error = A + v, size(A) * (3 * U) + size(q) * (8 * U)
     v = np.copysign(np.where(large, _RIGHT_ANGLE - v, v), y)
     error = (error + 6 * U).where(large, error)

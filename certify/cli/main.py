@@ -15,36 +15,33 @@ import os
 import sys
 from collections.abc import Iterable, Mapping
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NoReturn
 
-import typer
-from typer.core import TyperCommand
-
+from certify.cli.checked import checked
 from certify.cli.ending import INTERRUPTED, Interrupted, closed_pipe, end_by_sigterm, is_of_closed_pipe
-from certify.cli.options import Grouped, as_typed, options_of
 from certify.cli.terminal import say, tell
-from certify.cli.version import certify
 from certify.errors import BackendError, CertifyError, OptionError, SoundnessError
 
-_COMMANDS: dict[str, type[TyperCommand] | None] = {
-    "roa": Grouped,
-    "reach": Grouped,
-    "identify": Grouped,
-    "fit": Grouped,
-    "compose": Grouped,
-    "sweep": None,
-    "check": None,
-    "contains": None,
-    "report": None,
-    "plot": None,
-    "import": Grouped,
-    "learn-lyapunov": Grouped,
-    "plant": Grouped,
-    "systems": None,
-    "export-smt2": Grouped,
-    "prove-in-coq": None,
-    "float-error": Grouped,
-    "doctor": None,
+_COMMANDS: dict[str, bool] = {
+    "roa": True,
+    "reach": True,
+    "identify": True,
+    "fit": True,
+    "compose": True,
+    "sweep": False,
+    "check": False,
+    "contains": False,
+    "report": False,
+    "plot": False,
+    "import": True,
+    "learn-lyapunov": True,
+    "plant": True,
+    "systems": False,
+    "export-smt2": True,
+    "prove-in-coq": False,
+    "float-error": True,
+    "doctor": False,
 }
 """The commands in the order of the help, each in a file of its name; those whose help has panels are grouped."""
 
@@ -53,6 +50,11 @@ _STOPPED = "interrupted; nothing was left half-written."
 
 def command_line(names: Iterable[str] = _COMMANDS) -> Any:
     """The program with all its commands, or with these: only their files are loaded."""
+    import typer
+
+    from certify.cli.options import Grouped
+    from certify.cli.version import certify
+
     app = typer.Typer(
         no_args_is_help=True,
         rich_markup_mode=None,
@@ -62,7 +64,9 @@ def command_line(names: Iterable[str] = _COMMANDS) -> Any:
     app.callback()(certify)
     for name in names:
         function = "import_" if name == "import" else name.replace("-", "_")
-        app.command(name, cls=_COMMANDS[name])(getattr(import_module(f"certify.cli.{function}"), function))
+        app.command(name, cls=Grouped if _COMMANDS[name] else None)(
+            getattr(import_module(f"certify.cli.{function}"), function)
+        )
     return typer.main.get_command(app)
 
 
@@ -96,8 +100,8 @@ def _leave(status: int) -> NoReturn:
 def _run(arguments: list[str], as_json: bool) -> int:
     try:
         return _ended(arguments, as_json)
-    except typer.Exit as stop:  # a message met a closed pipe
-        return stop.exit_code
+    except _typer().Exit as stop:  # a message met a closed pipe
+        return int(stop.exit_code)
     except BrokenPipeError:
         return closed_pipe()
     except SystemExit as stop:
@@ -108,19 +112,23 @@ def _run(arguments: list[str], as_json: bool) -> int:
 
 def _ended(arguments: list[str], as_json: bool) -> int:
     """Run a command and return its exit status, however it ends."""
-    command = command_line([name for name in arguments[:1] if name in _COMMANDS] or _COMMANDS)
+    plain = len(arguments) == 2 and arguments[0] == "check" and not arguments[1].startswith("-")
+    # To load what reads options takes longer than to check a small certificate.
+    command = None if plain else command_line([name for name in arguments[:1] if name in _COMMANDS] or _COMMANDS)
     try:
+        if command is None:
+            return checked(Path(arguments[1]))
         status = command.main(arguments, prog_name="certify", standalone_mode=False)
         if status == INTERRUPTED:  # typer's answer to Ctrl-C
             return _fail(as_json, _STOPPED, INTERRUPTED)
         return status if isinstance(status, int) else 0
-    except typer.Exit as stop:
-        return stop.exit_code
-    except typer.TyperException as error:  # usage
+    except _typer().Exit as stop:
+        return int(stop.exit_code)
+    except _typer().TyperException as error:  # usage
         return _fail(as_json, error.format_message() if hasattr(error, "format_message") else str(error), 2)
     except Interrupted as stop:
         return _fail(as_json, str(stop), INTERRUPTED)
-    except (typer.Abort, KeyboardInterrupt):
+    except (_typer().Abort, KeyboardInterrupt):
         return _fail(as_json, _STOPPED, INTERRUPTED)
     except SoundnessError as error:
         return _fail(as_json, f"internal error: {error}", 70)
@@ -128,6 +136,8 @@ def _ended(arguments: list[str], as_json: bool) -> int:
         return _fail(as_json, str(error), 70)
     except OptionError as error:
         commands: Mapping[str, Any] = getattr(command, "commands", {})
+        from certify.cli.options import as_typed, options_of
+
         called = next((commands[name] for name in arguments if name in commands), command)
         return _fail(as_json, as_typed(str(error), options_of(called)), 2)
     except CertifyError as error:
@@ -136,6 +146,11 @@ def _ended(arguments: list[str], as_json: bool) -> int:
         return closed_pipe()
     except Exception as error:  # the last resort: no traceback reaches a user
         return _fail(as_json, f"internal error: {type(error).__name__}: {error}", 70)
+
+
+def _typer() -> Any:
+    """The library that reads options, loaded at the first use."""
+    return import_module("typer")
 
 
 def _fail(as_json: bool, message: str, status: int) -> int:

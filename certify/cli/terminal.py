@@ -8,8 +8,6 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any, TextIO
 
-import typer
-
 from certify.cli.ending import closed_pipe
 
 if TYPE_CHECKING:
@@ -26,6 +24,8 @@ def _put(stream: TextIO, text: str) -> None:
         stream.write(text)
         stream.flush()
     except BrokenPipeError:
+        import typer
+
         raise typer.Exit(closed_pipe()) from None
 
 

@@ -101,7 +101,9 @@ class Corners:
             M = self._solved(scaled, share * self.slowest)
             if M is not None:
                 P = M / half[:, None] / half[None]
-                return np.asarray((P + P.T) / 2)
+                P = np.asarray((P + P.T) / 2)
+                if self.decrease(P):  # the solver knows this to its tolerance only
+                    return P
         raise BackendError("no quadratic V is found that decreases at all corners of the ranges near the origin.")
 
     def _solved(self, rates: list[Array], decay: float) -> Array | None:

@@ -203,11 +203,12 @@ class _Search:
         self.constraints = Constraints(self.loop) if problem.keep else None
         self.asks_more = self.check_inputs or self.constraints is not None
 
+    @np.errstate(all="ignore")
     def violation(self, z: Array) -> tuple[Array, Array]:
         """(D', how far the worst input lies outside its bounds, or the largest g of a constraint) at x = T z, (B,)."""
         self._charge(len(z), 1)
         x = z @ self.T.T
-        return self._at(x, self._inputs(x)[0])
+        return self._at(x, self.loop.policy(x))
 
     def _charge(self, states: int, evaluations: int) -> None:
         """Count evaluations of the equations at states, and of the policy with each."""

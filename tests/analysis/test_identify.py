@@ -606,6 +606,16 @@ def test_without_data_ranges_are_taken_as_they_stand(known: Path, capsys: pytest
     assert "data" not in json.loads((known / "out" / "certificate.json").read_text())["claim"]
 
 
+def test_a_region_is_reached_for_ranges_as_they_stand(known: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    loop = [str(POLICY), "--system", str(known / "known.toml"), "--sample-time", "0.02"]
+    text = (known / "known.toml").read_text()
+    (known / "known.toml").write_text(text.replace('[angles]\ntheta = "2*pi"\n', ""))
+    asked = ["--target", "theta**2 <= 4", "--from", "theta=1..1.1,theta_dot=0", "--out", str(known / "out")]
+    assert _run(["reach", *loop, *asked, "--effort", "0.1", "--json"], True) == 0
+    said = capsys.readouterr()
+    assert "ranges are taken as they stand" in json.loads(said.out)["notice"] and "as they stand" in said.err
+
+
 def test_other_data_are_refused(known: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = (known / "data.csv").read_text()
     (tmp_path / "data.csv").write_text(text.replace("\n", "\n", 1) + "\n")  # the same rows in other bytes

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import certify.analysis.stages.candidate
-from certify.analysis.candidates.trials import Trial, trial
+import certify.lyapunov.corners
+from certify.analysis.candidates.trials import Trial, corrected, trial
 from certify.analysis.options import RoaOptions
 from certify.analysis.run import certify_roa
 from certify.analysis.selection import Race
@@ -21,6 +23,7 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System
 from certify.loop.policies import load_policy
 from certify.lyapunov import solve_lyapunov
+from certify.lyapunov.corners import Corners
 from certify.provers.base import Budget, Proof, Report
 from tests.support.loops import chain, scalar_tanh
 
@@ -137,3 +140,13 @@ def test_a_candidate_that_could_win_is_made(tmp_path: Path, monkeypatch: pytest.
     system, network = scalar_tanh()
     found = certify_roa(replace(system), network, tmp_path)
     assert found.verdict.value == "PROVED" and made == ["scalar"]
+
+
+def test_a_start_that_the_solver_only_nearly_mends_is_no_candidate(monkeypatch: pytest.MonkeyPatch) -> None:
+    system, network = chain(2, [-1, -2])
+    loop = ClosedLoop(system.with_sample((Fraction(1, 2), Fraction(1, 2))), network)
+    V = solve_lyapunov(ClosedLoop(system, network).linearise()[0], np.diag([1.0, 1e-4]))
+    assert not Corners(loop).decrease(V) and not Corners(loop).decrease(np.eye(2))
+    monkeypatch.setattr(certify.lyapunov.corners, "smallest_trace", lambda *_: np.eye(2))
+    last = trial(loop, V, "optimised", RoaOptions())
+    assert corrected(loop, last, [], RoaOptions(), Effort(0.1 * UNIT)) is None

@@ -45,7 +45,7 @@ SHIPPED = Path(__file__).parent.parent.parent / "examples" / "policies" / "pendu
 @pytest.mark.parametrize("n", slow_after(1, [3, 2, 4, 5, 6]))
 def test_linear_plants_reach_their_domain(tmp_path: Path, n: int) -> None:
     system, network = chain(n, [-1.0 - k for k in range(n)])
-    result = certify_roa(system, network, tmp_path)
+    result = certify_roa(system, network, tmp_path, RoaOptions(candidate="ellipsoid"))
     assert result.verdict is Verdict.PROVED and result.reason == "domain"
     # The limit in exact rationals, from the binary64 P that was proved.
     assert result.P is not None

@@ -25,6 +25,7 @@ from flint import arb, ctx, fmpq, fmpq_mat
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from certify.certificates import checking
 from certify.checker import tube, words
 from certify.checker.ball import Ball
 from certify.checker.case import Case
@@ -66,13 +67,10 @@ def verdicts(data: Document | bytes) -> set[str]:
 
 def verdict_of(raw: bytes) -> str:
     """The checker's word as a child process."""
-    command = [sys.executable, "-I", "-c", "import sys; sys.path.insert(0, sys.argv.pop(1)); "]
-    command[-1] += "from certify.checker.__main__ import main; sys.exit(main(sys.argv[1:]))"
     with NamedTemporaryFile(suffix=".json") as file:
         file.write(raw)
         file.flush()
-        done = subprocess.run([*command, str(ROOT), file.name, "--json"], capture_output=True, check=False)
-    answer = json.loads(done.stdout)
+        _, answer = checking.ask(Path(file.name))
     return str(answer.get("rule") or answer["result"])
 
 

@@ -165,7 +165,7 @@ u = [-3, 3]
         W, V = np.array([[0.5, 0.0], [0.0, 0.4]]), sign * np.array([[20.0, -25.0]])
         net = PolicyNetwork.of_layers((W, V), (np.array([0.1, 0.0]), np.zeros(1)), [1.0], [0.0], "identity", "none")
         save_policy(tmp_path / "filter.pt", Policy(net, "none"))
-        result = certify_roa(tmp_path / "plant.toml", gain, tmp_path / "out")
+        result = certify_roa(tmp_path / "plant.toml", gain, tmp_path / "out", candidate="ellipsoid")
         assert (result.verdict is Verdict.PROVED) == (wanted is Verdict.PROVED)
         if wanted is Verdict.PROVED:
             assert result.claim == "asymptotic" and [s.name for s in result.system.inputs] == ["u", "filter_0"]

@@ -123,7 +123,7 @@ def test_the_certificate_is_that_of_the_plant_that_was_shifted_by_hand(tmp_path:
     network = gain(system, (-1.0, -1.0))
     lines = []
     for k, plant in enumerate((system, shifted)):
-        result = certify_roa(plant, network, tmp_path / str(k), RoaOptions(effort=0.4))
+        result = certify_roa(plant, network, tmp_path / str(k), RoaOptions(effort=0.4, candidate="ellipsoid"))
         assert result.verdict is Verdict.PROVED and result.raw is not None
         lines.append(json.loads(result.raw))
     mine, theirs = (dict(d, provenance=None, plant=dict(d["plant"], dynamics=None)) for d in lines)
@@ -193,7 +193,9 @@ def test_a_result_without_an_operating_point_needs_none() -> None:
 )
 def test_an_odd_operating_point_in_a_certificate_is_passed_over(tmp_path: Path, x_eq: object) -> None:
     system = load_system(write(tmp_path))
-    result = certify_roa(system, gain(system, (-1.0, -1.0)), tmp_path / "o", RoaOptions(effort=0.4))
+    result = certify_roa(
+        system, gain(system, (-1.0, -1.0)), tmp_path / "o", RoaOptions(effort=0.4, candidate="ellipsoid")
+    )
     assert result.raw is not None
     assert parse_certificate(result.raw, "c").system.exact_x_eq() == system.exact_x_eq()
     data = json.loads(result.raw)
@@ -495,7 +497,7 @@ def test_the_code_of_a_plant_is_run_only_if_a_person_names_it(
         get_system(f"{path}:plant")
     assert not ran.exists()
     arguments = ["roa", "--policy", str(tmp_path / "p.pt"), "--system", f"{path}:plant", "--out", str(tmp_path / "o")]
-    assert _run(arguments, False) == 0 and ran.exists()
+    assert _run([*arguments, "--candidate", "ellipsoid"], False) == 0 and ran.exists()
     assert "was trained for" in capsys.readouterr().err
     ran.unlink()
     certificate = str(tmp_path / "o" / "certificate.json")
@@ -509,7 +511,7 @@ def test_a_policy_of_an_own_plant_asks_for_its_file(tmp_path: Path, capsys: pyte
     arguments = ["roa", "--policy", str(tmp_path / "p.pt"), "--out", str(tmp_path / "o")]
     assert _run(arguments, False) == 2
     assert "unknown system 'tank'" in (said := capsys.readouterr().err) and "--system tank.toml" in said
-    assert _run([*arguments, "--system", str(tmp_path / "tank.toml")], False) == 0
+    assert _run([*arguments, "--system", str(tmp_path / "tank.toml"), "--candidate", "ellipsoid"], False) == 0
     assert "the policy was trained with tau = 3; --system says otherwise, and counts" in capsys.readouterr().err
 
 

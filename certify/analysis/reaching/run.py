@@ -111,7 +111,7 @@ def certify_reach(
         if not result.reason:
             result = _proved(result, loop, target, effort, tools, out / "certificate.json", provenance or {})
     seconds = {"load": load_seconds, **tools.seconds, "total": load_seconds + time.perf_counter() - start}
-    return replace(result, seconds=seconds, notice="; ".join(tools.remarks) or None)
+    return replace(result, seconds=seconds, notice=tools.notice(system))
 
 
 def _require_inside(system: System, options: ReachOptions) -> None:

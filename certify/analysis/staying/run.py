@@ -90,7 +90,7 @@ def certify_invariant(
         result = InvariantResult(Verdict.UNKNOWN, "", system, network, options)
         result = _proved(result, loop, effort, tools, out / "certificate.json", provenance or {})
     seconds = {"load": load_seconds, **tools.seconds, "total": load_seconds + time.perf_counter() - start}
-    return replace(result, seconds=seconds, notice="; ".join(tools.remarks) or None)
+    return replace(result, seconds=seconds, notice=tools.notice(system))
 
 
 def _proved(
