@@ -141,9 +141,9 @@ class Function(ABC):
         """`last` of an expansion: sup |phi^(4)|/6, four times that of `fourth`, unless a row says otherwise."""
         return e.fourth * 4
 
-    @abstractmethod
     def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
-        """The first `count` coefficients of phi(v_0 + v_1 t + ...)."""
+        """The first `count` coefficients of phi(v_0 + v_1 t + ...), of a function that equations may have."""
+        raise Undecided(f"equations have no {self.name}")
 
     def expansion(self, v0: Near, radius: Above) -> Expansion:
         return Expansion(self, v0, radius)
@@ -228,9 +228,6 @@ class _Sigmoid(Function):
     def _of_tanh(self, e: Expansion) -> Expansion:
         return Expansion(FUNCTIONS["tanh"], e.v0 * 0.5, e.radius * 0.5)
 
-    def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
-        raise Undecided("equations have no sigmoid")
-
 
 class _Tabulated(Function):
     """A smooth function from Arb's formula of it, by polynomials. Each is 0 at 0, or has no rational value there."""
@@ -262,9 +259,6 @@ class _Tabulated(Function):
 
     def fourth(self, e: Expansion) -> Above:
         return self._around(e, 4)
-
-    def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
-        raise Undecided(f"equations have no {self.name}")
 
     def _at(self, y: Array, j: int) -> Near:
         return self.polynomials.at(y, j)
@@ -499,7 +493,8 @@ class _Sign(Function):
         return f[2]
 
     def slopes(self, v0: Near) -> FourBounds:
-        return _no_more(v0), _no_more(v0), _no_more(v0), _no_more(v0)
+        none = _no_more(v0)
+        return none, none, none, none
 
     def third(self, e: Expansion) -> Above:
         return _no_more(e.v)
@@ -547,7 +542,8 @@ class _Kink(_Bent):
         return f[2]
 
     def slopes(self, v0: Near) -> FourBounds:
-        return _UNIT, _no_more(v0), _no_more(v0), _no_more(v0)
+        none = _no_more(v0)
+        return _UNIT, none, none, none
 
     def third(self, e: Expansion) -> Above:
         return ZERO
@@ -609,9 +605,6 @@ class _Elu(_Bent):
     def lines(self, centre: Array, radius: Above) -> Lines:
         return _lines_by_parts(lambda y: self.at(Near(y))[:2], Above(0.5), centre, radius)
 
-    def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
-        raise Undecided("equations have no elu")
-
 
 class _Softsign(_Bent):
     """v / (1 + |v|), with the derivatives 1, -2 sign(v), 6, -24 sign(v), by (1 + |v|)^2, ^3, ^4, ^5."""
@@ -643,9 +636,6 @@ class _Softsign(_Bent):
 
     def lines(self, centre: Array, radius: Above) -> Lines:
         return _lines_by_parts(lambda y: self.at(Near(y))[:2], _UNIT, centre, radius)
-
-    def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
-        raise Undecided("equations have no softsign")
 
     def _inverse(self, c: Near) -> Near:
         return inverse(Near(np.abs(c.value), c.error) + _ONE)
