@@ -14,7 +14,7 @@ from operator import add
 
 from .case import Case, Failures
 from .expression import Tape, evaluate
-from .networks import Affine, Clip, Observe, OnNumbers, Product
+from .networks import Affine, Clip, Observe, OnNumbers
 
 MOST_TURNS = 2**32  # so that no product of many integers takes hours
 
@@ -74,9 +74,6 @@ class Windings(OnNumbers):
 
     def clip(self, step: Clip, v: list[Winding]) -> list[Winding]:
         return [x.still() for x in v]
-
-    def product(self, step: Product, v: list[Winding], w: list[Winding]) -> list[Winding]:
-        return [v[i % len(v)].still() + w[i % len(w)].still() for i in range(step.size)]
 
     def observe(self, step: Observe, v: list[Winding]) -> list[Winding]:
         return windings(step.tape, v)
