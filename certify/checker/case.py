@@ -31,7 +31,9 @@ class Case:
     @property
     def partition(self) -> Partition:
         """The evidence, of a certificate that has a tree."""
-        return _given(self.c.evidence if isinstance(self.c.evidence, Partition) else None, "a partition tree")
+        if not isinstance(self.c.evidence, Partition):
+            raise TypeError("this rule is about a partition tree")
+        return self.c.evidence
 
     @property
     def order(self) -> int:

@@ -25,6 +25,7 @@ from .near import (
     Polynomials,
     atan,
     exp,
+    halfway,
     inverse,
     lines_around_tanh,
     lower,
@@ -572,7 +573,7 @@ class _Kink(_Bent):
         s = np.where(lo >= 0, self.right, np.where(hi <= 0, self.left, s))
         at = np.array([lo, hi, np.clip(0.0, lo, hi)])
         lows, highs = (Near(self.value(at)) - Near(at) * Near(s)).ends
-        return _between(np.min(lows, axis=0), np.max(highs, axis=0), s)
+        return s, *halfway(np.min(lows, axis=0), np.max(highs, axis=0))
 
 
 class _Elu(_Bent):
@@ -720,13 +721,7 @@ def _lines_by_parts(at: Callable[[Array], tuple[Near, Near]], bend: Above, centr
     s = np.where(np.isnan(s), slopes.value[0], s)
     away = (f - Near(p) * Near(s)).wider(((slopes - Near(s)).size + bend * half) * half)
     lows, highs = away.ends
-    return _between(np.min(lows, axis=0), np.max(highs, axis=0), s)
-
-
-def _between(lower: Array, upper: Array, s: Array) -> Lines:
-    """Lines of the slopes s, from the ends of phi(v) - s v."""
-    m = 0.5 * (upper + lower)
-    return s, m, (Near(upper) - Near(m)).size.most((Near(lower) - Near(m)).size)
+    return s, *halfway(np.min(lows, axis=0), np.max(highs, axis=0))
 
 
 def _no_more(x: Near) -> Above:

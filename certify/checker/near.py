@@ -124,9 +124,12 @@ class Above:
         return Above(np.maximum(self.top - x, 0.0), 1)
 
     def sum(self, axis: int | tuple[int, ...] = 0) -> Above:
-        """Sums along axes, in any order: of n numbers they lose a factor 1 - n u, and 4 n u makes up for it."""
+        """Sums along axes, in any order: of n numbers they lose a factor 1 - n u, and 4 n u makes up for it. A single
+        bound of all numbers does not know how many there are."""
         if self is ZERO:
             return self
+        if np.ndim(self.v) == 0:
+            raise TypeError("a bound of each number is no bound of their sum")
         added = np.sum(self.v, axis=axis)
         n = np.size(self.v) // max(np.size(added), 1)
         return Above(added * (1 + 4 * n * U), self.k + 2)
@@ -205,7 +208,11 @@ class Near:
 
     @property
     def roughly(self) -> Above:
-        """Upper bound of the norm of what is stored: of sums and products by those of their parts."""
+        """Upper bound of the norm of what is stored: of sums and products by those of their parts.
+
+        It may be short by the roundings that made what is stored, which `error` has, twice. So it stands beside
+        `error`, or in `ulps`, which has a factor 2 to spare.
+        """
         return self.rough or self.size
 
     @property
@@ -782,6 +789,12 @@ def lines_around_tanh(centre: Array, radius: Above) -> tuple[Array, Array, Above
     return slope, shift, gap
 
 
+def halfway(lower: Array, upper: Array) -> tuple[Array, Above]:
+    """(m, gap) with |y - m| <= gap for lower <= y <= upper."""
+    m = 0.5 * (upper + lower)
+    return m, (Near(upper) - Near(m)).size.most((Near(lower) - Near(m)).size)
+
+
 def clip_of(v: Near, least: Array, most: Array) -> tuple[Array, Array, Above]:
     """(s, m, gap) with |min(max(v, least), most) - s v - m| <= gap for all numbers v between the ends of these.
 
@@ -794,9 +807,7 @@ def clip_of(v: Near, least: Array, most: Array) -> tuple[Array, Array, Above]:
     at = np.array([lo, hi, np.clip(least, lo, hi), np.clip(most, lo, hi)])
     away = Near(np.clip(at, least, most)) - Near(at) * Near(s)
     lows, highs = away.ends
-    upper, lower = np.max(highs, axis=0), np.min(lows, axis=0)
-    m = 0.5 * (upper + lower)
-    return s, m, (Near(upper) - Near(m)).size.most((Near(lower) - Near(m)).size)
+    return s, *halfway(np.min(lows, axis=0), np.max(highs, axis=0))
 
 
 def lines_around_product(V: Form, of_V: Above, W: Form, of_W: Above, same: bool) -> tuple[Array, Above]:
@@ -820,9 +831,7 @@ def lines_around_product(V: Form, of_V: Above, W: Form, of_W: Above, same: bool)
         least, top = (((V + part).size + errors) for part in (-scaled, scaled))
         least, top = ((s * s * (p * 0.25)).least(most) for s in (least, top))
         most = top
-    upper, lower = most.top, -least.top
-    m = 0.5 * (upper + lower)
-    return m, (Near(upper) - Near(m)).size.most((Near(lower) - Near(m)).size)
+    return halfway(-least.top, most.top)
 
 
 def spectral_norm(W: Array) -> Above:
