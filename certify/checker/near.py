@@ -533,11 +533,16 @@ def lower(x: Near) -> Any:
 
 def _table(values: Iterable[arb]) -> Array:
     """The binary64 numbers nearest to these values."""
-    pairs = [near_ball(x) for x in values]
-    # At 128 bits the midpoint rounds to within u |value| (1 + 2^-50) of the ball.
-    if not all(x.error.top <= U * abs(x.value) * (1 + 2.0**-20) + 4 * LEAST for x in pairs):
-        raise ArithmeticError("a table entry is not accurate to one rounding")
-    return np.array([x.value for x in pairs])
+    return np.array([_entry(x, 4 * LEAST) for x in values])
+
+
+def _entry(x: arb, slack: float) -> float:
+    """The binary64 number nearest to a value, within u of it and a slack. At 128 bits the midpoint rounds to within
+    u |value| (1 + 2^-50) of the ball."""
+    found = near_ball(x)
+    if not found.error.top <= U * abs(found.value) * (1 + 2.0**-20) + slack:
+        raise ArithmeticError("a table entry is not accurate enough")
+    return float(found.value)
 
 
 ctx.prec = 128
@@ -675,7 +680,8 @@ class Polynomials:
         self.sup = [Above(v) for v in largest]
         entries = [_coefficients(formula, g)[:_DEGREE] for g in points]
         self.tables = [
-            np.array([[_entry(comb(i, j) * at[i]) for at in entries] for i in range(j, _DEGREE)]) for j in range(5)
+            np.array([[_entry(comb(i, j) * at[i], 2.0**-90) for at in entries] for i in range(j, _DEGREE)])
+            for j in range(5)
         ]
         powers = 2.0 ** (-6 * np.arange(_DEGREE))
         self.sizes = [(size(t[1:]) * powers[: len(t) - 1, None]).sum().top for t in self.tables]
@@ -701,14 +707,6 @@ class Polynomials:
         error = (size(start) + size(d) * self.sizes[j][at]).ulps(2 * _DEGREE) + self.rests[j]
         far = np.where(np.isfinite(y), np.where(y > 0, (y, 1.0)[j] if j < 2 else 0.0, 0.0), np.nan)
         return Near(np.where(close, v, far), Above(np.where(close, error.top, _FAR_ERROR + 0 * far)))
-
-
-def _entry(x: arb) -> float:
-    """The binary64 number nearest to a value, within u of it and 2^-90."""
-    found = near_ball(x)
-    if not found.error.top <= U * abs(found.value) * (1 + 2.0**-20) + 2.0**-90:
-        raise ArithmeticError("a table entry is not accurate enough")
-    return float(found.value)
 
 
 def _coefficients(formula: Callable[[arb_series], arb_series], at: arb) -> list[arb]:
