@@ -134,7 +134,7 @@ class Case:
 
 
 def _given(value: T | None, what: str) -> T:
-    """What a rule is about, of a certificate that has it."""
+    """The part that a rule is about, of a certificate that has it."""
     if value is None:
         raise TypeError(f"this rule is about {what}")
     return value
