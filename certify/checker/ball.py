@@ -89,7 +89,11 @@ class Ball:
 
     @cached_property
     def inputs(self) -> list[Jet]:
-        """pi(x) on the ball before the clip, each input with its own error."""
+        """pi(x) on the ball before the clip, each input with its own error.
+
+        The remainder of `outputs` is a unit of each input's error (`reached`). Left for E are the roundings of the
+        product with the scale: those of Q and K are errors of these, and those of `reach` count times the units.
+        """
         h, scale = self.outputs, Near(self.case.net.scale)
         at_0 = all_near(self.case.c.u_eq) if self.starts_at_u_eq else h.c * scale + self.case.net.offset
         u = replace(h, c=at_0, a=h.a * scale, Q=Square(h.Q.value) * scale, K=Cubic(h.K.value) * scale)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from itertools import product
+from typing import TypeVar
 
 from flint import fmpq_mat
 
@@ -15,6 +16,7 @@ from .exact import exactly, gershgorin_lower, inverse_diagonal
 from .near import near
 from .network import Folded, fold
 
+T = TypeVar("T")
 Failures = Generator[tuple[str, str], None, int]  # a rule: each failure's (place, detail); the rule's count
 
 
@@ -43,30 +45,24 @@ class Case:
     @property
     def order(self) -> int:
         """The order of the series in time on leaves."""
-        if isinstance(self.c.evidence, Trusted | OuterTree):
-            raise TypeError("this rule is about leaves with a series in time")
-        return self.c.evidence.order
+        evidence = self.c.evidence
+        order = None if isinstance(evidence, Trusted | OuterTree) else evidence.order
+        return _given(order, "leaves with a series in time")
 
     @property
     def ranks(self) -> Ranks:
         """The ranks, of a certificate that has them."""
-        if self.c.ranks is None:
-            raise TypeError("this rule is about ranks")
-        return self.c.ranks
+        return _given(self.c.ranks, "ranks")
 
     @property
     def data(self) -> Data:
         """The measurements, of a certificate that has them."""
-        if self.c.data is None:
-            raise TypeError("this rule is about data")
-        return self.c.data
+        return _given(self.c.data, "data")
 
     @property
     def local(self) -> LocalBall:
         """The evidence of rule `local`, of a certificate that has it."""
-        if self.partition.local is None:
-            raise TypeError("this rule is about a local ball")
-        return self.partition.local
+        return _given(self.partition.local, "a local ball")
 
     @property
     def cells(self) -> Iterator[Intervals]:
@@ -96,9 +92,7 @@ class Case:
     def outer(self) -> tuple[Outer, OuterTree]:
         """The second function N and its evidence, of a claim with an outer set."""
         tree = self.c.evidence if isinstance(self.c.evidence, OuterTree) else self.partition.outer
-        if self.c.outer is None or tree is None:
-            raise TypeError("this rule is about an outer set")
-        return self.c.outer, tree
+        return _given(self.c.outer, "an outer set"), _given(tree, "an outer set")
 
     @cached_property
     def P_inverse(self) -> list[Fraction]:
@@ -144,3 +138,10 @@ class Case:
         elif not known:
             return False
         return all(lo <= a and b <= hi for (a, b), (lo, hi) in zip(ranges, bounds, strict=True))
+
+
+def _given(value: T | None, what: str) -> T:
+    """The part that a rule is about, of a certificate that has it."""
+    if value is None:
+        raise TypeError(f"this rule is about {what}")
+    return value

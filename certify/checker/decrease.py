@@ -3,8 +3,8 @@ rest, that this and k (V - c0) is negative around a level c0, or, along a path, 
 z'J'PJ z = 1.
 
 The models of G come with their rounding errors bounded (ball.py). From there on everything is in rationals, without
-rounding, except for the sums of many terms (pairs.py, `beyond`). FORMAT.md has the inequality, its six sums, and the
-proof that each is a bound.
+rounding, except for the sums of many terms (pairs.py, `beyond`). FORMAT.md has the inequality and its six sums,
+docs/mathematics/local.md the proof that each is a bound.
 """
 
 from __future__ import annotations
@@ -107,8 +107,12 @@ def sides(
     beyond: fmpq = _NOTHING,
     level: Level | None = None,
 ) -> tuple[fmpq_mat, fmpq_mat]:
-    """The negated leading form, and the sum of all bounds of the rest, both symmetric: over d at rest, (n, n), else
+    """The negated leading form, and the sum S of all bounds of the rest, both symmetric: over d at rest, (n, n), else
     over y = (1, d). `beyond` is Gamma, used where h > 0.
+
+    In `rest` come one after the other S_rest and S_apart (in the loop, which gathers the C_j of `joint`), S_cubic and
+    S_units, S_joint, the errors of f and a, S_step, as FORMAT.md has them; b_i is taken without its first entry, which
+    meets f alone.
     """
     k, first = models.A.ncols(), int(bool(models.f))
     U = padded(models.J, 0, k - models.J.ncols())  # x as a function of y, or d

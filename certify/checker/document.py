@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
 
@@ -215,8 +215,6 @@ class Certificate:
     """
 
     claim: str
-    rate: float
-    sample: tuple[Fraction, Fraction] | None  # the least and the largest period over which the input is held
     name: str
     discrete: bool
     states: tuple[str, ...]
@@ -229,10 +227,12 @@ class Certificate:
     input_bounds: Intervals
     networks: tuple[Network, ...]
     policy: Policy
-    P: Array
-    levels: dict[str, float]
     evidence: Partition | Trusted | Ranked | OuterTree
     sha256: str
+    P: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    levels: Mapping[str, float] = field(default_factory=dict)
+    rate: float = 0.0
+    sample: tuple[Fraction, Fraction] | None = None  # the least and the largest period over which the input is held
     start: Array | None = None  # P_0 of a claim with a tube
     centre: Array | None = None  # c_0 of a claim whose tube follows a path
     outer: Outer | None = None  # whose set trajectories leave into {V <= c2} only; never, if there is no V
@@ -315,17 +315,8 @@ def _staying(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: Valu
     levels.keys("")
     kind, tree = evidence.keys("kind outer")
     kind.choice("outer")
-    return Certificate(
-        "invariant",
-        0.0,
-        None,
-        **stated,
-        P=np.zeros((0, 0)),
-        levels={},
-        evidence=_outer_tree(tree, n),
-        outer=_outer(beyond, stated["states"], networks),
-        keep=_constraints(others[0], _names(stated)) if others else None,
-    )
+    outer, keep = _outer(beyond, stated["states"], networks), _kept(others, stated)
+    return Certificate("invariant", **stated, evidence=_outer_tree(tree, n), outer=outer, keep=keep)
 
 
 def _reaching(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: Value, evidence: Value) -> Certificate:
@@ -340,15 +331,12 @@ def _reaching(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: Val
     kind.choice("ranks")
     return Certificate(
         "reaches",
-        0.0,
-        periods,
         **stated,
-        P=np.zeros((0, 0)),
-        levels={},
         evidence=Ranked(order.integer(1, _most_order(stated, periods))),
+        sample=periods,
         ranks=_ranks(ranks, found, n, stated, periods),
         target=_constraints(target, names),
-        keep=_constraints(others[0], _names(stated)) if others else None,
+        keep=_kept(others, stated),
     )
 
 
@@ -386,17 +374,17 @@ def _attracting(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: V
     )
     return Certificate(
         kind,
-        fall,
-        periods,
         **stated,
+        evidence=by_tree,
         P=P.array(n, n),
         levels=numbers,
-        evidence=by_tree,
+        rate=fall,
+        sample=periods,
         start=of_tube[0].array(n, n) if of_tube else None,
         centre=of_tube[1].array(n) if kind == "reached" else None,
         outer=outer,
         ranks=_ranks(ranks, evidence.entry("ranks"), n, stated, periods) if ranks else None,
-        keep=None if keep is None else _constraints(keep, _names(stated)),
+        keep=_kept([] if keep is None else [keep], stated),
         data=_data(optional["data"], evidence.entry("data"), stated) if "data" in optional else None,
     )
 
@@ -452,8 +440,10 @@ def _most_order(stated: Mapping[str, Any], periods: tuple[Fraction, Fraction] | 
     return MAX_ORDER if periods is not None and not stated["dynamics"].calls else 1
 
 
-def _names(stated: Mapping[str, Any]) -> tuple[str, ...]:
-    return (*stated["states"], *stated["inputs"], *stated["uncertain"])
+def _kept(values: Sequence[Value], stated: Mapping[str, Any]) -> Tape | None:
+    """The constraints, if the claim has any."""
+    names = (*stated["states"], *stated["inputs"], *stated["uncertain"])
+    return _constraints(values[0], names) if values else None
 
 
 def _constraints(value: Value, names: tuple[str, ...]) -> Tape:

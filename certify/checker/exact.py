@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import reduce
@@ -14,9 +13,9 @@ from flint import fmpq, fmpq_mat, fmpz
 from numpy.typing import NDArray
 
 from .document import Policy
-from .expression import MAX_BITS, Call, evaluate
+from .expression import MAX_BITS, evaluate
 from .functions import FUNCTIONS, Undecided
-from .networks import Affine, Algebra, Clip, Concat, Map, Observe, Product, Sum
+from .networks import Affine, Clip, Observe, OnNumbers
 
 MAX_INVERSE_BITS = 2**14  # of a number in a matrix all of whose inverse is wanted, times the matrix's size
 MAX_MATRIX_BITS = 2**16  # of a number in a matrix, times the matrix's size: beyond, a decision takes minutes
@@ -119,34 +118,17 @@ class Exact:
         return self if self.value is None else Exact(FUNCTIONS[name].exact(self.value))
 
 
-class Exactly(Algebra[list[Exact]]):
+class Exactly(OnNumbers):
     """Networks of such numbers."""
 
     def affine(self, step: Affine, v: list[Exact]) -> list[Exact]:
         return [_row(row, bias, v) for row, bias in zip(step.weight.tolist(), step.bias.tolist(), strict=True)]
 
-    def map(self, step: Map, v: list[Exact]) -> list[Exact]:
-        return [x.function(step.function) for x in v]
-
     def clip(self, step: Clip, v: list[Exact]) -> list[Exact]:
         return [_clipped(x, *ends) for x, *ends in zip(v, step.lo.tolist(), step.hi.tolist(), strict=True)]
 
-    def sum(self, step: Sum, vectors: Sequence[list[Exact]]) -> list[Exact]:
-        return [reduce(add, entries) for entries in zip(*vectors, strict=True)]
-
-    def concat(self, step: Concat, vectors: Sequence[list[Exact]]) -> list[Exact]:
-        return [x for v in vectors for x in v]
-
-    def product(self, step: Product, v: list[Exact], w: list[Exact]) -> list[Exact]:
-        return [v[i % len(v)] * w[i % len(w)] for i in range(step.size)]
-
     def observe(self, step: Observe, v: list[Exact]) -> list[Exact]:
         return evaluate(step.tape, Exact, v)
-
-    def entries(self, call: Call, arguments: list[Exact]) -> list[Exact]:
-        """A call in equations."""
-        value = self.run(call.network, arguments)
-        return [value[i] for i in call.entries]
 
 
 def policy_at_origin(policy: Policy) -> list[Fraction | None]:

@@ -25,6 +25,7 @@ from .near import (
     Polynomials,
     atan,
     exp,
+    halfway,
     inverse,
     lines_around_tanh,
     lower,
@@ -112,10 +113,11 @@ class Function(ABC):
 
     name: str
     partial = False  # true if phi is not defined for all numbers
+    at_0: Fraction | None = Fraction(0)  # phi(0), None if rationals do not know it
 
     def exact(self, q: Fraction) -> Fraction | None:
         """phi(q), None where rationals do not know it: they know it at 0. Raises `Undecided` where there is none."""
-        return Fraction(0) if q == 0 else None
+        return self.at_0 if q == 0 else None
 
     @abstractmethod
     def at(self, c: Near) -> Three:
@@ -141,9 +143,9 @@ class Function(ABC):
         """`last` of an expansion: sup |phi^(4)|/6, four times that of `fourth`, unless a row says otherwise."""
         return e.fourth * 4
 
-    @abstractmethod
     def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
-        """The first `count` coefficients of phi(v_0 + v_1 t + ...)."""
+        """The first `count` coefficients of phi(v_0 + v_1 t + ...), of a function that equations may have."""
+        raise Undecided(f"equations have no {self.name}")
 
     def expansion(self, v0: Near, radius: Above) -> Expansion:
         return Expansion(self, v0, radius)
@@ -197,10 +199,7 @@ class _Tanh(Function):
 class _Sigmoid(Function):
     """1/(1 + exp(-v)), which is (1 + tanh(v/2))/2: all is known of tanh."""
 
-    name = "sigmoid"
-
-    def exact(self, q: Fraction) -> Fraction | None:
-        return Fraction(1, 2) if q == 0 else None
+    name, at_0 = "sigmoid", Fraction(1, 2)
 
     def lines(self, centre: Array, radius: Above) -> Lines:
         s, m, gap = lines_around_tanh(0.5 * centre, radius * 0.5)
@@ -228,9 +227,6 @@ class _Sigmoid(Function):
     def _of_tanh(self, e: Expansion) -> Expansion:
         return Expansion(FUNCTIONS["tanh"], e.v0 * 0.5, e.radius * 0.5)
 
-    def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
-        raise Undecided("equations have no sigmoid")
-
 
 class _Tabulated(Function):
     """A smooth function from Arb's formula of it, by polynomials. Each is 0 at 0, or has no rational value there."""
@@ -241,9 +237,6 @@ class _Tabulated(Function):
     @cached_property
     def polynomials(self) -> Polynomials:
         return Polynomials(self.formula)
-
-    def exact(self, q: Fraction) -> Fraction | None:
-        return self.at_0 if q == 0 else None
 
     def lines(self, centre: Array, radius: Above) -> Lines:
         return _lines_by_parts(lambda y: (self._at(y, 0), self._at(y, 1)), self._sup(2), centre, radius)
@@ -262,9 +255,6 @@ class _Tabulated(Function):
 
     def fourth(self, e: Expansion) -> Above:
         return self._around(e, 4)
-
-    def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
-        raise Undecided(f"equations have no {self.name}")
 
     def _at(self, y: Array, j: int) -> Near:
         return self.polynomials.at(y, j)
@@ -323,10 +313,7 @@ class _Inverse(Function):
 
 
 class _Exp(Function):
-    name = "exp"
-
-    def exact(self, q: Fraction) -> Fraction | None:
-        return Fraction(1) if q == 0 else None
+    name, at_0 = "exp", Fraction(1)
 
     def at(self, c: Near) -> Three:
         f0 = exp(c)
@@ -454,10 +441,7 @@ class _Sine(Function):
     """sin, and cos, which is the sine of v + pi/2."""
 
     def __init__(self, name: str, other: str) -> None:
-        self.name, self.other = name, other
-
-    def exact(self, q: Fraction) -> Fraction | None:
-        return Fraction(int(self.name == "cos")) if q == 0 else None
+        self.name, self.other, self.at_0 = name, other, Fraction(int(name == "cos"))
 
     def at(self, c: Near) -> Three:
         s, c = sin_cos(c)
@@ -499,7 +483,8 @@ class _Sign(Function):
         return f[2]
 
     def slopes(self, v0: Near) -> FourBounds:
-        return _no_more(v0), _no_more(v0), _no_more(v0), _no_more(v0)
+        none = _no_more(v0)
+        return none, none, none, none
 
     def third(self, e: Expansion) -> Above:
         return _no_more(e.v)
@@ -514,9 +499,11 @@ class _Sign(Function):
 class _Bent(Function):
     """A function that is smooth but at 0: it has derivatives where the sign of v is certain."""
 
-    @abstractmethod
+    half: Above  # bounds |phi''|/2, and |phi'(v) - phi'(w)| / (2 |v - w|) across 0
+
     def bend(self, v0: Near) -> Above:
         """phi(v) is within this times (v - v0)^2 of the tangent at v0, for all v; NaN where v0 may be 0."""
+        return self.half + _no_more(v0)
 
     def leap(self, v0: Near) -> Above:
         """phi'(v) is within this times |v - v0|^3 of phi'(v0), for all v."""
@@ -524,6 +511,9 @@ class _Bent(Function):
 
     def expansion(self, v0: Near, radius: Above) -> Expansion:
         return _Corner(self, v0, radius)
+
+    def lines(self, centre: Array, radius: Above) -> Lines:
+        return _lines_by_parts(lambda y: self.at(Near(y))[:2], self.half, centre, radius)
 
 
 class _Kink(_Bent):
@@ -547,7 +537,8 @@ class _Kink(_Bent):
         return f[2]
 
     def slopes(self, v0: Near) -> FourBounds:
-        return _UNIT, _no_more(v0), _no_more(v0), _no_more(v0)
+        none = _no_more(v0)
+        return _UNIT, none, none, none
 
     def third(self, e: Expansion) -> Above:
         return ZERO
@@ -576,13 +567,13 @@ class _Kink(_Bent):
         s = np.where(lo >= 0, self.right, np.where(hi <= 0, self.left, s))
         at = np.array([lo, hi, np.clip(0.0, lo, hi)])
         lows, highs = (Near(self.value(at)) - Near(at) * Near(s)).ends
-        return _between(np.min(lows, axis=0), np.max(highs, axis=0), s)
+        return s, *halfway(np.min(lows, axis=0), np.max(highs, axis=0))
 
 
 class _Elu(_Bent):
     """v, and exp(v) - 1 for v < 0; slopes are within 1 of each other across 0 as well."""
 
-    name = "elu"
+    name, half = "elu", Above(0.5)
 
     def exact(self, q: Fraction) -> Fraction | None:
         return q if q >= 0 else None
@@ -603,20 +594,11 @@ class _Elu(_Bent):
     def fourth(self, e: Expansion) -> Above:
         return self.third(e).over(4.0) + _no_more(e.v)
 
-    def bend(self, v0: Near) -> Above:
-        return Above(0.5) + _no_more(v0)
-
-    def lines(self, centre: Array, radius: Above) -> Lines:
-        return _lines_by_parts(lambda y: self.at(Near(y))[:2], Above(0.5), centre, radius)
-
-    def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
-        raise Undecided("equations have no elu")
-
 
 class _Softsign(_Bent):
     """v / (1 + |v|), with the derivatives 1, -2 sign(v), 6, -24 sign(v), by (1 + |v|)^2, ^3, ^4, ^5."""
 
-    name = "softsign"
+    name, half = "softsign", _UNIT
 
     def exact(self, q: Fraction) -> Fraction | None:
         return q / (1 + abs(q))
@@ -637,15 +619,6 @@ class _Softsign(_Bent):
 
     def fourth(self, e: Expansion) -> Above:
         return self.third(e) * self._inverse(Near(lower(e.v))).size
-
-    def bend(self, v0: Near) -> Above:
-        return _UNIT + _no_more(v0)
-
-    def lines(self, centre: Array, radius: Above) -> Lines:
-        return _lines_by_parts(lambda y: self.at(Near(y))[:2], _UNIT, centre, radius)
-
-    def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
-        raise Undecided("equations have no softsign")
 
     def _inverse(self, c: Near) -> Near:
         return inverse(Near(np.abs(c.value), c.error) + _ONE)
@@ -730,13 +703,7 @@ def _lines_by_parts(at: Callable[[Array], tuple[Near, Near]], bend: Above, centr
     s = np.where(np.isnan(s), slopes.value[0], s)
     away = (f - Near(p) * Near(s)).wider(((slopes - Near(s)).size + bend * half) * half)
     lows, highs = away.ends
-    return _between(np.min(lows, axis=0), np.max(highs, axis=0), s)
-
-
-def _between(lower: Array, upper: Array, s: Array) -> Lines:
-    """Lines of the slopes s, from the ends of phi(v) - s v."""
-    m = 0.5 * (upper + lower)
-    return s, m, (Near(upper) - Near(m)).size.most((Near(lower) - Near(m)).size)
+    return s, *halfway(np.min(lows, axis=0), np.max(highs, axis=0))
 
 
 def _no_more(x: Near) -> Above:

@@ -221,7 +221,9 @@ class Jet:
             c, a = c.wider(x.sway * y.sway), a.wider(x.sway * y.tilt + y.sway * x.tilt)
             a_y = a_y + _each(x.c_y, y.a) + _each(y.c_y, x.a)
         (s, t), (zx, lx, _, tx), (zy, ly, _, ty) = (x.gradient.size, y.gradient.size), x.beyond, y.beyond
-        # all products of what v and w have beyond v(0) and w(0), but those that are in Q and K
+        # All products of what v and w have beyond v(0) and w(0), but those that are in Q and K: of gradient, Q, K and
+        # the rest (`whole`), `known` has those without a rest. The others are a rest of w times anything of v, and one
+        # of v times what w has without a rest.
         known = s * y.twist + t * x.twist + (x.bend + x.twist) * (y.bend + y.twist)
         E = times(y.E, x.v0.size) + times(x.E, y.v0.size)
         E = (E + times(y.whole, x.radius) + times(x.whole, t + y.bend + y.twist)).wider(known)

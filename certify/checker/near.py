@@ -124,9 +124,12 @@ class Above:
         return Above(np.maximum(self.top - x, 0.0), 1)
 
     def sum(self, axis: int | tuple[int, ...] = 0) -> Above:
-        """Sums along axes, in any order: of n numbers they lose a factor 1 - n u, and 4 n u makes up for it."""
+        """Sums along axes, in any order: of n numbers they lose a factor 1 - n u, and 4 n u makes up for it. A single
+        bound of all numbers does not know how many there are."""
         if self is ZERO:
             return self
+        if np.ndim(self.v) == 0:
+            raise TypeError("a bound of each number is no bound of their sum")
         added = np.sum(self.v, axis=axis)
         n = np.size(self.v) // max(np.size(added), 1)
         return Above(added * (1 + 4 * n * U), self.k + 2)
@@ -205,7 +208,11 @@ class Near:
 
     @property
     def roughly(self) -> Above:
-        """Upper bound of the norm of what is stored: of sums and products by those of their parts."""
+        """Upper bound of the norm of what is stored: of sums and products by those of their parts.
+
+        It may be short by the roundings that made what is stored, which `error` has, twice. So it stands beside
+        `error`, or in `ulps`, which has a factor 2 to spare.
+        """
         return self.rough or self.size
 
     @property
@@ -528,11 +535,16 @@ def lower(x: Near) -> Any:
 def _table(function: Callable[[arb], arb], end: float) -> Array:
     """The binary64 numbers nearest to a function at 0, h, 2h, ..., end."""
     with ctx.workprec(128):
-        pairs = [near_ball(function(arb(k) * _STEP)) for k in range(int(end / _STEP) + 1)]
-    # At 128 bits the midpoint rounds to within u |value| (1 + 2^-50) of the ball.
-    if not all(x.error.top <= U * abs(x.value) * (1 + 2.0**-20) + 4 * LEAST for x in pairs):
-        raise ArithmeticError("a table entry is not accurate to one rounding")
-    return np.array([x.value for x in pairs])
+        return np.array([_entry(function(arb(k) * _STEP), 4 * LEAST) for k in range(int(end / _STEP) + 1)])
+
+
+def _entry(x: arb, slack: float) -> float:
+    """The binary64 number nearest to a value, within u of it and a slack. At 128 bits the midpoint rounds to within
+    u |value| (1 + 2^-50) of the ball."""
+    found = near_ball(x)
+    if not found.error.top <= U * abs(found.value) * (1 + 2.0**-20) + slack:
+        raise ArithmeticError("a table entry is not accurate enough")
+    return float(found.value)
 
 
 def _sech2(x: arb) -> arb:
@@ -670,7 +682,8 @@ class Polynomials:
         self.sup = [Above(v) for v in largest]
         entries = [_coefficients(formula, g)[:_DEGREE] for g in points]
         self.tables = [
-            np.array([[_entry(comb(i, j) * at[i]) for at in entries] for i in range(j, _DEGREE)]) for j in range(5)
+            np.array([[_entry(comb(i, j) * at[i], 2.0**-90) for at in entries] for i in range(j, _DEGREE)])
+            for j in range(5)
         ]
         powers = 2.0 ** (-6 * np.arange(_DEGREE))
         self.sizes = [(size(t[1:]) * powers[: len(t) - 1, None]).sum().top for t in self.tables]
@@ -696,14 +709,6 @@ class Polynomials:
         error = (size(start) + size(d) * self.sizes[j][at]).ulps(2 * _DEGREE) + self.rests[j]
         far = np.where(np.isfinite(y), np.where(y > 0, (y, 1.0)[j] if j < 2 else 0.0, 0.0), np.nan)
         return Near(np.where(close, v, far), Above(np.where(close, error.top, _FAR_ERROR + 0 * far)))
-
-
-def _entry(x: arb) -> float:
-    """The binary64 number nearest to a value, within u of it and 2^-90."""
-    found = near_ball(x)
-    if not found.error.top <= U * abs(found.value) * (1 + 2.0**-20) + 2.0**-90:
-        raise ArithmeticError("a table entry is not accurate enough")
-    return float(found.value)
 
 
 def _coefficients(formula: Callable[[arb_series], arb_series], at: arb) -> list[arb]:
@@ -784,6 +789,12 @@ def lines_around_tanh(centre: Array, radius: Above) -> tuple[Array, Array, Above
     return slope, shift, gap
 
 
+def halfway(lower: Array, upper: Array) -> tuple[Array, Above]:
+    """(m, gap) with |y - m| <= gap for lower <= y <= upper."""
+    m = 0.5 * (upper + lower)
+    return m, (Near(upper) - Near(m)).size.most((Near(lower) - Near(m)).size)
+
+
 def clip_of(v: Near, least: Array, most: Array) -> tuple[Array, Array, Above]:
     """(s, m, gap) with |min(max(v, least), most) - s v - m| <= gap for all numbers v between the ends of these.
 
@@ -796,9 +807,7 @@ def clip_of(v: Near, least: Array, most: Array) -> tuple[Array, Array, Above]:
     at = np.array([lo, hi, np.clip(least, lo, hi), np.clip(most, lo, hi)])
     away = Near(np.clip(at, least, most)) - Near(at) * Near(s)
     lows, highs = away.ends
-    upper, lower = np.max(highs, axis=0), np.min(lows, axis=0)
-    m = 0.5 * (upper + lower)
-    return s, m, (Near(upper) - Near(m)).size.most((Near(lower) - Near(m)).size)
+    return s, *halfway(np.min(lows, axis=0), np.max(highs, axis=0))
 
 
 def lines_around_product(V: Form, of_V: Above, W: Form, of_W: Above, same: bool) -> tuple[Array, Above]:
@@ -822,9 +831,7 @@ def lines_around_product(V: Form, of_V: Above, W: Form, of_W: Above, same: bool)
         least, top = (((V + part).size + errors) for part in (-scaled, scaled))
         least, top = ((s * s * (p * 0.25)).least(most) for s in (least, top))
         most = top
-    upper, lower = most.top, -least.top
-    m = 0.5 * (upper + lower)
-    return m, (Near(upper) - Near(m)).size.most((Near(lower) - Near(m)).size)
+    return halfway(-least.top, most.top)
 
 
 def spectral_norm(W: Array) -> Above:

@@ -139,10 +139,15 @@ class OnBoxes(Algebra[Enclosed]):
         return self.by_lines(v, h, slope, gap)
 
     def by_lines(self, v: Enclosed, h: Form, slope: Array, gap: Above) -> Enclosed:
-        """A function of v that lies within `gap` of lines of these slopes; h are the lines of the forms."""
+        """A function of v that lies within `gap` of lines of these slopes, at v with all of its errors; h are the lines
+        of the forms. So errors of v pass times the slopes, exactly, and `gap` and the roundings of h are new.
+
+        Where v was made by a matrix for this step alone, what that step added passes here and nowhere else: it is
+        counted as added here, times the slopes, and not once more on the way back.
+        """
         new, steep = gap + h.error, size(slope)
         if v.step and self.steps[v.step] is not None and self.is_read_once(v.step):
-            new, self.added[v.step] = new + self.added[v.step] * steep, ZERO  # one product less on the way back
+            new, self.added[v.step] = new + self.added[v.step] * steep, ZERO
             passed = v.old * steep
             ball = (v.ball * steep.max()).least(passed.norm())
         else:
@@ -152,7 +157,8 @@ class OnBoxes(Algebra[Enclosed]):
         return Enclosed(Form(h.value), new, passed, ball, len(self.steps) - 1)
 
     def is_read_once(self, k: int) -> bool:
-        """True if the errors that step k adds reach the value through the step in hand alone, and are fresh."""
+        """True if what step k adds reaches the value through the step in hand alone, and is all that is fresh there:
+        the centring and the squash come after the network's last vector, which no step reads."""
         return isinstance(self.steps[k], Affine) and len(self.network.readers.get(k, ())) <= 1
 
     def sum(self, step: Sum, vectors: Sequence[Enclosed]) -> Enclosed:

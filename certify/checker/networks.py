@@ -12,13 +12,14 @@ import struct
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import add
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .expression import Tape, parse
+from .expression import Call, Tape, parse
 from .schema import Value
 
 MAX_NETWORKS, MAX_STEPS, MAX_WIDTH, MAX_NAMES = 64, 256, 2**14, 64
@@ -335,3 +336,24 @@ class Algebra(ABC, Generic[V]):
             case Observe():
                 return self.observe(step, vectors[0])
         raise TypeError(f"no kind of step: {type(step).__name__}")
+
+
+class OnNumbers(Algebra[list[Any]]):
+    """Networks on numbers that add, multiply and know functions; a vector is a list of them."""
+
+    def map(self, step: Map, v: list[Any]) -> list[Any]:
+        return [x.function(step.function) for x in v]
+
+    def sum(self, step: Sum, vectors: Sequence[list[Any]]) -> list[Any]:
+        return [reduce(add, entries) for entries in zip(*vectors, strict=True)]
+
+    def concat(self, step: Concat, vectors: Sequence[list[Any]]) -> list[Any]:
+        return [x for v in vectors for x in v]
+
+    def product(self, step: Product, v: list[Any], w: list[Any]) -> list[Any]:
+        return [v[i % len(v)] * w[i % len(w)] for i in range(step.size)]
+
+    def entries(self, call: Call, arguments: list[Any]) -> list[Any]:
+        """A call in equations."""
+        value = self.run(call.network, arguments)
+        return [value[i] for i in call.entries]

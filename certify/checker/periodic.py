@@ -13,8 +13,8 @@ from functools import reduce
 from operator import add
 
 from .case import Case, Failures
-from .expression import Call, Tape, evaluate
-from .networks import Affine, Algebra, Clip, Concat, Map, Observe, Product, Sum
+from .expression import Tape, evaluate
+from .networks import Affine, Clip, Observe, OnNumbers
 
 MOST_TURNS = 2**32  # so that no product of many integers takes hours
 
@@ -63,7 +63,7 @@ class Winding:
         return Winding((0,) * len(self.turns)) if name in ("sin", "cos") else self.still()
 
 
-class Windings(Algebra[list[Winding]]):
+class Windings(OnNumbers):
     """Networks of such numbers."""
 
     def affine(self, step: Affine, v: list[Winding]) -> list[Winding]:
@@ -72,28 +72,11 @@ class Windings(Algebra[list[Winding]]):
         rows = step.weight.tolist()
         return [reduce(add, (x.times(Fraction(row[i])) for i, x in turning), nothing) for row in rows]
 
-    def map(self, step: Map, v: list[Winding]) -> list[Winding]:
-        return [x.function(step.function) for x in v]
-
     def clip(self, step: Clip, v: list[Winding]) -> list[Winding]:
         return [x.still() for x in v]
 
-    def sum(self, step: Sum, vectors: Sequence[list[Winding]]) -> list[Winding]:
-        return [reduce(add, entries) for entries in zip(*vectors, strict=True)]
-
-    def concat(self, step: Concat, vectors: Sequence[list[Winding]]) -> list[Winding]:
-        return [x for v in vectors for x in v]
-
-    def product(self, step: Product, v: list[Winding], w: list[Winding]) -> list[Winding]:
-        return [v[i % len(v)].still() + w[i % len(w)].still() for i in range(step.size)]
-
     def observe(self, step: Observe, v: list[Winding]) -> list[Winding]:
         return windings(step.tape, v)
-
-    def entries(self, call: Call, arguments: list[Winding]) -> list[Winding]:
-        """A call in equations."""
-        value = self.run(call.network, arguments)
-        return [value[i] for i in call.entries]
 
 
 def windings(tape: Tape, variables: Sequence[Winding]) -> list[Winding]:

@@ -1,9 +1,9 @@
 """The rules, as tables in FORMAT.md's order: what is not shown is refused under the name of its rule.
 
 A rule is a function that yields its failures as (place, detail) and returns how many things it has looked at; the
-first failure of all ends the examination. Together the rules imply the claim (FORMAT.md gives the inequalities and
-why they suffice). What only some certificates need is a module that is loaded for these alone: steps of time (flow.py),
-tubes, contraction, sets of another function. An answer names the modules that it rests on.
+first failure of all ends the examination. Together the rules imply the claim: FORMAT.md has the inequalities,
+docs/mathematics/ the proof. What only some certificates need is a module that is loaded for these alone. An answer
+names the modules that it rests on.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ import pytest
 from flint import arb, ctx
 
 from certify.checker import near
-from certify.checker.near import Above, Cubic, Form, Near, Square, Uniform, Vector, gram, mixed, outer, symmetric
+from certify.checker.near import ZERO, Above, Cubic, Form, Near, Square, Uniform, Vector, gram, mixed, outer, symmetric
 from tests.support.marks import slow_after
 
 Array = np.ndarray
@@ -132,6 +132,14 @@ def test_upper_bounds_are_no_less(count: int) -> None:
                 bounds.append(made[0])
                 truths.append(made[1])
     assert said > count / 4
+
+
+def test_a_bound_of_each_number_is_none_of_their_sum() -> None:
+    """A single bound does not know how many numbers it bounds."""
+    for added in (lambda bound: bound.sum(), lambda bound: bound.norm(), lambda bound: Near(np.ones(3), bound).sum()):
+        with pytest.raises(TypeError, match="no bound of their sum"):
+            added(Above(np.float64(1.0)))
+    assert Above(np.ones(3)).sum().top >= 3 and ZERO.sum() is ZERO
 
 
 def test_a_bound_of_many_roundings_keeps_its_promise() -> None:

@@ -516,6 +516,18 @@ def test_what_is_periodic(change: dict[str, Any], rule: str | None) -> None:
     assert verdicts(certificate(loop, scaled(1.0, 0.5), cosine, (-3.25, 3.25), 6)[0]) == (rule, rule)
 
 
+@pytest.mark.parametrize(("factor", "rule"), [("3", None), ("1/2", "angles")])
+def test_a_product_in_a_network_winds_as_one_in_equations(factor: str, rule: str | None) -> None:
+    data = certificate(ROUND, scaled(1.0, 0.5), cosine, (-3.25, 3.25), 6)[0]
+    first, second = ({"kind": "observe", "of": [0], "names": ["a", "b"], "expressions": [name]} for name in "ab")
+    times = {"name": "times", "reads": 2, "steps": [first, second, {"kind": "product", "of": [1, 2]}]}
+    called = ["sin", ["network", "times", 0, factor, "x"]]
+    data = edited(
+        data | {"networks": [*data["networks"], times]}, "plant.dynamics", [["+", "x", "1/2", ["*", "0", called]]]
+    )
+    assert verdicts(data) == (rule, rule)
+
+
 def test_rates_of_angles_have_no_winding() -> None:
     loop = Loop([["+", "1", "u"]], [affine([[0.0]])], TURNING, angles=("x",), sample=("1/2", "1/2"))
     data = certificate(loop, scaled(1.0, 0.5), cosine, (-3.25, 3.25), 6)[0]
