@@ -210,10 +210,9 @@ def economical(
 def share_of_robust(loop: ClosedLoop) -> float:
     """Share of the effort that it may take to be made.
 
-    Where an input is held, in many states, it is twice as much as for the loop without a period, which comes first:
-    there no ring can make up for what is left out.
+    In many states it is twice as much as for others: there no ring can make up for what is left out.
     """
-    return OPTIMISING * (2 if loop.system.sample is not None and loop.system.n > MANY else 1)
+    return OPTIMISING * (2 if loop.system.n > MANY else 1)
 
 
 def peak(loop: ClosedLoop, options: RoaOptions, effort: Effort) -> Trial | None:
