@@ -15,6 +15,8 @@ from .exact import exactly, gershgorin_lower, inverse_diagonal
 from .near import near
 from .network import Folded, fold
 
+AT_CORNERS = 6  # uncertain quantities of which rule `local` decides every corner
+
 Failures = Generator[tuple[str, str], None, int]  # a rule: each failure's (place, detail); the rule's count
 
 
