@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from certify.analysis.api import certify_roa
     from certify.analysis.identifying.api import identify
+    from certify.analysis.identifying.linear import LinearStructure
     from certify.analysis.identifying.run import IdentifyResult
     from certify.analysis.options import RoaOptions
     from certify.analysis.results import RoaResult
@@ -66,6 +67,7 @@ _PUBLIC = {
     "certify_roa": "certify.analysis.api",
     "identify": "certify.analysis.identifying.api",
     "IdentifyResult": "certify.analysis.identifying.run",
+    "LinearStructure": "certify.analysis.identifying.linear",
     "RoaResult": "certify.analysis.results",
     "RoaOptions": "certify.analysis.options",
     "ImportOptions": "certify.loop.policies.importers",
@@ -78,6 +80,7 @@ __all__ = [
     "IdentifyResult",
     "ImportOptions",
     "InputError",
+    "LinearStructure",
     "Neural",
     "Policy",
     "PolicyNetwork",
