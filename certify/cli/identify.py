@@ -58,7 +58,7 @@ def _without_a_model() -> Bundle:
     """The options of the structure `linear`, as a `LinearStructure`, or None where none is given."""
     shown: dict[str, Any] = {"rich_help_panel": "A plant without a model, --structure linear"}
     many: dict[str, Any] = {"metavar": "NAME=D"} | shown
-    second = "Bound of what a state's equation has beyond A x + B u, as in theta_dot='10*theta**2'; repeatable."
+    second = "Bound of what a state's equation has beyond A x + B u, as in theta_dot='10*theta*theta'; repeatable."
     prior = "Prior of an entry, A21=LO..HI, or of all in a state's row; repeatable. By default around least squares."
     ends = "Half-width of {}, or NAME=LO..HI; repeatable. By default as far as the data reach."
     options = (

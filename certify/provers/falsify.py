@@ -306,17 +306,7 @@ class _Search:
             step = np.minimum(np.where(better, 1.5 * step, 0.4 * step), 0.5)
             if float(step.max()) < 1e-7 or self.effort.over:
                 break
-        return self._shown(self._lowest_few(self._lifted(self._shrink(z, 1.0, halvings=50), start), 32))
-
-    def _lifted(self, z: Array, start: Array) -> Array:
-        """Violating points (B, n), those moved outwards that are so near to the origin that floats say nothing there.
-
-        A V that rises at all radii along a ray is refuted as well by a state of a size that can be computed with."""
-        size = np.max(np.abs(z), axis=-1, keepdims=True)  # squares may be below binary64's numbers
-        norm = size * np.linalg.norm(z / np.maximum(size, 1e-300), axis=-1, keepdims=True)
-        least = _NEAR_0 * np.max(np.linalg.norm(start, axis=-1))
-        lifted = np.where((norm > 0) & (norm < least), z / np.maximum(norm, 1e-300) * least, z)
-        return np.asarray(lifted[self.bad(lifted)])
+        return self._shown(self._lowest_few(_lifted(self, self._shrink(z, 1.0, halvings=50), start), 32))
 
     def _shown(self, z: Array) -> Witness | None:
         """A violation at one of these points (B, n): the binary64 state is what counts, so that a point is pulled
@@ -393,6 +383,18 @@ class _Search:
         z = z / np.linalg.norm(z, axis=-1, keepdims=True)
         tangent = gradient - (gradient * z).sum(-1, keepdims=True) * z
         return np.asarray(tangent / (np.linalg.norm(tangent, axis=-1, keepdims=True) + 1e-300))
+
+
+def _lifted(search: _Search, z: Array, start: Array) -> Array:
+    """Violating points (B, n), those moved outwards that are so near to the origin that floats say nothing there.
+
+    A V that rises at all radii along a ray is refuted as well by a state of a size that can be computed with.
+    """
+    size = np.max(np.abs(z), axis=-1, keepdims=True)  # squares may be below binary64's numbers
+    norm = size * np.linalg.norm(z / np.maximum(size, 1e-300), axis=-1, keepdims=True)
+    least = _NEAR_0 * np.max(np.linalg.norm(start, axis=-1))
+    lifted = np.where((norm > 0) & (norm < least), z / np.maximum(norm, 1e-300) * least, z)
+    return np.asarray(lifted[search.bad(lifted)])
 
 
 @np.errstate(all="ignore")
