@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from certify.analysis.api import certify_roa
     from certify.analysis.composing import compose
     from certify.analysis.identifying.api import identify
+    from certify.analysis.identifying.linear import LinearStructure
     from certify.analysis.identifying.run import IdentifyResult
     from certify.analysis.options import RoaOptions
     from certify.analysis.results import RoaResult
@@ -68,6 +69,7 @@ _PUBLIC = {
     "compose": "certify.analysis.composing",
     "identify": "certify.analysis.identifying.api",
     "IdentifyResult": "certify.analysis.identifying.run",
+    "LinearStructure": "certify.analysis.identifying.linear",
     "RoaResult": "certify.analysis.results",
     "RoaOptions": "certify.analysis.options",
     "ImportOptions": "certify.loop.policies.importers",
@@ -80,6 +82,7 @@ __all__ = [
     "IdentifyResult",
     "ImportOptions",
     "InputError",
+    "LinearStructure",
     "Neural",
     "Policy",
     "PolicyNetwork",

@@ -19,7 +19,10 @@ from certify.analysis.options import RoaOptions
 from certify.errors import InputError, OptionError
 
 if TYPE_CHECKING:
+    from certify.analysis.identifying.linear import LinearStructure
     from certify.loop.plants import System
+
+_LISTS = "without", "inputs", "states"
 
 
 def options_of(texts: Mapping[str, Any], plant: System, tell: Tell) -> RoaOptions:
@@ -60,6 +63,25 @@ def changes_of(texts: Mapping[str, Any]) -> PlantChanges:
     """
     options = declared(PlantChanges)
     return PlantChanges(**{name: _READERS[options[name].kind](text, name) for name, text in texts.items()})
+
+
+def linear_from(texts: Mapping[str, Any]) -> LinearStructure | None:
+    """A plant without a model from texts by the fields of `LinearStructure`; None without any.
+
+    Raises
+    ------
+    InputError : a text is not what it must be, or no state has a bound `second`.
+    """
+    from certify.analysis.identifying.linear import LinearStructure
+
+    given = {name: value for name, value in texts.items() if value}
+    if not given:
+        return None
+    read: dict[str, Any] = {
+        name: _ranges(given[name], name) for name in ("domain", "input_bounds", "prior") if name in given
+    }
+    read |= {name: [part.strip() for part in given[name].split(",")] for name in _LISTS if name in given}
+    return LinearStructure(second=dict(_assignment(e, "`second`") for e in given.get("second", ())), **read)
 
 
 def _ranges(entries: Sequence[str], name: str) -> dict[str, Any]:

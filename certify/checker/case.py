@@ -17,6 +17,8 @@ from .near import near
 from .network import Folded, fold
 
 T = TypeVar("T")
+AT_CORNERS = 6  # uncertain quantities of which rule `local` decides every corner
+
 Failures = Generator[tuple[str, str], None, int]  # a rule: each failure's (place, detail); the rule's count
 
 

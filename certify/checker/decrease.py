@@ -17,14 +17,17 @@ from itertools import product
 import numpy as np
 from flint import fmpq, fmpq_mat
 
+from .case import AT_CORNERS
 from .document import Multipliers, Path
-from .exact import exactly, is_definite, root_above
+from .exact import exactly, fraction, is_definite, root_above
 from .jets import Jet, unpacked
 from .near import Above, Array, Near, Tensor, Vector, at_least_0, mixed, norm, size, symmetrised, triples
 from .pairs import bound_of_pairs, in_binary64
 
 _NOTHING = fmpq(0)
 _SHARE = fmpq(1, 4)  # of 1 against d, around a level
+_SHORT = 6  # bits of a number that is chosen here
+_OF_ONE = 16  # the weight of 1 over that of all of d: any positive number would do
 
 
 @dataclass(frozen=True)
@@ -55,16 +58,34 @@ class Models:
         self.f = []
         if not rest:
             self.f = [rational(g.c.value) - v for g, v in zip(G, velocity or [fmpq(0)] * len(G), strict=True)]
-        self.by_y = [
-            ([rational(g.c_y.value[j]) for g in G], exactly(np.array([g.a_y.value[:, j] for g in G])))
+        moves = [
+            (
+                np.array([0 * g.c_y.value[j] if rest else g.c_y.value[j] for g in G]),
+                np.array([g.a_y.value[:, j] for g in G]),
+            )
             for j in range(len(G[0].c_y.value))
         ]
+        self.moves = [
+            (c_y, a_y) for c_y, a_y in moves if np.any(c_y) or np.any(a_y)
+        ]  # what else y does is in the errors
+        self.others: list[fmpq_mat] = []
 
-    def corners(self) -> Iterator[Models]:
-        """The models at each y of which all entries are 1 or -1; the one there is where nothing is uncertain."""
-        for signs in product((1, -1), repeat=len(self.by_y)):
+    def corners(self, P: Array | None = None) -> Iterator[Models]:
+        """The models at each y of which all entries are 1 or -1; the one there is where nothing moves f or A.
+
+        If P is given, only the AT_CORNERS that move these most have corners. What each of the others adds to
+        Y = (f, A), or at rest to A, are then the `others` of every corner, (n, 1 + k) or (n, k)."""
+        moves, others = self.moves, list[tuple[Array, Array]]()
+        if P is not None and len(moves) > AT_CORNERS:
+            roots = np.sqrt(np.diag(P))
+            moves = sorted(moves, key=lambda y: (bool(np.any(y[0])), float(roots @ np.sqrt((y[1] ** 2).sum(1)))))[::-1]
+            moves, others = moves[:AT_CORNERS], moves[AT_CORNERS:]
+        whole = [exactly(np.column_stack([*([c_y] if self.f else []), a_y])) for c_y, a_y in others]
+        known = [([rational(c) for c in c_y.tolist()], exactly(a_y)) for c_y, a_y in moves]
+        for signs in product((1, -1), repeat=len(known)):
             corner = copy(self)
-            for sign, (c_y, a_y) in zip(signs, self.by_y, strict=True):
+            corner.others = whole
+            for sign, (c_y, a_y) in zip(signs, known, strict=True):
                 corner.A = corner.A + sign * a_y
                 corner.f = [f + sign * c for f, c in zip(corner.f, c_y, strict=True)] if self.f else []
             yield corner
@@ -149,12 +170,14 @@ def sides(
     share = _SHARE if path is None else fmpq(1)
     size = [abs(row[0]) if first else fmpq(0) for row in b.tolist()]
     at_0, along = doubts(models, P, h, beyond, size, lengths, share)
+    of_others = of_quantities(models, b, by.weight)
     if h > 0:
         f = fmpq_mat(len(models.f), 1, models.f) if first else fmpq_mat(P.nrows(), 1)
         along += h * beyond * (beyond + 2 * root_above((f.transpose() * P * f)[0, 0]))
     rest += diagonal([along] * k)
     if first:
         rest = fmpq_mat([[at_0, *[0] * k], *([0, *row] for row in rest.tolist())])
+    rest += of_others
     if level is not None:
         form += level.edge * (U.transpose() * P * U)
         form[0, 0] -= level.edge * level.c0
@@ -174,6 +197,12 @@ def doubts(
     roots = [root_above(P[i, i]) if h > 0 else fmpq(0) for i in range(P.nrows())]  # of no step P may be any matrix
     e = sum((root * v for root, v in zip(roots, models.error, strict=True)), fmpq(0))
     s = sum((root * v for root, v in zip(roots, models.slack, strict=True)), fmpq(0))
+    if h > 0:
+        for Y in models.others:  # its part with b_i is in `of_quantities`
+            first = int(bool(models.f))
+            lengths_of_1 = [(Y.transpose() * P * Y)[j, j] for j in range(Y.ncols())]
+            e += root_above(sum(lengths_of_1[:first], fmpq(0)))
+            s += root_above(sum(lengths_of_1[first:], fmpq(0)))
     pairs = list(zip(at_0, lengths, models.error, models.slack, strict=True))
     both = sum((length * wrong + p * slack for p, length, wrong, slack in pairs), h * e * s)
     start = 2 * sum((p * wrong for p, _, wrong, _ in pairs), fmpq(0)) + h * e * e
@@ -226,6 +255,45 @@ def of_units(models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:
         return fmpq_mat(b.ncols(), b.ncols())
     row, by = in_binary64(models.B.transpose() * b)
     return bound_of_pairs(vectors(row.through(L.T)), Tensor(R), weight) * fmpq(2) ** by
+
+
+def of_quantities(models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:
+    """S_ranges over d, or (1, d): 2 |b_i.y| |Y_i.y| <= tau (b_i.y)^2 + (Y_i.y)^2 / tau for each row of each of the
+    models' others, whatever tau > 0 is."""
+    k = b.ncols()
+    S = fmpq_mat(k, k)
+    if not models.others:
+        return S
+    W = np.zeros((k, k))
+    W[k - len(weight) :, k - len(weight) :] = weight
+    if k > len(weight):
+        W[0, 0] = _OF_ONE * np.trace(weight)
+    for p, *steps in zip(b.tolist(), *(Y.tolist() for Y in models.others), strict=True):
+        row = fmpq_mat(1, k, p)
+        size = _size(p, W)
+        for q in steps:
+            if any(q) and any(p):
+                tau, other = _short_root(_size(q, W), size), fmpq_mat(1, k, q)
+                S += tau * (row.transpose() * row) + other.transpose() * other / tau
+    return S
+
+
+def _size(row: Sequence[fmpq], W: Array) -> float:
+    """row W row', about; NaN where that is not near any number of binary64."""
+    try:
+        p = np.array([float(fraction(v)) for v in row])
+    except OverflowError:
+        return float("nan")
+    with np.errstate(all="ignore"):
+        return float(p @ W @ p)
+
+
+def _short_root(above: float, below: float) -> fmpq:
+    """About the root of a quotient, of few bits; 1 where that is no positive number."""
+    with np.errstate(all="ignore"):
+        m, e = np.frexp(np.sqrt(np.float64(above) / np.float64(below)))
+    tau = float(np.ldexp(np.round(m * 2**_SHORT) / 2**_SHORT, e))
+    return rational(tau) if 0 < tau < np.inf else fmpq(1)
 
 
 def vectors(rows: Near) -> Vector:

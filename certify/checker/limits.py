@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import prod
 
-from .case import Case, Failures
+from .case import AT_CORNERS, Case, Failures
 from .document import Array, Certificate, OuterTree, Partition, Trusted
 from .expression import Tape
 from .networks import Map, Network
@@ -254,8 +254,9 @@ class Sizes:
         cells = prod(evidence.cells)
         if evidence.local:
             times = cells + (self.evaluations(evidence.local.order) + 8 if self.c.sample else 0)
-            corners = cells * 2**self.y
-            found += self.ball + times * self.equations + corners * self.inequality + self.decision(self.n)
+            corners = cells * 2 ** min(self.y, AT_CORNERS)
+            each = self.inequality + 2**8 * self.y * self.n * (self.d + 1) ** 2
+            found += self.ball + times * self.equations + corners * each + self.decision(self.n)
         if evidence.contraction:
             corners = cells * 2**self.y
             found += self.ball + cells * self.equations + corners * self.inequality + self.decision(self.n)

@@ -14,7 +14,7 @@ from flint import fmpq, fmpq_mat
 
 from . import ball
 from .ball import Ball
-from .case import Case, Failures
+from .case import AT_CORNERS, Case, Failures
 from .decrease import Level, Models, are_finite, are_usable, rational, sides, size_beyond
 from .document import Intervals
 from .exact import contains_ball, exactly, fraction, is_definite, root_above
@@ -121,7 +121,7 @@ class Local(Ball):
             if models is None or not np.isfinite(most):
                 yield None
                 return
-            for corner in models.corners():
+            for corner in models.corners(c.P):
                 yield sides(corner, P, R, by.multipliers, None, h, rational(most), level)
 
 
@@ -133,12 +133,12 @@ def _margin(decay: fmpq_mat, rest: fmpq_mat) -> float:
         return float("nan")
 
 
-def is_large_enough(ball: Ball, place: str, name: str, level: float) -> Failures:
+def is_large_enough(ball: Ball, place: str, name: str, level: float, most: int = 64) -> Failures:
     """The ball contains {V <= level}, whose name and place are these, and deciding an inequality at each corner of each
-    cell does not take too long."""
+    cell, of `most` of the numbers y, does not take too long."""
     if not contains_ball(exactly(ball.J), exactly(ball.case.c.P), Fraction(level)):
         yield place, f"the ball must contain {{V <= {name}}}"
-    corners = prod(ball.case.partition.cells) * 2**ball.count
+    corners = prod(ball.case.partition.cells) * 2 ** min(ball.count, most)
     if corners > _MOST_CORNERS or corners * len(ball.J) ** 4 > _MOST_WORK:
         yield "evidence.cells", "there are too many cells for this rule"
     return 0
@@ -147,7 +147,7 @@ def is_large_enough(ball: Ball, place: str, name: str, level: float) -> Failures
 def fits(local: Local) -> Failures:
     """`local`: the ball contains {V <= c1}, and its jets take neither too much memory nor too much time."""
     c = local.case.c
-    yield from is_large_enough(local, "levels.local", "c1", c.c1)
+    yield from is_large_enough(local, "levels.local", "c1", c.c1, AT_CORNERS)
     if not are_usable(local.case.local.multipliers):
         yield "evidence.local", "no multiplier may be negative, none of g 0 where some beta is"
     if c.step > 0 and Fraction(local.case.local.edge) * c.step > 1:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from certify.analysis.arguments import bound_or_bounds, value_or_range
+from certify.analysis.arguments import bound_or_bounds, linear_from, value_or_range
 from certify.cli.options import Bundle, parameter, takes
 from certify.cli.shared import Json, Quiet, noting, write
 from certify.cli.terminal import say, show
@@ -54,14 +54,41 @@ def _of_environment() -> Bundle:
     return Bundle({one.name: one for one in options}, dict)
 
 
-@takes(environment=_of_environment())
+def _without_a_model() -> Bundle:
+    """The options of the structure `linear`, as a `LinearStructure`, or None where none is given."""
+    shown: dict[str, Any] = {"rich_help_panel": "A plant without a model, --structure linear"}
+    many: dict[str, Any] = {"metavar": "NAME=D"} | shown
+    second = "Bound of what a state's equation has beyond A x + B u, as in theta_dot='10*theta*theta'; repeatable."
+    prior = "Prior of an entry, A21=LO..HI, or of all in a state's row; repeatable. By default around least squares."
+    ends = "Half-width of {}, or NAME=LO..HI; repeatable. By default as far as the data reach."
+    options = (
+        parameter("second", "--second", second, list[str], metavar="NAME=BOUND", **shown),
+        parameter("prior", "--prior", prior, list[str], **many),
+        parameter("domain", "--domain", ends.format("a state's domain"), list[str], **many),
+        parameter("input_bounds", "--input-bound", ends.format("an input's bounds"), list[str], **many),
+        parameter(
+            "without", "--without", "States that no equation contains, such as a position.", metavar="LIST", **shown
+        ),
+        parameter(
+            "inputs", "--inputs", "Columns of inputs; needed without columns NAME_next.", metavar="LIST", **shown
+        ),
+        parameter("states", "--states", "Names of the states of an .npz file.", metavar="LIST", **shown),
+    )
+    return Bundle({one.name: one for one in options}, linear_from)
+
+
+@takes(environment=_of_environment(), linear=_without_a_model())
 def identify(
     data: Annotated[
         Path | None, typer.Argument(metavar="DATA", help="Measured transitions: .csv, .npz or .parquet.")
     ] = None,
     *,
     structure: Annotated[
-        Path, typer.Option(metavar="PLANT.toml", help="The plant's equations, with ranges of unknown parameters.")
+        Path,
+        typer.Option(
+            metavar="PLANT.toml",
+            help="The plant's equations, with ranges of unknown parameters; or linear: no equation is known.",
+        ),
     ],
     noise: Annotated[
         str,
@@ -75,6 +102,7 @@ def identify(
         Path, typer.Option(metavar="FILE", help="Plant with the ranges that are left; a page lies beside it.")
     ] = Path("known.toml"),
     environment: dict[str, Any],
+    linear: Any,  # a LinearStructure or None
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -82,17 +110,23 @@ def identify(
 
     The exit status is 0 for ranges, 1 if the measurements refute the structure with this noise.
     """
+    from certify.analysis.identifying.linear import structure_for
     from certify.analysis.identifying.run import identify_plant, read_and_measure
     from certify.loop.plants import load_system
     from certify.provers.data import Contradiction
     from certify.report.identified import page
 
-    note, system = noting(quiet), load_system(structure)
+    note = noting(quiet)
     if out.suffix != ".toml":
         raise InputError(f"--out must be a .toml file; found {out}.")
+    period, bounds = (
+        None if sample_time is None else value_or_range(sample_time, "sample_time"),
+        bound_or_bounds(noise, "noise"),
+    )
+    structure = structure_for(data, structure, linear, out, period, bounds)
+    system = load_system(structure)
     source = _recorded(data, environment, system, out, note)
-    period = None if sample_time is None else value_or_range(sample_time, "sample_time")
-    measured, readings = read_and_measure(source, system, period, bound_or_bounds(noise, "noise"))
+    measured, readings = read_and_measure(source, system, period, bounds)
     for line in readings.notes:
         note(line)
     try:

@@ -33,6 +33,8 @@ _TOGETHER = 15  # levels that are looked at in one batch
 Kind = Literal["vdot", "input", "keep"]
 _STARTS = 256  # points from which each constraint is looked for
 _APART = 1e-7  # share of a state's or an input's size between the points of a difference
+_NEAR_0 = 1e-6  # share of the largest state, below which the rounding of the policy hides its values
+_CASES = 8  # corners of the ranges, and periods, at which a state is shown to violate: the worst ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,7 +307,7 @@ class _Search:
             step = np.minimum(np.where(better, 1.5 * step, 0.4 * step), 0.5)
             if float(step.max()) < 1e-7 or self.effort.over:
                 break
-        return self._shown(self._lowest_few(self._shrink(z, 1.0, halvings=50), 32))
+        return self._shown(self._lowest_few(_lifted(self, self._shrink(z, 1.0, halvings=50), start), 32))
 
     def _shown(self, z: Array) -> Witness | None:
         """A violation at one of these points (B, n): the binary64 state is what counts, so that a point is pulled
@@ -384,6 +386,18 @@ class _Search:
         return np.asarray(tangent / (np.linalg.norm(tangent, axis=-1, keepdims=True) + 1e-300))
 
 
+def _lifted(search: _Search, z: Array, start: Array) -> Array:
+    """Violating points (B, n), those moved outwards that are so near to the origin that floats say nothing there.
+
+    A V that rises at all radii along a ray is refuted as well by a state of a size that can be computed with.
+    """
+    size = np.max(np.abs(z), axis=-1, keepdims=True)  # squares may be below binary64's numbers
+    norm = size * np.linalg.norm(z / np.maximum(size, 1e-300), axis=-1, keepdims=True)
+    least = _NEAR_0 * np.max(np.linalg.norm(start, axis=-1))
+    lifted = np.where((norm > 0) & (norm < least), z / np.maximum(norm, 1e-300) * least, z)
+    return np.asarray(lifted[search.bad(lifted)])
+
+
 @np.errstate(all="ignore")
 def _worst_cases(search: _Search, x: Array) -> list[tuple[Fraction | None, Mapping[str, Fraction]]]:
     """The periods and the corners of the ranges at which D' is not negative at a state (n,), in floats; the worst
@@ -392,4 +406,4 @@ def _worst_cases(search: _Search, x: Array) -> list[tuple[Fraction | None, Mappi
     decrease = np.concatenate([search._decrease(x[None], u, values, step) for values, step in search.worst])[:, 0]
     later = sorted(search.periods, key=lambda period: period == 0)  # as `worst` has them
     every = list(itertools.product(later, search.corners))
-    return [every[k] for k in np.argsort(-decrease, kind="stable") if not decrease[k] < 0]
+    return [every[k] for k in np.argsort(-decrease, kind="stable")[:_CASES] if not decrease[k] < 0]

@@ -11,11 +11,14 @@ these numbers, as multipliers or by a weight.
 
 Where something is uncertain f and A are affine in its symbols y. At one d, and for one value of the other parts, the
 left side is a convex function of G, as P is positive definite, and so of y: it is largest at a corner of [-1, 1]^N.
+Of many symbols most are no corners' but errors eps_i of the components, of which 2 (b_i.d) eps_i is bounded as above,
+term by term, and the rest by lengths.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from itertools import product
 
 from flint import arb, arb_mat, fmpq, fmpq_mat
@@ -23,6 +26,7 @@ from flint import arb, arb_mat, fmpq, fmpq_mat
 from .balls import ONE, ZERO, certainly_definite, columns_scaled, finite, identity, norm, total
 from .evidence import Ball, Path
 from .fields import exact
+from .limits import AT_CORNERS
 from .loop import Field
 from .model import Model
 from .rational import positive_definite
@@ -50,16 +54,31 @@ def contains(ball: Ball, P: fmpq_mat, level: fmpq_mat) -> bool:
     return positive_definite(ball.J.transpose() * P * ball.J - level)
 
 
-def whatever_y(F: Field, holds: Callable[[Field], bool]) -> bool:
-    """True if it holds with every y absorbed into the balls of the models, or else at each corner."""
+def whatever_y(F: Field, holds: Callable[[Field], bool], P: fmpq_mat | None = None) -> bool:
+    """True if it holds with every y absorbed into the balls of the models, or else at each corner.
+
+    With P, where more than AT_CORNERS move anything, only the corners of those that move most are asked, and the
+    others are handed over as `others`.
+    """
     count = max(len(f.dv) for f in F.components)
     if count == 0:
         return holds(F)
     if holds(F.whatever()):
         return True
     moved = [not all(f.without(j) for f in F.components) for j in range(count)]
+    if P is not None and sum(moved) > AT_CORNERS:
+        order = sorted((j for j in range(count) if moved[j]), key=lambda j: effect(F, j, P), reverse=True)
+        F = replace(F, others=tuple(F.moved_by(j) for j in order[AT_CORNERS:]))
+        moved = [j in order[:AT_CORNERS] for j in range(count)]
     few = 2 ** sum(moved) <= MAX_CORNERS
     return few and all(holds(F.where(y)) for y in product(*((-1, 1) if each else (0,) for each in moved)))
+
+
+def effect(F: Field, j: int, P: fmpq_mat) -> tuple[bool, float]:
+    """By how much y_j moves F, to order the symbols: any order will do."""
+    each = F.moved_by(j)
+    size = total(arb(abs(P[i, i])).sqrt() * norm(da.entries()) for i, (_, da) in enumerate(each))
+    return any(not dv.is_zero() for dv, _ in each), float(size.mid())
 
 
 def decreases(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq = NO_STEP) -> bool:
@@ -70,7 +89,8 @@ def decreases(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq = NO_STEP)
     known, A, columns = quadratic(ball, P, R, G, h)
     gamma = length_beyond(P, G, A.nrows()) if h > 0 else ZERO
     along = doubts(P, G, h, columns, gamma)[1] + arb(h) * gamma * gamma
-    return certainly_positive(-known - beyond_second(ball, columns, G) - along * identity(A.ncols()))
+    errors = of_others(columns, [[da for _, da in each] for each in G.others], arb_mat(ball.weight))
+    return certainly_positive(-known - beyond_second(ball, columns, G) - errors - along * identity(A.ncols()))
 
 
 def decreases_around(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq, level: fmpq) -> bool:
@@ -89,7 +109,11 @@ def decreases_around(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq, le
     linear = -((arb_mat(ball.J) + arb(h) * A).transpose() * of_P * f)
     first = [arb(k * level) - arb(h) * length - at_centre, *linear.entries()]
     below = (below + below.transpose()) / 2
-    return certainly_positive(arb_mat([first, *([v, *row] for v, row in zip(first[1:], below.tolist(), strict=True))]))
+    whole = arb_mat([first, *([v, *row] for v, row in zip(first[1:], below.tolist(), strict=True))])
+    at_1 = (arb(h) * (of_P * f)).entries()
+    b = [arb_mat(n + 1, 1, [p, *column.entries()]) for p, column in zip(at_1, columns, strict=True)]
+    others = [[arb_mat(n + 1, 1, [dv, *da.entries()]) for dv, da in each] for each in G.others]
+    return certainly_positive(whole - of_others(b, others, with_one(arb_mat(ball.weight))))
 
 
 def doubts(
@@ -104,14 +128,41 @@ def doubts(
     turn = total(2 * norm(b.entries()) * g.slack for b, g in zip(columns, components, strict=True))
     roots = [arb(P[i, i]).sqrt() for i in range(P.nrows())] if h > 0 else []
     s = total(root * g.slack for root, g in zip(roots, components, strict=h > 0))
+    far, wide = lengths_of_others(P, G) if h > 0 else (ZERO, ZERO)
+    s += wide
     turn += arb(h) * (s * s + 2 * gamma * s)
     if moved is None:
         return ZERO, turn
-    e = total(root * g.off for root, g in zip(roots, components, strict=h > 0))
+    e = far + total(root * g.off for root, g in zip(roots, components, strict=h > 0))
     each = list(zip(columns, map(abs, moved.entries()), components, strict=True))
     both = total(norm(b.entries()) * g.off + p * g.slack for b, p, g in each) + arb(h) * e * s
     still = total(2 * p * g.off for _, p, g in each) + arb(h) * e * e
     return still + share * both, turn + 2 * arb(h) * gamma * e + both / share
+
+
+def lengths_of_others(P: fmpq_mat, G: Field) -> tuple[arb, arb]:
+    """(e, s): with ||v|| = (v'Pv)^(1/2) what the others add to G is never longer than e + s ||d||."""
+    of_P, e, s = arb_mat(P), ZERO, ZERO
+    for each in G.others:
+        e += length_of(arb_mat([[dv] for dv, _ in each]), of_P)
+        s += length_of(arb_mat([list(da.entries()) for _, da in each]), of_P)
+    return e, s
+
+
+def of_others(b: Sequence[arb_mat], others: Sequence[Sequence[arb_mat]], weight: arb_mat) -> arb_mat:
+    """S_ranges: a bound of 2 sum_i |b_i.d| |a_i.d| of each of the others, whose columns a_i are given, as that of
+    pairs."""
+    result = arb_mat(weight.nrows(), weight.nrows())
+    for each in others:
+        for p, a in zip(b, each, strict=True):
+            result += balanced(p, a * a.transpose(), weight)
+    return result
+
+
+def with_one(weight: arb_mat) -> arb_mat:
+    """The weight of (1, d). That of 1 is 16 times that of d: d is short where a level is reached."""
+    n = weight.nrows()
+    return arb_mat([[16 * weight.trace(), *[ZERO] * n], *([ZERO, *row] for row in weight.tolist())])
 
 
 def quadratic(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq) -> tuple[arb_mat, arb_mat, list[arb_mat]]:

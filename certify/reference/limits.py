@@ -20,6 +20,7 @@ from .rational import bits
 from .refusal import require
 
 MAX_NUMBERS = 2**25
+AT_CORNERS = 6  # quantities whose corners are all asked
 MAX_OPERATIONS, MAX_IN_PATIENCE = 2**34, 2**46  # the second where somebody has said that it may take days
 LEAF = 255
 
@@ -310,12 +311,13 @@ def inequality(z: Sizes) -> int:
 
 def on_balls(c: Certificate, z: Sizes, evidence: Tree) -> int:
     cells, work = math.prod(evidence.cells), 0
-    decided = networks_on_a_ball(z) + cells * 2**z.y * inequality(z) + deciding(z.n)
+    once = networks_on_a_ball(z) + deciding(z.n)
     if evidence.ball is not None:
         times = cells + (0 if c.sample is None else evaluations(c, evidence.ball.order) + 8)
-        work += times * equations_on_a_ball(z) + decided
+        each = inequality(z) + 2**8 * z.y * z.n * (z.d + 1) ** 2
+        work += times * equations_on_a_ball(z) + once + cells * 2 ** min(z.y, AT_CORNERS) * each
     if evidence.contraction is not None:
-        work += cells * equations_on_a_ball(z) + decided
+        work += cells * equations_on_a_ball(z) + once + cells * 2**z.y * inequality(z)
     return work
 
 

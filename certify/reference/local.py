@@ -42,7 +42,7 @@ def local(loop: Loop, ball: Ball, parts: Sequence[int]) -> None:
         kept_on_ball(steps, cells(c.plant.ranges, parts), "ball")
     for number, cell in enumerate(cells(c.plant.ranges, parts)):
         at = f"cell {number}" if parts else "ball"
-        everywhere = whatever_y(steps.change(cell, "local", at), falls)
+        everywhere = whatever_y(steps.change(cell, "local", at), falls, c.P)
         require(
             everywhere, "local", at, "that V falls does not follow: the matrix that is left is not positive definite"
         )

@@ -20,16 +20,25 @@ from .tangents import Calls, Policy, Units
 
 @dataclass(frozen=True)
 class Field:
-    """Models of the components of F on a ball, and the errors behind those of the inputs."""
+    """Models of the components of F on a ball, and the errors behind those of the inputs.
+
+    F may differ from them by sum_j y_j (dv_i + da_i.d) in component i, |y_j| <= 1; `others` has dv_i and da_i, i being
+    the inner index.
+    """
 
     components: list[Model]
     units: Units
+    others: tuple[Sequence[tuple[arb, arb_mat]], ...] = ()
 
     def whatever(self) -> Field:
         return replace(self, components=[f.whatever() for f in self.components])
 
     def where(self, y: Sequence[int]) -> Field:
         return replace(self, components=[f.where(y) for f in self.components])
+
+    def moved_by(self, j: int) -> list[tuple[arb, arb_mat]]:
+        """dv and da of y_j in each component."""
+        return [(f.dv[j], f.da[j]) if f.dv else (ZERO, 0 * f.a) for f in self.components]
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -85,8 +85,8 @@ def with_tube(claim: str) -> Document:
     return edited(data, "evidence.tube", [slab, slab])
 
 
-def nearby() -> Document:
-    data = loop(k=2, cells=[3, 2], claim="nearby", levels=(0.25, 0.5, 1.0))
+def nearby(k: int = 2, cells: Sequence[int] = (3, 2)) -> Document:
+    data = loop(k=k, cells=cells, claim="nearby", levels=(0.25, 0.5, 1.0))
     ball = {"J": encode(np.eye(2)), "weights": encode([1.0, 1.0]), "weight": encode(np.eye(2))}
     return edited(data, "evidence.contraction", ball)
 
@@ -131,7 +131,8 @@ BOMBS: dict[str, tuple[Callable[[], Document], str]] = {
     "operations and symbols": (lambda: loop(n=60, m=2, k=60, terms=600), "numbers"),
     "order and leaves": (lambda: loop(terms=60, leaves=2000, sample=SAMPLE, order=8), "operations"),
     "cells and corners": (lambda: on_a_ball(loop(n=1, k=4, cells=[8, 8, 8, 8])), "operations"),
-    "corners": (lambda: on_a_ball(loop(n=1, k=40)), "operations"),
+    "cells and six corners": (lambda: on_a_ball(loop(n=8, k=40, cells=[64, 64, *[1] * 38])), "operations"),
+    "corners": (lambda: nearby(40, [1] * 40), "operations"),
     "leaves and states": (lambda: loop(n=40, m=8, leaves=8000), "operations"),
     "leaves and units": (lambda: loop(leaves=40_000, hidden=(1024, 1024)), "operations"),
     "units and units": (lambda: on_a_ball(loop(hidden=(256,) * 17)), "numbers"),
@@ -233,6 +234,7 @@ def test_the_counts_are_those_of_the_page(tmp_path: Path) -> None:
     K = sum(p * (q * (d + g) + g * t) + 2**21 for p, q, g in layers) + 64 * H * t
     Z = a * (2**17 + 64 * t + 16 * d**2 * (m + y))
     inequality = 2**23 + 2**12 * 3**4 + 8 * d**5 + 4 * H * d**3 + 2**14 * 3**3
+    inequality += 2**8 * y * n * (d + 1) ** 2
     work = 2**15 * a + F + X + of_S + 2**8 * 9 + B + R + K + 2 * Z + 2 * 2 * inequality + 2**14 * n**3
     assert counts(data, tmp_path) == (numbers, work)
 

@@ -14,7 +14,7 @@ from certify.certificates.claims import Problem
 from certify.certificates.verdict import Verdict
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, symbols
-from certify.loop.plants import System, at_values, corners, get_system, with_input_errors
+from certify.loop.plants import System, at_values, corners, get_system, load_system, with_input_errors
 from certify.loop.policies import PolicyNetwork, load_policy
 from certify.loop.rigorous import evaluate_vdot
 from certify.lyapunov import diagonalising_coordinates
@@ -161,3 +161,40 @@ def test_a_wider_range_proves_less_with_one_cell() -> None:
 def test_nothing_local_is_proved_where_one_end_is_unstable() -> None:
     problem, T = problem_of(*gain("2/5", "1001/1000"))
     assert prove_local(problem, T, 1.0) is None
+
+
+NINE = """
+name = "pendulum"
+states = ["theta", "theta_dot"]
+inputs = ["u"]
+[parameters]
+A1 = [19.3, 19.9]
+A2 = [-2.8, -2.5]
+B1 = [26, 27]
+C1 = [-0.05, 0.05]
+C2 = [-0.02, 0.02]
+B0 = [-0.01, 0.01]
+D1 = [-0.1, 0.1]
+D2 = [-0.02, 0.02]
+[residual]
+theta_dot = "10*theta**2"
+[dynamics]
+theta = "(1 + C2)*theta_dot + C1*theta + B0*u"
+theta_dot = "(A1 + D1)*theta + (A2 + D2)*theta_dot + B1*u"
+[u_eq]
+u = 0
+[domain]
+theta = [-3.14, 3.14]
+theta_dot = [-20, 20]
+[input_bounds]
+u = [-6, 6]
+"""
+
+
+def test_more_quantities_than_have_corners_are_proved(tmp_path: Path) -> None:
+    (tmp_path / "nine.toml").write_text(NINE)
+    policy, options = load_policy(POLICIES / "pendulum.pt").network, RoaOptions(candidate="optimised", effort=0.1)
+    result = certify_roa(load_system(tmp_path / "nine.toml"), policy, tmp_path / "out", options)
+    assert result.verdict is Verdict.PROVED, result.detail
+    assert result.levels is not None and result.levels.local is not None and result.levels.local > 0.1
+    assert result.raw is not None and judge_bytes(result.raw) is None

@@ -222,7 +222,7 @@ def test_a_norm_would_not_do(monkeypatch: pytest.MonkeyPatch) -> None:
     )  # fmt: skip
     assert accepted(stiff)
 
-    def by_norms(F: Any, holds: Any) -> bool:
+    def by_norms(F: Any, holds: Any, P: Any) -> bool:
         """Each gradient within the 2-norm of what y does to it, in any direction."""
         far = [decrease.norm(sum((decrease.arb_mat(p) for p in f.da), 0 * f.a).entries()) for f in F.components]
         models = [
@@ -240,13 +240,13 @@ def test_each_corner_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     false, found = turned(Fraction(101, 100)), []
     for left_out in itertools.product((-1, 1), repeat=2):
 
-        def some(F: Any, holds: Any, left_out: tuple[int, int] = left_out) -> bool:
+        def some(F: Any, holds: Any, P: Any, left_out: tuple[int, int] = left_out) -> bool:
             return all(holds(F.where(y)) for y in itertools.product((-1, 1), repeat=2) if y != left_out)
 
         monkeypatch.setattr(local, "whatever_y", some)
         found.append(accepted(false))
     assert found == [False] * 4  # (1, -1) and (-1, 1) both fail
-    monkeypatch.setattr(local, "whatever_y", lambda F, holds: all(holds(F.where(y)) for y in ((1, 1), (-1, -1))))
+    monkeypatch.setattr(local, "whatever_y", lambda F, holds, P: all(holds(F.where(y)) for y in ((1, 1), (-1, -1))))
     assert accepted(false)
 
 

@@ -76,7 +76,7 @@ def _text(file: PlantFile, structure: Path, known: System, data: Measurements, s
             raise file.refuse(
                 f"the range must stand on a line of its own, as in {name} = [0.1, 0.3].", "parameters", name
             )
-        lines[number - 1] = f"{entry[1]}{_pair(known.ranges[name])}{entry[2]}"
+        lines[number - 1] = f"{entry[1]}{pair_text(known.ranges[name])}{entry[2]}"
     return "\n".join([*lines, "", *_table(known, data, source), ""])
 
 
@@ -88,20 +88,20 @@ def _table(known: System, data: Measurements, source: str) -> Iterator[str]:
     yield f'sha256 = "{data.sha256}"'
     if data.period is not None:
         lo, hi = data.period
-        yield f"period = {_number(lo) if lo == hi else _pair(data.period)}"
+        yield f"period = {decimal_text(lo) if lo == hi else pair_text(data.period)}"
     yield ""
     yield "[data.noise] # each measured state is within these of the true one"
-    yield from (f"{s.name} = {_number(w)}" for s, w in zip(known.states, data.noise, strict=True))
+    yield from (f"{s.name} = {decimal_text(w)}" for s, w in zip(known.states, data.noise, strict=True))
     yield ""
     yield "[data.priors] # ranges that were assumed"
-    yield from (f"{p} = {_pair(pair)}" for p, pair in data.priors.items())
+    yield from (f"{p} = {pair_text(pair)}" for p, pair in data.priors.items())
 
 
-def _pair(pair: Interval) -> str:
-    return f"[{_number(pair[0])}, {_number(pair[1])}]"
+def pair_text(pair: Interval) -> str:
+    return f"[{decimal_text(pair[0])}, {decimal_text(pair[1])}]"
 
 
-def _number(value: Fraction) -> str:
+def decimal_text(value: Fraction) -> str:
     """A number of TOML that is exactly this one: a decimal, or else a fraction as text."""
     digits = next((k for k in range(_MOST_DIGITS) if 10**k % value.denominator == 0), None)
     if digits is None:

@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 _MOST = 64  # cells
 _FEW = 8  # cells that do not show anything at the origin: then more will not
 _ENOUGH = 0.9  # share of the decay at the origin that the gradients' departures have to leave
+_NO_SLACK = 1e-12  # share of the decay
 _WORTH = 0.01  # share of the decay that twice the cells have to gain
 
 
@@ -44,9 +45,11 @@ def cuts_for(steps: Steps, J: Array, P: Array, R: Array | None) -> tuple[int, ..
     if steps.is_plain:  # a look at the origin saves less than it takes
         return cuts
     left = _left(steps, tiny, P, R, cuts)
+    if left is None:
+        return None
     while ranges and left < _ENOUGH and 2 * int(np.prod(cuts)) <= _MOST:
         finer = [tuple(2 * c if i == j else c for j, c in enumerate(cuts)) for i in range(len(ranges))]
-        found, best = max((_left(steps, tiny, P, R, one), one) for one in finer)
+        found, best = max((_left(steps, tiny, P, R, one) or -np.inf, one) for one in finer)
         hopeless = int(np.prod(cuts)) >= _FEW if found == -np.inf else left > 0 and not found > left + _WORTH
         if hopeless:
             break
@@ -54,9 +57,9 @@ def cuts_for(steps: Steps, J: Array, P: Array, R: Array | None) -> tuple[int, ..
     return cuts if left > 0 else None
 
 
-def _left(steps: Steps, J: Array, P: Array, R: Array | None, cuts: tuple[int, ...]) -> float:
+def _left(steps: Steps, J: Array, P: Array, R: Array | None, cuts: tuple[int, ...]) -> float | None:
     """The least share of the decay, in any cell and direction, that the gradients' slack leaves; what the values at the
-    origin are does not count."""
+    origin are does not count. None if a corner has no decay, and no slack that cells could make smaller."""
     least = 1.0
     for models in steps.models(J, cut(list(steps.known.loop.system.ranges.values()), cuts), np.zeros(len(J))):
         if not models.finite:
@@ -68,5 +71,7 @@ def _left(steps: Steps, J: Array, P: Array, R: Array | None, cuts: tuple[int, ..
             slack = nothing if spread is None else spread.slack
             charge = 2 * float(np.linalg.norm(corner.b, axis=1) @ slack)
             values = np.linalg.eigvalsh(corner.decay + charge * np.eye(len(J)))
+            if values[0] <= 0 and charge <= _NO_SLACK * float(np.max(np.abs(values))):
+                return None
             least = min(least, 1 - charge / float(values[0]) if values[0] > 0 else -np.inf)
     return least

@@ -23,6 +23,7 @@ _FOCUS, _LEAST_WEIGHT = 2.0, 1e-4
 _SETTLED = 2e-3  # the least gain of a margin by further rounds
 _NEGLIGIBLE, _ROUNDING = 1e-9, 1e-12  # shares: of the bounds; of the decay, where a checker's Q is not quite 0
 _SHARE = 0.25  # weight of 1 against d in products of the two, as the checker has it
+_OF_ONE = 16  # the weight of 1 over that of all of d, as the checker has it
 _SHORT = 5  # bits of a multiplier: the checker's rationals stay short
 
 
@@ -50,7 +51,8 @@ class Corner:
     """The inequality at a corner of a cell, as far as it does not depend on multipliers.
 
     `b` (n, k) are the weights of the components, `decay` (k, k) is what the rest has to stay below. Where G does not
-    vanish at d = 0 it gives `2 linear.d + start` beside them: linear (k,).
+    vanish at d = 0 it gives `2 linear.d + start` beside them: linear (k,), and each component has the weight `of_1` of
+    1 beside b, (n,).
     """
 
     models: Models
@@ -58,6 +60,7 @@ class Corner:
     decay: Array
     linear: Array
     start: float
+    of_1: Array
 
 
 def corners_of(models: Models, J: Array, P: Array, R: Array | None = None, h: float = 0.0) -> list[Corner]:
@@ -65,7 +68,8 @@ def corners_of(models: Models, J: Array, P: Array, R: Array | None = None, h: fl
 
     What is known of f and A as a norm is charged to the decay, and so is `h g'P g`, g what the models have beyond them.
     """
-    gamma, weights = _gamma(models, P) if h else 0.0, dict[bytes, Array]()
+    models, weights = models.with_others(P), dict[bytes, Array]()
+    gamma = _gamma(models, P) if h else 0.0
     found = []
     for f, A in models.corners:
         key = A.tobytes() if h else b""
@@ -86,14 +90,26 @@ def _corner(
     error, slack = models.rounding, np.zeros_like(f)
     if models.spread is not None:
         error, slack = error + models.spread.error, models.spread.slack
-    if np.any(error) or np.any(slack):
+    far, wide = _lengths(models.others, P) if h else (0.0, 0.0)
+    if np.any(error) or np.any(slack) or far or wide:
         roots = np.sqrt(np.diag(P))
-        e, s, p = float(roots @ error), float(roots @ slack), h * np.abs(moved)
+        e, s, p = float(roots @ error) + far, float(roots @ slack) + wide, h * np.abs(moved)
         lengths = np.linalg.norm(b, axis=1)
         both = float(lengths @ error + p @ slack) + h * e * s
         charge += 2 * float(lengths @ slack) + h * s * s + 2 * h * gamma * (e + s) + both / _SHARE
         start += 2 * float(p @ error) + h * e * e + _SHARE * both
-    return Corner(models, b, decay - charge * np.eye(len(decay)), b.T @ f, start)
+    return Corner(models, b, decay - charge * np.eye(len(decay)), b.T @ f, start, h * moved)
+
+
+def _lengths(others: tuple[Array, Array] | None, P: Array) -> tuple[float, float]:
+    """(e, s): ||eps||_P of what the others add is at most e + s ||d||."""
+    if others is None:
+        return 0.0, 0.0
+    squares = (
+        np.sum((part.swapaxes(1, -1) @ P).swapaxes(1, -1) * part, axis=tuple(range(1, part.ndim))) for part in others
+    )
+    e, s = (float(np.sum(np.sqrt(np.maximum(each, 0.0)))) for each in squares)
+    return e, s
 
 
 def _gamma(models: Models, P: Array) -> float:
@@ -174,7 +190,20 @@ def rests_of(corners: Sequence[Corner], multipliers: Multipliers) -> list[Array]
     for corner in corners:
         if id(corner.b) not in known:
             known[id(corner.b)] = rest_of(corner.models, corner.b, multipliers)
-    return [known[id(corner.b)] for corner in corners]
+    return [known[id(corner.b)] + of_others(corner, multipliers.weight)[1:, 1:] for corner in corners]
+
+
+def of_others(corner: Corner, weight: Array) -> Array:
+    """The bound of what the models' others add, over (1, d): (1 + k, 1 + k)."""
+    k = len(weight)
+    if corner.models.others is None:
+        return np.zeros((1 + k, 1 + k))
+    moves, turns = corner.models.others
+    W = np.zeros((1 + k, 1 + k))
+    W[1:, 1:], W[0, 0] = weight, _OF_ONE * np.trace(weight)
+    p = np.concatenate([np.column_stack([corner.of_1, corner.b])] * len(moves))
+    steps = np.concatenate([moves[..., None], turns], axis=2).reshape(len(p), 1 + k)
+    return _by_weight(p, steps[:, :, None] * steps[:, None], W)
 
 
 def rest_of(models: Models, b: Array, multipliers: Multipliers) -> Array:

@@ -18,8 +18,17 @@ from certify.certificates.claims import Problem
 from certify.effort import UNLIMITED, Effort
 from certify.lyapunov import extents
 from certify.provers.ball.cells import cut, cuts_for
-from certify.provers.ball.decrease import NOT_SHOWN, Corner, Multipliers, Shown, best_at, corners_of, rests_of
-from certify.provers.ball.models import Models, Paths, paths
+from certify.provers.ball.decrease import (
+    NOT_SHOWN,
+    Corner,
+    Multipliers,
+    Shown,
+    best_at,
+    corners_of,
+    of_others,
+    rests_of,
+)
+from certify.provers.ball.models import AT_CORNERS, Models, Paths, paths
 from certify.provers.ball.steps import Cell, Steps, steps_of
 
 Array = NDArray[np.float64]
@@ -201,7 +210,7 @@ class Rule:
     def operations(self) -> float:
         """Operations of a look at one ball, about, as an `Effort` counts them."""
         n, units = len(self.T), self.problem.loop.network.network.units
-        corners = max(1, len(self.cells)) * 2 ** len(self.problem.loop.system.ranges)
+        corners = max(1, len(self.cells)) * 2 ** min(len(self.problem.loop.system.ranges), AT_CORNERS)
         return float(self.operations_of_models + corners * _WEIGHINGS * (_WEIGHING + 30.0 * units * n**2 + 15.0 * n**5))
 
     @property
@@ -243,7 +252,9 @@ class Rule:
         for c, rest in zip(corners, rests_of(corners, by), strict=True):
             left = (1 - _MARGIN) * c.decay - rest
             values, vectors = eigh((left + left.T) / 2, V)
-            parts.append((values, (vectors.T @ c.linear) ** 2, c.start + _ROUNDING * float(np.trace(c.decay))))
+            more = of_others(c, by.weight)
+            linear, start = c.linear + more[1:, 0], c.start + float(more[0, 0])
+            parts.append((values, (vectors.T @ linear) ** 2, start + _ROUNDING * float(np.trace(c.decay))))
         most, h = min(float(values[0]) for values, _, _ in parts), self.steps.longest
         if not most > 0:
             return replace(_NOWHERE, rounds=_ROUNDS)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +35,7 @@ _CALL, _EACH, _ENTRY = 3e5, 1e5, 0.12  # operations of a layer, of one of the eq
 _MOST_NUMBERS, _MOST_PRODUCTS = 2**25, 2**33  # size of the sums over paths: the checker refuses more
 _MARGIN = 1e-3  # share of an input's range, left to the checker's rounding where a clip begins
 _AT_CORNER = 1e-12  # what a unit reads, so near 0 that no ball of any use is free of its corner
+AT_CORNERS = 6  # uncertain quantities of which the checker decides every corner
 _UNIT = 2.0**-51  # twice what a checker counts for each term of a sum, relative to the sum's size
 _ROUNDED = 2.0**-49  # and for anything else that it computes
 
@@ -74,6 +75,7 @@ class Models:
     Those are N numbers |e_q| <= d'R_q d, R (N, k, k), which enter F as `shares` (n, N) times e; `squares` are R_q'R_q.
     `spread` says what is uncertain of f and A, None that nothing is; `stays` whether the states are certain to stay in
     the domain over a sampling period; `rounding` (n,) is about what a checker does not know of f for its roundings.
+    `others` are y beside those of `spread` that have no corners, `moves` and `turns` as there; see `with_others`.
     """
 
     f: Array
@@ -88,6 +90,20 @@ class Models:
     rounding: Array
     spread: Spread | None = None
     stays: bool = True
+    others: tuple[Array, Array] | None = None
+
+    def with_others(self, P: Array) -> Models:
+        """The same without those y that move neither f nor A, and of more than AT_CORNERS with those of the least
+        effect as `others`, as the checker has it for P (n, n)."""
+        if self.spread is None or not len(self.spread.moves):
+            return self
+        moves, turns, roots = self.spread.moves, self.spread.turns, np.sqrt(np.abs(np.diag(P)))
+        size = np.linalg.norm(turns, axis=2) @ roots
+        some = np.flatnonzero((size > 0) | np.any(moves != 0, axis=1))
+        some = some[np.lexsort((-size[some], ~np.any(moves[some] != 0, axis=1)))]
+        first, last = some[:AT_CORNERS], some[AT_CORNERS:]
+        spread = replace(self.spread, moves=moves[first], turns=turns[first])
+        return replace(self, spread=spread, others=(moves[last], turns[last]) if len(last) else None)
 
     @property
     def corners(self) -> list[tuple[Array, Array]]:
