@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from certify.analysis.candidates.economical import Forecast, economical_candidate, is_forecast
-from certify.analysis.candidates.trials import economical, trial
+from certify.analysis.candidates.trials import economical
 from certify.analysis.options import RoaOptions
-from certify.effort import UNIT, UNLIMITED, Effort
+from certify.effort import UNLIMITED, Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import get_system
 from certify.loop.policies import PolicyNetwork, load_policy
@@ -69,11 +69,10 @@ def test_where_no_effort_is_left_the_best_start_is_taken(curved: ClosedLoop) -> 
 
 
 def test_it_is_asked_for_where_boxes_limit_the_proof_alone(curved: ClosedLoop) -> None:
-    options, (P, _) = RoaOptions(), starts(curved)
-    one = trial(curved, P, "lyapunov", options, Effort(UNIT))
-    asked = economical(curved, [one], 20, options, UNLIMITED)
+    options, found = RoaOptions(), {"lyapunov": starts(curved)[0]}
+    asked = economical(curved, found, 20, options, UNLIMITED)
     assert asked is not None and asked.name == "economical"
-    assert economical(curved, [one], 1e12, options, UNLIMITED) is None
+    assert economical(curved, found, 1e12, options, UNLIMITED) is None
 
 
 def test_no_forecast_is_made_of_loops_whose_boxes_it_does_not_know(curved: ClosedLoop) -> None:

@@ -40,7 +40,7 @@ _BELOW_WITNESS = 1e-3
 _SMALLEST = 1e-120  # the least level: squares of states and products of bounds must not underflow
 _BLENDS = (0.05, 0.15, 0.3)
 MANY = 6  # states, beyond which there is next to nothing but the local set
-_BOXES_SUFFICE = 0.1  # share of the largest volume within reach
+_BOXES_SUFFICE = 0.1  # share of a volume within reach
 OPTIMISING = 0.2  # share of the effort that the optimised candidate may take
 SAMPLING = 0.25  # further share of that for sampling what a candidate could give
 FOR_PEAK = 0.4  # share of the effort for a candidate that may be the only one
@@ -194,16 +194,15 @@ def robust(loop: ClosedLoop, options: RoaOptions, effort: Effort) -> Trial | Non
 
 
 def economical(
-    loop: ClosedLoop, trials: Sequence[Trial], boxes: float, options: RoaOptions, effort: Effort
+    loop: ClosedLoop, found: Mapping[str, Array], boxes: float, options: RoaOptions, effort: Effort
 ) -> Trial | None:
-    """The candidate that these boxes are forecast to prove most with, or None if they prove most of what is within the
-    reach of one of the trials."""
-    forecast, most = Forecast(loop, effort, FEW_STATES), max(t.volume for t in trials)
-    for t in by_reach(trials):
-        level = t.task.target * min(1.0, _BOXES_SUFFICE * most / t.volume) ** (2 / loop.system.n)
-        if forecast.boxes(t.P, level) <= boxes:
-            return None
-    P = economical_candidate(loop, [t.P for t in trials], boxes, effort)
+    """The candidate that these boxes are forecast to prove most with, from `solutions` on, or None if they prove more
+    than a small part of what is within the reach of the first of these."""
+    first = trial(loop, next(iter(found.values())), "", options, effort)
+    level = first.task.target * _BOXES_SUFFICE ** (2 / loop.system.n)
+    if Forecast(loop, effort, FEW_STATES).boxes(first.P, level) <= boxes:
+        return None
+    P = economical_candidate(loop, list(found.values()), boxes, effort)
     return trial(loop, P, "economical", options, effort)
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
 
 from certify.analysis.asked import ellipsoid_in
 from certify.analysis.candidates.converging import is_nearby
@@ -56,6 +59,7 @@ _MISLED = 0.9  # share of its reach: a violation below it is one that the sample
 _REACHED = 0.9  # share of its target: a level above it leaves nothing to a candidate that is easier to prove
 _APART = 1 / 16  # shares of a blend that are no farther apart are not told apart
 
+Array = NDArray[np.float64]
 Make = Callable[[RoaOptions, Effort], Trial | None]
 
 
@@ -167,6 +171,9 @@ class _Choice:
                 trials = solved(loop, found, state.options, self._granted())
             rests = loop.network.is_moved and not loop.system.ranges
             return (self._around_its_rest if rests else self._around_a_level)(trials)
+        thrifty = self._economical(found) if state.interruptible and state.options.engine != "dreal" else None
+        if thrifty is not None:
+            return race.enter([thrifty])
         large = self._made(partial(optimised, loop)) if state.options.engine != "dreal" else None
         most = volume(ellipsoid_in(loop.system), 1.0)
         if state.interruptible and large is not None and race.is_settled_by(large, most):
@@ -175,9 +182,6 @@ class _Choice:
         if not self.effort.over or not race.proved:
             with self.tools.timing("candidate"):
                 trials = [*solved(loop, found, state.options, self._granted()), *trials]
-        thrifty = self._economical(trials) if state.interruptible else None
-        if thrifty is not None:
-            return race.enter([thrifty])
         if state.interruptible:
             return self._among(trials)
         race.enter(by_reach(trials)[:1])
@@ -198,14 +202,15 @@ class _Choice:
             race.enter(between, None if race.gained else 0.0)  # without a gain their local levels tell
         race.knock_out()
 
-    def _economical(self, trials: list[Trial]) -> Trial | None:
-        """The candidate for the boxes that the effort left can bound and check, if they limit what is proved."""
+    def _economical(self, found: Mapping[str, Array]) -> Trial | None:
+        """The candidate for the boxes that the effort left can bound and check, if they limit what is proved with the
+        first of these solutions."""
         loop, effort = self.loop, self.effort
         if not (FEW < loop.system.n <= MANY and is_forecast(loop)):
             return None
         each = operations_of_box(loop) + operations_of_check(loop)
         boxes = (effort.left - OPTIMISING * self.tools.whole) / each
-        return None if boxes < 1 else self._made(partial(economical, loop, trials, boxes))
+        return None if boxes < 1 else self._made(partial(economical, loop, found, boxes))
 
     def _around_a_level(self, trials: list[Trial]) -> None:
         """A practical claim in many states, where no tree of boxes can carry what a ball does not: the candidate made
