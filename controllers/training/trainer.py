@@ -53,6 +53,7 @@ class Trainer:
     device : where the networks and the replay table live; of no account for checkpoints and policies.
     plant : where the evaluations during the run start; default: the plant that ships under the system's name, and no
         evaluations if there is none.
+    environment : the plant step by step; default: by the system's equations.
 
     Raises
     ------
@@ -60,11 +61,16 @@ class Trainer:
     """
 
     def __init__(
-        self, system: System, options: TrainingOptions, device: torch.device = CPU, plant: Plant | None = None
+        self,
+        system: System,
+        options: TrainingOptions,
+        device: torch.device = CPU,
+        plant: Plant | None = None,
+        environment: PlantEnvironment | None = None,
     ) -> None:
         options.check(system)
         self.system, self.options, self.plant = system, options, plant
-        self.environment = PlantEnvironment(system, options)
+        self.environment = PlantEnvironment(system, options) if environment is None else environment
         self.interface = Interface(system)
         Q_c, R_c = np.diag(options.state_weights), np.diag(options.input_weights)
         first: Phase = "idle" if options.identification == "never" else "A"
