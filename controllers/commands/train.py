@@ -119,8 +119,9 @@ class _Task:
         if data is None:
             return found | {"next": "again with --write-data data.csv, for certify identify: there are no equations"}
         count = black_box.write_data(data, trainer, self.box)
-        following = f"certify identify {data} --structure linear --second NAME=BOUND --noise E, then certify roa"
-        return found | {"data": f"{data}, {count} transitions", "next": following}
+        bounds = " ".join(f"--second '{s}=BOUND'" for s in self.system.states)
+        following = f"certify identify {data} --structure linear {bounds} --noise E"
+        return {"data": f"{data}, {count} transitions"} | found | {"next": following}
 
 
 def _task(plant: str | None, given: dict[str, Any], preset: str, chosen: dict[str, Any], made: dict[str, Any]) -> _Task:

@@ -120,6 +120,8 @@ def _system(told: Told, env: Any, states: Mapping[str, bool], inputs: list[str],
             if not (abs(low) < 1e9 and abs(high) < 1e9):  # of some environments 3.4e38 stands for infinity
                 raise OptionError(f"`domain` must have a half-width of {name}, as in {name}=1: it is unbounded.")
             half = min(Fraction(high) - at, at - Fraction(low))
+            if not half > 0:
+                raise OptionError(f"`rest` must lie inside what {told.name} shows; found {name}={float(at):g}.")
         domain.append((-half, half))
     unknown = tuple(Symbol(f"unknown_{s}") for s in states)
     return System(

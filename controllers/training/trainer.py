@@ -146,7 +146,7 @@ class Trainer:
         ------
         InputError : the run is too short to have learned a gain, or has diverged, or a unit's corner is at the origin.
         """
-        self._require_finite(self.distance()[1])
+        _require_finite(self.distance()[1], self.steps_done)
         if not self.ships:
             passing = self.options.identification_starts == "domain"
             instead = ", or `identification_starts` ball, which goes where the gain is learned" if passing else ""
@@ -165,7 +165,7 @@ class Trainer:
         ------
         InputError : the run has diverged.
         """
-        self._require_finite(self.distance()[1])
+        _require_finite(self.distance()[1], self.steps_done)
         state = {
             "format": CHECKPOINT_FORMAT,
             "system": [self.system.name, parameters_of(self.system)],
@@ -238,16 +238,17 @@ class Trainer:
         ended = self.episode
         kind = "identification" if ended.near else "training"
         distance, offset = self.distance()
-        self._require_finite(offset)
+        _require_finite(offset, self.steps_done)
         self.episodes.append(Episode(self.steps_done, kind, ended.length, ended.total, outcome, distance, offset))
         self._begin_episode()
 
-    def _require_finite(self, offset: float) -> None:
-        if not math.isfinite(offset):
-            raise OptionError(
-                f"the run has diverged: the actor's weights are not finite after {self.steps_done} steps. Try a "
-                "smaller `learning_rate` or `gain_weight`, or another `seed`; an earlier checkpoint is still sound."
-            )
+
+def _require_finite(offset: float, steps: int) -> None:
+    if not math.isfinite(offset):
+        raise OptionError(
+            f"the run has diverged: the actor's weights are not finite after {steps} steps. Try a smaller "
+            "`learning_rate` or `gain_weight`, or another `seed`; an earlier checkpoint is still sound."
+        )
 
 
 def train(
