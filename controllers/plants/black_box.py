@@ -20,6 +20,7 @@ from controllers.plants.defaults import default_plant
 
 Array = NDArray[np.float64]
 _HALF_TURN = Fraction(314, 100)
+_STILL = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,7 +74,8 @@ def black_box(told: Told) -> BlackBox:
     Raises
     ------
     InputError : it does not exist, its actions are not numbers with finite bounds, its observation is not as it was
-        said, a step has no time, a state no bounds, or an option names nothing of it.
+        said, a step has no time, a state no bounds, an option names nothing of it, or a step from the operating point
+        leads away, where the state can be set to find out.
     """
     env = opened(told.name)
     import gymnasium
@@ -104,8 +106,10 @@ def black_box(told: Told) -> BlackBox:
     settable = _settable(env, read, np.array([states[s] for s in states]))
     plant = default_plant(system, _step_of(told, env))
     starts = plant.preset if settable else replace(plant.preset, identification_starts="domain")
-    angles = np.array(list(states.values()))
-    return BlackBox(env, read, system, replace(plant, preset=starts), angles, settable)
+    box = BlackBox(env, read, system, replace(plant, preset=starts), np.array(list(states.values())), settable)
+    if settable:
+        _require_rest(box)
+    return box
 
 
 def _system(told: Told, env: Any, states: Mapping[str, bool], inputs: list[str], entries: list[str]) -> System:
@@ -165,6 +169,21 @@ def _settable(env: Any, read: Callable[[Any], Array], angles: NDArray[np.bool_])
     except (AttributeError, TypeError, ValueError):
         return False
     return bool(np.array_equal(ends[0], ends[1]) and not np.array_equal(ends[0], ends[2]))
+
+
+def _require_rest(box: BlackBox) -> None:
+    """Refuse an operating point from which a step moves a state by more than a thousandth of its domain."""
+    system, env = box.system, box.env
+    x, u = (np.array([float(q) for q in point]) for point in (system.exact_x_eq(), system.exact_u_eq()))
+    env.reset(seed=0)
+    env.unwrapped.state = x
+    moved = turned(box.read(env.step(u.astype(env.action_space.dtype))[0]) - x, box.angles)
+    for s, by, (_, half) in zip(system.states, moved.tolist(), system.domain, strict=True):
+        if abs(by) > _STILL * float(half):
+            raise OptionError(
+                "`rest` and `rest_input` must say where the environment rests; a step from there moves "
+                f"{s} by {by:.3g}."
+            )
 
 
 def turned(difference: Array, angles: NDArray[np.bool_]) -> Array:

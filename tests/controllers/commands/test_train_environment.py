@@ -86,7 +86,7 @@ class Ending(Shown):
         return shown, reward, True, False, info
 
 class Turning(gymnasium.Env):
-    """An angle that turns by 1 a step."""
+    """An angle that turns by the action."""
     observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float64)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float64)
     dt = 0.1
@@ -97,7 +97,7 @@ class Turning(gymnasium.Env):
         return self._show(), {}
 
     def step(self, action):
-        self.state = self.state + 1.0
+        self.state = self.state + action
         return self._show(), 0.0, False, False, {}
 
     def _show(self):
@@ -199,7 +199,7 @@ def test_an_angle_is_followed_over_full_turns(world):
     environment = BlackBoxEnvironment(box, replace(box.plant.preset, start=0.1))
     x, _ = environment.reset(seed=0)
     for k in range(1, 10):
-        assert np.allclose(environment.step(np.zeros(1))[0], x + k)
+        assert np.allclose(environment.step(np.ones(1))[0], x + k)
 
 
 def test_the_reward_is_that_of_any_plant_and_an_end_by_itself_is_a_failure(world):
@@ -225,6 +225,8 @@ def test_the_reward_is_that_of_any_plant_and_an_end_by_itself_is_a_failure(world
         ("Shown", ["--inputs", "a,b"], "--inputs must name the 1 actions"),
         ("Shown", ["--rest", "y=1"], "--rest names 'y'"),
         ("Shown", ["--rest", "x1=3"], "--rest must lie inside what"),
+        ("Shown", ["--rest", "x1=0.5"], "--rest and --rest-input must say where the environment rests"),
+        ("Elsewhere", ["--rest", "x1=0.5"], "a step from there moves x2 by -0.1"),
         ("Timeless", [], "--dt must be given"),
         ("Wide", [], "--domain must have a half-width of x1"),
         ("Keys", [], "must be a row of numbers with finite bounds"),
