@@ -35,7 +35,7 @@ TRAINER = {  # who imports whom within controllers, besides what is open there
     "history": "evaluation identification training",
     "identification": "simulation",
     "plants": "identification",
-    "training": "evaluation identification simulation",
+    "training": "evaluation identification plants simulation",
 }
 OPEN = {"cli", "options", "storage"}  # of controllers: its entry, and modules that anybody there may import
 ROOMS = {"analysis", "certificates", "checker", "cli", "loop", "lyapunov", "provers", "reference", "report"} | LEAVES

@@ -34,7 +34,7 @@ def _of_environment() -> Bundle:
         parameter(
             "env",
             "--env",
-            "Take the data from this environment of Gymnasium, and write them beside the plant.",
+            "Environment of Gymnasium, or FILE.py:NAME, to take the data from; they are written beside the plant.",
             metavar="ID",
             **shown,
         ),

@@ -6,7 +6,7 @@ import inspect
 import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
 
@@ -14,6 +14,7 @@ import typer
 
 from certify.cli.options import parameter
 from certify.errors import OptionError
+from controllers.commands import black_box
 from controllers.commands.shared import Json, beside_a_gain, emit, errors
 from controllers.options import Plant, TrainingOptions, overridden
 from controllers.storage import make_folder, read, require_writable, set_aside
@@ -22,12 +23,16 @@ if TYPE_CHECKING:
     from certify.loop.plants import System
     from certify.loop.policies import Policy
     from controllers.history.policies import PolicyWriter
+    from controllers.plants.black_box import BlackBox
     from controllers.training.trainer import Trainer
 
 
 def train(
     context: typer.Context,
-    plant: Annotated[str, typer.Argument(help="A plant that ships, FILE.toml, or FILE.py:NAME, whose code is run.")],
+    plant: Annotated[
+        str | None, typer.Argument(help="A plant that ships, FILE.toml, or FILE.py:NAME, whose code is run.")
+    ] = None,
+    *,
     out: Annotated[Path, typer.Option("--out", help="The policy file to write.")],
     preset: Annotated[
         str,
@@ -56,38 +61,103 @@ def train(
     """Train a policy: soft actor-critic tied to a learned LQR gain.
 
     Options that are not given take the plant's preset; for a plant of one's own they come from the table [training] of
-    its file, and else from its domain and input bounds. The policy file records them all, and the plant's name.
+    its file, and else from its domain and input bounds. The policy file records them all, and the plant's name. An
+    environment, --env, is a plant without equations: no evaluations, no checkpoints.
     """
     with errors(context, as_json):
-        from controllers.plants.choice import chosen_plant
-
-        system, plant_options = chosen_plant(plant)
-        options = overridden(plant_options.named(preset), _given(chosen))
-        from certify.loop.plants import require_equilibrium
-        from certify.loop.policies import save_policy
-        from controllers.history.policies import PolicyWriter
-        from controllers.training.device import find_device
-        from controllers.training.trainer import Trainer
-
-        require_equilibrium(system, rounded=True)
         if checkpoint_every < 1:
             raise OptionError(f"`checkpoint_every` must be positive; found {checkpoint_every}.")
         if evaluate_every < 0:
             raise OptionError(f"`evaluate_every` must be at least 0; found {evaluate_every}.")
+        of_environment = {name: chosen.pop(name) for name in black_box.OPTIONS}
+        data = of_environment["write_data"]
+        made = {"checkpoint_dir": checkpoint_dir, "resume": resume, "evaluations": evaluations, "keep": keep}
+        task = _task(plant, of_environment, preset, _given(chosen), made)
         for option, path in (("evaluations", evaluations), ("keep", keep)):
             if path is not None and not evaluate_every:
                 raise OptionError(f"`{option}` needs an `evaluate_every` above 0.")
-        for path in filter(None, (out, log, evaluations)):
+        for path in filter(None, (out, log, evaluations, data)):
             require_writable(path)
-        trainer = Trainer(system, options, find_device(device), plant_options)
+        trainer = task.trainer(device)
         checkpoint = _checkpoint(checkpoint_dir, resume)
-        writer = None if keep is None else PolicyWriter(keep, resume)
+        writer = None if keep is None else _policy_writer(keep, resume)
         if resume and checkpoint is not None:
             trainer.restore(read(checkpoint))
         set_aside(out)
-        policy = _run(trainer, log, evaluations, writer, (checkpoint, checkpoint_every, evaluate_every))
-        save_policy(out, policy)
-        emit(_summary(policy, out) | _prospects(policy, out, system, plant, plant_options, as_json), as_json)
+        plan = checkpoint, checkpoint_every, 0 if task.box else evaluate_every
+        policy = _run(trainer, log, evaluations, writer, plan)
+        _save(out, policy)
+        emit(_summary(policy, out) | task.prospects(policy, out, data, trainer, as_json), as_json)
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """The plant that somebody typed, or the environment that stands for it, and how it is trained."""
+
+    named: str
+    system: System
+    plant: Plant
+    options: TrainingOptions
+    box: BlackBox | None = None
+
+    def trainer(self, device: str) -> Trainer:
+        """A new run."""
+        from controllers.training.black_box import BlackBoxEnvironment
+        from controllers.training.device import find_device
+        from controllers.training.trainer import Trainer
+
+        environment = None if self.box is None else BlackBoxEnvironment(self.box, self.options)
+        return Trainer(self.system, self.options, find_device(device), self.plant, environment)
+
+    def prospects(
+        self, policy: Policy, out: Path, data: Path | None, trainer: Trainer, as_json: bool
+    ) -> dict[str, Any]:
+        """The data that are written, how the policy is, and the command to type next."""
+        found = _prospects(policy, out, self.system, self.named, self.plant, as_json)
+        if self.box is None:
+            return found
+        if data is None:
+            return found | {"next": "again with --write-data data.csv, for certify identify: there are no equations"}
+        count = black_box.write_data(data, trainer, self.box)
+        bounds = " ".join(f"--second '{s}=BOUND'" for s in self.system.states)
+        following = f"certify identify {data} --structure linear {bounds} --noise E"
+        return {"data": f"{data}, {count} transitions"} | found | {"next": following}
+
+
+def _task(plant: str | None, given: dict[str, Any], preset: str, chosen: dict[str, Any], made: dict[str, Any]) -> _Task:
+    """The task that somebody typed.
+
+    Parameters
+    ----------
+    given : the options of an environment, None where they were not given.
+    made : options that need a plant with equations.
+    """
+    if (plant is None) is (given["env"] is None):
+        raise OptionError("name a plant, or an environment with `env`; one of the two.")
+    if plant is None:
+        black_box.refuse(made, "must be left out with `env`: an environment has no equations, and is not stored")
+        box = black_box.named_environment(given, chosen.get("dt"))
+        return _Task(given["env"], box.system, box.plant, overridden(box.plant.named(preset), chosen), box)
+    black_box.refuse(given, "is for an environment, with `env`")
+    from certify.loop.plants import require_equilibrium
+    from controllers.plants.choice import chosen_plant
+
+    system, plant_options = chosen_plant(plant)
+    options = overridden(plant_options.named(preset), chosen)
+    require_equilibrium(system, rounded=True)
+    return _Task(plant, system, plant_options, options)
+
+
+def _policy_writer(keep: Path, resume: bool) -> PolicyWriter:
+    from controllers.history.policies import PolicyWriter
+
+    return PolicyWriter(keep, resume)
+
+
+def _save(out: Path, policy: Policy) -> None:
+    from certify.loop.policies import save_policy
+
+    save_policy(out, policy)
 
 
 def _run(
@@ -126,6 +196,7 @@ def _run(
 def _signature() -> inspect.Signature:
     own = inspect.signature(train, eval_str=True).parameters.values()
     parameters = [p for p in own if p.kind is not inspect.Parameter.VAR_KEYWORD]
+    parameters += black_box.OPTIONS.values()
     hints = get_type_hints(TrainingOptions, include_extras=True)
     for option in fields(TrainingOptions):
         kind, text = get_args(hints[option.name])

@@ -106,6 +106,10 @@ class GainLearner:
         if self.phase == "idle":
             self._begin("A")
 
+    def transitions_used(self) -> list[Row]:
+        """The transitions (x, v, x+) that A and B are fitted to, in rounds that are complete or under way."""
+        return [*self._rows["A"], *self._rows["B"]]
+
     def state(self) -> dict[str, Any]:
         """Plain values for a checkpoint."""
         found = self.identified

@@ -26,11 +26,11 @@ STEPS = 20_000
 RESOLUTION = 0.2  # the time step in units of 1 / (fastest rate of the LQR loop)
 
 
-def default_plant(system: System) -> Plant:
+def default_plant(system: System, dt: float | None = None) -> Plant:
     """The training of a plant of which nothing is known but its equations, domain and input bounds.
 
     With w the half-width of a state's domain and U that of an input's bounds around u_eq, weights are 1/w^2 and 1/U^2.
-    The time step is that of `time_step`.
+    The time step is `dt`, or that of `time_step`, which reads the equations.
 
     Raises
     ------
@@ -45,7 +45,7 @@ def default_plant(system: System) -> Plant:
     size = 100 * max(system.n, system.m)
     options = TrainingOptions(
         steps=STEPS,
-        dt=time_step(system, w, U),
+        dt=time_step(system, w, U) if dt is None else dt,
         horizon=250,
         start=0.5,
         reward_offset=1.0,

@@ -12,6 +12,7 @@ later read no entry points of installed packages; an id that names this module f
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,7 +59,7 @@ class PlantEnvironment(gymnasium.Env):  # type: ignore[misc]  # gymnasium is unt
         options.check(system)
         self.system = system
         self.options = options
-        self._step = Stepper(system, options.dt, "numpy")
+        self._step: Callable[[Array, Array], Array] = Stepper(system, options.dt, "numpy")
         self._lo, self._hi = np.array(system.domain, dtype=np.float64).T
         self._u_lo, self._u_hi = np.array(system.input_bounds, dtype=np.float64).T
         self._Q_r = np.array(options.reward_weights)

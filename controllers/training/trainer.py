@@ -53,6 +53,7 @@ class Trainer:
     device : where the networks and the replay table live; of no account for checkpoints and policies.
     plant : where the evaluations during the run start; default: the plant that ships under the system's name, and no
         evaluations if there is none.
+    environment : the plant step by step; default: by the system's equations.
 
     Raises
     ------
@@ -60,11 +61,16 @@ class Trainer:
     """
 
     def __init__(
-        self, system: System, options: TrainingOptions, device: torch.device = CPU, plant: Plant | None = None
+        self,
+        system: System,
+        options: TrainingOptions,
+        device: torch.device = CPU,
+        plant: Plant | None = None,
+        environment: PlantEnvironment | None = None,
     ) -> None:
         options.check(system)
         self.system, self.options, self.plant = system, options, plant
-        self.environment = PlantEnvironment(system, options)
+        self.environment = PlantEnvironment(system, options) if environment is None else environment
         self.interface = Interface(system)
         Q_c, R_c = np.diag(options.state_weights), np.diag(options.input_weights)
         first: Phase = "idle" if options.identification == "never" else "A"
@@ -140,7 +146,7 @@ class Trainer:
         ------
         InputError : the run is too short to have learned a gain, or has diverged, or a unit's corner is at the origin.
         """
-        self._require_finite(self.distance()[1])
+        _require_finite(self.distance()[1], self.steps_done)
         if not self.ships:
             passing = self.options.identification_starts == "domain"
             instead = ", or `identification_starts` ball, which goes where the gain is learned" if passing else ""
@@ -159,7 +165,7 @@ class Trainer:
         ------
         InputError : the run has diverged.
         """
-        self._require_finite(self.distance()[1])
+        _require_finite(self.distance()[1], self.steps_done)
         state = {
             "format": CHECKPOINT_FORMAT,
             "system": [self.system.name, parameters_of(self.system)],
@@ -232,16 +238,17 @@ class Trainer:
         ended = self.episode
         kind = "identification" if ended.near else "training"
         distance, offset = self.distance()
-        self._require_finite(offset)
+        _require_finite(offset, self.steps_done)
         self.episodes.append(Episode(self.steps_done, kind, ended.length, ended.total, outcome, distance, offset))
         self._begin_episode()
 
-    def _require_finite(self, offset: float) -> None:
-        if not math.isfinite(offset):
-            raise OptionError(
-                f"the run has diverged: the actor's weights are not finite after {self.steps_done} steps. Try a "
-                "smaller `learning_rate` or `gain_weight`, or another `seed`; an earlier checkpoint is still sound."
-            )
+
+def _require_finite(offset: float, steps: int) -> None:
+    if not math.isfinite(offset):
+        raise OptionError(
+            f"the run has diverged: the actor's weights are not finite after {steps} steps. Try a smaller "
+            "`learning_rate` or `gain_weight`, or another `seed`; an earlier checkpoint is still sound."
+        )
 
 
 def train(

@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from certify.analysis.identifying.reading import NEXT
 from certify.certificates import write_atomically
 from certify.errors import InputError
 from certify.loop.plants import System
+from certify.loop.plants.python import load_python
 
 Array = NDArray[np.float64]
 _ANGLES = "cos", "sin"
@@ -28,7 +30,7 @@ class Black:
 
     Parameters
     ----------
-    name : its id in Gymnasium.
+    name : its id in Gymnasium, or FILE.py:NAME, whose code is run.
     episodes : how many.
     policy : a policy file whose inputs are the actions; None for random ones.
     observed : the observation's entries, states or cos and sin of one, separated by commas; None for the states.
@@ -49,23 +51,44 @@ def record(black: Black, system: System, path: Path) -> None:
     ------
     InputError : Gymnasium is missing, has no such environment, or this shows other numbers than the plant's states.
     """
-    try:
-        import gymnasium
-    except ImportError as error:
-        raise InputError("an environment needs gymnasium: pip install gymnasium; or give a file of data.") from error
-    try:
-        env = gymnasium.make(black.name)
-    except (gymnasium.error.Error, ImportError) as error:
-        raise InputError(f"gymnasium has no environment {black.name!r}: {str(error).rstrip('.')}.") from error
+    env = opened(black.name)
+    import gymnasium
+
     if not isinstance(env.action_space, gymnasium.spaces.Box) or env.action_space.shape != (system.m,):
         raise InputError(
             f"actions of {black.name} must be {system.m} numbers, the inputs of {system.name}; they are "
             f"{env.action_space}."
         )
-    read, act = _reader(black, system), _actor(black, env, system)
-    rows = list(_rows(black, env, read, act))
+    names = [s.name for s in system.states]
+    read, act = reader(black, names), _actor(black, env, system)
+    write_transitions(path, names, [u.name for u in system.inputs], _rows(black, env, read, act))
     env.close()
-    states, inputs = [s.name for s in system.states], [u.name for u in system.inputs]
+
+
+def opened(name: str) -> Any:
+    """The environment of this id, or of a class or function FILE.py:NAME, whose code is run.
+
+    Raises
+    ------
+    InputError : Gymnasium is missing, or there is no such environment.
+    """
+    try:
+        import gymnasium
+    except ImportError as error:
+        raise InputError("an environment needs gymnasium: pip install gymnasium; or give a file of data.") from error
+    file, _, attribute = name.rpartition(":")
+    if file.endswith(".py"):
+        return load_python(Path(file), attribute, gymnasium.Env, "an environment of Gymnasium")
+    try:
+        return gymnasium.make(name)
+    except (gymnasium.error.Error, ImportError) as error:
+        raise InputError(f"gymnasium has no environment {name!r}: {str(error).rstrip('.')}.") from error
+
+
+def write_transitions(
+    path: Path, states: Sequence[str], inputs: Sequence[str], rows: Iterable[Sequence[float]]
+) -> None:
+    """Write a CSV file of single transitions: rows of states, inputs and next states."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow([*states, *inputs, *(f"{s}{NEXT}" for s in states)])
@@ -101,15 +124,25 @@ def _actor(black: Black, env: Any, system: System) -> Callable[[Array], NDArray[
     return lambda x: np.clip(np.asarray(loop.policy(x - at), dtype=space.dtype), space.low, space.high)
 
 
-def _reader(black: Black, system: System) -> Callable[[Any], Array]:
-    """The states from an observation.
+def states_of(observed: str) -> dict[str, bool]:
+    """The states that an observation shows, in its order, and of each if it is an angle, by its cos and sin.
+
+    >>> states_of("cos(theta), sin(theta), theta_dot")
+    {'theta': True, 'theta_dot': False}
+    """
+    entries = [part.strip() for part in observed.split(",")]
+    angles = [re.fullmatch(rf"(?:{'|'.join(_ANGLES)})\((.*)\)", entry) for entry in entries]
+    return {(found[1] if found else entry): bool(found) for entry, found in zip(entries, angles, strict=True)}
+
+
+def reader(black: Black, names: Sequence[str]) -> Callable[[Any], Array]:
+    """The states of these names from an observation.
 
     Raises
     ------
     InputError : it does not have every state once, or an angle without its cos or sin.
     """
-    names = [s.name for s in system.states]
-    entries = names if black.observed is None else [part.strip() for part in black.observed.split(",")]
+    entries = list(names) if black.observed is None else [part.strip() for part in black.observed.split(",")]
     places = [_place(name, entries) for name in names]
     used = sorted(k for place in places for k in place)
     if used != list(range(len(entries))):

@@ -1,4 +1,4 @@
-"""A user's plant in Python: `my_plant.py:plant`.
+"""A user's plant in Python: `my_plant.py:plant`; and anything else that somebody names in this way.
 
 Reading it runs its code. So this module is never called for a name in a file, only for a name that a person typed
 on the command line (`registry.chosen_system`).
@@ -10,6 +10,7 @@ import importlib.util
 import sys
 from contextlib import redirect_stdout
 from pathlib import Path
+from typing import Any
 
 from certify.errors import CertifyError, InputError
 from certify.loop.plants.equations import nearest
@@ -24,6 +25,23 @@ def load_python_system(path: Path, name: str) -> System:
     ------
     InputError : the file cannot be run, has no such name, or the name is no plant; an x_eq that is no equilibrium.
     """
+    made: System = load_python(path, name, System, "a System")
+    if any(made.exact_x_eq()):
+        require_equilibrium(made, lambda message: InputError(f"`{name}` in {path}: {message}"))
+    return made
+
+
+def load_python(path: Path, name: str, kind: type, what: str) -> Any:
+    """Run a Python file and return its `name`, of this kind, or the result of that without arguments.
+
+    Parameters
+    ----------
+    what : the kind in words, with an article.
+
+    Raises
+    ------
+    InputError : the file cannot be run, has no such name, or it is nothing of this kind.
+    """
     if not path.is_file():
         raise InputError(f"system file {path} cannot be read: there is no such file.")
     spec = importlib.util.spec_from_file_location("certify_plant_of_ones_own", path)
@@ -36,7 +54,7 @@ def load_python_system(path: Path, name: str) -> System:
         with redirect_stdout(sys.stderr):  # standard output is for results
             spec.loader.exec_module(module)
             found = getattr(module, name, None)
-            made = found() if callable(found) and not isinstance(found, System) else found
+            made = found() if callable(found) and not isinstance(found, kind) else found
     except CertifyError as error:
         raise InputError(f"{path}: {error}") from error
     except (Exception, SystemExit) as error:  # another's code may raise anything, and its exit status is no verdict
@@ -47,15 +65,13 @@ def load_python_system(path: Path, name: str) -> System:
         sys.modules.pop(spec.name, None)
     if found is None:
         public = [key for key in vars(module) if not key.startswith("_")]
-        close = nearest(name, public) or "; give a System, or a function without arguments that returns one."
+        close = nearest(name, public) or f"; give {what}, or a function without arguments that returns one."
         raise InputError(f"{path} has no {name!r}{close}")
-    if not isinstance(made, System):
+    if not isinstance(made, kind):
         raise InputError(
-            f"`{name}` in {path} must be a System or a function without arguments that returns one; "
+            f"`{name}` in {path} must be {what} or a function without arguments that returns one; "
             f"it gives {type(made).__name__}."
         )
-    if any(made.exact_x_eq()):
-        require_equilibrium(made, lambda message: InputError(f"`{name}` in {path}: {message}"))
     return made
 
 
