@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from certify.effort import UNLIMITED, Effort
 from certify.loop.closed_loop import ClosedLoop
@@ -130,6 +129,8 @@ class Forecast:
             gradient = np.einsum("k,kij->ij", -by / size, along)
             gradient -= np.einsum("ku,kuij->ij", (by * m / size)[:, None] * np.sign(each), asked)
             return float(math.log(total) + np.maximum(_LEAST - m, 0.0).sum()), gradient[rows] * often
+
+        from scipy.optimize import minimize  # which a proof that asks no forecast does not load
 
         with np.errstate(all="ignore"):
             start = np.eye(n)[rows]
