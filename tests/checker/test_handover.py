@@ -27,6 +27,7 @@ from certify.reference.rational import positive_definite
 from certify.reference.refusal import Refused
 from tests.checker.test_reference_data import true
 from tests.checker.test_uncertain import disturbed_claim
+from tests.support.balls import with_ball
 from tests.support.certificates import Document, decode, edited, encode, grow, make, rehash
 from tests.support.earlier import newer
 from tests.support.steps import stepping
@@ -339,6 +340,24 @@ def test_measurements_of_both_are_around_the_same_point() -> None:
             with pytest.raises(Refused):
                 of_reference(both)
     of_reference(replace(other, data=by.data))
+
+
+def called(bias: float, levels: tuple[float, float], claim: str) -> Document:
+    """x' = -x + f(x) + u, u = -tanh(x), f a network that is this number."""
+    equation = ["+", ["-", "x"], ["network", "f", 0, "x"], "u"]
+    data = newer(make([equation], [([[1.0]], [0.0])], [[1.0]], levels, claim=claim, centre="none"))
+    step = {"kind": "affine", "of": [0], "shape": [1, 1], "weight": encode([[0.0]]), "bias": encode([bias])}
+    return grow(with_ball({**data, "networks": [*data["networks"], {"name": "f", "reads": 1, "steps": [step]}]}))
+
+
+def test_the_same_section_plant_may_call_other_networks() -> None:
+    """Each claim is true of its own plant, and one of the first does not converge: it is none of both."""
+    outer, inner = called(0.125, (0.04, 0.25), "practical"), called(0.0, (0.05, 0.1), "asymptotic")
+    assert outer["plant"] == inner["plant"] and verdicts(joined(outer, inner)) == ACCEPTED
+    x = 0.1
+    for _ in range(4000):
+        x += 0.01 * (-x + 0.125 - np.tanh(x))
+    assert abs(x + np.tanh(x) - 0.125) < 1e-9 and x > 0.06
 
 
 # ---------------------------------------------------------------------------------------------- limits, words, truth

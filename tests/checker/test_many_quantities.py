@@ -202,10 +202,11 @@ def test_claims_that_fail_at_one_corner_are_refused(program: Callable[[Document]
     assert share > 0.25
 
 
-def one_state(hi: str, **more: Any) -> Document:
-    """x' = (q1 + ... + q8) x + u, u = -tanh(x): V falls near 0 if the q add up to less than 1."""
+def one_state(hi: str, lo: str = "0", **more: Any) -> Document:
+    """x' = (q1 + ... + q8) x + u, u = -tanh(x): V falls near 0 if the q add up to less than 1; in discrete time if they
+    add up to more than 0 and less than 2."""
     terms = [["*", f"q{i}", "x"] for i in range(8)]
-    uncertain = [(f"q{i}", "0", hi) for i in range(8)]
+    uncertain = [(f"q{i}", lo, hi) for i in range(8)]
     return make([["+", *terms, "u"]], [([[1.0]], [0.0])], [[1.0]], (1e-8, 1e-8), uncertain=uncertain,
                 cells=[1] * 8, centre="none", **more)  # fmt: skip
 
@@ -216,6 +217,16 @@ def test_in_one_state_nothing_is_lost(program: Callable[[Document], str | None],
     above, below = Fraction(1, 8) * (1 + Fraction(over)), Fraction(1, 8) * (1 - Fraction(over))
     assert program(settled(one_state(str(above)))) == "local"
     assert program(settled(one_state(str(below)))) in (None, "ACCEPTED")
+
+
+@pytest.mark.parametrize("program", [verdict, judge])
+@pytest.mark.parametrize("over", ["1/1000000", "1/1000", "1/10"])
+def test_nor_with_a_step(program: Callable[[Document], str | None], over: str) -> None:
+    for sign in (1, -1):
+        hi = Fraction(1, 4) * (1 + sign * Fraction(over))
+        data = settled(one_state(str(hi), "1/10", time="discrete"))
+        data = edited(data, "evidence.local.multipliers", encode([0.0, 2.0**-60, 1.0]))
+        assert program(data) in (("local",) if sign > 0 else (None, "ACCEPTED"))
 
 
 FORGED: dict[str, Callable[[Document], Document]] = {

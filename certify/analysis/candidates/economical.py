@@ -132,6 +132,8 @@ class Forecast:
             gradient -= np.einsum("ku,kuij->ij", (by * m / size)[:, None] * np.sign(each), asked)
             return float(math.log(total) + np.maximum(_LEAST - m, 0.0).sum()), gradient[rows] * often
 
+        from scipy.optimize import minimize  # which a proof that asks no forecast does not load
+
         with np.errstate(all="ignore"):
             start = np.eye(n)[rows]
             bounds = [(v - trust, v + trust) for v in start]
