@@ -110,8 +110,6 @@ class Forecast:
 
     def easier(self, P: Array, level: float, trust: float) -> Array:
         """P (n, n) of the same determinant for which the present states need the fewest boxes, near the present one."""
-        from scipy.optimize import minimize
-
         n, found, L = len(P), self.sampled(P, level), np.linalg.cholesky(P)
         rows = np.triu_indices(n)
         z, F, errors = found.x @ L, found.F @ L, found.errors @ L
