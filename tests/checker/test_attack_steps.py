@@ -174,7 +174,7 @@ BROKEN: dict[str, tuple[str, Any, str, Any]] = {
     "Euler's steps": ("a period", flow, "later", in_steps_of_euler),
     "no square of the step": ("a rate of steps", local, "sides", without_the_square),
     "no rate": ("a rate of samples", local, "sides", without_the_rate),
-    "one corner": ("a range that moves all", Models, "corners", lambda models: iter([models])),
+    "one corner": ("a range that moves all", Models, "corners", lambda models, P: iter([models])),
     "no doubt": ("a level of samples", local, "sides", lambda models, *rest: SIDES(certain(models), *rest)),
     "any multiplier of the level": ("a jump from within", Ring, "bound_of_steps", from_any_level),
 }

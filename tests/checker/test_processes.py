@@ -424,7 +424,7 @@ def test_an_answer_that_nobody_hears_is_no_refusal(tmp_path: Path) -> None:
     assert subprocess.run(["sh", "-c", shell], stderr=subprocess.DEVNULL, check=False).returncode == 70
 
 
-FEATURES = {"flow", "tube", "contraction", "outer", "ranks", "periodic", "data", "invariant"}
+FEATURES = {"flow", "tube", "contraction", "outer", "ranks", "periodic", "data", "invariant", "handover"}
 
 
 @pytest.mark.parametrize(

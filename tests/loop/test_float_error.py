@@ -29,7 +29,8 @@ from tests.support.marks import slow_after
 from tests.support.single import Machine, adversarial, by_torch, f32, off_by, units
 
 EXAMPLES = Path(__file__).parent.parent.parent / "examples"
-POLICIES = sorted((EXAMPLES / "policies").rglob("*.pt"), key=lambda path: path.stat().st_size)
+SHIPPED = sorted((EXAMPLES / "policies").rglob("*.pt"), key=lambda path: path.stat().st_size)
+POLICIES = [path for path in SHIPPED if load_policy(path).network.network.observation is None]  # others are refused
 U = 2.0**-24
 MACHINES = [
     Machine(),

@@ -68,7 +68,7 @@ class WarmCheckers:
 
     def run(self, line: Sequence[str], *, check: bool, **options: Any) -> subprocess.CompletedProcess[str]:
         """The result of a command line, in a fork if it is that of a checker."""
-        name, folder = (*line, "", "")[4:6]
+        name, folder = (*line, *[""] * 6)[4:6]
         if list(line[:4]) != [_PYTHON, "-I", "-c", checking._LAUNCH] or self._folders.get(name) != folder:
             return subprocess.run(line, check=check, **options)
         with self._lock:
