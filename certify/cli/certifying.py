@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
 
@@ -83,9 +83,28 @@ def certified(
     if result.notice is not None:
         note(as_typed(result.notice, options_of(context.command)))
     data = _with_next_command(result.to_dict(), context, policy)
+    finished(result, data, drawing.page_of, folder, summary, as_json, asked)
+
+
+def finished(
+    result: RoaResult | ResultWithoutV,
+    data: dict[str, Any],
+    page_of: Callable[..., str],
+    folder: Path,
+    summary: Callable[[Mapping[str, Any]], Any],
+    as_json: bool,
+    asked: str | None,
+) -> NoReturn:
+    """Write the report of a result with this JSON object, print it, and end the command with the verdict's exit status.
+
+    Parameters
+    ----------
+    page_of, summary : make the page and what is printed.
+    asked : a state or a box, as people write it; the result says if the proved set contains it.
+    """
     if result.certificate is not None and result.raw is not None:
         answer = None if result.checker is None else dict(result.checker)
-        write(folder / "report.html", drawing.page_of(result.raw, result.certificate, answer, data))
+        write(folder / "report.html", page_of(result.raw, result.certificate, answer, data))
     where = None if asked is None else where_of(result, asked)
     if where is not None:
         data["contains"] = where[0]

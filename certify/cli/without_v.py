@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-import typer
-
-from certify.cli.certifying import where_of
-from certify.cli.shared import noting, page_of, write
-from certify.cli.terminal import ProgressLine, say, show
+from certify.cli.certifying import finished
+from certify.cli.shared import noting, page_of
+from certify.cli.terminal import ProgressLine
 
 if TYPE_CHECKING:
     from certify.analysis.options import RoaOptions
@@ -67,19 +64,4 @@ def concluded(
             note(line)
     if result.notice is not None:
         note(result.notice)
-    data = result.to_dict()
-    if result.certificate is not None and result.raw is not None:
-        answer = None if result.checker is None else dict(result.checker)
-        write(folder / "report.html", page_of(result.raw, result.certificate, answer, data))
-    where = None if asked is None else where_of(result, asked)
-    if where is not None:
-        data["contains"] = where[0]
-    if as_json:
-        say(json.dumps(data))
-    else:
-        show(summary(data))
-        if where is not None:
-            say(where[1])
-        if result.certificate is not None:
-            say(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}")
-    raise typer.Exit(result.verdict.exit_status)
+    finished(result, result.to_dict(), page_of, folder, summary, as_json, asked)
