@@ -19,7 +19,7 @@ from certify.loop.files.arrays import Numbers
 from certify.loop.policies.importers import graph
 from certify.loop.policies.importers.graph import Chain
 from certify.loop.policies.importers.onnx_weights import load_weights
-from certify.loop.policies.importers.onnx_written import written_out
+from certify.loop.policies.importers.onnx_written import with_gelu, written_out
 from certify.loop.policies.importers.options import WITH_TANH, WITHOUT_NORMALISATION
 from certify.loop.policies.importers.reading import Observations, Reading, Values, gives
 from certify.loop.policies.importers.steps import MOST_NORMALISED, Affine
@@ -244,7 +244,9 @@ def _walk(graph_: Any, name: str, output: str, what: str) -> Chain:
         constants[tensor.name] = _constant(tensor, what)
     chains: dict[str, Chain | _Root] = {name: ()}
     wide = _given_width(graph_, name)
-    for node in graph_.node:
+    said = {node.output[0]: node for node in graph_.node if node.op_type == "Constant" and len(node.output) == 1}
+    numbers = constants | {made: _attribute({a.name: a for a in node.attribute}, what) for made, node in said.items()}
+    for node in with_gelu(list(graph_.node), numbers, output):
         at = f"{node.op_type} {node.name}".strip()
         if node.domain not in _STANDARD or len(node.output) != 1:
             raise InputError(f"{what} must hold {_KNOWN}; found {node.domain}.{at}.")
