@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import pickle
 import warnings
+import zipfile
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -438,6 +439,84 @@ def test_torchscript(make: Any, how: str, tmp_path: Path) -> None:
     if make is Scaled:
         mean, std = np.float32([0.1, 0.2]).astype(float), np.float32([0.9, 2.0]).astype(float)
         np.testing.assert_allclose(imported.policy.valid, np.stack([mean - 4 * std, mean + 4 * std], 1), rtol=1e-15)
+
+
+ACTIVATIONS = [
+    *("ReLU", "ELU", "SiLU", "Mish", "Softsign", "LeakyReLU", "SELU", "CELU", "Hardtanh", "ReLU6", "Hardswish"),
+    *("Hardsigmoid", "Tanh", "GELU", "Sigmoid", "Softplus", "LogSigmoid"),
+]
+
+
+@pytest.mark.parametrize("how", ["trace", "script", "freeze"])
+@pytest.mark.parametrize("name", [*ACTIVATIONS, *(f"{name} in place" for name in ACTIVATIONS[:3])])
+def test_torchscript_of_every_activation(name: str, how: str, tmp_path: Path) -> None:
+    torch.manual_seed(4)
+    kind, _, in_place = name.partition(" ")
+    unit = getattr(torch.nn, kind)(**({"inplace": True} if in_place else {}))
+    path = scripted(torch.nn.Sequential(torch.nn.Linear(2, 6), unit, torch.nn.Linear(6, 1)), how, tmp_path / "p.pt")
+    assert gap(import_policy(path, plant(), SAID), jit(path, X)) < 5e-6
+
+
+class InPlace(torch.nn.Module):
+    """What an operation in place has overwritten is read again."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.a, self.b = torch.nn.Linear(2, 6), torch.nn.Linear(6, 1)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        y = self.a(x)
+        z = torch.nn.functional.relu(y, inplace=True)
+        result: torch.Tensor = self.b(y + z)
+        return result
+
+
+@pytest.mark.parametrize("how", ["script", "freeze"])
+def test_a_value_that_was_overwritten_is_not_read(how: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="in place has overwritten"):
+        import_policy(scripted(InPlace(), how, tmp_path / "p.pt"), plant(), SAID)
+
+
+def test_a_trace_reads_what_was_written(tmp_path: Path) -> None:
+    path = scripted(InPlace(), "trace", tmp_path / "p.pt")
+    assert gap(import_policy(path, plant(), SAID), jit(path, X)) < 5e-6
+
+
+def rewritten(path: Path, old: str, new: str) -> Path:
+    """The archive with another text in its code."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+        for name, raw in members.items():
+            archive.writestr(name, raw.replace(old.encode(), new.encode()) if name.endswith(".py") else raw)
+    return path
+
+
+def test_a_function_is_what_its_archive_says(tmp_path: Path) -> None:
+    torch.manual_seed(4)
+    module = torch.nn.Sequential(torch.nn.Linear(2, 6), torch.nn.ReLU(), torch.nn.Linear(6, 1))
+    path = rewritten(scripted(module, "script", tmp_path / "p.pt"), "torch.relu(input)", "torch.tanh(input)")
+    module[1] = torch.nn.Tanh()
+    with torch.no_grad():
+        wanted = module(torch.tensor(X, dtype=torch.float32)).numpy()
+    assert gap(import_policy(path, plant(), SAID), wanted) < 5e-6
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("if inplace:", "if torch.relu(input):", "must branch on constants alone"),
+        ("return result", "pass", "must return its value"),
+        ("inplace: bool=False", "*inplace: bool", "by their place alone"),
+        ("relu(input, False, )", "relu(input, False, 1)", "must have 2 arguments"),
+        ("result = torch.relu(input)", "result = __torch__.torch.nn.functional.relu(input, False)", "at most 40 deep"),
+    ],
+)
+def test_functions_that_are_not_read(old: str, new: str, message: str, tmp_path: Path) -> None:
+    module = torch.nn.Sequential(torch.nn.Linear(2, 6), torch.nn.ReLU(), torch.nn.Linear(6, 1))
+    path = rewritten(scripted(module, "script", tmp_path / "p.pt"), old, new)
+    with pytest.raises(InputError, match=message):
+        import_policy(path, plant(), SAID)
 
 
 class Hidden(torch.nn.Module):

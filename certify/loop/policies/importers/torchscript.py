@@ -37,8 +37,12 @@ _ACTIVATIONS: dict[str, tuple[float, ...]] = {  # with what a program may write 
     "gelu-tanh": (),
     **dict.fromkeys(("selu", "relu6", "hardsigmoid", "hardswish", "log_sigmoid"), ()),
 }
+_IN_PLACE = (
+    *("relu", "elu", "leaky_relu", "selu", "celu", "silu", "mish", "tanh", "sigmoid"),
+    *("hardtanh", "hardswish", "hardsigmoid", "relu6", "clamp"),
+)
 _NORMALISATIONS = ("batch_norm", "group_norm", "instance_norm", "rms_norm")
-_RESERVED = ("torch", "CONSTANTS", "getattr")
+_RESERVED = ("torch", "__torch__", "ops", "CONSTANTS", "getattr")
 _DEFAULTS: dict[str, tuple[Any, ...]] = {"hardtanh": (-1.0, 1.0), "clamp": (None, None)}
 
 
@@ -71,12 +75,21 @@ class _Value:
 
 @dataclass(frozen=True, slots=True)
 class _Program:
-    """The archive's classes and constants, and how many operations were met."""
+    """The archive's classes, functions and constants, how many operations were met, and the values that one of them
+    has overwritten."""
 
     file: TorchFile
     classes: dict[Name, ast.ClassDef]
+    functions: dict[str, ast.FunctionDef]
     constants: tuple[Any, ...]
     count: list[int] = field(default_factory=lambda: [0])
+    overwritten: list[_Value] = field(default_factory=list)
+
+    def counted(self) -> None:
+        """Count an operation or a call."""
+        self.count[0] += 1
+        if self.count[0] > _MAX_OPERATIONS:
+            raise InputError(f"{self.file.what} must have at most {_MAX_OPERATIONS} operations; it has more.")
 
 
 def is_torchscript(file: TorchFile) -> bool:
@@ -92,11 +105,12 @@ def read_torchscript(file: TorchFile) -> Reading:
     InputError : the archive is damaged, or its code is no chain of known operations.
     """
     constants = file.pickle("constants.pkl") if file.holds("constants.pkl") else ()
-    program = _Program(file, _classes(file), constants if isinstance(constants, tuple) else ())
+    program = _Program(file, *_definitions(file), constants if isinstance(constants, tuple) else ())
     try:
         value = _forward(program, file.pickle("data.pkl"), _Value(), 0)
     except RecursionError as error:
         raise InputError(f"the code of {file.what} nests too deep to be read.") from error
+    _require_kept(program, value)
     made = value.made
     own = any(a.dtype == np.float64 and a.ndim for v in made for a in v.given if _is_array(a))
 
@@ -130,9 +144,9 @@ def _torch(what: str) -> Any:
     return torch
 
 
-def _classes(file: TorchFile) -> dict[Name, ast.ClassDef]:
-    """The classes of the archive's code by the names that its pickle has for them."""
-    found = {}
+def _definitions(file: TorchFile) -> tuple[dict[Name, ast.ClassDef], dict[str, ast.FunctionDef]]:
+    """The classes of the archive's code by the names that its pickle has for them, and its functions by theirs."""
+    classes, functions = dict[Name, ast.ClassDef](), dict[str, ast.FunctionDef]()
     start = f"{file.root}code/"
     for member in file.archive.names:
         if not member.startswith(start) or not member.endswith(".py"):
@@ -146,46 +160,76 @@ def _classes(file: TorchFile) -> dict[Name, ast.ClassDef]:
             raise InputError(f"{member} in {file.what} is no code that can be read: {error}.") from error
         module = member.removeprefix(start).removesuffix(".py").replace("/", ".")
         for node in tree.body:
+            if not isinstance(node, ast.ClassDef | ast.FunctionDef):
+                continue
+            name = Name(module, node.name)
+            if name in classes or str(name) in functions:
+                raise InputError(f"{file.what} must define each name once; {name} stands there twice.")
             if isinstance(node, ast.ClassDef):
-                name = Name(module, node.name)
-                if name in found:
-                    raise InputError(f"{file.what} must define each class once; {name} stands there twice.")
-                found[name] = node
-    return found
+                classes[name] = node
+            else:
+                functions[str(name)] = node
+    return classes, functions
 
 
 def _forward(program: _Program, module: Any, given: _Value, depth: int, method: str = "forward") -> _Value:
     """A call of a module; a trace has a method for each of its calls, forward, forward1, forward2."""
     what = program.file.what
-    if depth > _MAX_DEPTH:
-        raise InputError(f"the modules of {what} must nest at most {_MAX_DEPTH} deep.")
     if not isinstance(module, Call) or not isinstance(module.function, Name) or len(module.states) != 1:
         raise InputError(f"{what} must hold modules; found {brief(module)}.")
     definition = program.classes.get(module.function)
     methods = [] if definition is None else [n for n in definition.body if isinstance(n, ast.FunctionDef)]
     forward = [node for node in methods if node.name == method]
-    if len(forward) != 1 or len(forward[0].args.args) != 2 or forward[0].decorator_list:
+    if len(forward) != 1 or len(forward[0].args.args) != 2:
         raise InputError(f"{module.function} in {what} must have one {method} of one observation.")
-    names = [argument.arg for argument in forward[0].args.args]
-    if len(set(names)) != 2 or any(name in _RESERVED for name in names):
-        raise InputError(f"forward of {module.function} in {what} must not rename {', '.join(_RESERVED)}.")
-    values: dict[str, Any] = {names[0]: module, names[1]: given}
-    for statement in forward[0].body:
+    result = _called(program, forward[0], [module, given], depth, f"{method} of {module.function} in {what}")
+    if isinstance(result, _Value):
+        return result
+    raise InputError(f"{method} of {module.function} in {what} must return what it makes of the observation.")
+
+
+def _called(program: _Program, function: ast.FunctionDef, given: list[Any], depth: int, at: str) -> Any:
+    """The result of a function of the archive; arguments that are not given have their defaults."""
+    if depth > _MAX_DEPTH:
+        raise InputError(f"the modules of {program.file.what} must nest at most {_MAX_DEPTH} deep.")
+    program.counted()
+    names, said = [argument.arg for argument in function.args.args], function.args.defaults
+    missing = len(names) - len(given)
+    if len(set(names)) != len(names) or any(name in _RESERVED for name in names):
+        raise InputError(f"{at} must not rename {', '.join(_RESERVED)}, nor give two arguments one name.")
+    other = function.args
+    if function.decorator_list or other.posonlyargs or other.vararg or other.kwonlyargs or other.kwarg:
+        raise InputError(f"{at} must have arguments by their place alone.")
+    if not 0 <= missing <= len(said):
+        raise InputError(f"{at} must have {len(names)} arguments; it is given {len(given)}.")
+    defaults = [_evaluate(program, node, {}, depth) for node in said[len(said) - missing :]]
+    values = dict[str, Any](zip(names, [*given, *defaults], strict=True))
+    returned = _through(program, function.body, values, depth, at)
+    if returned is None:
+        raise InputError(f"{at} must return its value.")
+    return returned[0]
+
+
+def _through(program: _Program, body: list[ast.stmt], values: dict[str, Any], depth: int, at: str) -> tuple[Any] | None:
+    """What these statements return; None if they end without a return."""
+    for statement in body:
         match statement:
             case ast.Assign(targets=[ast.Name(id=name)]) if name not in _RESERVED:
                 values[name] = _evaluate(program, statement.value, values, depth)
             case ast.Return(value=ast.expr() as expression):
-                result = _evaluate(program, expression, values, depth)
-                if isinstance(result, _Value):
-                    return result
-                raise InputError(
-                    f"forward of {module.function} in {what} must return what it makes of the observation."
-                )
+                return (_evaluate(program, expression, values, depth),)
+            case ast.If(test=test):
+                decided = _evaluate(program, test, values, depth)
+                if not isinstance(decided, bool):
+                    raise InputError(f"{at} must branch on constants alone; found {_text(test)}.")
+                returned = _through(program, statement.body if decided else statement.orelse, values, depth, at)
+                if returned is not None:
+                    return returned
+            case ast.Pass():
+                continue
             case _:
-                raise InputError(
-                    f"forward of {module.function} in {what} has a statement that is not read: {_text(statement)}."
-                )
-    raise InputError(f"forward of {module.function} in {what} must return its action.")
+                raise InputError(f"{at} has a statement that is not read: {_text(statement)}.")
+    return None
 
 
 def _evaluate(program: _Program, node: ast.expr, values: dict[str, Any], depth: int) -> Any:
@@ -193,7 +237,7 @@ def _evaluate(program: _Program, node: ast.expr, values: dict[str, Any], depth: 
     match node:
         case ast.Name(id=name) if name in values:
             return values[name]
-        case ast.Constant(value=bool() | int() | float() | None as value):
+        case ast.Constant(value=bool() | int() | float() | str() | None as value):
             return value
         case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() | float() as value)):
             return -value
@@ -204,6 +248,8 @@ def _evaluate(program: _Program, node: ast.expr, values: dict[str, Any], depth: 
             if index >= len(program.constants):
                 raise InputError(f"{program.file.what} has no constant {index}.")
             return _tensor(program, program.constants[index], attr, "constants")
+        case ast.Attribute() if (function := _function(program, node, values)) is not None:
+            return function
         case ast.Attribute(value=inner, attr=attr):
             return _attribute(program, _evaluate(program, inner, values, depth), attr)
         case ast.Call(func=ast.Name(id="getattr"), args=[inner, ast.Constant(value=str() as attr)], keywords=[]):
@@ -213,6 +259,9 @@ def _evaluate(program: _Program, node: ast.expr, values: dict[str, Any], depth: 
                 raise InputError(f"torch.{name} in {program.file.what} is not read. {WITHOUT_NORMALISATION}")
             arguments = [_evaluate(program, argument, values, depth) for argument in node.args]
             return _operation(program, name, arguments, node)
+        case ast.Call(func=inner, args=arguments, keywords=[]) if function := _function(program, inner, values):
+            given = [_evaluate(program, argument, values, depth) for argument in arguments]
+            return _called(program, function, given, depth + 1, f"{function.name} in {program.file.what}")
         case ast.Call(func=ast.Attribute(value=inner, attr=method), args=[argument], keywords=[]) if _is_call(method):
             module = _evaluate(program, inner, values, depth)
             given = _evaluate(program, argument, values, depth)
@@ -220,6 +269,18 @@ def _evaluate(program: _Program, node: ast.expr, values: dict[str, Any], depth: 
                 raise InputError(f"a module of {program.file.what} must be given what depends on the observation.")
             return _forward(program, module, given, depth + 1, method)
     raise InputError(f"{program.file.what} has an expression that is not read: {_text(node)}. Known are {_KNOWN}.")
+
+
+def _function(program: _Program, node: ast.expr, values: dict[str, Any]) -> ast.FunctionDef | None:
+    """The archive's function that a name stands for, or the whole path of one; None if it is none."""
+    if isinstance(node, ast.Name):
+        found = values.get(node.id)
+        return found if isinstance(found, ast.FunctionDef) else None
+    names = list[str]()
+    while isinstance(node, ast.Attribute):
+        names.append(node.attr)
+        node = node.value
+    return program.functions.get(".".join([node.id, *names[::-1]])) if isinstance(node, ast.Name) else None
 
 
 def _is_call(method: str) -> bool:
@@ -261,9 +322,14 @@ def _tensor(program: _Program, node: Any, name: str, folder: str) -> Numbers:
 
 def _operation(program: _Program, name: str, given: list[Any], node: ast.Call) -> Any:
     at = f"torch.{name} in {program.file.what}"
-    program.count[0] += 1
-    if program.count[0] > _MAX_OPERATIONS:
-        raise InputError(f"{program.file.what} must have at most {_MAX_OPERATIONS} operations; it has more.")
+    program.counted()
+    if name == "gt" and len(given) == 2 and all(isinstance(v, int | float) for v in given) and not node.keywords:
+        return given[0] > given[1]
+    for value in [v for part in given for v in (part if isinstance(part, list) else [part])]:
+        _require_kept(program, value)
+    if name.removesuffix("_") in _IN_PLACE and name.endswith("_"):
+        program.overwritten.extend(v for v in given if isinstance(v, _Value))
+        name = name.removesuffix("_")
     for word in node.keywords:
         said = word.value.value if isinstance(word.value, ast.Constant) else None
         if name == "gelu" and word.arg == "approximate" and said in ("none", "tanh"):
@@ -295,6 +361,12 @@ def _operation(program: _Program, name: str, given: list[Any], node: ast.Call) -
     others = tuple(v for v in given if not isinstance(v, _Value))
     chain = _step(name, places[0], len(given), given[places[0]].chain, others, at)
     return _Value(chain, name, tuple(given))
+
+
+def _require_kept(program: _Program, value: Any) -> None:
+    """Refuse a value that an operation in place has overwritten."""
+    if any(value is gone for gone in program.overwritten):
+        raise InputError(f"{program.file.what} must not read a value again that an operation in place has overwritten.")
 
 
 def _normalised(given: list[Any], at: str) -> Chain:
