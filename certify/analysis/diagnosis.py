@@ -21,7 +21,7 @@ from certify.analysis.facts import Diagnosis, Share, Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
 from certify.analysis.simulated import NEARLY_ALL
-from certify.analysis.suggested import beyond_the_ellipsoid, by_centring, by_learning, side
+from certify.analysis.suggested import beyond_the_ellipsoid, by_centring, by_clipping, by_learning, side
 from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT, UNLIMITED, WHOLE, Effort
 from certify.errors import InputError
@@ -182,6 +182,8 @@ def _next(
         return centred
     if (flatter := _flatter(result, options, proof)) is not None:
         return flatter
+    if (clipped := by_clipping(result, asked, effort)) is not None:
+        return clipped
     if (beyond := beyond_the_ellipsoid(result, options, effort)) is not None:
         return beyond
     if result.stop is Stop.DOMAIN and options.level is None:

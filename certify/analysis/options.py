@@ -40,11 +40,11 @@ class RoaOptions:
     claim: Asked = option("auto", "claim", "word", first=True, help=(
         "asymptotic: trajectories converge to the origin. practical: they enter a small set and stay there. nearby: "
         "they also converge to one equilibrium in it, if that can be shown. auto: asymptotic if the origin is "
-        "exactly an equilibrium of the loop, else nearby. invariant: a set {N <= n2} is never left, without an "
-        "equilibrium; N is given, or learned: a network, unless the candidate is polynomial."))
+        "exactly an equilibrium of the loop, else nearby. invariant: no trajectory leaves {N <= n2}, and no "
+        "equilibrium is needed; N is given, or learned: a network, or a polynomial if that is the candidate."))
     around: Around = option("auto", "claim", "word", metavar="POINT", help=(
-        "Where V is 0 if the origin is no equilibrium. origin: there. rest: at the loop's equilibrium, which then "
-        "is the operating point. auto: rest if that is a stable point and nothing is given around the origin."))
+        "The centre of V if the origin is no equilibrium: the origin, or rest, the loop's equilibrium, which then is "
+        "the operating point. auto: rest if that is a stable point and nothing is given around the origin."))
     level: float | None = option(None, "claim", "number", _POSITIVE, first=True, help=(
         "Prove exactly V <= LEVEL; a smaller set counts as UNKNOWN. By default the largest level is looked for."))
     rate: float = option(0.0, "claim", "number", _FROM_0, help=(
@@ -55,7 +55,7 @@ class RoaOptions:
         "Look for a tube that leads from a larger set into the proved one."))
     box: Mapping[str, float] | None = option(None, "claim", "widths", _HALF_WIDTHS, metavar="HALF-AXES", help=(
         "Let the tube start from the largest multiple of the ellipsoid with these half-axes; a state that is not named "
-        "gets the smallest share of its domain that a named one has."),
+        "gets the smallest fraction of its domain among those that are."),
         written="As in x=0.4,phi=0.2.", python="Half-axes by state.")
     reach_from: Mapping[str, Fraction | float] | None = option(
         None, "claim", "state", _NUMBERS, typed="--from", metavar="STATE", varies=False, first=True, help=(
@@ -76,10 +76,10 @@ class RoaOptions:
         "Prove exactly N <= LEVEL; a smaller outer set counts as UNKNOWN. By default the largest is looked for."))
     candidate: Candidate = option("auto", "candidate", "word", first=True, varies=False, help=(
         "Where the matrix P comes from: lyapunov, scaled, lqr, optimised, robust, or peak, which makes the floor of a "
-        "practical claim small. ellipsoid: several, of which the largest proved set counts; with Q or a level "
-        "lyapunov, with R lqr. auto: as ellipsoid; and if that is not most of what converges in simulation, in up to "
-        "three states a second function is learned for an outer set, or boxes get ranks where time goes in steps. "
-        "neural, polynomial: as ellipsoid, and this kind of second function is learned in any case."))
+        "practical claim small. ellipsoid: try several and keep the largest proved set; only lyapunov if Q or a level "
+        "is given, only lqr if R is. auto: as ellipsoid; and if that is not most of what converges in simulation, in "
+        "up to three states learn a second function for an outer set, or give ranks to boxes where time goes in steps. "
+        "neural, polynomial: as ellipsoid, and learn this kind of second function in any case."))
     Q: tuple[float, ...] | None = option(None, "candidate", "row", metavar="NUMBERS", written="As in 1,1.", help=(
         "Diagonal of the weights Q, a positive number for each state; ones by default."))
     R: tuple[float, ...] | None = option(None, "candidate", "row", metavar="NUMBERS", written="As in 1.", help=(
@@ -101,8 +101,8 @@ class RoaOptions:
     max_boxes: int = option(4_000_000, "effort", "whole", _ABOVE_0, metavar="BOXES", help=(
         "Stop the search in the ring after this number of boxes."))
     engine: EngineName = option("bounds", "effort", "word", variable="CERTIFY_ENGINE", help=(
-        "What proves the ring. bounds: branch and bound. dreal: a solver, whose word is trusted and not checked. both: "
-        "bounds prove, and dReal is asked as well."))
+        "The prover of V's decrease between the local set and the boundary. bounds: branch and bound. dreal: a solver, "
+        "whose word is trusted and not checked. both: bounds prove, and dReal is asked as well."))
     dreal_precision: float = option(
         1e-3, "effort", "number", ("lie between 0 and 1", lambda delta: 0 < delta < 1),
         typed="--precision", metavar="DELTA", help="The precision delta of dReal.")

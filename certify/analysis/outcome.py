@@ -112,8 +112,8 @@ def lowest_witness(*witnesses: Witness | None) -> Witness | None:
 
 def limit_of(stop: Stop, task: Task, witness: Witness | None) -> Stop:
     """The limit of a level, from what stopped its proof."""
-    if stop is Stop.WITNESS and witness is not None and witness.kind == "keep":
-        return Stop.KEEP
+    if stop is Stop.WITNESS and witness is not None:
+        return _BY_KIND[witness.kind]
     if stop is not Stop.REQUESTED or task.exactly:
         return stop
     return Stop.DOMAIN if witness is None else _BY_KIND[witness.kind]

@@ -53,7 +53,7 @@ class RoaResult:
     `rest` is the loop's equilibrium, if not the origin. `candidate` is the source of P, `tried` all that were tried,
     `notice` says what is not as it was asked for. `reach_from` is the state that was asked about, by the states'
     values; if the verdict on it is UNKNOWN by `Stop.PATH`, `certificate` and `levels` are of a proved set without it.
-    If the verdict is UNKNOWN by `Stop.BEYOND` they, and `outer`, are of a smaller set than was asked for. `constraints`
+    If it is UNKNOWN by `Stop.BEYOND`, these and `outer` describe a smaller set than was asked for. `constraints`
     are those that trajectories are to keep, in words by their names; with a certificate they are proved. `simulated`
     counts runs, in up to three states, and `nonlinearity` is sampled on the set. `checker` is the checker's answer,
     None if it was not reached, about `raw`, the certificate's bytes; `solver` has dReal's version and every query with
@@ -125,9 +125,9 @@ class RoaResult:
     def volume(self) -> float | None:
         """A certain lower bound of the proved set's volume, in the product of the states' units; None without a set.
 
-        With a tube it is that of the larger one of {V <= c2} and the tube's start, of which the set is the union; with
-        an outer set it is that of {V <= c2} alone: `outer.volume` is an estimate of the union's. With ranks too:
-        `ranks.volume` is that of their boxes, rounded down.
+        With a tube, the larger of the volumes of {V <= c2} and the tube's start, whose union is the set. With an outer
+        set or ranks, that of {V <= c2} alone: `outer.volume` estimates the union's, and `ranks.volume` is that of the
+        boxes with ranks, rounded down.
         """
         return None if self.ellipsoid is None else volume(*self.ellipsoid)
 

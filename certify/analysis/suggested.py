@@ -72,6 +72,29 @@ def by_centring(
     return Step((("--centre", centre), *stronger), why + more)
 
 
+def by_clipping(result: RoaResult, asked: tuple[System, PolicyNetwork], effort: Effort) -> Step | None:
+    """The step of a policy that asks for more than the actuator gives, where one that is clipped at the input bounds
+    converges from more states in simulation."""
+    system, network = asked
+    free = network.clip is None and network.squash == "identity" and system.n <= FEW
+    if result.stop is not Stop.INPUTS or not free or result.problem is None or result.levels.roa is None:
+        return None
+    bounds = tuple(np.array([float(end) for end in ends]) for ends in zip(*system.input_bounds, strict=True))
+    try:
+        loop = ClosedLoop(result.system, replace(result.network, clip=bounds))
+        there = _share(loop, result.problem.V, result.levels.roa, effort)
+    except InputError:
+        return None
+    here = _converging(result)
+    if there is None or here is None or there < here:
+        return None
+    ends = ",".join(f"{lo:g}..{hi:g}" for lo, hi in zip(*bounds, strict=True))
+    why = (
+        f"the policy asks for more than the actuator gives; if the actuator saturates there, clip the policy at {ends}"
+    )
+    return Step((), f"{why} (--clip, where the file of another program is read), and the larger set can be tried")
+
+
 def beyond_the_ellipsoid(result: RoaResult, options: RoaOptions, effort: Effort) -> Step | None:
     """The step after a set that goes beyond the ellipsoid, or where the ellipsoid is little of what there is; None
     where the ellipsoid's own limits come first."""

@@ -164,7 +164,7 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
     return [
         *stated(c),
         *takes_over,
-        "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items()),
+        "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items() if count),
         *([] if c.then is None else [_counted(answer["then"]["rules"])]),
         "modules that were used: " + ", ".join(answer["modules"]),
         rest,

@@ -164,7 +164,9 @@ def _path() -> list[Finding]:
             )
         ]  # fmt: skip
     other = found_by_import(Path.cwd())
-    if other is not None:
+    if other is not None and (Path.cwd() / "certify" / "checker" / "FORMAT.md").exists():
+        findings.append(Finding("path", "import certify", "ok", f"scripts of this folder import its own, {other}"))
+    elif other is not None:
         findings.append(
             Finding(
                 "path", "import certify", "warning", f"scripts and notebooks of this folder import {other}",

@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True, slots=True)
 class ClosedLoop:
     """A plant under a policy; `u_eq` is the exact equilibrium input, `folded` the policy without its centring,
-    `dynamics` the nominal equations. `operations` are about those of F at one state, as an `Effort` counts them, and
-    `of_equations` those of f among them.
+    `dynamics` the nominal equations. `operations` estimates the cost of F at one state, as an `Effort` counts it;
+    `of_equations` is the part of f.
 
     Raises
     ------

@@ -135,13 +135,19 @@ def _written(node: Expression) -> str:
 def _term(node: Expression) -> str:
     """The node with the sign that joins it to a sum."""
     if isinstance(node, Operation) and node.operator == "-":
-        return f"<mo>{SIGN}</mo>{_row(node.operands[0], PRODUCT)}"
+        inner = node.operands[0]
+        negative = isinstance(inner, Operation) and inner.operator == "*" and _is_negative(inner.operands[0])
+        return f"<mo>{SIGN}</mo>{_row(inner, POWER if negative else PRODUCT)}"
     if isinstance(node, Number) and node.value < 0:
         return f"<mo>{SIGN}</mo>{_number(-node.value)}"
     leading = node.operands[0] if isinstance(node, Operation) and node.operator == "*" else None
     if isinstance(leading, Number) and leading.value < 0:
         return f"<mo>{SIGN}</mo>{_row(Operation('*', Number(-leading.value), *node.operands[1:]), PRODUCT)}"
     return f"<mo>+</mo>{_row(node, PRODUCT)}"
+
+
+def _is_negative(node: Expression) -> bool:
+    return isinstance(node, Number) and node.value < 0
 
 
 def _factor(node: Expression) -> str:

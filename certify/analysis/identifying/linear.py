@@ -42,7 +42,7 @@ class LinearStructure:
     Parameters
     ----------
     second : by state, a bound of what its equation has beyond A x + B u, as text in states and inputs, such as
-        "10*theta*theta". Each term of a sum is one of its own; of signs nothing counts. A state without one is linear.
+        "10*theta*theta". Each term of a sum is bounded separately; signs are ignored. A state without one is linear.
     prior : ranges of entries of A and B, half-widths or intervals, by the entry's name, such as A21, or by state those
         of its row. By default four times as wide as what bounded errors leave of least squares, and a fifth of the
         values more: an assumption all the same, which the claim says.

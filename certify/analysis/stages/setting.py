@@ -119,7 +119,12 @@ def _with_claim(state: State) -> State:
     kind, why = _kind_of(state.loop, options)
     state = replace(state, converging=converging)
     if why is not None:
-        state = state.noting(f"practical stability is claimed, because {why}")
+        weaker = (
+            "practical stability is claimed, or a nearby equilibrium"
+            if converging
+            else "practical stability is claimed"
+        )
+        state = state.noting(f"{weaker}, because {why}")
     if kind == "practical" and options.enlarges:
         if options.reach_from is not None:
             raise InputError(

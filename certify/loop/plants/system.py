@@ -91,7 +91,7 @@ class System:
         else is said; empty for the states.
     calls : networks that the dynamics call, whose results stand there as symbols; see `certify.loop.composition`.
     rest_of_calls : exact values of results at the operating point, by their symbols' names, where they are given.
-    angles : names of states of which 2 pi more is the same place.
+    angles : names of states that are angles: x and x + 2 pi are the same place.
     constraints : expressions g by name, as the dynamics; g < 0 is asked for along trajectories.
     measurements : those with which uncertain parameters, constants, are consistent; None where ranges are assumed.
 

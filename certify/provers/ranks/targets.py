@@ -23,7 +23,7 @@ class Target(Protocol):
 
     def holds(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
         """True (B,) where states `x[:, 0] + x[:, 1:] d` within e, (n, n + 1, B) and (n, B), certainly lie in the set;
-        `angles` are numbers of states of which 2 pi more is the same place."""
+        `angles` are numbers of states that are angles: x and x + 2 pi are the same place."""
 
     def misses(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
         """True (B,) where none of these states lies in the set."""

@@ -92,7 +92,10 @@ def not_staying_of(certificate: InvariantCertificate) -> list[tuple[str, str]]:
 
 def _turns(certificate: AnyCertificate) -> Iterator[tuple[str, str]]:
     """The gap about angles, unless full turns of them are the same place."""
-    ranks, said = certificate.claim.ranks, "States are real numbers: an angle of a full turn is not the origin."
+    ranks, said = (
+        certificate.claim.ranks,
+        "States are real numbers: a state that is an angle is not the origin after a full turn.",
+    )
     if ranks is None or not ranks.angles:
         yield ("Wrapped angles.", said)
     elif certificate.system.n > len(ranks.angles):

@@ -85,7 +85,7 @@ def status_of(certificate: AnyCertificate, sha256: str, answer: Mapping[str, Any
         )
     second = answer.get("reference") or {}
     both = (second.get("result"), second.get("certificate_sha256")) == ("ACCEPTED", sha256)
-    also = " So did the reference, a second checker that shares no line with it." if both else ""
+    also = " So did the reference, a second checker that shares no code with it." if both else ""
     return Status("ACCEPTED", f"The independent checker accepted the certificate.{also}", _modules(answer))
 
 

@@ -95,6 +95,9 @@ class ImportOptions:
             raise InputError(
                 f"--activation must be one of {', '.join(IMPORTED)}; found {self.activation!r}. {WITH_TANH}"
             )
+        for name in ("action_scale", "action_offset"):
+            if isinstance(value := getattr(self, name), int | float | Fraction):
+                object.__setattr__(self, name, (Fraction(value),))
         if self.action_scale is not None and 0 in self.action_scale:
             raise InputError("--action-scale must not be 0.")
         if self.epsilon is not None and self.epsilon < 0:

@@ -213,7 +213,8 @@ def _only(tensors: Mapping[str, Numbers], n: int, m: int) -> str:
     listed = "; ".join(described) or "none (layers must be called PREFIX.NUMBER.weight and PREFIX.NUMBER.bias)"
     raise InputError(
         f"a file must hold one policy from {n} states to {m} inputs; it holds {len(fitting)}. "
-        f"Name its keys up to their numbers with --prefix, and its states with --states. Found {listed}."
+        f"Name its keys up to their numbers with --prefix, and its states with --states. Found {listed}. "
+        "Of a module that was pickled whole, save the state_dict, or a trace."
     )
 
 
