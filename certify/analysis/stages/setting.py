@@ -119,12 +119,8 @@ def _with_claim(state: State) -> State:
     kind, why = _kind_of(state.loop, options)
     state = replace(state, converging=converging)
     if why is not None:
-        weaker = (
-            "practical stability is claimed, or a nearby equilibrium"
-            if converging
-            else "practical stability is claimed"
-        )
-        state = state.noting(f"{weaker}, because {why}")
+        or_nearby = ", or a nearby equilibrium" if converging else ""
+        state = state.noting(f"practical stability is claimed{or_nearby}, because {why}")
     if kind == "practical" and options.enlarges:
         if options.reach_from is not None:
             raise InputError(
