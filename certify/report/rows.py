@@ -163,13 +163,18 @@ def _operating_point(result: Mapping[str, Any]) -> tuple[str, str]:
 
 def _policy_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     policy = result["policy"]
-    rows = [("policy", "-".join(map(str, policy["layers"]))), ("its sha256", str(policy["sha256"]))]
+    rows = [("policy", "-".join(map(str, policy["layers"]))), ("its sha256", begun(str(policy["sha256"])))]
     if result.get("nonlinearity"):
         rows.append(("linear part", nonlinearity_in_words(result["nonlinearity"])))
     if result.get("eigenvalues"):
         held = " (at the nominal values)" if result.get("uncertain") else ""
         rows.append(("eigenvalues", ", ".join(map(str, result["eigenvalues"])) + held))
     return rows
+
+
+def begun(sha256: str) -> str:
+    """The first digits of a hash, which stay on one line of a terminal; `--json` and `certify check` have all."""
+    return f"{sha256[:16]}…"
 
 
 def _work_rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
@@ -250,7 +255,7 @@ def _tube(result: Mapping[str, Any]) -> str:
 def _outer(outer: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Describe N, its outer set, and the limit of its level."""
     if outer["kind"] == "network":
-        name, named = network_name(outer["layers"]), [("sha256 of N", str(outer["sha256"]))]
+        name, named = network_name(outer["layers"]), [("sha256 of N", begun(str(outer["sha256"])))]
     else:
         text = str(outer["expression"])
         name, named = text if len(text) <= _LONG else f"an expression of {len(text):,} characters", []
