@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import re
 import shlex
 import signal
 import subprocess
@@ -424,7 +425,24 @@ def test_an_answer_that_nobody_hears_is_no_refusal(tmp_path: Path) -> None:
     assert subprocess.run(["sh", "-c", shell], stderr=subprocess.DEVNULL, check=False).returncode == 70
 
 
-FEATURES = {"flow", "tube", "contraction", "outer", "ranks", "periodic", "data", "invariant", "handover"}
+PACKAGE = Path(boxes.__file__).parent
+CHAPTERS = {  # the core page's table: the modules that a chapter is about
+    name: set(re.findall(r"`(\w+)`", modules))
+    for name, modules in re.findall(
+        r"^\| \[(\w+)\]\(format/\1\.md\) \| [^|]* \|([^|]*)\|$", (PACKAGE / "FORMAT.md").read_text(), re.M
+    )
+}
+FEATURES = set().union(*CHAPTERS.values())
+
+
+def test_each_feature_has_a_chapter_and_a_page_of_the_site() -> None:
+    pages = {path.stem for path in (PACKAGE / "format").glob("*.md")}
+    assert pages == {*CHAPTERS, "example"}
+    root = PACKAGE.parent.parent
+    nav = re.findall(r"- format/(\w+)\.md$", (root / "mkdocs.yml").read_text(), re.M)
+    assert set(nav) == pages == {path.stem for path in (root / "docs" / "format").glob("*.md")}
+    core = len((PACKAGE / "FORMAT.md").read_text().split())
+    assert core <= 5_000 and len(FEATURES) > 8
 
 
 @pytest.mark.parametrize(
@@ -436,8 +454,7 @@ def test_an_answer_rests_on_the_modules_that_it_needs(name: str, used: set[str],
     assert answer["result"] == "ACCEPTED"
     modules = set(json.loads(run_alone(write(honest(name), tmp_path)))["modules"])
     assert modules & FEATURES == used
-    package = Path(boxes.__file__).parent
-    assert modules - FEATURES == {path.stem for path in package.glob("[a-z]*.py")} - FEATURES
+    assert modules - FEATURES == {path.stem for path in PACKAGE.glob("[a-z]*.py")} - FEATURES
 
 
 def run_alone(path: Path) -> str:
