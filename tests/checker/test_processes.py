@@ -32,6 +32,8 @@ from certify.checker.processes import Batch, in_order
 from certify.checker.ring import Ring
 from certify.errors import BackendError, InputError
 from tests.checker.test_rules import HONEST, honest, scalar_claim
+from tests.support import network_loops
+from tests.support.balls import with_ball
 from tests.support.certificates import Document, edited, grow, parse, with_tree, write
 from tests.support.marks import slow_after
 from tests.support.mutants import family
@@ -455,6 +457,16 @@ def test_an_answer_rests_on_the_modules_that_it_needs(name: str, used: set[str],
     modules = set(json.loads(run_alone(write(honest(name), tmp_path)))["modules"])
     assert modules & FEATURES == used
     assert modules - FEATURES == {path.stem for path in PACKAGE.glob("[a-z]*.py")} - FEATURES
+
+
+def test_activations_are_loaded_where_a_network_or_an_equation_has_them(tmp_path: Path) -> None:
+    """Nobody else has added them to the table in a process of its own."""
+    plain, bent = honest("rotor"), network_loops.honest("relu")
+    rise = ["*", ["abs", ["+", "2", "x"]], ["+", ["/", "x", "4"], ["/", "u", "2"]]]
+    equation = grow(with_ball(edited(scalar_claim(c2=1.0, bias=0.0), "plant.dynamics", [rise])))
+    for data, known in ((plain, False), (bent, True), (equation, True)):
+        answer = json.loads(run_alone(write(data, tmp_path)))
+        assert answer["result"] == "ACCEPTED" and ("activations" in answer["modules"]) is known
 
 
 def run_alone(path: Path) -> str:
