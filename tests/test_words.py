@@ -13,7 +13,7 @@ SOURCES = [path for room in ("certify", "controllers") for path in sorted((ROOT 
 PAGES = [
     *sorted((ROOT / "docs").rglob("*.md")),
     *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "examples/README.md")),
-    ROOT / "certify" / "checker" / "FORMAT.md",
+    *sorted((ROOT / "certify" / "checker").rglob("*.md")),
 ]
 _OPENER = re.compile(r"\W*(?:What|Whether|Of|Those|How|Where|Which|That)\b")
 _SENTENCE = re.compile(r"(?:^\W*|[.:!] |\| )((?:What|Whether|Of|Those|How)\b[^.?|]*)(?:[.|]|$)", re.M)

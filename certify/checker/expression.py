@@ -180,8 +180,10 @@ class _Builder:
                 return self.apply("+", a, self.apply("neg", b))
             case "/", [a, b]:
                 return self.apply("*", a, self.apply("inv", b))
-            case (("sin" | "cos" | "tanh" | "exp" | "atan" | "sqrt" | "abs"), [a]):
+            case (("sin" | "cos" | "tanh" | "exp" | "atan" | "sqrt"), [a]):
                 return self.apply(name, a)
+            case "abs", [a]:
+                return self.abs(a)
             case "tan", [a]:
                 return self.apply("*", self.apply("sin", a), self.apply("inv", self.apply("cos", a)))
             case (("min" | "max"), [first, *others]) if others:
@@ -190,9 +192,15 @@ class _Builder:
                 return self.extreme("min", self.extreme("max", v, lo), hi)
         strict.fail(at, f"operator {name[:20]!a} with {len(arguments)} operands is not in the grammar")
 
+    def abs(self, a: Part) -> Part:
+        from . import activations
+
+        activations.add()
+        return self.apply("abs", a)
+
     def extreme(self, name: str, a: Part, b: Part) -> Part:
         """The larger of two numbers, (a + b + |a - b|)/2, or the lesser one, with -|a - b|."""
-        apart = self.apply("abs", self.apply("+", a, self.apply("neg", b)))
+        apart = self.abs(self.apply("+", a, self.apply("neg", b)))
         apart = apart if name == "max" else self.apply("neg", apart)
         return self.apply("*", Fraction(1, 2), self.apply("+", self.apply("+", a, b), apart))
 

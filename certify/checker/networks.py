@@ -23,10 +23,8 @@ from .expression import Call, Tape, parse
 from .schema import Value
 
 MAX_NETWORKS, MAX_STEPS, MAX_WIDTH, MAX_NAMES = 64, 256, 2**14, 64
-FUNCTIONS = (
-    *("sin", "cos", "tanh", "exp", "atan", "sqrt"),
-    *("relu", "elu", "sigmoid", "silu", "gelu", "softplus", "mish", "softsign"),
-)
+PLAIN = ("sin", "cos", "tanh", "exp", "atan", "sqrt")
+FUNCTIONS = (*PLAIN, "relu", "elu", "sigmoid", "silu", "gelu", "softplus", "mish", "softsign")
 Array = NDArray[np.float64]
 V = TypeVar("V")
 
@@ -241,7 +239,12 @@ def _step(value: Value, sizes: Sequence[int]) -> Step:
         case "affine":
             return _affine(read, width, *others)
         case "map":
-            return Map(read, width, others[0].choice(*FUNCTIONS))
+            function = others[0].choice(*FUNCTIONS)
+            if function not in PLAIN:
+                from . import activations
+
+                activations.add()
+            return Map(read, width, function)
         case "clip":
             lo, hi = (end.array(width) for end in others)
             value.must(bool(np.all(lo < hi)), "lower, then upper ends")

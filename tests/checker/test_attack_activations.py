@@ -16,6 +16,7 @@ import pytest
 from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from certify.checker import ball, contraction, document, limits, rules
+from certify.checker.activations import add as add_activations
 from certify.checker.ball import Ball
 from certify.checker.case import Case
 from certify.checker.errors import Rejected
@@ -40,6 +41,9 @@ from tests.checker.test_networks import CORNERED, Numbers, a_jet, checked, hash_
 from tests.support.certificates import Document, encode, make
 from tests.support.earlier import newer
 from tests.support.reference import judge_bytes
+
+add_activations()
+
 
 Array = Any
 PROGRAMS = pytest.mark.parametrize("program", [checked, judge_bytes], ids=["checker", "reference"])

@@ -569,8 +569,8 @@ def test_a_practical_claim_with_one_level_asks_the_leaves(tmp_path: Path) -> Non
 
 
 def test_the_format_s_own_example_is_accepted_with_its_margin(tmp_path: Path) -> None:
-    """FORMAT.md prints one certificate in full and works out its numbers."""
-    text = (Path(document.__file__).parent / "FORMAT.md").read_text(encoding="utf-8")
+    """The format prints one certificate in full and works out its numbers."""
+    text = (Path(document.__file__).parent / "format" / "example.md").read_text(encoding="utf-8")
     [example] = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
     file = write(example.encode(), tmp_path)
     answer = run(file)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import re
 import shlex
 import signal
 import subprocess
@@ -31,6 +32,8 @@ from certify.checker.processes import Batch, in_order
 from certify.checker.ring import Ring
 from certify.errors import BackendError, InputError
 from tests.checker.test_rules import HONEST, honest, scalar_claim
+from tests.support import network_loops
+from tests.support.balls import with_ball
 from tests.support.certificates import Document, edited, grow, parse, with_tree, write
 from tests.support.marks import slow_after
 from tests.support.mutants import family
@@ -424,7 +427,24 @@ def test_an_answer_that_nobody_hears_is_no_refusal(tmp_path: Path) -> None:
     assert subprocess.run(["sh", "-c", shell], stderr=subprocess.DEVNULL, check=False).returncode == 70
 
 
-FEATURES = {"flow", "tube", "contraction", "outer", "ranks", "periodic", "data", "invariant", "handover"}
+PACKAGE = Path(boxes.__file__).parent
+CHAPTERS = {  # the core page's table: the modules that a chapter is about
+    name: set(re.findall(r"`(\w+)`", modules))
+    for name, modules in re.findall(
+        r"^\| \[(\w+)\]\(format/\1\.md\) \| [^|]* \|([^|]*)\|$", (PACKAGE / "FORMAT.md").read_text(), re.M
+    )
+}
+FEATURES = set().union(*CHAPTERS.values())
+
+
+def test_each_feature_has_a_chapter_and_a_page_of_the_site() -> None:
+    pages = {path.stem for path in (PACKAGE / "format").glob("*.md")}
+    assert pages == {*CHAPTERS, "example"}
+    root = PACKAGE.parent.parent
+    nav = re.findall(r"- format/(\w+)\.md$", (root / "mkdocs.yml").read_text(), re.M)
+    assert set(nav) == pages == {path.stem for path in (root / "docs" / "format").glob("*.md")}
+    core = len((PACKAGE / "FORMAT.md").read_text().split())
+    assert core <= 5_000 and len(FEATURES) > 8
 
 
 @pytest.mark.parametrize(
@@ -436,8 +456,17 @@ def test_an_answer_rests_on_the_modules_that_it_needs(name: str, used: set[str],
     assert answer["result"] == "ACCEPTED"
     modules = set(json.loads(run_alone(write(honest(name), tmp_path)))["modules"])
     assert modules & FEATURES == used
-    package = Path(boxes.__file__).parent
-    assert modules - FEATURES == {path.stem for path in package.glob("[a-z]*.py")} - FEATURES
+    assert modules - FEATURES == {path.stem for path in PACKAGE.glob("[a-z]*.py")} - FEATURES
+
+
+def test_activations_are_loaded_where_a_network_or_an_equation_has_them(tmp_path: Path) -> None:
+    """Nobody else has added them to the table in a process of its own."""
+    plain, bent = honest("rotor"), network_loops.honest("relu")
+    rise = ["*", ["abs", ["+", "2", "x"]], ["+", ["/", "x", "4"], ["/", "u", "2"]]]
+    equation = grow(with_ball(edited(scalar_claim(c2=1.0, bias=0.0), "plant.dynamics", [rise])))
+    for data, known in ((plain, False), (bent, True), (equation, True)):
+        answer = json.loads(run_alone(write(data, tmp_path)))
+        assert answer["result"] == "ACCEPTED" and ("activations" in answer["modules"]) is known
 
 
 def run_alone(path: Path) -> str:

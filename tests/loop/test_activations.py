@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from certify.checker.activations import add as add_activations
 from certify.checker.document import Policy as Stated
 from certify.checker.functions import FUNCTIONS
 from certify.checker.networks import FUNCTIONS as OF_MAPS
@@ -25,6 +26,9 @@ from certify.loop.policies.importers import ImportOptions, import_policy
 from certify.loop.policies.importers.memory import import_module, import_state_dict
 from certify.loop.rigorous import precision
 from tests.support.loops import pendulum_network
+
+add_activations()
+
 
 NEW = [name for name in ACTIVATIONS if name != "tanh"]
 PLANT = get_system("pendulum")

@@ -20,6 +20,7 @@ from certify.certificates.coq.data import read_claim
 from certify.certificates.model import Certificate
 from certify.certificates.reading import read_certificate
 from certify.certificates.verdict import Verdict
+from certify.checker.activations import add as add_activations
 from certify.checker.functions import FUNCTIONS
 from certify.checker.near import Above, Form
 from certify.checker.network import enclose_on_boxes, fold
@@ -40,6 +41,9 @@ from tests.support.cases import case_of
 from tests.support.certificates import parse
 from tests.support.loops import saturated_lqr, scalar_tanh
 from tests.support.ways import WAYS, Way, bounded
+
+add_activations()
+
 
 NEW = [name for name in ACTIVATIONS if name != "tanh"]
 BENT = [name for name in NEW if not ACTIVATIONS[name].is_smooth]

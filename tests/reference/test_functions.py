@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from flint import arb, arb_mat, arb_series, ctx, fmpq
 
+from certify.checker.activations import add as add_activations
 from certify.checker.functions import FUNCTIONS as CHECKERS
 from certify.checker.near import Above, Near
 from certify.reference.balls import ON_LEAVES, PRECISION, SPREAD
@@ -32,6 +33,9 @@ from tests.support.balls import with_ball
 from tests.support.certificates import Document, decode, edited, encode, grow, make
 from tests.support.earlier import newer
 from tests.support.reference import judge_bytes
+
+add_activations()
+
 
 ACTIVATIONS = ("relu", "elu", "sigmoid", "silu", "gelu", "softplus", "mish", "softsign")
 EVERYWHERE = pytest.mark.parametrize("name", [*ACTIVATIONS, "tanh", "sin", "cos", "atan", "abs"])

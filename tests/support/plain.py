@@ -12,12 +12,16 @@ from flint import arb
 from numpy.typing import NDArray
 
 from certify.checker import near, network, taylor
+from certify.checker.activations import add as add_activations
 from certify.checker.document import Policy
 from certify.checker.expression import parse
 from certify.checker.functions import FUNCTIONS
 from certify.checker.near import Above, Form, Near
 from certify.checker.networks import Affine, Map, Network, Step
 from certify.checker.outer import Function
+
+add_activations()
+
 
 if TYPE_CHECKING:
     from certify.loop.policies import PolicyNetwork
