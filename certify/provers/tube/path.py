@@ -73,6 +73,8 @@ def find_path(
                 return None, f"the path has not arrived after {spent:.3g} units of time and {len(slabs)} slabs"
             if not _is_in_domain(loop, P, c):
                 return None, f"the tube leaves the domain after {spent:.3g} units of time"
+            if loop.system.constraints and not paths(loop, c).keeps(root(P)):
+                return None, f"the tube may violate a constraint after {spent:.3g} units of time"
             try:
                 slab = _slab(loop, flow, P, c, rate, goal, duration, effort)
             except np.linalg.LinAlgError:  # numbers that have no finite model, or an ellipsoid without extent
@@ -151,8 +153,9 @@ def _slab(
             J = WIDER * math.sqrt(_ROOM) * root(middle)
             known = paths(loop, (c + end) / 2)
             effort.charge(2 * look(known))
-            models = known.models(np.append(J, ((end - c) / (2 * _SHARE))[:, None], axis=1))
-            if models.finite and models.admitted:
+            ball = np.append(J, ((end - c) / (2 * _SHARE))[:, None], axis=1)
+            models = known.models(ball)
+            if models.finite and models.admitted and known.keeps(ball):
                 along = _multipliers(models, J, models.f - (end - c) / duration, middle, J.T @ goal @ J)
                 nodes = nodes_of(along.growth, J, P, duration, _ROOM)
                 if nodes is not None:
