@@ -217,9 +217,17 @@ def simulated_roa_fraction(
 
 
 def run_until_near(
-    flow: Flow, x: Array, P: Array, target: float, step: float, horizon: float, effort: Effort = UNLIMITED
+    flow: Flow,
+    x: Array,
+    P: Array,
+    target: float,
+    step: float,
+    horizon: float,
+    effort: Effort = UNLIMITED,
+    kept: Callable[[Array], Mask] | None = None,
 ) -> tuple[Mask, Mask, float]:
-    """Simulate; return the runs that reached `V <= target`, those that left the domain, and the simulated seconds."""
+    """Simulate; return the runs that reached `V <= target`, those that left the domain, or a state (n,) that is `kept`
+    after a step, and the simulated seconds."""
     attracted, left = np.zeros((2, len(x)), dtype=np.bool_)
     alive, apart = np.arange(len(x)), flow.steps_between(step)
     reached, u = horizon, None
@@ -238,6 +246,7 @@ def run_until_near(
             u = flow.input(x, u, k, step)
             x = flow.advance(x, u, step)
             inside = np.all((x >= flow.lo) & (x <= flow.hi), axis=-1)  # False for NaN
+            inside = inside if kept is None else inside & kept(x)
             left[alive[~inside]] = True
             x, alive, u = x[inside], alive[inside], None if u is None else u[inside]
         near = quadratic(P, x) <= target

@@ -1,7 +1,8 @@
 """The closed loop for learning: rates in floats, at the nominal plant and at the corners of the ranges.
 
 A run reports its fate and integrals along its path. It converges if it enters the inner ellipsoid; it is lost if it
-leaves the domain, violates a constraint, or its input leaves the bounds, because no set of a claim may contain such states.
+leaves the domain, violates a constraint, or its input leaves the bounds, because no set of a claim may contain such
+states.
 """
 
 from __future__ import annotations

@@ -56,8 +56,8 @@ class Rise:
 
 
 class Sampler:
-    """A search of the domain of a loop for states at which N does not fall, or an input leaves its bounds; only `beyond`
-    {V < c2}, if V and c2 are given."""
+    """A search of the domain of a loop for states at which N does not fall, or an input leaves its bounds; `beyond` is
+    (V, c2) of a set {V < c2} that is left out."""
 
     def __init__(
         self,

@@ -151,7 +151,7 @@ class LoopOnN(ABC):
     def kept(
         self, on: OnBoxes, bound: Array, score: Array, gaps: Callable[[Taylor, Index], Sequence[Taylor]]
     ) -> tuple[Array, Array, Mask]:
-        """`bound` and `score`, worse on boxes where a constraint is not shown; True where one is violated at the centre.
+        """`bound` and `score`, worse on boxes where a constraint is not shown; True where one is broken at the centre.
 
         `gaps` gives models that are not negative where anything is asked, on boxes by their indices.
         """
