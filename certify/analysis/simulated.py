@@ -7,7 +7,6 @@ The same loop and effort draw the same states, whatever machine simulates them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +17,6 @@ from certify.certificates.membership import Region
 from certify.effort import Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.constraints import Constraints
 from certify.lyapunov.function import Quadratic
 from certify.provers.ranks import root_box, turning
 from certify.report.flow import Flow, time_scales
@@ -75,7 +73,6 @@ def simulated_region(loop: ClosedLoop, V: Quadratic, level: float, effort: Effor
         flow = replace(flow, lo=lo, hi=hi, angles=tuple(turning(loop)))
     else:
         flow = replace(flow, angles=())
-    kept = _kept(loop)
     step, horizon = time_scales(flow)
     step, generator = flow.fitting(step), np.random.default_rng(0)
     left = Effort(_QUICK * effort.left)
@@ -84,19 +81,10 @@ def simulated_region(loop: ClosedLoop, V: Quadratic, level: float, effort: Effor
     found, runs = list[Array](), 0
     while runs < _MOST and sum(map(len, found)) < _ENOUGH:
         x = generator.uniform(flow.lo, flow.hi, (batch, loop.system.n))
-        begun = x if kept is None else x[kept(x)]
-        converge, _, _ = run_until_near(flow, begun, V.P, level, step, horizon, left, kept)
+        converge, _, _ = run_until_near(flow, x, V.P, level, step, horizon, left)
         if left.over:
             break
-        found.append(begun[converge])
+        found.append(x[converge])
         runs += batch
     effort.charge(left.spent / _QUICK)
     return SimulatedRegion(np.concatenate(found), runs) if runs else None
-
-
-def _kept(loop: ClosedLoop) -> Callable[[Array], NDArray[np.bool_]] | None:
-    """The test of states (N, n) for constraints that hold there; None without constraints."""
-    if not loop.system.constraints:
-        return None
-    constraints = Constraints(loop)
-    return lambda x: np.asarray(constraints.at(x, loop.policy(x)).max(-1) < 0)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from certify.effort import UNLIMITED, Effort
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.constraints import Constraints
+from certify.loop.constraints import keeping
 from certify.loop.plants import corners
 from certify.loop.plants.ode import eigenvalues_of, rk4_step
 from certify.loop.policies import bounded_by_form
@@ -85,7 +85,7 @@ class LearningFlow:
         self.policy = policy
         self.rate: Callable[[Array], Array] = lambda x: np.asarray(nominal(x, policy(x)))
         self._general, self._corners = general, [list(map(float, at.values())) for at in corners(system)]
-        self.constraints, self._limits = Constraints(loop) if system.constraints else None, None
+        self._kept, self._limits = keeping(loop), None
         if not bounded_by_form(loop.network, system.input_bounds):
             self._limits = np.array([[float(end) for end in pair] for pair in system.input_bounds]).T
         generator = np.random.default_rng(0)
@@ -115,8 +115,8 @@ class LearningFlow:
         if self._limits is not None:
             u = self.policy(x)
             within &= np.all((u >= self._limits[0]) & (u <= self._limits[1]), axis=-1)
-        if self.constraints is not None:
-            within &= self.constraints.at(x, self.policy(x)).max(-1) < 0
+        if self._kept is not None:
+            within &= self._kept(x)
         return np.asarray(within)
 
     def directions(self, x: Array, scale: Array) -> Array:

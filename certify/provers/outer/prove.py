@@ -88,11 +88,8 @@ def prove_outer(
     """
     require_function(system := problem.loop.system, function, problem.rate)
     start = time.monotonic()
-    search = Falsifier(problem, c2, function, budget.effort)
-    searches: list[Sampler] = [search]
-    if problem.keep:
-        searches.append(Hazards(problem.loop, function, budget.effort, (problem.V, c2)))
-    floor = search.least_value()
+    searches = _searches(problem, c2, function, budget)
+    floor = searches[0].least_value()
     if not math.isfinite(floor):
         return Nothing("every sampled state of the domain lies in the ellipsoid")
     aim = _aim(searches, floor, level)
@@ -138,6 +135,12 @@ def prove_outer(
         sum(count(each) for each in (tree, *faces)),
         seconds,
     )
+
+
+def _searches(problem: Problem, c2: float, function: Neural | Symbolic, budget: Budget) -> Sequence[Sampler]:
+    """The searches for violations: of N's fall, and of constraints if there are any."""
+    falls = Falsifier(problem, c2, function, budget.effort)
+    return (falls, Hazards(problem.loop, function, budget.effort, (problem.V, c2))) if problem.keep else (falls,)
 
 
 def _lowest(found: Iterable[Rise | None]) -> Rise | None:
