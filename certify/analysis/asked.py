@@ -42,7 +42,12 @@ def require_one_that_knows(system: System, options: RoaOptions) -> None:
             "a set beyond the ellipsoid must be of a plant in continuous time whose input follows the state at once; "
             f"the time of {system.name} goes in steps. Ask for the set without it."
         )
-    _require_no_constraints(system, options)
+    if system.constraints and options.engine != "bounds":
+        raise OptionError(
+            "`engine` must be bounds where constraints are to be kept: dReal is not asked about them; found "
+            f"{', '.join(system.constraints)} in {system.name}. Use the engine bounds, or leave the constraints out "
+            "(in the plant's file the table [constraints])."
+        )
     if options.engine == "bounds" and not options.enlarges:
         return
     if system.in_steps:
@@ -64,25 +69,6 @@ def require_one_that_knows(system: System, options: RoaOptions) -> None:
         f"`engine` must be bounds where something is uncertain: dReal is asked about exact equations; {found}. Use the "
         "engine bounds, or leave the ranges out."
     )
-
-
-def _require_no_constraints(system: System, options: RoaOptions) -> None:
-    """Refuse what says nothing of constraints, where there are any."""
-    if not system.constraints:
-        return
-    found = f"found {', '.join(system.constraints)} in {system.name}"
-    without = "leave the constraints out (in the plant's file the table [constraints])"
-    if options.enlarges or options.goes_beyond:
-        what, plain = ("a tube", "it") if options.enlarges else ("a set beyond the ellipsoid", "it")
-        raise InputError(
-            f"{what} must be of a plant without constraints: along it nothing is shown of them; {found}. Ask for the "
-            f"set without {plain}, or {without}."
-        )
-    if options.engine != "bounds":
-        raise OptionError(
-            f"`engine` must be bounds where constraints are to be kept: dReal is not asked about them; {found}. Use "
-            f"the engine bounds, or {without}."
-        )
 
 
 def require_kept_at_origin(loop: ClosedLoop) -> None:

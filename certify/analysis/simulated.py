@@ -1,4 +1,5 @@
-"""The simulated region of attraction: drawn states of the domain from which runs converge without leaving it.
+"""The simulated region of attraction: drawn states of the domain from which runs converge without leaving it, and
+without violating a constraint.
 
 It says how much of what is there has been proved, and so if more is worth its effort. Nothing in it is part of a proof.
 The same loop and effort draw the same states, whatever machine simulates them.
@@ -63,7 +64,8 @@ def simulated_region(loop: ClosedLoop, V: Quadratic, level: float, effort: Effor
 
     Notes
     -----
-    Where boxes may have ranks, one turn of each angle is drawn from, and full turns count as the same place.
+    Where boxes may have ranks, one turn of each angle is drawn from, and full turns count as the same place. A run that
+    violates a constraint at one of its steps does not count, a held input being taken as a new one there.
     """
     flow = Flow.of(loop.system, loop.network)
     if loop.system.in_steps:

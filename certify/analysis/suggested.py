@@ -121,7 +121,7 @@ def beyond_the_ellipsoid(result: RoaResult, options: RoaOptions, effort: Effort)
 def by_learning(result: RoaResult, options: RoaOptions, candidate: str) -> Step | None:
     """The step by which a function is learned for an outer set, where that may gain something and is allowed."""
     system, free = result.system, options.level is None and options.P is None and not options.resume
-    plain = not (options.rate or options.enlarges or result.constraints) and options.engine == "bounds"
+    plain = not (options.rate or options.enlarges) and options.engine == "bounds"
     nearly = result.simulated is None or (result.simulated.share or 0.0) >= NEARLY_ALL
     if not (free and plain) or system.in_steps or nearly or options.goes_beyond:
         return None

@@ -173,6 +173,14 @@ def keeps_inputs(ball: Ball) -> Failures:
     return len(c.inputs)
 
 
+def keeps_constraints(ball: Ball, constraints: Sequence[Jet]) -> Failures:
+    """`keep`: every constraint is negative on the ball."""
+    for j, g in enumerate(constraints):
+        if not g.range.ends[1] < 0:
+            yield ball.at, f"constraint {j} may be violated"
+    return len(constraints)
+
+
 def is_not_clipped(ball: Ball) -> Failures:
     """Every input lies strictly inside the policy's clip, so that the clip does not change its jets."""
     clip = ball.case.net.clip

@@ -343,11 +343,11 @@ def _reaching(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: Val
 def _attracting(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: Value, evidence: Value) -> Certificate:
     """The rest of a certificate with V."""
     n, networks, kind = len(stated["states"]), {net.name: net for net in stated["networks"]}, claim.raw["kind"]
-    stated_of = {"enlarged": " start", "reached": " start centre"}
-    may_be = "".join(map(claim.maybe, ("ranks", "keep", "data")))
-    _, rate, sample, beyond, *more = claim.keys(f"kind rate sample outer{stated_of.get(kind, may_be)}")
-    of_tube, others = (more, []) if kind in WITH_TUBE else ([], more)
-    optional = dict(zip(may_be.split(), others, strict=True)) if kind not in WITH_TUBE else {}
+    stated_of = {"enlarged": "start", "reached": "start centre"}.get(kind, "").split()
+    may_be = "".join(map(claim.maybe, ("keep",) if kind in WITH_TUBE else ("ranks", "keep", "data")))
+    _, rate, sample, beyond, *more = claim.keys(" ".join(("kind rate sample outer", *stated_of)) + may_be)
+    of_tube, others = more[: len(stated_of)], more[len(stated_of) :]
+    optional = dict(zip(may_be.split(), others, strict=True))
     fall, periods = rate.binary64(), _sample(sample)
     rate.must(0 <= fall < math.inf and (fall == 0 or kind not in WITH_TUBE), "0, or a rate where a claim may have one")
     plain = periods is None and not stated["discrete"]
@@ -355,7 +355,6 @@ def _attracting(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: V
     sample.must(periods is None or kind != "nearby", "null under this claim")
     sample.must(periods is None or not stated["discrete"], "null where time is discrete")
     outer = _outer(beyond, stated["states"], networks)
-    beyond.must(outer is None or "keep" not in optional, "null with constraints")
     beyond.must(outer is None or (plain and fall == 0 and kind not in WITH_TUBE), "null under this claim")
     form, P = lyapunov.keys("kind P")
     form.choice("quadratic")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from .boxes import Leaves, keeps_constraints, keeps_inputs, middle
+from .boxes import Leaves, middle
 from .near import Array
-from .outer import Beyond, falls
+from .outer import Beyond
 
 
 class Staying(Beyond):
@@ -24,10 +24,5 @@ class Staying(Beyond):
         course = self.course(x[:, left])
         bound = self.least_bound(course.rise, [course.below.at], -np.inf)
         bound[self.function.is_below(course.x, self.level)] = -np.inf
-        kept = [self.least_bound(g, [course.below.at]) < 0 for g in self.constraints(course.states, course.held)]
-        held_back = np.array(kept, dtype=bool).reshape(len(kept), len(left))
-        hold = (bound < 0) & course.finite
-        return Leaves(self, first + left, "outer leaf ", course.inputs.range, bound, hold, held_back)
-
-
-ON_LEAVES = (("inputs", keeps_inputs), ("keep", keeps_constraints), ("outer", falls))
+        hold, kept = (bound < 0) & course.finite, self.kept(course, [course.below.at])
+        return Leaves(self, first + left, "outer leaf ", course.inputs.range, bound, hold, kept)

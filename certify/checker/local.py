@@ -182,10 +182,8 @@ def keeps_constraints(local: Local) -> Failures:
     whole = c.sample is not None and local.way is not None
     for cell in [None] if whole else local.case.cells:
         states = local.during(local.way) if local.way is not None and whole else local.states
-        for j, g in enumerate(local.constraints(states, local.ranges if cell is None else local.symbols(cell))):
-            if not g.range.ends[1] < 0:
-                yield local.at, f"constraint {j} may be violated"
-            count += 1
+        quantities = local.ranges if cell is None else local.symbols(cell)
+        count += yield from ball.keeps_constraints(local, local.constraints(states, quantities))
     return count
 
 

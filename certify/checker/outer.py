@@ -18,7 +18,7 @@ from operator import add
 import numpy as np
 from flint import fmpq, fmpq_mat
 
-from .boxes import LEAF, Boxes, Leaves, batches, is_whole, keeps_inputs, middle
+from .boxes import LEAF, Boxes, Leaves, batches, is_whole, keeps_constraints, keeps_inputs, middle
 from .case import Case, Failures
 from .exact import exactly, inverse
 from .expression import Call, Tape, evaluate
@@ -250,19 +250,23 @@ class Beyond(Boxes):
         return batches(self.evidence.tree, -self.evidence.root, self.evidence.root, size)
 
     def examine(self, first: int, lo: Array, hi: Array) -> Leaves:
-        """The leaves with these corners, numbered from `first`, of which N'F is asked."""
+        """The leaves with these corners, numbered from `first`, on which N'F and the constraints must be negative where
+        N <= n2 and V >= c2."""
         centre, radius = middle(lo, hi)
         x = self.states(centre, radius)
         left = self.close(x, self.levels(lo, hi)[1] < self.c.c2)
         course = self.course(x[:, left])
         centre, radius = centre[:, left], radius[:, left]
-        bound = self.least_bound(
-            course.rise,
-            [course.below.at, lambda few: self.gap(centre[:, few], radius[:, few], self.c.c2, -1.0)],
-        )
-        none_kept = np.zeros((0, len(left)), dtype=bool)
+        gaps = [course.below.at, lambda few: self.gap(centre[:, few], radius[:, few], self.c.c2, -1.0)]
+        bound = self.least_bound(course.rise, gaps)
         hold = (bound < 0) & course.finite
-        return Leaves(self, first + left, "outer leaf ", course.inputs.range, bound, hold, none_kept)
+        kept = self.kept(course, gaps)
+        return Leaves(self, first + left, "outer leaf ", course.inputs.range, bound, hold, kept)
+
+    def kept(self, course: Course, gaps: Sequence[Callable[[Array], Taylor]]) -> Array:
+        """True for each constraint and box on which it is negative where no gap is."""
+        kept = [self.least_bound(g, gaps) < 0 for g in self.constraints(course.states, course.held)]
+        return np.array(kept, dtype=bool).reshape(len(kept), len(course.finite))
 
     def close(self, x: Form, free: Array) -> Array:
         """The numbers of boxes that are not free, may meet the domain, and have N at its level or below somewhere."""
@@ -293,7 +297,7 @@ class Beyond(Boxes):
 OF_OUTER = (("outer", is_small),)
 ON_FACES = (("faces", is_above_on_faces),)
 OF_OUTER_TREE = (("outer", contains_domain), ("outer", is_partition))
-ON_OUTER_LEAVES = (("inputs", keeps_inputs), ("outer", falls))
+ON_OUTER_LEAVES = (("inputs", keeps_inputs), ("keep", keeps_constraints), ("outer", falls))
 
 
 def _function(case: Case) -> Function:

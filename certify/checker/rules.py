@@ -243,9 +243,10 @@ def _examine_outer(tally: Tally, case: Case) -> None:
 
     for table in (outer.OF_OUTER, outer.ON_FACES, outer.OF_OUTER_TREE):
         tally.hold(table, case)
-    bounds, on_leaves = outer.Beyond(case), tuple(outer.ON_OUTER_LEAVES)
+    bounds = outer.Beyond(case)
     if case.c.without_V:
         from . import invariant
 
-        bounds, on_leaves = invariant.Staying(case), tuple(invariant.ON_LEAVES)
-    tally.outer_margin = tally.hold_on_leaves(on_leaves, bounds, case.outer[1].tree, lambda leaves: leaves.bound)
+        bounds = invariant.Staying(case)
+    tree = case.outer[1].tree
+    tally.outer_margin = tally.hold_on_leaves(outer.ON_OUTER_LEAVES, bounds, tree, lambda leaves: leaves.bound)

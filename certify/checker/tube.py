@@ -141,5 +141,16 @@ def decreases(piece: Piece) -> Failures:
     return 1
 
 
+def keeps_constraints(piece: Piece) -> Failures:
+    """`keep`: every constraint is negative on the ball, and so on the ellipsoids between nodes, which lie in it."""
+    return (yield from ball.keeps_constraints(piece, piece.constraints(piece.states, ())))
+
+
 OF_THE_TUBE = (("tube", nodes_are_sound),)
-ON_SLABS = (("tube", fits), ("inputs", ball.keeps_inputs), ("tube", ball.is_not_clipped), ("tube", decreases))
+ON_SLABS = (
+    ("tube", fits),
+    ("inputs", ball.keeps_inputs),
+    ("tube", ball.is_not_clipped),
+    ("keep", keeps_constraints),
+    ("tube", decreases),
+)

@@ -34,8 +34,10 @@ def contains(
 ) -> None:
     """Check a certificate and decide exactly whether a state, or every state of a box, lies in the proved set."""
     from certify.certificates.claims import Reaches
+    from certify.certificates.located import Containment
     from certify.certificates.membership import proved_set
     from certify.certificates.ranked import steps_from
+    from certify.loop.plants.constraints import in_words
 
     proved = proved_set(certificate, patient)
     box = region(" ".join(states), proved.system, "STATES", deviations)
@@ -53,6 +55,10 @@ def contains(
         steps = steps_from(proved.ranked, box)
         data["steps"] = steps
         said += "" if steps is None else f"; the region is reached after {steps:,} steps or periods at the latest"
+    if proved.system.constraints:
+        data["constraints"] = in_words(proved.system)
+        if found.answer is Containment.CONTAINED:
+            said += f"\n(kept along every trajectory from there: {'; '.join(data['constraints'].values())})"
     say(json.dumps(data) if as_json else said)
     raise typer.Exit(found.answer.exit_status)
 

@@ -8,7 +8,7 @@ proved with it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from fractions import Fraction
 
 import flint
@@ -91,6 +91,14 @@ class Constraints:
         moved = np.concatenate([z[None], z + np.eye(n)[:, None] * apart]).reshape(-1, n) @ T.T
         values = self.at(moved, self.loop.policy(moved))[:, k].reshape(n + 1, len(z))
         return values[0], ((values[1:] - values[0]) / apart.T).T
+
+
+def keeping(loop: ClosedLoop) -> Callable[[Array], NDArray[np.bool_]] | None:
+    """The test of states (..., n) for all constraints, in floats; None without constraints."""
+    if not loop.system.constraints:
+        return None
+    constraints = Constraints(loop)
+    return lambda x: np.asarray(constraints.at(x, loop.policy(x)).max(-1) < 0)
 
 
 def _plane(system: System, g: Expression) -> tuple[Array, float] | None:

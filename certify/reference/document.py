@@ -233,8 +233,7 @@ def read_sections(value: Any, claims: tuple[str, ...]) -> Certificate:
     require(plainly, "format", "claim.outer", "null was expected with a tube, a rate, a sample and in discrete time")
     timeless = claim != INVARIANT or not plant.discrete
     require(timeless, "format", "plant.time", f"time must be continuous with claim '{claim}'")
-    apart = claim in WITH_TUBE or (beyond is not None and claim != INVARIANT)
-    ranks, keep, target = read_more(said, plant, apart)
+    ranks, keep, target = read_more(said, plant)
     measured = read_data(said["data"], plant, claim) if "data" in said else None
     policy = read_policy(data["policy"], networks, n, len(plant.inputs), claim)
     P = read_P(data["lyapunov"], n, claim)
@@ -268,12 +267,11 @@ def read_claim(value: Any) -> dict[str, Any]:
         said = keys(value, "claim", "kind", "sample", "target", "ranks", maybe=("keep",))
         return {**said, "rate": (0.0).hex(), "outer": None}
     more = {"enlarged": ("start",), "reached": ("start", "centre")}.get(value["kind"], ())
-    return keys(value, "claim", "kind", "rate", "sample", "outer", *more, maybe=("ranks", "keep", "data"))
+    maybe = ("keep",) if more else ("ranks", "keep", "data")
+    return keys(value, "claim", "kind", "rate", "sample", "outer", *more, maybe=maybe)
 
 
-def read_more(
-    said: Mapping[str, Any], plant: Plant, tube_or_outer: bool
-) -> tuple[Ranks | None, Equations | None, Equations | None]:
+def read_more(said: Mapping[str, Any], plant: Plant) -> tuple[Ranks | None, Equations | None, Equations | None]:
     """`ranks`, `keep` and `target`, of which each may be missing."""
     ranks = keep = target = None
     if "ranks" in said:
@@ -281,7 +279,6 @@ def read_more(
         require(steps, "format", "claim.ranks", "it was not expected in continuous time without a sample")
         ranks = read_ranks(said["ranks"], plant.states)
     if "keep" in said:
-        require(not tube_or_outer, "format", "claim.keep", "it was not expected with a tube or an outer set")
         keep = read_expressions(said["keep"], "claim.keep", {*plant.states, *plant.inputs, *plant.uncertain})
     if "target" in said:
         target = read_expressions(said["target"], "claim.target", set(plant.states))

@@ -1,5 +1,8 @@
 """Rule `keep`: expressions in states, inputs and uncertain quantities that are negative wherever the loop is.
 
+That is in {V <= c2} by its ball and its leaves, in a second function's set by the leaves of its tree on which states
+may be beyond {V <= c2}, and in a tube by the ball of each slab, for no ellipsoid between two nodes leaves it.
+
 With a sample they are so at all times of a period, in which the inputs are held: then they are taken at the states of
 the whole period, and what is uncertain may be any number of its range at each place.
 """
@@ -11,6 +14,7 @@ from typing import Any
 
 from .document import Interval
 from .flow import Steps
+from .loop import Known, Loop
 from .model import Model
 from .motion import Motion, Stage
 from .refusal import Refused, require
@@ -37,6 +41,11 @@ def kept(motion: Motion, at: Stage, within: Mapping[str, Taylor] | None, slacks:
     for i, g in enumerate(values):
         holds = g.is_finite() and is_negative(g, slacks)
         require(holds, RULE, at.place, f"expression {i} is not certain to be negative")
+
+
+def kept_in_slab(loop: Loop, known: Known, at: str) -> None:
+    """The rule on the ball of a slab, where nothing is uncertain."""
+    negative_on_ball(Steps(loop, known), known.names, at)
 
 
 def kept_on_ball(steps: Steps, cells: Iterable[Sequence[Interval]], at: str) -> None:

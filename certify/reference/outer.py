@@ -8,6 +8,7 @@ of the one set than into the other.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from fractions import Fraction
 from itertools import islice
 
@@ -19,6 +20,7 @@ from .document import Certificate
 from .evidence import Covering, Tree
 from .fields import exact
 from .function import Models
+from .keep import kept
 from .leaves import Box, Leaf, Leaves, boxes, cut, structure
 from .refusal import Refused, require
 from .taylor import Taylor, is_negative
@@ -154,8 +156,19 @@ class Region(OverDomain):
         leaves, F = self.leaves, self.leaves.F(leaf)
         N, rate = self.models.moving([leaves.affine(row) for row in leaf.x], F)
         known = N.is_finite() and rate.is_finite()
-        slacks = [Taylor(self.models.level) + -N, leaves.V(leaf) + Taylor(-leaves.outer)]
-        return known and is_negative(rate, slacks)
+        return known and is_negative(rate, [Taylor(self.models.level) + -N, self.beyond(leaf)])
+
+    def beyond(self, leaf: Leaf) -> Taylor:
+        """V - c2, which is not negative where N is asked to fall."""
+        return self.leaves.V(leaf) + Taylor(-self.leaves.outer)
+
+    def slacks(self, leaf: Leaf) -> list[Taylor]:
+        """V - c2 and n2 - N; the first alone where N may be undefined."""
+        try:
+            N = self.models.value([self.leaves.affine(row) for row in leaf.x])
+        except Refused:
+            return [self.beyond(leaf)]
+        return [self.beyond(leaf), Taylor(self.models.level) + -N]
 
 
 def check_leaves(c: Certificate, models: Models, covering: Covering) -> None:
@@ -168,6 +181,9 @@ def check_leaves(c: Certificate, models: Models, covering: Covering) -> None:
         for leaf in enclosed:
             good = bounded or within_bounds(c, leaf.ranges())
             require(good, "inputs", place(leaf), "an input is not certain to stay in its bounds")
+        if c.keep is not None:
+            for leaf in enclosed:
+                kept(region.leaves, replace(leaf, place=place(leaf)), None, region.slacks(leaf))
         for leaf in enclosed:
             try:
                 falls = region.falls(leaf)

@@ -20,6 +20,7 @@ from .decrease import contains, decreases, decreases_along, sound_multipliers
 from .document import Certificate
 from .evidence import Path, Slab
 from .fields import exact
+from .keep import kept_in_slab
 from .loop import Field, Loop
 from .rational import beyond_domain, identity, inverse_diagonal, positive_definite, root_above
 from .refusal import require
@@ -83,7 +84,7 @@ def passes(loop: Loop, slab: Slab, nodes: Ends, centres: Ends, at: str) -> None:
         require(none_negative, "tube", at, "a multiplier of the path is negative")
         F = relative(loop, slab, slab.path, centres, at)
     else:
-        F = loop.on(slab.ball.J, "tube", at)
+        F = kept(loop, slab.ball.J, at)
     for name, P, rate in pieces:
         if slab.path is None:
             falls = decreases(slab.ball, P, rate, F)
@@ -98,11 +99,18 @@ def share_of(path: Path, at: str) -> fmpq:
     return exact(path.share)
 
 
+def kept(loop: Loop, J: fmpq_mat, at: str, centre: fmpq_mat | None = None) -> Field:
+    """Models of F on the ball of a slab, after rules `inputs` and `keep`."""
+    known = loop.known(J, "tube", at, centre)
+    kept_in_slab(loop, known, at)
+    return loop.within(known, (), "tube", at)
+
+
 def relative(loop: Loop, slab: Slab, path: Path, centres: Ends, at: str) -> Field:
     """F less the velocity of the path, where x = m + J z + w sigma; m is half-way, and m +- share w are the centres."""
     before, after = centres
     step = after - before
     J = [[*row, w] for row, w in zip(slab.ball.J.tolist(), (step / (2 * exact(path.share))).entries(), strict=True)]
-    F = loop.on(fmpq_mat(J), "tube", at, (before + after) / 2)
+    F = kept(loop, fmpq_mat(J), at, (before + after) / 2)
     velocity = (step / exact(slab.duration)).entries()
     return replace(F, components=[f.shifted(arb(-v)) for f, v in zip(F.components, velocity, strict=True)])

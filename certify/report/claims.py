@@ -346,7 +346,7 @@ def words_for(kind: str, timing: TimingInWords = PLAIN, has: Additions = NONE) -
     words = _with_outer(CLAIMS[kind]) if has.beyond else CLAIMS[kind]
     words = replace(words, parts=tuple(_in_steps(kind, _with_ball(kind, words.parts, has.ball), timing)))
     words = with_ranks(words, has.angles) if has.ranked else words
-    words = with_constraints(words, ranked=has.ranked) if has.kept else words
+    words = with_constraints(words, ranked=has.ranked, beyond=has.beyond) if has.kept else words
     words = words if has.then is None else with_handover(words, has.then)
     phrases = phrases_of(timing)
     return Words(**{f.name: _filled(getattr(words, f.name), phrases) for f in fields(Words)})

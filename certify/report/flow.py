@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from certify.certificates.membership import angles_in
 from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.constraints import keeping
 from certify.loop.plants import System
 from certify.loop.plants.ode import eigenvalues_of, rk4_step
 from certify.loop.policies import PolicyNetwork
@@ -47,6 +49,7 @@ class Flow:
     period : over which the input is held, the longest that is allowed, in seconds; 0 if it follows the state at once.
     discrete : whether F(x) is the state one step later, and not the rate of change.
     cost : of F at one state, in multiplications' worth.
+    kept : whether states (..., n) and their inputs keep all constraints, (...); None without constraints.
     angles : the numbers of states in which full turns are the same place: they are kept within half a turn of 0.
     """
 
@@ -59,6 +62,7 @@ class Flow:
     discrete: bool = False
     cost: float = 0.0
     angles: tuple[int, ...] = ()
+    kept: Callable[[Array], NDArray[np.bool_]] | None = None
 
     @classmethod
     def of(cls, system: System, network: PolicyNetwork) -> Flow:
@@ -86,8 +90,12 @@ class Flow:
             return np.asarray(f(x, u))
 
         period = 0.0 if system.sample is None else float(system.sample[1])
-        steps, angles = system.time == "discrete", angles_in(system)
-        return cls(field, policy, *domain_bounds(system), plant, period, steps, cost_of(network), angles)
+        steps, angles, kept = system.time == "discrete", angles_in(system), keeping(ClosedLoop(system, network))
+        return cls(field, policy, *domain_bounds(system), plant, period, steps, cost_of(network), angles, kept)
+
+    def keeps(self, x: Array) -> NDArray[np.bool_]:
+        """True for each state (..., n) that keeps all constraints with the input that the policy has there."""
+        return np.ones(x.shape[:-1], dtype=np.bool_) if self.kept is None else self.kept(x)
 
     def fitting(self, step: float) -> float:
         """The largest step of a simulation up to `step`, in seconds, that divides the period; in discrete time 1."""

@@ -71,9 +71,11 @@ def _not_ranked(turned: str) -> tuple[tuple[str, str], ...]:
     return (*found, turns) if turned else found
 
 
-def with_constraints(words: Words, *, ranked: bool) -> Words:
-    """The words of a claim with constraints; `ranked` says that it has ranks too."""
-    where = "for all x with V(x) ≤ c₂" + (", and before each step from a box with a rank" if ranked else "")
+def with_constraints(words: Words, *, ranked: bool, beyond: bool) -> Words:
+    """The words of a claim with constraints; it may have ranks too, or a set `beyond` {V <= c2}."""
+    where = "for all x with V(x) ≤ c₂" + (" and all x of the outer set" if beyond else "")
+    where += " and all x in an ellipsoid of the tube" if words.start else ""
+    where += ", and before each step from a box with a rank" if ranked else ""
     part = ("Constraints", f"Each of the constraints above, g(x, π(x)) < 0, holds {where}$meanwhile", _ON_ALL)
     other = (
         "Other constraints.",
@@ -85,6 +87,7 @@ def with_constraints(words: Words, *, ranked: bool) -> Words:
         statement=words.statement
         + " Along each of these trajectories the constraints hold $always_kept: {constraints}.",
         headline=words.headline + "; kept on the way: {constraints}",
+        simulated=words.simulated.replace("domain", "domain, keep the constraints", 1),
         parts=(*words.parts, part),
         excluded=(*words.excluded[:-1], other, words.excluded[-1]),
     )

@@ -219,9 +219,12 @@ def simulated_roa_fraction(
 def run_until_near(
     flow: Flow, x: Array, P: Array, target: float, step: float, horizon: float, effort: Effort = UNLIMITED
 ) -> tuple[Mask, Mask, float]:
-    """Simulate; return the runs that reached `V <= target`, those that left the domain, and the simulated seconds."""
+    """Simulate; return the runs that reached `V <= target`, those that left the domain or what is kept, and the
+    simulated seconds."""
     attracted, left = np.zeros((2, len(x)), dtype=np.bool_)
-    alive, apart = np.arange(len(x)), flow.steps_between(step)
+    keeps = flow.keeps(x)
+    alive, x, apart = np.flatnonzero(keeps), x[keeps], flow.steps_between(step)
+    left[~keeps] = True
     reached, u = horizon, None
     with np.errstate(all="ignore"):
         for k in range(math.ceil(horizon / step / apart) * apart):
@@ -238,6 +241,7 @@ def run_until_near(
             u = flow.input(x, u, k, step)
             x = flow.advance(x, u, step)
             inside = np.all((x >= flow.lo) & (x <= flow.hi), axis=-1)  # False for NaN
+            inside &= flow.keeps(x)
             left[alive[~inside]] = True
             x, alive, u = x[inside], alive[inside], None if u is None else u[inside]
         near = quadratic(P, x) <= target

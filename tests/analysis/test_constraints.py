@@ -80,8 +80,6 @@ def test_nonsense_is_refused(changes: dict[str, tuple[str, ...]], said: str) -> 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (RoaOptions(enlarge=True), "a tube must be of a plant without constraints"),
-        (RoaOptions(candidate="polynomial"), "a set beyond the ellipsoid must be of a plant without constraints"),
         (RoaOptions(engine="dreal"), "`engine` must be bounds where constraints are to be kept"),
         (RoaOptions(engine="both"), "`engine` must be bounds where constraints are to be kept"),
     ],

@@ -118,9 +118,13 @@ def test_an_ellipsoid_alone_is_suggested_to_go_on(tmp_path: Path) -> None:
     assert result.diagnosis is not None and dict(result.diagnosis.next.options) == {"--candidate": "auto"}
 
 
-def test_constraints_exclude_an_outer_set(tmp_path: Path) -> None:
-    result = proved(tmp_path, keep="x <= 1.5")
-    assert result.outer is None and result.constraints
+def test_constraints_are_kept_beyond_the_ellipsoid(by_default: RoaResult, tmp_path: Path) -> None:
+    """The wall takes states from the set and from the simulated region, by whose share the run went on."""
+    result, everything = proved(tmp_path, keep="wall: x <= 0.4"), by_default.simulated
+    assert result.verdict is Verdict.PROVED and result.constraints == {"wall": "x - 0.4 < 0"}
+    assert result.outer is not None and result.simulated is not None and everything is not None
+    assert not result.contains([0.41]) and result.simulated.converging < everything.converging
+    assert (result.simulated.share or 0.0) > 0.6
 
 
 def test_an_ellipsoid_that_is_most_of_it_is_enough(tmp_path: Path) -> None:

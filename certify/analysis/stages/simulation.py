@@ -25,10 +25,8 @@ _WANTED = 0.95  # share of it in boxes with ranks, with which their search ends
 
 
 def goes_on(state: State) -> bool:
-    """True if the run may go on beyond the ellipsoid: few states, and a claim to which an outer set or ranks can be
-    added."""
-    system = state.loop.system
-    return state.options.goes_on and system.n <= FEW and (system.in_steps or not system.constraints)
+    """True if the run may go on beyond the ellipsoid: few states, and nothing else that was asked for."""
+    return state.options.goes_on and state.loop.system.n <= FEW
 
 
 @dataclass(frozen=True)

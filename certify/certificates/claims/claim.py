@@ -105,7 +105,7 @@ class Claim:
 
     Raises
     ------
-    InputError : `keep` or `ranks` stands beside a tube or an outer set, or `keep` has more than 64 expressions.
+    InputError : `ranks` stands beside a tube or an outer set, or `keep` has more than 64 expressions.
     """
 
     kind: ClassVar[str]
@@ -119,8 +119,8 @@ class Claim:
     keep: tuple[Expression, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
-        if (self.ranks is not None or self.keep) and (self.start is not None or self.outer is not None):
-            raise InputError("a claim with a tube or an outer set can have neither ranks nor constraints.")
+        if self.ranks is not None and (self.start is not None or self.outer is not None):
+            raise InputError("a claim with a tube or an outer set can have no ranks.")
         if len(self.keep) > MOST_KEPT:
             raise InputError(f"`keep` must have at most {MOST_KEPT} expressions; found {len(self.keep)}.")
 
@@ -205,11 +205,11 @@ class Asymptotic(Claim):
 
     def with_tube(self, start: Quadratic, centre: tuple[float, ...] | None = None) -> Claim | None:
         """The same, and every trajectory from {W(x - c) <= 1}, W = `start`, c = `centre`, reaches {V <= c2}."""
-        if self.ranks is not None or self.keep:
+        if self.ranks is not None:
             return None
         if centre is None:
-            return Enlarged(self.roa, self.local, start, rate=self.rate, outer=self.outer)
-        return Reached(self.roa, self.local, start, centre, rate=self.rate, outer=self.outer)
+            return Enlarged(self.roa, self.local, start, **self._beside())
+        return Reached(self.roa, self.local, start, centre, **self._beside())
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +221,7 @@ class Enlarged(Asymptotic):
 
     def without_tube(self) -> Claim | None:
         """The same without the set from which a tube leads."""
-        return Asymptotic(self.roa, self.local, rate=self.rate, outer=self.outer)
+        return Asymptotic(self.roa, self.local, **self._beside())
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,8 @@
 """The closed loop for learning: rates in floats, at the nominal plant and at the corners of the ranges.
 
 A run reports its fate and integrals along its path. It converges if it enters the inner ellipsoid; it is lost if it
-leaves the domain or its input leaves the bounds, because no set of a claim may contain such states.
+leaves the domain, violates a constraint, or its input leaves the bounds, because no set of a claim may contain such
+states.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from certify.effort import UNLIMITED, Effort
 from certify.loop.closed_loop import ClosedLoop
+from certify.loop.constraints import keeping
 from certify.loop.plants import corners
 from certify.loop.plants.ode import eigenvalues_of, rk4_step
 from certify.loop.policies import bounded_by_form
@@ -83,7 +85,7 @@ class LearningFlow:
         self.policy = policy
         self.rate: Callable[[Array], Array] = lambda x: np.asarray(nominal(x, policy(x)))
         self._general, self._corners = general, [list(map(float, at.values())) for at in corners(system)]
-        self._limits = None
+        self._kept, self._limits = keeping(loop), None
         if not bounded_by_form(loop.network, system.input_bounds):
             self._limits = np.array([[float(end) for end in pair] for pair in system.input_bounds]).T
         generator = np.random.default_rng(0)
@@ -108,11 +110,13 @@ class LearningFlow:
         return x
 
     def inside(self, x: Array) -> Mask:
-        """True for each state that lies in the domain and has its input within bounds, (B,)."""
+        """True for each state of the domain with its input within bounds and no constraint violated, (B,)."""
         within = np.all((x >= self.low) & (x <= self.high), axis=-1)
         if self._limits is not None:
             u = self.policy(x)
             within &= np.all((u >= self._limits[0]) & (u <= self._limits[1]), axis=-1)
+        if self._kept is not None:
+            within &= self._kept(x)
         return np.asarray(within)
 
     def directions(self, x: Array, scale: Array) -> Array:

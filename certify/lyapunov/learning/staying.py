@@ -13,7 +13,6 @@ from scipy.spatial import cKDTree
 from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.constraints import Constraints
 from certify.loop.plants.ode import rk4_step
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.learning.flow import LearningFlow
@@ -39,7 +38,6 @@ class StayingFlow(LearningFlow):
 
     def __init__(self, loop: ClosedLoop, generator: np.random.Generator, effort: Effort = UNLIMITED) -> None:
         super().__init__(loop, Quadratic(np.eye(loop.system.n)), 0.0, effort)
-        self.constraints = Constraints(loop) if loop.system.constraints else None
         self.half = (self.high - self.low) / 2
         self.ends = self._ends(generator)
         self.near = cKDTree(self.ends / self.half)
@@ -70,13 +68,6 @@ class StayingFlow(LearningFlow):
         ends = ends[self.inside(ends)]
         _, some = np.unique(np.round(ends / self.half / (_APART * _RADIUS)), axis=0, return_index=True)
         return np.asarray(ends[some])
-
-    def inside(self, x: Array) -> Mask:
-        """True for each state of the domain with its input within bounds and no constraint violated, (B,)."""
-        found = super().inside(x)
-        if self.constraints is not None:
-            found &= self.constraints.at(x, self.policy(x)).max(-1) < 0
-        return np.asarray(found)
 
     def is_home(self, x: Array) -> Mask:
         """True for each state near one at which runs end up, (B,)."""

@@ -23,9 +23,10 @@ from certify.certificates.limits import numbers_of_a_jet
 from certify.errors import InputError
 from certify.loop.activations import CERTAIN
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import evaluate, nodes
+from certify.loop.expressions import Expression, evaluate, nodes
 from certify.loop.networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Product, Sum
 from certify.loop.networks.floats import evaluated, jacobian
+from certify.loop.plants import kept_constraints
 from certify.loop.policies import bounded_by_form
 from certify.provers.ball.jets import Jet, Jets, basis, beyond_tangent, product_beyond, remainder, sizes
 from certify.provers.ball.ranged import RangedJet
@@ -38,6 +39,7 @@ _AT_CORNER = 1e-12  # what a unit reads, so near 0 that no ball of any use is fr
 AT_CORNERS = 6  # uncertain quantities of which the checker decides every corner
 _UNIT = 2.0**-51  # twice what a checker counts for each term of a sum, relative to the sum's size
 _ROUNDED = 2.0**-49  # and for anything else that it computes
+_WIDER, _BEYOND = 1 + 1e-9, 1e-12  # of a constraint's radius, and of its middle, for the checker's rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,15 +232,25 @@ class Paths:
 
     def models_on(self, balls: Array) -> list[Models]:
         """The same on several balls, (N, n, k); if one has no finite models, none has."""
-        driven, loop = [self.driven(J) for J in balls], self.loop
-        models, errors = of_all(driven)
+        driven = [self.driven(J) for J in balls]
+        F = self._of(self.loop.dynamics, balls, driven)
+        return [one.models(F, number) for number, one in enumerate(driven)]
+
+    def keeps(self, J: Array) -> bool:
+        """True if every constraint holds on such a ball."""
+        keep = tuple(kept_constraints(self.loop.system).values())
+        found = self._of(keep, J[None], [self.driven(J)]) if keep else []
+        return all(bool(np.all(g.c + _WIDER * g.radius < -_BEYOND * abs(g.c))) for g in found)
+
+    def _of(self, expressions: Sequence[Expression], balls: Array, driven: Sequence[Driven]) -> list[Jet]:
+        """Expressions in states and inputs on balls."""
+        system, (models, errors) = self.loop.system, of_all(driven)
         algebra = Jets(len(balls), balls.shape[2], errors)
         states = [algebra.state(float(m), balls[:, i]) for i, m in enumerate(self.middle)]
         inputs = [algebra.input(j, float(u), *models[j]) for j, u in enumerate(self.u)]
-        values = dict(zip((*loop.system.states, *loop.system.inputs), (*states, *inputs), strict=True))
+        values = dict(zip((*system.states, *system.inputs), (*states, *inputs), strict=True))
         shared = dict[Any, Jet]()
-        F = [evaluate(e, values, algebra, shared) for e in loop.dynamics]
-        return [one.models(F, number) for number, one in enumerate(driven)]
+        return [evaluate(e, values, algebra, shared) for e in expressions]
 
     def driven(self, J: Array) -> Driven:
         """The inputs on that ball."""

@@ -15,40 +15,15 @@ from numpy.typing import NDArray
 
 from certify.effort import UNLIMITED, Effort
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.constraints import Constraints
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.symbolic import Symbolic
-from certify.provers.outer.falsify import Rise, Sampler
+from certify.provers.outer.falsify import Hazards, Rise, Sampler
 
 Array = NDArray[np.float64]
 _FEW, _STEPS = 256, 60  # violating states that are driven along the edge of what violates, and how far
 _NARROW = 1e-3  # share of the span of N, that a band must have
 _WITHIN = (0.05, 0.2, 0.5)  # shares of a band, below its end, at which a level is tried
 _MOST = 8  # levels
-
-
-class Hazards(Sampler):
-    """A search of the domain for states that no set may have: an input or a constraint is violated."""
-
-    def __init__(self, loop: ClosedLoop, function: Neural | Symbolic, effort: Effort = UNLIMITED) -> None:
-        super().__init__(loop, function, effort)
-        self.constraints = Constraints(loop) if loop.system.constraints else None
-
-    def violation(self, x: Array) -> Array:
-        """A number (B,) that is at least 0 where one is violated."""
-        self.effort.charge(2e5 + 2 * len(x) * self.loop.operations)
-        u = self.loop.policy(x)
-        excess = np.maximum(self.least - u, u - self.most).max(-1)
-        found = np.where(excess > 0, excess, -np.inf) if self.check_inputs else np.full(len(x), -np.inf)
-        return found if self.constraints is None else np.maximum(found, self.constraints.at(x, u).max(-1))
-
-    def rise(self, x: Array) -> Rise:
-        """The violation at a state (n,)."""
-        u = self.loop.policy(x[None])
-        names = () if self.constraints is None else self.constraints.names
-        worst = [] if self.constraints is None else self.constraints.at(x[None], u)[0].tolist()
-        broken = next((name for name, g in zip(names, worst, strict=True) if g >= 0), "")
-        return Rise(x, float(self.value(x)), "keep" if broken else "input", constraint=broken)
 
 
 @dataclass(frozen=True, slots=True)

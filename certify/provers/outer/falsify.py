@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 from certify.certificates.claims import Problem
 from certify.effort import UNLIMITED, Effort
 from certify.loop.closed_loop import ClosedLoop
+from certify.loop.constraints import Constraints
 from certify.loop.plants import System, corners
 from certify.loop.policies import bounded_by_form
+from certify.lyapunov.function import Quadratic
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.symbolic import Symbolic
 
@@ -54,9 +56,17 @@ class Rise:
 
 
 class Sampler:
-    """A search of the domain of a loop for states at which N does not fall, or an input leaves its bounds."""
+    """A search of the domain of a loop for states at which N does not fall, or an input leaves its bounds; `beyond` is
+    (V, c2) of a set {V < c2} that is left out."""
 
-    def __init__(self, loop: ClosedLoop, function: Neural | Symbolic, effort: Effort = UNLIMITED) -> None:
+    def __init__(
+        self,
+        loop: ClosedLoop,
+        function: Neural | Symbolic,
+        effort: Effort = UNLIMITED,
+        beyond: tuple[Quadratic, float] | None = None,
+    ) -> None:
+        self.beyond = beyond
         self.loop, self.N, self.effort, self.system = loop, function, effort, loop.system
         self.f = self.system.uncertain_function()
         self.corners = corners(self.system)
@@ -85,13 +95,14 @@ class Sampler:
         return np.where(self.check_inputs & (worst < 0) & (excess > 0), excess, worst)
 
     def asked(self, x: Array) -> NDArray[np.bool_]:
-        """True where a condition is asked: in the domain."""
+        """True where a condition is asked: in the domain, and V >= c2."""
         inside: NDArray[np.bool_] = np.all((x >= self.low) & (x <= self.high), axis=-1)
-        return inside
+        return inside if self.beyond is None else inside & (self.beyond[0](x) >= self.beyond[1])
 
     def wall(self, x: Array) -> Array:
-        """The direction (B, n) along which states are asked for only up to some surface; zeros if there is none."""
-        return np.zeros_like(x)
+        """The direction (B, n) along which states are asked for only up to some surface, the gradient of V; zeros if
+        there is none."""
+        return np.zeros_like(x) if self.beyond is None else self.beyond[0].gradient(x)
 
     def sample(self, generator: np.random.Generator) -> Array:
         """Points of the domain, (B, n)."""
@@ -202,16 +213,37 @@ class Falsifier(Sampler):
     """A search of the domain outside of {V < c2}."""
 
     def __init__(self, problem: Problem, c2: float, function: Neural | Symbolic, effort: Effort = UNLIMITED) -> None:
-        super().__init__(problem.loop, function, effort)
-        self.V, self.c2 = problem.V, c2
+        super().__init__(problem.loop, function, effort, (problem.V, c2))
 
-    def asked(self, x: Array) -> NDArray[np.bool_]:
-        """True where a condition is asked: in the domain, V >= c2."""
-        return super().asked(x) & (self.V(x) >= self.c2)
 
-    def wall(self, x: Array) -> Array:
-        """The gradient of V."""
-        return self.V.gradient(x)
+class Hazards(Sampler):
+    """A search of the domain for states that no set may have: an input or a constraint is violated."""
+
+    def __init__(
+        self,
+        loop: ClosedLoop,
+        function: Neural | Symbolic,
+        effort: Effort = UNLIMITED,
+        beyond: tuple[Quadratic, float] | None = None,
+    ) -> None:
+        super().__init__(loop, function, effort, beyond)
+        self.constraints = Constraints(loop) if loop.system.constraints else None
+
+    def violation(self, x: Array) -> Array:
+        """A number (B,) that is at least 0 where one is violated."""
+        self.effort.charge(_CALL + 2 * len(x) * self.loop.operations)
+        u = self.loop.policy(x)
+        excess = np.maximum(self.least - u, u - self.most).max(-1)
+        found = np.where(excess > 0, excess, -np.inf) if self.check_inputs else np.full(len(x), -np.inf)
+        return found if self.constraints is None else np.maximum(found, self.constraints.at(x, u).max(-1))
+
+    def rise(self, x: Array) -> Rise:
+        """The violation at a state (n,)."""
+        u = self.loop.policy(x[None])
+        names = () if self.constraints is None else self.constraints.names
+        worst = [] if self.constraints is None else self.constraints.at(x[None], u)[0].tolist()
+        broken = next((name for name, g in zip(names, worst, strict=True) if g >= 0), "")
+        return Rise(x, float(self.value(x)), "keep" if broken else "input", constraint=broken)
 
 
 def _unit(v: Array) -> Array:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
@@ -23,7 +24,7 @@ from certify.lyapunov.neural import Neural
 from certify.lyapunov.symbolic import Symbolic
 from certify.provers.base import Budget, Report
 from certify.provers.execution import Runner
-from certify.provers.outer.falsify import Falsifier, Rise
+from certify.provers.outer.falsify import Falsifier, Hazards, Rise, Sampler
 from certify.provers.outer.rule import FaceBound, FallBound
 from certify.provers.outer.search import Cover, count
 
@@ -87,11 +88,11 @@ def prove_outer(
     """
     require_function(system := problem.loop.system, function, problem.rate)
     start = time.monotonic()
-    search = Falsifier(problem, c2, function, budget.effort)
-    floor = search.least_value()
+    searches = _searches(problem, c2, function, budget)
+    floor = searches[0].least_value()
     if not math.isfinite(floor):
         return Nothing("every sampled state of the domain lies in the ellipsoid")
-    aim = _aim(search, floor, level)
+    aim = _aim(searches, floor, level)
     if isinstance(aim, Nothing):
         return aim
     top, span, stop, witness = aim
@@ -108,9 +109,8 @@ def prove_outer(
 
     def deepen(z: Array) -> float:
         nonlocal witness
-        deeper = search.lowest((T @ z)[None])
-        if deeper is not None and (witness is None or deeper.level < witness.level):
-            witness = deeper
+        deeper = _lowest(each.lowest((T @ z)[None]) for each in searches)
+        witness = _lowest((witness, deeper))
         return math.inf if deeper is None else deeper.level
 
     root, rule = root_around(system, T), FallBound(problem, c2, T, function)
@@ -137,9 +137,22 @@ def prove_outer(
     )
 
 
-def _aim(search: Falsifier, floor: float, level: float | None) -> tuple[float, float, Stop, Rise | None] | Nothing:
+def _searches(problem: Problem, c2: float, function: Neural | Symbolic, budget: Budget) -> Sequence[Sampler]:
+    """The searches for violations: of N's fall, and of constraints if there are any."""
+    falls = Falsifier(problem, c2, function, budget.effort)
+    return (falls, Hazards(problem.loop, function, budget.effort, (problem.V, c2))) if problem.keep else (falls,)
+
+
+def _lowest(found: Iterable[Rise | None]) -> Rise | None:
+    return min((each for each in found if each is not None), key=lambda each: each.level, default=None)
+
+
+def _aim(
+    searches: Sequence[Sampler], floor: float, level: float | None
+) -> tuple[float, float, Stop, Rise | None] | Nothing:
     """The level that sampling allows, the span of N down to its least value, what limits the level, and the lowest
     violation."""
+    search = searches[0]
     top = min(search.lowest_on_faces(), math.inf if level is None else level)
     if not top > floor:
         what = "the level that was asked for" if level is not None and top == level else "N somewhere on the faces"
@@ -147,7 +160,7 @@ def _aim(search: Falsifier, floor: float, level: float | None) -> tuple[float, f
     stop = Stop.DOMAIN if level is None or top < level else Stop.REQUESTED
     span = top - floor
     top = level if stop is Stop.REQUESTED and level is not None else top - _BESIDE_FACE * span
-    witness = search.search(top)
+    witness = _lowest(each.search(top) for each in searches)
     if witness is not None and witness.level - _BESIDE_RISE * span < top:
         top, stop = witness.level - _BESIDE_RISE * span, Stop.WITNESS
     return top, span, stop, witness

@@ -8,7 +8,7 @@ only falls with it and the multipliers do not depend on it.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -84,18 +84,21 @@ def enclosure_of(function: Neural | Symbolic) -> NeuralEnclosure | SymbolicEnclo
 
 
 class LoopOnN(ABC):
-    """A rule about N and the loop on boxes in the coordinates z, x = T z, wherever N <= n2 in the domain."""
+    """A rule about N and the loop on boxes in the coordinates z, x = T z, wherever N <= n2 in the domain; there each g
+    of `keep` is negative."""
 
-    def __init__(self, loop: ClosedLoop, T: Array, function: Neural | Symbolic) -> None:
+    def __init__(
+        self, loop: ClosedLoop, T: Array, function: Neural | Symbolic, keep: Sequence[Expression] = ()
+    ) -> None:
         self.system = loop.system
         self.T = np.ascontiguousarray(T)
         self.N = enclosure_of(function)
         self.policy = policy_enclosure(loop)
-        self.dynamics = self.system.uncertain_dynamics()
+        self.dynamics, self.keep = self.system.uncertain_dynamics(), tuple(keep)
         self.check_inputs = not bounded_by_form(loop.network, self.system.input_bounds)
         self.ends = np.array([[float(end) for end in pair] for pair in self.system.domain]).T[:, :, None]
         symbols = self.system.n + self.system.m + len(self.system.uncertain)
-        equations = sum(1 for _ in nodes(*self.dynamics)) + 3 * self.system.n
+        equations = sum(1 for _ in nodes(*self.dynamics, *self.keep)) + 3 * self.system.n
         own = _EACH * (1 + symbols) ** 2 * (equations + 4 * self.N.units)
         self.operations = operations_of_policy(loop.network) + own  # of a box, roughly
         self.piece = max(16, _NUMBERS // (self.N.units * (1 + symbols) * (2 + symbols) // 2))
@@ -144,6 +147,28 @@ class LoopOnN(ABC):
     def judged(self, on: OnBoxes, level: float) -> tuple[Mask, Array, Array, Mask]:
         """`proved`, `bound` and `score` of the boxes as of `OuterBounds`, and True where a condition fails at the
         centre if N is at most the level there; bounds of inputs are not meant."""
+
+    def kept(
+        self, on: OnBoxes, bound: Array, score: Array, gaps: Callable[[Taylor, Index], Sequence[Taylor]]
+    ) -> tuple[Array, Array, Mask]:
+        """`bound` and `score`, worse on boxes where a constraint is not shown; True where one is broken at the centre.
+
+        `gaps` gives models that are not negative where anything is asked, on boxes by their indices.
+        """
+        algebra, known, broken = Models(on.fall), dict[Expression, Taylor](), np.zeros(len(bound), dtype=bool)
+        n, inputs = len(on.centre), len(on.centre) + self.system.m
+        for g in self.keep:
+            model = evaluate(g, on.values, algebra, known)
+            own, excess = upper_bound(model)
+            left = chosen(~(own < 0))
+            if len(left):
+                for gap in gaps(model, left):
+                    own[left] = lessened(own[left], model.at(left), gap, n)
+            doubt = np.abs(model.g[n:inputs]).sum(0) + np.abs(model.Q[n:, n:]).sum((0, 1)) + model.r
+            broken |= model.c + np.abs(model.g[inputs:]).sum(0) - doubt >= 0
+            score = np.where(own < 0, score, on.score(excess, model))
+            bound = np.where(own < 0, bound, np.inf)
+        return bound, score, broken
 
     def _outside(self, x: Array, error: Array) -> Mask:
         """True for the boxes (B,) that lie outside of the domain."""
@@ -198,10 +223,10 @@ class LoopOnN(ABC):
 
 
 class FallBound(LoopOnN):
-    """The rule that N falls wherever N <= n2 and V >= c2 in the domain."""
+    """The rule that N falls, and constraints hold, wherever N <= n2 and V >= c2 in the domain."""
 
     def __init__(self, problem: Problem, c2: float, T: Array, function: Neural | Symbolic) -> None:
-        super().__init__(problem.loop, T, function)
+        super().__init__(problem.loop, T, function, problem.keep)
         self.c2, self.V = c2, FormBound(problem.V.P, T)
 
     def free(self, lo: Array, hi: Array) -> Mask:
@@ -223,20 +248,23 @@ class FallBound(LoopOnN):
         rises = fall.c + np.abs(fall.g[inputs:]).sum(0) - doubt >= 0
         smooth = on.smooth & np.isfinite(bound)
         bound = self._where_asked(bound, fall, on.N, on.centre, on.radius, level)
+        score = on.score(excess, fall)
+
+        def gaps(g: Taylor, index: Index) -> list[Taylor]:
+            at = on.centre.take(index, -1), on.radius.take(index, -1)
+            return [below(on.N.at(index), level), self.V.gap(*at, g.at(index), self.c2, -1.0)]
+
+        bound, score, broken = self.kept(on, bound, score, gaps)
         bound = np.where(smooth, bound, np.inf)
-        return bound < 0, bound, np.where(smooth, on.score(excess, fall), np.inf), rises
+        return bound < 0, bound, np.where(smooth, score, np.inf), rises | broken
 
     def _where_asked(self, bound: Array, fall: Taylor, N: Taylor, centre: Array, radius: Array, level: float) -> Array:
         """The bound, made tighter where it is not negative by `k (n2 - N)` and `k (V - c2)`, which are >= 0 there."""
         n = len(centre)
         left = chosen(~(bound < 0))
         if len(left):
-            own, at = N.at(left), fall.at(left)
-            rest = own.r + EPS * (np.abs(own.c) + abs(level))
-            gap = Taylor(level - own.c, -own.g, -own.Q, rest)
-            bound[left] = lessened(bound[left], at, gap, n)
-        below = self.V.levels(centre - radius, centre + radius)[0] < self.c2
-        left = chosen(below & ~(bound < 0))
+            bound[left] = lessened(bound[left], fall.at(left), below(N.at(left), level), n)
+        left = chosen((self.V.levels(centre - radius, centre + radius)[0] < self.c2) & ~(bound < 0))
         if len(left):
             at = fall.at(left)
             gap = self.V.gap(centre.take(left, -1), radius.take(left, -1), at, self.c2, -1.0)
@@ -294,6 +322,11 @@ def least_value(
     by_model = np.where(np.isfinite(by_model), by_model, -np.inf)
     lowest[index] = np.maximum(lowest[index], by_model)
     return lowest, index, known
+
+
+def below(N: Taylor, level: float) -> Taylor:
+    """n2 - N."""
+    return Taylor(level - N.c, -N.g, -N.Q, N.r + EPS * (np.abs(N.c) + abs(level)))
 
 
 def _pieces(count: int, most: int) -> int:

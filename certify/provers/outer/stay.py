@@ -11,24 +11,20 @@ from collections.abc import Sequence
 import numpy as np
 
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import Expression, evaluate, nodes
+from certify.loop.expressions import Expression
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.symbolic import Symbolic
-from certify.provers.bounds import Models, Taylor, upper_bound
+from certify.provers.bounds import Taylor, upper_bound
 from certify.provers.bounds.arrays import Array, Mask, chosen
-from certify.provers.bounds.taylor import EPS
 from certify.provers.boxes.lessening import lessened
-from certify.provers.outer.rule import LoopOnN, OnBoxes
+from certify.provers.outer.rule import LoopOnN, OnBoxes, below
 
 
 class StayBound(LoopOnN):
     """The rule for a loop and its constraints, each g of `keep` negative where N <= n2."""
 
     def __init__(self, loop: ClosedLoop, keep: Sequence[Expression], T: Array, function: Neural | Symbolic) -> None:
-        super().__init__(loop, T, function)
-        self.keep = tuple(keep)
-        symbols = self.system.n + self.system.m + len(self.system.uncertain)
-        self.operations += 2.0 * (1 + symbols) ** 2 * sum(1 for _ in nodes(*self.keep)) if self.keep else 0.0
+        super().__init__(loop, T, function, keep)
 
     def free(self, lo: Array, hi: Array) -> Mask:
         """False: there is no other set."""
@@ -40,19 +36,11 @@ class StayBound(LoopOnN):
 
     def judged(self, on: OnBoxes, level: float) -> tuple[Mask, Array, Array, Mask]:
         """N'F where N = n2, and each constraint where N <= n2."""
-        gap = _below(on.N, level)
+        gap = below(on.N, level)
         bound, score, wrong = self._falls(on, gap)
-        for g in self._constraints(on):
-            own, excess = upper_bound(g)
-            index = chosen(~(own < 0))
-            if len(index):
-                own[index] = lessened(own[index], g.at(index), gap.at(index), len(on.centre))
-            holds = own < 0
-            score = np.where(holds, score, on.score(excess, g))
-            wrong |= _largest_at_centre(g, len(on.centre), self.system.m) >= 0
-            bound = np.where(holds, bound, np.inf)
+        bound, score, broken = self.kept(on, bound, score, lambda g, index: [gap.at(index)])
         bound = np.where(on.smooth, bound, np.inf)
-        return bound < 0, bound, score, wrong
+        return bound < 0, bound, score, wrong | broken
 
     def _falls(self, on: OnBoxes, gap: Taylor) -> tuple[Array, Array, Mask]:
         """A bound (B,) of N'F where N = n2, -inf where N is below n2; the score of the axes; and True where N'F is
@@ -69,21 +57,6 @@ class StayBound(LoopOnN):
         bent = np.abs(N.Q).sum((0, 1)) + N.r
         crossed = np.abs(gap.c) < np.abs(N.g).sum(0) - bent
         return np.where(below, -np.inf, bound), on.score(excess, fall), crossed & (fall.c + quantities - whole >= 0)
-
-    def _constraints(self, on: OnBoxes) -> list[Taylor]:
-        algebra, known = Models(on.fall), dict[Expression, Taylor]()
-        return [evaluate(g, on.values, algebra, known) for g in self.keep]
-
-
-def _largest_at_centre(g: Taylor, n: int, m: int) -> Array:
-    """The value at the centre for the worst uncertain quantities, less all errors."""
-    doubt = np.abs(g.g[n : n + m]).sum(0) + np.abs(g.Q[n:, n:]).sum((0, 1)) + g.r
-    return np.asarray(g.c + np.abs(g.g[n + m :]).sum(0) - doubt)
-
-
-def _below(N: Taylor, level: float) -> Taylor:
-    """n2 - N."""
-    return Taylor(level - N.c, -N.g, -N.Q, N.r + EPS * (np.abs(N.c) + abs(level)))
 
 
 def _negative(v: Taylor) -> Taylor:

@@ -116,7 +116,7 @@ def surround(
             if tube is not None:
                 best, proved = Found(tube, name), size
             elif proved or best is None:
-                refused, why = size, said
+                refused, why = size, why if why and share.over else said  # what ended the search says little
             else:
                 break
             size = min(_FIRST * proved, math.sqrt(proved * refused)) if proved else _SHORTER * size

@@ -40,6 +40,7 @@ Flow = Callable[[Array], Array]
 _SHARE = 0.25  # share of a slab's ball that the motion of its middle takes
 _ROOM = 1 / (1 - _SHARE**2)
 _FIRST, _LONGEST, _LONGER = 0.02, 0.5, 1.5  # units of time of a slab; growth from one to the next
+_SHORTEST = 1e-3  # units of time of a slab, with less of which the tube may be on its way into a constraint
 _STEPS = 8  # steps of the simulation for each slab
 _MOST_TIME = 1000.0  # units of time, after which a path that has not arrived is given up
 _GROWN = 12.0  # logarithm of a volume, relative to the start, at which a tube is given up
@@ -77,6 +78,11 @@ def find_path(
                 slab = _slab(loop, flow, P, c, rate, goal, duration, effort)
             except np.linalg.LinAlgError:  # numbers that have no finite model, or an ellipsoid without extent
                 slab = None
+            shortest = _SHORTEST if loop.system.constraints else 0.0
+            if slab is None or slab.duration < shortest:
+                wide = WIDER * math.sqrt(_ROOM) * root(P) / (1 - _SHARE)
+                if shortest and not paths(loop, c).keeps(wide):
+                    return None, f"the tube may violate a constraint after {spent:.3g} units of time"
             if slab is None or slab.path is None or begin - np.linalg.slogdet(slab.end)[1] > 2 * _GROWN:
                 return None, f"the tube cannot be continued after {spent:.3g} units of time"
             around = [(Q, x) for Q in (P, slab.middle, slab.end) for x in (c, slab.path.centre)]
@@ -151,8 +157,9 @@ def _slab(
             J = WIDER * math.sqrt(_ROOM) * root(middle)
             known = paths(loop, (c + end) / 2)
             effort.charge(2 * look(known))
-            models = known.models(np.append(J, ((end - c) / (2 * _SHARE))[:, None], axis=1))
-            if models.finite and models.admitted:
+            ball = np.append(J, ((end - c) / (2 * _SHARE))[:, None], axis=1)
+            models = known.models(ball)
+            if models.finite and models.admitted and known.keeps(ball):
                 along = _multipliers(models, J, models.f - (end - c) / duration, middle, J.T @ goal @ J)
                 nodes = nodes_of(along.growth, J, P, duration, _ROOM)
                 if nodes is not None:

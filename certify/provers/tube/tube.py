@@ -95,7 +95,7 @@ def _slab(known: Paths, P: Array, rate: Array | None, weight: Array, effort: Eff
             J = WIDER * root(middle)
             effort.charge(look(known))
             models = known.models(J)
-            if models.finite and models.admitted:
+            if models.finite and models.admitted and known.keeps(J):
                 multipliers = _multipliers(models, J, P, weight)
                 nodes = nodes_of(partial(_growth, models, J, multipliers), J, P, duration)
                 if nodes is not None:
