@@ -26,7 +26,7 @@ EDGES = {  # who imports whom, besides these: exactly the arrows that exist
     "controllers": "analysis certificates cli loop lyapunov provers report",
 }
 TRAINER = {  # who imports whom within controllers, besides what is open there
-    "commands": "comparison distillation evaluation figures flattening history plants training",
+    "commands": "comparison distillation evaluation figures flattening history identification plants training",
     "comparison": "simulation training",
     "distillation": "evaluation flattening plants simulation training",
     "evaluation": "identification plants simulation",

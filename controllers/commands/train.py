@@ -15,6 +15,8 @@ import typer
 from certify.cli.options import parameter
 from certify.errors import OptionError
 from controllers.commands import black_box
+from controllers.commands.identify_report import OPTIONS as REPORTED
+from controllers.commands.identify_report import report_of
 from controllers.commands.shared import Json, beside_a_gain, emit, errors
 from controllers.options import Plant, TrainingOptions, overridden
 from controllers.storage import make_folder, read, require_writable, set_aside
@@ -71,13 +73,16 @@ def train(
             raise OptionError(f"`evaluate_every` must be at least 0; found {evaluate_every}.")
         of_environment = {name: chosen.pop(name) for name in black_box.OPTIONS}
         data = of_environment["write_data"]
+        reported = report_of({name: chosen.pop(name) for name in REPORTED})
         made = {"checkpoint_dir": checkpoint_dir, "resume": resume, "evaluations": evaluations, "keep": keep}
         task = _task(plant, of_environment, preset, _given(chosen), made)
         for option, path in (("evaluations", evaluations), ("keep", keep)):
             if path is not None and not evaluate_every:
                 raise OptionError(f"`{option}` needs an `evaluate_every` above 0.")
-        for path in filter(None, (out, log, evaluations, data)):
+        for path in filter(None, (out, log, evaluations, data, reported and reported.path)):
             require_writable(path)
+        if reported is not None:
+            reported.declared.terms(task.system)
         trainer = task.trainer(device)
         checkpoint = _checkpoint(checkpoint_dir, resume)
         writer = None if keep is None else _policy_writer(keep, resume)
@@ -87,7 +92,8 @@ def train(
         plan = checkpoint, checkpoint_every, 0 if task.box else evaluate_every
         policy = _run(trainer, log, evaluations, writer, plan)
         _save(out, policy)
-        emit(_summary(policy, out) | task.prospects(policy, out, data, trainer, as_json), as_json)
+        found = {} if reported is None else reported.written(trainer, as_json)
+        emit(_summary(policy, out) | task.prospects(policy, out, data, trainer, as_json) | found, as_json)
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,7 +202,7 @@ def _run(
 def _signature() -> inspect.Signature:
     own = inspect.signature(train, eval_str=True).parameters.values()
     parameters = [p for p in own if p.kind is not inspect.Parameter.VAR_KEYWORD]
-    parameters += black_box.OPTIONS.values()
+    parameters += [*black_box.OPTIONS.values(), *REPORTED.values()]
     hints = get_type_hints(TrainingOptions, include_extras=True)
     for option in fields(TrainingOptions):
         kind, text = get_args(hints[option.name])

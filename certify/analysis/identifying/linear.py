@@ -132,7 +132,7 @@ def _lines(
     rows = [s for s in states if s not in known or s in given.second]
     columns = [s for s in states if s not in given.without]
     entries = {s: _entries(k, columns, inputs, states) for k, s in enumerate(states) if s in rows}
-    terms = {s: _terms(given.second[s], [*states, *inputs], s) for s in given.second}
+    terms = {s: terms_of(given.second[s], [*states, *inputs], s) for s in given.second}
     priors = _priors(data, entries, terms, step, noise)
     odd = next((p for p in given.prior if p not in entries and p not in priors), None)
     if odd is not None:
@@ -201,7 +201,7 @@ def _entries(row: int, columns: Sequence[str], inputs: Sequence[str], states: Se
     return of_A | {f"B{row + 1}{between}{k + 1}": u for k, u in enumerate(inputs)}
 
 
-def _terms(bound: str, names: Sequence[str], state: str) -> list[Expression]:
+def terms_of(bound: str, names: Sequence[str], state: str) -> list[Expression]:
     """The terms of a bound, without abs around factors, which have no corner then."""
     try:
         e = parse_expression(bound, dict(zip(names, symbols(list(names)), strict=True)))

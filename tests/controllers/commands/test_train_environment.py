@@ -272,3 +272,43 @@ def test_gymnasium_s_own_pendulum(tmp_path):
     assert np.allclose(found, [x[0] + 0.05 * omega, omega], atol=1e-6)
     with pytest.raises(InputError, match="there are 3"):
         black_box(replace(told, observed="theta,omega"))
+
+
+REPORT = ["--noise", "1e-9", "--second", "v=0.05*p**2"]
+
+
+def test_a_report_has_guaranteed_ranges_of_what_was_learned(world, tmp_path):
+    """They hold the true A and B, and the gain that the true plant would have."""
+    out, report = tmp_path / "p.pt", tmp_path / "p.json"
+    arguments = ["--env", f"{world}:Shown", "--observed", "p,v", *SHORT, "--out", out]
+    done = _train(*arguments, "--identify-report", report, *REPORT)
+    assert done.exit_code == 0, done.stderr
+    found, learned = json.loads(report.read_text()), load_policy(out).training
+    true = riccati_gain(A, B, np.diag(learned["state_weights"]), np.diag(learned["input_weights"]))
+    for name, matrix in {"A": A, "B": B, "K": true}.items():
+        lo, hi = (np.array(found[name]["range"][end]) for end in ("lo", "hi"))
+        assert (lo <= matrix).all() and (matrix <= hi).all() and np.abs(hi - lo).max() < 1e-3, name
+        assert found[name]["learned"] == learned[name]
+    assert found["second"] == {"v": "0.05*p**2"} and found["transitions"] == 120
+    assert f"identified   {report}" in done.stdout and "K11" in done.stdout and "off by at most" in done.stdout
+    too_little = _train(*arguments, "--identify-report", report, "--noise", "1e-9", "--json")
+    assert (
+        too_little.exit_code == 0
+        and "of v the bounds must be at least" in json.loads(too_little.stdout)["identified"]["refuted"]
+    )
+
+
+@pytest.mark.parametrize(
+    "more, message",
+    [
+        (["--second", "v=p**2"], "--second is for the report of --identify-report"),
+        (["--identify-report", "r.json"], "--identify-report needs --noise"),
+        (["--identify-report", "r.json", "--noise", "1e-9", "--second", "w=p**2"], "--second names 'w'"),
+        (["--identify-report", "r.json", "--noise", "0"], "--noise must be a positive bound"),
+    ],
+)
+def test_a_report_needs_what_it_assumes(world, tmp_path, monkeypatch, more, message):
+    monkeypatch.chdir(tmp_path)
+    done = _train("--env", f"{world}:Shown", "--observed", "p,v", *SHORT, *more, "--out", tmp_path / "p.pt")
+    assert done.exit_code == 2 and message in done.stderr and "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
