@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from certify.errors import InputError
 from certify.loop.activations import activation
+from certify.loop.networks import Affine, Network, Observe, Sum, Values
 from certify.loop.policies import PolicyNetwork
 
 Array = NDArray[np.float64]
@@ -43,6 +44,8 @@ def contracted(network: PolicyNetwork, factor: float) -> PolicyNetwork:
     """
     if not 0 < factor <= 1:
         raise InputError(f"`factor` must be in (0, 1]; found {factor}.")
+    if not network.network.is_chain:
+        return _contracted_steps(network, factor)
     last = len(network.weights) - 1
     weights, biases = [], []
     h = shrunk = np.zeros(network.n)
@@ -63,12 +66,69 @@ def contracted(network: PolicyNetwork, factor: float) -> PolicyNetwork:
     return network.with_layers(weights=tuple(weights), biases=tuple(biases))
 
 
+def _contracted_steps(network: PolicyNetwork, factor: float) -> PolicyNetwork:
+    """The same for a network of any steps, where all vectors keep their values at the origin.
+
+    A vector's deviations are `factor` times what they were where layers alone decide that: the state and the output
+    keep theirs, and so does each vector that a step other than a layer ties to one of them.
+    """
+    steps, values = network.network.steps, _at_origin(network)
+    tied = list(range(len(values)))  # a representative of each class of vectors that have one factor
+
+    def root(i: int) -> int:
+        return i if tied[i] == i else root(tied[i])
+
+    for k, step in enumerate(steps, 1):
+        if not isinstance(step, Affine):
+            for i in step.of:
+                tied[root(i)] = root(k)
+    kept = {root(0), root(len(steps))}
+    kept |= {root(k) for k, step in enumerate(steps, 1) if isinstance(step, Observe)}
+    share = [1.0 if root(k) in kept else factor for k in range(len(values))]
+    weights, biases = [], []
+    for k, step in enumerate(steps, 1):
+        if isinstance(step, Affine):
+            weights.append(_single(step.weight * (share[k] / share[step.of[0]])))
+            biases.append(_single(values[k] - weights[-1] @ values[step.of[0]]))
+    return network.with_numbers(weights, biases)
+
+
+class _Kept(Values):
+    """Values of one state, all of which are kept."""
+
+    def __init__(self, state: Array) -> None:
+        self.found = [state]
+
+    def run_all(self, network: Network) -> list[Array]:
+        for step in network.steps:
+            self.found.append(getattr(self, step.kind)(step, *(self.found[i] for i in step.of)))
+        return self.found
+
+
+def _at_origin(network: PolicyNetwork) -> list[Array]:
+    """Every vector of a network at the origin."""
+    return _Kept(np.array(network.origin)).run_all(network.network)
+
+
 def with_value_at_origin(network: PolicyNetwork, value: Array) -> PolicyNetwork:
-    """The network with the last bias that makes net(0) equal `value` (m,), up to rounding."""
-    h, phi = np.zeros(network.n), activation(network.activation)
-    for weight, bias in zip(network.weights[:-1], network.biases[:-1], strict=True):
-        h, _ = phi.pair(weight @ h + bias)
-    return network.with_layers(biases=(*network.biases[:-1], _last_bias(network.weights[-1], h, value)))
+    """The network with the bias that makes net(0) equal `value` (m,), up to rounding.
+
+    It is that of the last layer, which is the last step or is added to it; without such a layer nothing changes.
+    """
+    steps, values = network.network.steps, _at_origin(network)
+    last = len(steps)
+    if isinstance(steps[-1], Sum):
+        read = [i for step in steps for i in step.of]
+        layers = [i for i in steps[-1].of if i and isinstance(steps[i - 1], Affine) and read.count(i) == 1]
+        last = layers[-1] if layers else last
+    step = steps[last - 1]
+    if not isinstance(step, Affine):
+        return network
+    others = values[-1] - values[last] if last < len(steps) else np.zeros(len(value))
+    biases = [each.bias for each in network.network.affine]
+    at = [each is step for each in network.network.affine].index(True)
+    biases[at] = _last_bias(step.weight, values[step.of[0]], value - others)
+    return network.with_numbers([each.weight for each in network.network.affine], biases)
 
 
 def _last_bias(weight: Array, h: Array, wanted: Array) -> Array:

@@ -15,7 +15,6 @@ from controllers.flattening.result import Ended
 from controllers.flattening.selection import GAIN, Selection
 from controllers.flattening.student import Student
 from controllers.flattening.task import SMALLEST, Task
-from controllers.training.departure import departure
 
 Array = NDArray[np.float64]
 Report = Callable[[int, float, float], None]
@@ -80,7 +79,7 @@ class Descent:
             change = (student(states) - wanted) / size
             fit = change.square().sum(1).mean()
             gain = ((slope[:, None] * student.jacobian()) * box - J).square().sum() / largest
-            bends = departure(student.weights, student.biases, box, student.units)
+            bends = student.departure(box)
             return fit + GAIN * gain + task.options.weight * bends, fit, bends
 
         return loss

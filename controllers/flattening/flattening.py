@@ -64,7 +64,8 @@ def flatten(
         where that is asked for; or no iterate has a lower departure within the bounds.
     """
     options, began = options or FlattenOptions(), time.monotonic()
-    policy.network.require_layers("flattening")
+    if options.gain == "lqr":
+        policy.network.require_layers("another gain")
     torch.set_num_threads(options.threads)
     task = Task(policy, options, chosen)
     selection = Selection(task, task.visited(task.goal))

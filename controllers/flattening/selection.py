@@ -54,7 +54,7 @@ class Selection:
 
     def keep(self, network: PolicyNetwork) -> bool:
         """Remember a policy that is better than all before and within the bounds; True if it is one."""
-        if not all(np.all(np.isfinite(a)) for a in (*network.weights, *network.biases)):
+        if not all(np.all(np.isfinite(a)) for a in (a for step in network.network.affine for a in step.arrays)):
             return False
         objective = self.objective(network)
         if self.best is not None and objective >= self._objective:

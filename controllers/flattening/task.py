@@ -118,7 +118,7 @@ class Task:
 
     def with_layers(self, weights: tuple[Array, ...], biases: tuple[Array, ...]) -> PolicyNetwork:
         """The old policy with other layers, and with the old value before its squash at the origin."""
-        network = self.old.with_layers(weights=weights, biases=biases)
+        network = self.old.with_numbers(weights, biases)
         return with_value_at_origin(network, np.asarray(self.old.net(np.zeros(self.system.n))))
 
     def lqr_weights(self) -> tuple[Array, Array]:
@@ -154,7 +154,7 @@ class Task:
                 f"the policy must map {system.n} states to {system.m} inputs for {system.name}; "
                 f"it maps {network.n} to {network.m}."
             )
-        if len(network.weights) < 2:
+        if not network.network.functions:
             raise InputError("a policy to flatten must have hidden units; this one is a single layer, already flat.")
         if box is not None and len(box) != system.n:
             raise OptionError(f"`box` must have {system.n} half-widths for {system.name}; found {len(box)}.")

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from certify.loop.policies import PolicyNetwork
+from controllers.training.forms import Forms, Numbers
 from controllers.training.units import Units
 
 _TANH = Units()
@@ -94,9 +95,23 @@ def departure(weights: Sequence[Tensor], biases: Sequence[Tensor], box: Tensor, 
     return total / linear.clamp_min(_LEAST)
 
 
+def departure_of_steps(numbers: Numbers, box: Tensor, origin: Tensor) -> Tensor:
+    """The departure of a network of any steps on the box with half-widths (n,) around the state `origin` (n,).
+
+    Its units' bends are those of `Forms`, errors of lines and not differences from tangents: about half of `departure`.
+    """
+    forms = Forms(numbers)
+    y, J = forms.run(numbers.network, (origin[None], torch.diag(box)[None]))
+    bends = forms.errors(y).sum() if forms.bends else J.new_zeros(())
+    return bends / J.abs().sum().clamp_min(_LEAST)
+
+
 def departure_of(network: PolicyNetwork, box: Sequence[float]) -> float:
     """`departure` of a policy on the box with these half-widths, (n,)."""
-    weights, biases = (
-        [torch.tensor(a, dtype=torch.float64) for a in arrays] for arrays in (network.weights, network.biases)
-    )
+    layers = network.network.affine
+    weights = [torch.tensor(a.weight, dtype=torch.float64) for a in layers]
+    biases = [torch.tensor(a.bias, dtype=torch.float64) for a in layers]
+    if not network.network.is_chain:
+        numbers, half_widths = Numbers(network.network, weights, biases), torch.tensor(box, dtype=torch.float64)
+        return departure_of_steps(numbers, half_widths, torch.tensor(network.origin)).item()
     return departure(weights, biases, torch.tensor(box, dtype=torch.float64), Units(network.activation)).item()

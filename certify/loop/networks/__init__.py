@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certify.loop.networks.floats import Gradients, Tangent, Tangents, tangent_at, values
+from certify.loop.networks.floats import Gradients, Tangent, Tangents, Values, evaluated, tangent_at, values
 from certify.loop.networks.layers import clipped, frozen, frozen_layers, like, sha256_of, tanh, through, widths
 from certify.loop.networks.steps import (
     Affine,
@@ -33,7 +33,9 @@ __all__ = [
     "Sum",
     "Tangent",
     "Tangents",
+    "Values",
     "clipped",
+    "evaluated",
     "frozen",
     "frozen_layers",
     "layered",

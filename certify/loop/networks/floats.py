@@ -13,7 +13,7 @@ from certify.loop.networks.layers import clipped, like
 from certify.loop.networks.steps import Affine, Algebra, Array, Clip, Concat, Map, Network, Observe, Product, Sum
 
 
-class _Values(Algebra[Any]):
+class Values(Algebra[Any]):
     """Arrays or tensors, entries along the last axis."""
 
     def affine(self, step: Affine, v: Any) -> Any:
@@ -38,7 +38,7 @@ class _Values(Algebra[Any]):
         return evaluated(step.expressions, step.symbols, v)
 
 
-_VALUES = _Values()
+_VALUES = Values()
 
 
 def values(network: Network, x: Any) -> Any:
@@ -118,7 +118,7 @@ def tangent_at(network: Network, x: Array) -> Tangent:
     return Tangents().run(network, Tangent(x, np.eye(network.reads)))
 
 
-class Gradients(_Values):
+class Gradients(Values):
     """A network's values at states x (B, reads), `value` (B, gives), and derivatives of numbers that follow from it."""
 
     def __init__(self, network: Network, x: Array) -> None:

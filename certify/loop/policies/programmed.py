@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.loop.networks import Network, layered
+from certify.loop.networks import Affine, Network, layered
 
 Array = NDArray[np.float64]
 WHOSE = "the policy"  # in messages
@@ -90,6 +90,12 @@ class Programmed:
         self.require_layers("to replace its layers one")
         given = (weights or self.weights, biases or self.biases, activation or self.activation)
         return replace(self, network=chain(*given), **others)
+
+    def with_numbers(self, weights: Sequence[Any], biases: Sequence[Any]) -> Self:
+        """The same policy of any steps with other matrices and biases in its layers, in their order."""
+        new = zip(weights, biases, strict=True)
+        steps = [Affine(step.of, *next(new)) if isinstance(step, Affine) else step for step in self.network.steps]
+        return replace(self, network=Network(self.n, tuple(steps)))
 
 
 def chain(weights: Sequence[Any], biases: Sequence[Any], function: str) -> Network:

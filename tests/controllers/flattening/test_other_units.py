@@ -10,7 +10,7 @@ import pytest
 
 from certify.errors import InputError
 from certify.loop.activations import ACTIVATIONS
-from certify.loop.networks import Affine, Map, Network, Sum
+from certify.loop.networks import Affine, Map, Network, Sum, tangent_at
 from certify.loop.plants import get_system
 from certify.loop.policies import Policy, PolicyNetwork, require_centred
 from controllers.evaluation.corners import nearest_corner
@@ -82,8 +82,59 @@ def test_it_is_easier_to_prove_and_within_its_bounds(name):
     require_centred(new, ORIGIN)
 
 
-def test_other_steps_than_layers_are_refused():
-    steps = (Affine((0,), np.eye(2), np.zeros(2)), Map((1,), "tanh"), Sum((0, 2)), Affine((3,), -GAIN, np.zeros(1)))
-    policy = Policy(PolicyNetwork(Network(2, steps), np.ones(1), np.zeros(1)), "pendulum")
-    with pytest.raises(InputError, match="flattening needs a policy of layers that read the states"):
-        flatten(policy, QUICK)
+def _skipping(name: str = "tanh") -> PolicyNetwork:
+    """A policy with two skip connections, one around a hidden layer and one around all, whose J(0) is -GAIN."""
+    generator = np.random.default_rng(5)
+    W0, W1, W2 = (generator.normal(size=shape) for shape in ((12, 2), (12, 12), (1, 12)))
+    b0, b1 = generator.uniform(0.4, 1.0, (2, 12))
+    steps = [
+        Affine((0,), W0, b0), Map((1,), name), Affine((2,), W1 / 3, b1), Map((3,), name), Sum((2, 4)),
+        Affine((5,), 0.2 * W2, np.zeros(1)), Affine((0,), np.zeros((1, 2)), np.zeros(1)), Sum((6, 7)),
+    ]  # fmt: skip
+    around = -GAIN - tangent_at(Network(2, tuple(steps)), np.zeros(2)).J
+    steps[6] = Affine((0,), around, np.array([0.125]))
+    return PolicyNetwork(Network(2, tuple(steps)), np.array([6.0]), np.zeros(1))
+
+
+@pytest.mark.parametrize("name", ["tanh", "relu", "silu"])
+def test_contraction_of_skip_connections_keeps_value_and_jacobian(name):
+    network = _skipping(name)
+    J, at_0 = network.jacobian_at_origin(ORIGIN), network.net(np.zeros(2))
+    flat = contracted(network, 2.0**-6)
+    np.testing.assert_allclose(flat.jacobian_at_origin(ORIGIN), J, atol=1e-4 * np.abs(J).max())
+    np.testing.assert_allclose(flat.net(np.zeros(2)), at_0, atol=1e-4)
+    assert [step.kind for step in flat.network.steps] == [step.kind for step in network.network.steps]
+    new, old = (nonlinearity_on(each, ORIGIN, BOX).bend for each in (flat, network))
+    assert old > 0.05 and new < 0.05 * old + 1e-4
+    assert departure_of(flat, BOX.tolist()) < 0.1 * departure_of(network, BOX.tolist())
+
+
+def test_the_departure_of_skip_connections_is_that_of_the_units_beside_the_linear_part():
+    """One unit beside a linear path: lines leave half of what a tangent leaves of a parabola."""
+    y, W = 0.3, np.array([[0.5, -0.25]])
+    steps = (Affine((0,), W, np.array([y])), Map((1,), "tanh"), Affine((0,), -GAIN, np.zeros(1)), Sum((2, 3)))
+    network = PolicyNetwork(Network(2, steps), np.ones(1), np.zeros(1))
+    box = np.array([1e-2, 1e-2])
+    v, slope = np.abs(W) @ box, 1 - np.tanh(y) ** 2
+    second = abs(np.tanh(y + v) + np.tanh(y - v) - 2 * np.tanh(y)) / 4
+    linear = np.abs(slope * W - GAIN) @ box
+    assert departure_of(network, box.tolist()) == pytest.approx((second / linear).item(), rel=1e-2)
+
+
+def test_skip_connections_are_flattened():
+    network = _skipping()
+    result = flatten(Policy(network, "pendulum"), replace(QUICK, max_cost_change=0.2))
+    new = result.policy.network
+    assert result.after.departure < 0.2 * result.before.departure and result.gain_change < 0.05
+    assert [step.of for step in new.network.steps] == [step.of for step in network.network.steps]
+    require_centred(new, ORIGIN)
+
+
+def test_another_gain_needs_layers():
+    with pytest.raises(InputError, match="another gain needs a policy of layers that read the states"):
+        flatten(Policy(_skipping(), "pendulum"), replace(QUICK, gain="lqr"))
+
+
+def test_the_value_at_the_origin_of_skip_connections_is_set():
+    wanted = np.array([0.5])
+    np.testing.assert_allclose(with_value_at_origin(_skipping(), wanted).net(np.zeros(2)), wanted, atol=1e-6)
