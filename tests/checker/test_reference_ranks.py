@@ -161,8 +161,8 @@ def test_two_states_that_wind_inwards_in_several_steps() -> None:
 
 
 def test_many_steps_of_terms_that_cancel() -> None:
-    """x+ = 10 x + 19 u = x/2; the radii of balls that went on from step to step would grow 19 times in each."""
-    loop = Loop([["+", ["*", "10", "x"], ["*", "19", "u"]]], HALF, NEAR)
+    """x+ = 31/3 x + 59/3 u = x/2; the radii of balls that are passed on from step to step grow 20 times in each."""
+    loop = Loop([["+", ["*", "31/3", "x"], ["*", "59/3", "u"]]], HALF, NEAR)
     tree, leaves = uniform([-2.0], [2.0], 5)
     count = [0 if within(0.2)(box) else 99 for box in leaves]
     assert verdicts(document(loop, (-2.0, 2.0), tree, count, count)) == (None, None)
