@@ -7,14 +7,17 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from itertools import product
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from flint import fmpq_mat
 
-from .document import Array, Certificate, Data, Intervals, LocalBall, Outer, OuterTree, Partition, Ranks, Slab, Trusted
+from .document import Array, Certificate, Intervals, LocalBall, Outer, OuterTree, Partition, Trusted
 from .exact import exactly, gershgorin_lower, inverse_diagonal
 from .near import near
 from .network import Folded, fold
+
+if TYPE_CHECKING:
+    from .sections import Data, Ranks, Slab
 
 T = TypeVar("T")
 AT_CORNERS = 6  # uncertain quantities of which rule `local` decides every corner

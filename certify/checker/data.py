@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from .boxes import LEAF, is_whole
 from .case import Case, Failures
-from .document import Array, Data, Intervals, Round
+from .document import Array, Intervals
 from .expression import evaluate
 from .flow import enclosed, later
 from .near import Above, Near, all_near, combined, near, size
+from .sections import Data, Round
 from .taylor import Taylor, affine, constants, pairs
 
 _BATCH_NUMBERS = 800_000

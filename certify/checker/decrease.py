@@ -13,16 +13,20 @@ from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 from flint import fmpq, fmpq_mat
 
 from .case import AT_CORNERS
-from .document import Multipliers, Path
+from .document import Multipliers
 from .exact import exactly, fraction, is_definite, root_above
 from .jets import Jet, unpacked
 from .near import Above, Array, Near, Tensor, Vector, at_least_0, mixed, norm, size, symmetrised, triples
 from .pairs import bound_of_pairs, in_binary64
+
+if TYPE_CHECKING:
+    from .sections import Path
 
 _NOTHING = fmpq(0)
 _SHARE = fmpq(1, 4)  # of 1 against d, around a level

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from flint import fmpq
@@ -19,11 +19,13 @@ from .networks import read as read_networks
 from .schema import Value
 from .strict import MAX_VALUES, load
 
+if TYPE_CHECKING:
+    from .sections import Data, Ranks, Slab
+
 MAX_STATES, MAX_SLABS = 64, 10**4
 MAX_ORDER = 8  # of a series in time
 MAX_CELLS, MAX_CUTS = 4096, 64  # of the box of uncertain quantities in all, and of one range
 MAX_CONSTRAINTS, MAX_RANK = 64, 2**16 - 1  # that rank is none
-MAX_TRANSITIONS, MAX_ROUNDS, MAX_PARTS = 2**16, 64, 4096  # of data; rounds of a part of the priors
 CLAIMS = ("asymptotic", "practical", "nearby", "enlarged", "reached", "reaches", "invariant")
 WITHOUT_V = ("reaches", "invariant")
 PRACTICAL = ("practical", "nearby")
@@ -92,30 +94,6 @@ class Contraction:
 
 
 @dataclass(frozen=True)
-class Path:
-    """The centre of a slab's ellipsoid at its end, the share of its ball that the motion takes, and the multipliers of
-    the tube's boundary and of the motion."""
-
-    centre: Array
-    share: float
-    edge: float
-    motion: float
-    joint: float
-
-
-@dataclass(frozen=True)
-class Slab:
-    """A piece of the tube up to the node `end`, in its time, with a ball that contains it and multipliers on it."""
-
-    middle: Array
-    end: Array
-    duration: float
-    J: Array
-    multipliers: Multipliers
-    path: Path | None
-
-
-@dataclass(frozen=True)
 class Partition:
     """Evidence that is replayed: a partition tree of the box |z| <= root, x = T z; the local ball; the tube's slabs."""
 
@@ -138,56 +116,6 @@ class OuterTree:
     root: Array
     tree: bytes
     faces: tuple[bytes, ...]
-
-
-@dataclass(frozen=True)
-class Ranks:
-    """The states that are angles, by their numbers, and the most steps to the target; as evidence a partition tree of
-    the box lo <= x <= hi, and of each leaf its rank and the number of its steps."""
-
-    angles: tuple[int, ...]
-    most: int
-    lo: Array
-    hi: Array
-    tree: bytes
-    ranks: bytes
-    steps: bytes
-
-
-@dataclass(frozen=True)
-class Round:
-    """A box that holds the rest of another, by weights (2, K, T, n) of all transitions."""
-
-    box: Intervals
-    weights: Array
-
-
-@dataclass(frozen=True)
-class Data:
-    """Measurements on which ranges of parameters rest, and multipliers that show it.
-
-    A run has states (T + 1, n), within `noise` of the true ones, and the inputs (T, m) that are held in between, for a
-    time in `period`, or for a step where that is None; measured is `origin` + x. A transition is followed in so many
-    `pieces`, with a series in time of an `order`. The priors are partitioned by a tree; each of its `leaves` has
-    rounds, and so has what these leave of the priors.
-    """
-
-    sha256: str  # of the file that they come from
-    parameters: tuple[str, ...]
-    priors: Intervals
-    period: tuple[Fraction, Fraction] | None
-    origin: tuple[Fraction, ...]
-    noise: tuple[Fraction, ...]
-    runs: tuple[tuple[Array, Array], ...]
-    order: int
-    pieces: int
-    tree: bytes
-    leaves: tuple[tuple[Round, ...], ...]
-    rounds: tuple[Round, ...]
-
-    @property
-    def transitions(self) -> int:
-        return sum(len(inputs) for _, inputs in self.runs)
 
 
 @dataclass(frozen=True)
@@ -291,53 +219,17 @@ def certificate(data: Any, sha256: str, at: str = "", kinds: tuple[str, ...] = C
     stated["policy"] = _policy(policy, networks, n, m, kind in PRACTICAL)
     stated["networks"], stated["sha256"] = tuple(networks.values()), sha256
     provenance.must(isinstance(provenance.raw, dict), "an object")
-    read_rest = {"reaches": _reaching, "invariant": _staying}.get(kind, _attracting)
-    c = read_rest(stated, claim, lyapunov, levels, evidence)
-    return replace(c, then=_taking_over(c, then[0])) if then else c
+    if kind in WITHOUT_V:
+        from . import sections
 
+        read_rest = sections.reaching if kind == "reaches" else sections.staying
+        return read_rest(stated, claim, lyapunov, levels, evidence)
+    c = _attracting(stated, claim, lyapunov, levels, evidence)
+    if then:
+        from . import sections
 
-def _taking_over(c: Certificate, value: Value) -> Certificate:
-    """The certificate that takes over: by induction on the claim's kind it has none of its own."""
-    then = certificate(value.raw, c.sha256, value.at, TAKING_OVER)
-    for one in (c, then):
-        value.must(one.ranks is None, "missing, and without ranks, where a claim has ranks")
-        value.must(isinstance(one.evidence, Partition), "missing where evidence is not replayed, and replayed itself")
-    return then
-
-
-def _staying(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: Value, evidence: Value) -> Certificate:
-    """The rest of a certificate for a set that is not left."""
-    n, networks = len(stated["states"]), {net.name: net for net in stated["networks"]}
-    _, beyond, *others = claim.keys(f"kind outer{claim.maybe('keep')}")
-    claim.must(not stated["discrete"], "another where time is discrete")
-    beyond.must(beyond.raw is not None, "an object under this claim")
-    lyapunov.must(lyapunov.raw is None, "null under this claim")
-    levels.keys("")
-    kind, tree = evidence.keys("kind outer")
-    kind.choice("outer")
-    outer, keep = _outer(beyond, stated["states"], networks), _kept(others, stated)
-    return Certificate("invariant", **stated, evidence=_outer_tree(tree, n), outer=outer, keep=keep)
-
-
-def _reaching(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: Value, evidence: Value) -> Certificate:
-    """The rest of a certificate for a region that is reached."""
-    n, names = len(stated["states"]), stated["states"]
-    _, sample, target, ranks, *others = claim.keys(f"kind sample target ranks{claim.maybe('keep')}")
-    periods = _sample(sample)
-    sample.must(periods is None or not stated["discrete"], "null where time is discrete")
-    lyapunov.must(lyapunov.raw is None, "null under this claim")
-    levels.keys("")
-    kind, order, found = evidence.keys("kind order ranks")
-    kind.choice("ranks")
-    return Certificate(
-        "reaches",
-        **stated,
-        evidence=Ranked(order.integer(1, _most_order(stated, periods))),
-        sample=periods,
-        ranks=_ranks(ranks, found, n, stated, periods),
-        target=_constraints(target, names),
-        keep=_kept(others, stated),
-    )
+        return replace(c, then=sections.taking_over(c, then[0]))
+    return c
 
 
 def _attracting(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: Value, evidence: Value) -> Certificate:
@@ -348,13 +240,17 @@ def _attracting(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: V
     _, rate, sample, beyond, *more = claim.keys(" ".join(("kind rate sample outer", *stated_of)) + may_be)
     of_tube, others = more[: len(stated_of)], more[len(stated_of) :]
     optional = dict(zip(may_be.split(), others, strict=True))
-    fall, periods = rate.binary64(), _sample(sample)
+    fall, periods = rate.binary64(), periods_of(sample)
     rate.must(0 <= fall < math.inf and (fall == 0 or kind not in WITH_TUBE), "0, or a rate where a claim may have one")
     plain = periods is None and not stated["discrete"]
     sample.must(plain or kind not in WITH_TUBE, "null, and the plant continuous, under this claim")
     sample.must(periods is None or kind != "nearby", "null under this claim")
     sample.must(periods is None or not stated["discrete"], "null where time is discrete")
-    outer = _outer(beyond, stated["states"], networks)
+    outer = None
+    if beyond.raw is not None:
+        from . import sections
+
+        outer = sections.read_outer(beyond, stated["states"], networks)
     beyond.must(outer is None or (plain and fall == 0 and kind not in WITH_TUBE), "null under this claim")
     form, P = lyapunov.keys("kind P")
     form.choice("quadratic")
@@ -366,14 +262,23 @@ def _attracting(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: V
         n,
         len(stated["uncertain"]),
         kind,
-        _most_order(stated, periods),
+        most_order(stated, periods),
         outer is not None,
         plain and fall == 0 and outer is None and not optional,
         "".join(f" {name}" for name in ("ranks", "data") if name in optional),
     )
+    besides = dict[str, Any]()
+    if ranks is not None or "data" in optional:
+        from . import sections
+
+        if ranks is not None:
+            besides["ranks"] = sections.read_ranks(ranks, evidence.entry("ranks"), n, stated, periods)
+        if "data" in optional:
+            besides["data"] = sections.read_data(optional["data"], evidence.entry("data"), stated)
     return Certificate(
         kind,
         **stated,
+        **besides,
         evidence=by_tree,
         P=P.array(n, n),
         levels=numbers,
@@ -382,96 +287,30 @@ def _attracting(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: V
         start=of_tube[0].array(n, n) if of_tube else None,
         centre=of_tube[1].array(n) if kind == "reached" else None,
         outer=outer,
-        ranks=_ranks(ranks, evidence.entry("ranks"), n, stated, periods) if ranks else None,
-        keep=_kept([] if keep is None else [keep], stated),
-        data=_data(optional["data"], evidence.entry("data"), stated) if "data" in optional else None,
+        keep=kept([] if keep is None else [keep], stated),
     )
 
 
-def _data(claim: Value, evidence: Value, stated: Mapping[str, Any]) -> Data:
-    n, m, discrete = len(stated["states"]), len(stated["inputs"]), stated["discrete"]
-    claim.must(not stated["dynamics"].calls, "missing where the equations call a network")
-    sha256, priors, period, origin, noise, runs = claim.keys("sha256 parameters period origin noise runs")
-    quantities = priors.listed(_quantity, 1, len(stated["uncertain"]))
-    names = tuple(name for name, _ in quantities)
-    priors.must({*names} <= {*stated["uncertain"]} and len({*names}) == len(names), "different uncertain quantities")
-    times = _sample(period)
-    period.must((times is None) is discrete and (times is None or times[0] > 0), "null in discrete time, else positive")
-    measured = runs.listed(lambda run: _run(run, n, m), 1, MAX_TRANSITIONS)
-    count = sum(len(inputs) for _, inputs in measured)
-    runs.must(count <= MAX_TRANSITIONS, f"of {MAX_TRANSITIONS} transitions at most")
-    errors = noise.listed(Value.rational, n)
-    noise.must(min(errors) >= 0, "at least 0")
-    order, pieces, tree, leaves, rounds = evidence.keys("order pieces tree leaves rounds")
-
-    def read_rounds(value: Value) -> tuple[Round, ...]:
-        return value.listed(lambda each: _round(each, len(names), count, n), 0, MAX_ROUNDS)
-
-    return Data(
-        sha256.text("[0-9a-f]{64}", "64 hexadecimal digits"),
-        names,
-        tuple(pair for _, pair in quantities),
-        times,
-        origin.listed(Value.rational, n),
-        errors,
-        measured,
-        order.integer(1, 1 if discrete else MAX_ORDER),
-        pieces.integer(1, 1 if discrete else MAX_CUTS),
-        tree.octets(),
-        leaves.listed(read_rounds, 1, MAX_PARTS),
-        read_rounds(rounds),
-    )
-
-
-def _round(value: Value, K: int, T: int, n: int) -> Round:
-    box, weights = value.keys("box weights")
-    lo, hi = box.array(2, K).tolist()
-    return Round(tuple(zip(map(Fraction, lo), map(Fraction, hi), strict=True)), weights.array(2, K, T, n))
-
-
-def _run(value: Value, n: int, m: int) -> tuple[Array, Array]:
-    steps, states, inputs = value.keys("steps states inputs")
-    count = steps.integer(1, MAX_TRANSITIONS)
-    return states.array(count + 1, n), inputs.array(count, m)
-
-
-def _most_order(stated: Mapping[str, Any], periods: tuple[Fraction, Fraction] | None) -> int:
+def most_order(stated: Mapping[str, Any], periods: tuple[Fraction, Fraction] | None) -> int:
     return MAX_ORDER if periods is not None and not stated["dynamics"].calls else 1
 
 
-def _kept(values: Sequence[Value], stated: Mapping[str, Any]) -> Tape | None:
+def kept(values: Sequence[Value], stated: Mapping[str, Any]) -> Tape | None:
     """The constraints, if the claim has any."""
     names = (*stated["states"], *stated["inputs"], *stated["uncertain"])
-    return _constraints(values[0], names) if values else None
+    return constraints(values[0], names) if values else None
 
 
-def _constraints(value: Value, names: tuple[str, ...]) -> Tape:
+def constraints(value: Value, names: tuple[str, ...]) -> Tape:
     """Expressions that call no networks."""
     return parse(value.listed(lambda tree: tree.raw, 1, MAX_CONSTRAINTS), names, value.at)
-
-
-def _ranks(
-    claim: Value,
-    evidence: Value,
-    n: int,
-    stated: Mapping[str, Any],
-    periods: tuple[Fraction, Fraction] | None,
-) -> Ranks:
-    claim.must(stated["discrete"] or periods is not None, "missing where time does not go in steps")
-    angles, most = claim.keys("angles steps")
-    states = stated["states"]
-    named = angles.listed(lambda name: states.index(name.choice(*states)), 0, n)
-    angles.must(len(set(named)) == len(named), "different names")
-    lo, hi, tree, ranks, steps = evidence.keys("lo hi tree ranks steps")
-    octets = tree.octets(), ranks.octets(), steps.octets()
-    return Ranks(named, most.integer(1, MAX_RANK - 1), lo.array(n), hi.array(n), *octets)
 
 
 def _plant(plant: Value, networks: Mapping[str, Network]) -> dict[str, Any]:
     keys = "name time states inputs uncertain dynamics u_eq domain input_bounds"
     name, time, *names, uncertain, dynamics, u_eq, domain, bounds = plant.keys(keys)
     states, inputs = (value.listed(Value.name, 1, MAX_STATES) for value in names)
-    quantities = uncertain.listed(_quantity, 0, MAX_STATES)
+    quantities = uncertain.listed(quantity, 0, MAX_STATES)
     n, m, others = len(states), len(inputs), tuple(other for other, _ in quantities)
     everything = states + inputs + others
     plant.must(len(set(everything)) == len(everything), "a plant in which no name stands for two things")
@@ -489,7 +328,7 @@ def _plant(plant: Value, networks: Mapping[str, Network]) -> dict[str, Any]:
     }
 
 
-def _sample(value: Value) -> tuple[Fraction, Fraction] | None:
+def periods_of(value: Value) -> tuple[Fraction, Fraction] | None:
     if value.raw is None:
         return None
     lo, hi = value.listed(Value.rational, 2)
@@ -497,7 +336,7 @@ def _sample(value: Value) -> tuple[Fraction, Fraction] | None:
     return lo, hi
 
 
-def _quantity(value: Value) -> tuple[str, tuple[Fraction, Fraction]]:
+def quantity(value: Value) -> tuple[str, tuple[Fraction, Fraction]]:
     name, interval = value.keys("name range")
     return name.name(), interval.interval()
 
@@ -518,27 +357,13 @@ def _policy(value: Value, networks: Mapping[str, Network], n: int, m: int, pract
     return policy
 
 
-def _outer(value: Value, states: tuple[str, ...], networks: Mapping[str, Network]) -> Outer | None:
-    if value.raw is None:
-        return None
-    tree, level = value.keys("expression level")
-    n2 = level.binary64()
-    level.must(math.isfinite(n2), "finite")
-    return Outer(parse((tree.raw,), states, tree.at, networks), n2)
-
-
-def _outer_tree(value: Value, n: int) -> OuterTree:
-    T, root, tree, faces = value.keys("T root tree faces")
-    return OuterTree(T.array(n, n), root.array(n), tree.octets(), faces.listed(Value.octets, 2 * n))
-
-
 def _local(value: Value, n: int, claim: str, most: int) -> LocalBall | None:
     if claim in PRACTICAL and value.raw is None:
         return None
     J, multipliers, weight, edge, order = value.keys("J multipliers weight edge order")
     k = edge.binary64()
     edge.must(0 <= k < math.inf and (k == 0 or claim in PRACTICAL), "0, or a multiplier under a practical claim")
-    return LocalBall(J.array(n, n), _multipliers(multipliers, weight, n, n), k, order.integer(1, most))
+    return LocalBall(J.array(n, n), multipliers_of(multipliers, weight, n, n), k, order.integer(1, most))
 
 
 def _contraction(value: Value, n: int, claim: str) -> Contraction | None:
@@ -549,22 +374,21 @@ def _contraction(value: Value, n: int, claim: str) -> Contraction | None:
     return Contraction(J.array(n, n), weights.array(n), weight.array(n, n))
 
 
-def _slab(value: Value, n: int, claim: str) -> Slab:
-    middle, end, duration, J, multipliers, weight, path = value.keys("middle end duration J multipliers weight path")
-    nodes = middle.array(n, n), end.array(n, n)
-    by = _multipliers(multipliers, weight, n, n + (claim == "reached"))
-    return Slab(*nodes, duration.binary64(), J.array(n, n), by, _path(path, n, claim))
+def _slabs(value: Value, n: int, claim: str) -> tuple[Slab, ...]:
+    if claim not in WITH_TUBE:
+        return value.listed(lambda slab: slab.raw, 0)
+    from . import sections
+
+    return value.listed(lambda slab: sections.read_slab(slab, n, claim), 1, MAX_SLABS)
 
 
-def _path(value: Value, n: int, claim: str) -> Path | None:
-    if claim != "reached":
-        value.must(value.raw is None, "null under this claim")
-        return None
-    centre, *numbers = value.keys("centre share edge motion joint")
-    return Path(centre.array(n), *(number.binary64() for number in numbers))
+def _beyond(value: Value, n: int) -> OuterTree:
+    from . import sections
+
+    return sections.read_outer_tree(value, n)
 
 
-def _multipliers(value: Value, weight: Value, n: int, k: int) -> Multipliers:
+def multipliers_of(value: Value, weight: Value, n: int, k: int) -> Multipliers:
     rows = value.array(3, n)
     rest, apart, joint = (tuple(fmpq(*v.as_integer_ratio()) for v in row) for row in rows.tolist())
     return Multipliers(rest, apart, joint, weight.array(k, k))
@@ -601,12 +425,12 @@ def _evidence(
         cuts = cells.listed(lambda cut: cut.integer(1, MAX_CUTS), k)
         cells.must(math.prod(cuts) <= MAX_CELLS, f"{MAX_CELLS} parts in all")
         value.must(k == 0 or claim not in WITH_TUBE, "another where quantities are uncertain")
-        slabs = tube.listed(lambda slab: _slab(slab, n, claim), *((1, MAX_SLABS) if claim in WITH_TUBE else (0, 0)))
+        slabs = _slabs(tube, n, claim)
         ball = _local(local, n, claim, most)
         close = _contraction(contraction, n, claim)
         by_boxes = T.array(n, n), root.array(n), tree.octets(), order.integer(1, most)
         beyond.must(outer or beyond.raw is None, "null where the claim has none")
-        return Partition(*by_boxes, cuts, ball, close, slabs, _outer_tree(beyond, n) if outer else None)
+        return Partition(*by_boxes, cuts, ball, close, slabs, _beyond(beyond, n) if outer else None)
     _, solver, version, precision, queries = value.keys("kind solver version precision queries")
     precision.must(precision.binary64() > 0, "positive")
     answers = queries.listed(lambda pair: pair.listed(Value.word, 2), 0, MAX_VALUES)

@@ -20,7 +20,9 @@ import numpy as np
 
 from .expression import Tape, evaluate
 from .functions import FUNCTIONS
-from .taylor import Taylor
+from .near import Above, Array, Near, size
+from .ring import Motion, Moving
+from .taylor import Taylor, affine, pairs
 
 Constant = Callable[[Fraction], Any]
 _ATTEMPTS = 4  # at the a-priori enclosure
@@ -119,3 +121,41 @@ def enclosed(
             break
         way = np.where(good, way, 1.25 * most if attempt < _ATTEMPTS else np.nan)
     return during, F
+
+
+def motion(
+    boxes: Moving, period: tuple[Fraction, Fraction], states: list[Taylor], inputs: list[Taylor], ranges: list[Taylor]
+) -> Motion:
+    """G over a period, and where the state may be until it is over."""
+    c, longest = boxes.c, boxes.case.longest
+    loose = [*inputs, *(affine(v.c, np.zeros_like(v.g), v.moved) for v in ranges)]  # by their ranges, without symbols
+    during, F = enclosed(lambda x: boxes.f(x, loose), states, longest)
+    h = boxes.number(period, boxes.symbols - 1, len(inputs[0].c))
+    G = [of_mean(boxes, f) for f in boxes.f(during if boxes.order == 1 else states, [*inputs, *ranges])]
+    if boxes.order > 1:
+        number = boxes.constant(len(inputs[0].c))
+        rising = later(c.dynamics, number, states, during, loose, h, boxes.order, lambda v: v)
+        G = [x + h * more for x, more in zip(G, rising, strict=True)]
+    return Motion(G, during, loose, hull(states, F, boxes.widest, longest))
+
+
+def hull(states: list[Taylor], F: list[Taylor], widest: list[float], longest: float) -> Array:
+    """Between what the states lie that start at |x_i| <= `widest` and move as fast as F for a period at most."""
+    found = []
+    for x, f, most in zip(states, F, widest, strict=True):
+        (lo, hi), (slowest, fastest) = x.range.ends, f.range.ends
+        down, up = (Above(np.maximum(v, 0.0)) * longest for v in (-slowest, fastest))
+        low, high = Near(np.maximum(lo, -most), down), Near(np.minimum(hi, most), up)
+        found.append((low.ends[0], high.ends[1]))
+    return np.moveaxis(np.array(found), 1, 0)
+
+
+def of_mean(boxes: Moving, f: Taylor) -> Taylor:
+    """A model with the symbols of uncertain quantities, and of the errors of calls, which change within a period too,
+    as their means: what is of second order in them, whose mean is another, becomes part of the remainder."""
+    first, last = boxes.errors + boxes.m, boxes.calls + boxes.c.dynamics.entries
+    i, j = ((first <= index) & (index < last) for index in pairs(boxes.symbols))
+    own = boxes.symbols + np.flatnonzero(i & j)
+    p = f.p.copy()
+    p[own] = 0.0
+    return Taylor(f.c, p, f.r + size(f.p[own]).sum())

@@ -14,10 +14,10 @@ from flint import fmpq
 from .boxes import Boxes, Leaves, batches, is_whole, middle, multipliers
 from .case import Case, Failures
 from .exact import fraction, root_above
-from .near import Above, Array, Near, near, size
+from .near import Array, near
 from .network import enclose_on_boxes
 from .processes import Batch
-from .taylor import Taylor, affine, combination, pairs, upper_bound
+from .taylor import Taylor, combination, upper_bound
 
 _BATCH_NUMBERS = 800_000  # in the largest array of a batch: more would not stay in a cache
 
@@ -63,36 +63,9 @@ class Moving(Boxes):
             F = self.f(states, [*inputs, *ranges])
             G = [f + -x for f, x in zip(F, states, strict=True)] if self.c.discrete else F
             return Motion(G, states, [*inputs, *ranges], nothing)
-        loose = [*inputs, *(_between(v) for v in ranges)]
-        from .flow import enclosed, later
+        from .flow import motion
 
-        during, F = enclosed(lambda x: self.f(x, loose), states, self.case.longest)
-        h = self.number(self.c.sample, self.symbols - 1, batch)
-        G = [self.of_mean(f) for f in self.f(during if self.order == 1 else states, [*inputs, *ranges])]
-        if self.order > 1:
-            rising = later(self.c.dynamics, self.constant(batch), states, during, loose, h, self.order, _itself)
-            G = [x + h * more for x, more in zip(G, rising, strict=True)]
-        return Motion(G, during, loose, self.hull(states, F))
-
-    def hull(self, states: list[Taylor], F: list[Taylor]) -> Array:
-        """Between what the states lie that start at |x_i| <= `widest` and move as fast as F for a period at most."""
-        h, found = self.case.longest, []
-        for x, f, widest in zip(states, F, self.widest, strict=True):
-            (lo, hi), (slowest, fastest) = x.range.ends, f.range.ends
-            down, up = (Above(np.maximum(v, 0.0)) * h for v in (-slowest, fastest))
-            low, high = Near(np.maximum(lo, -widest), down), Near(np.minimum(hi, widest), up)
-            found.append((low.ends[0], high.ends[1]))
-        return np.moveaxis(np.array(found), 1, 0)
-
-    def of_mean(self, f: Taylor) -> Taylor:
-        """A model with the symbols of uncertain quantities, and of the errors of calls, which change within a period
-        too, as their means: what is of second order in them, whose mean is another, becomes part of the remainder."""
-        first, last = self.errors + self.m, self.calls + self.c.dynamics.entries
-        i, j = ((first <= index) & (index < last) for index in pairs(self.symbols))
-        own = self.symbols + np.flatnonzero(i & j)
-        p = f.p.copy()
-        p[own] = 0.0
-        return Taylor(f.c, p, f.r + size(f.p[own]).sum())
+        return motion(self, self.c.sample, states, inputs, ranges)
 
 
 class Ring(Moving):
@@ -200,12 +173,3 @@ def decreases(leaves: RingLeaves) -> Failures:
         steps = leaves.boxes.c.step > 0
         yield f"leaf {leaves.numbers[first]}", smooth if leaves.meet[first] or steps else "F may be undefined"
     return int(np.sum(leaves.meet))
-
-
-def _between(v: Taylor) -> Taylor:
-    """Replace a model's symbols by its range."""
-    return affine(v.c, np.zeros_like(v.g), v.moved)
-
-
-def _itself(v: Taylor) -> Taylor:
-    return v

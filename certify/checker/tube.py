@@ -19,9 +19,9 @@ from . import ball
 from .ball import Ball
 from .case import Case, Failures
 from .decrease import Models, are_finite, are_usable, rational, shows
-from .document import Slab
 from .exact import contains_ball, exactly, inverse_diagonal, is_definite, root_above
 from .near import Array
+from .sections import Slab
 
 _MOST_WORK = 2**26  # slabs times n^4, which is what an inequality takes
 

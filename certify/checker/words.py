@@ -6,7 +6,7 @@ import math
 from fractions import Fraction
 from typing import Any
 
-from .document import MAX_RANK, Array, Certificate, Data, Partition, Policy, Ranks
+from .document import Array, Certificate, Partition, Policy
 from .expression import Tape
 from .networks import Map, Network, Observe, Product, Step, Sum, hashed
 
@@ -50,75 +50,18 @@ def claim(c: Certificate) -> list[str]:
     if c.sample is not None:
         lo, hi = c.sample
         when = _SAMPLED if lo else _SAMPLED_FROM_0
-        each = f"any sequence of periods in {_interval(c.sample)}" if lo < hi else f"exactly {_number(hi)}"
+        each = f"any sequence of periods in {interval(c.sample)}" if lo < hi else f"exactly {number(hi)}"
         lines.append(f"  the input is held from each sampling instant to the next, for {each} units of time")
     if c.rate:
         lines.append(f"  {_falls(c)}, lambda = {c.rate!r}")
-    if c.outer is not None and not c.without_V:
-        lines.append(
-            f"  and every trajectory that starts in the union of V <= {c.c2!r} and of the states of the domain with "
-            f"N(x) <= {c.outer.level!r} stays in this union, enters V <= {c.c2!r} in finite time, and from then on is "
-            "one of those above; u stays in its bounds; states outside the domain are not meant, whatever N is there"
-        )
-    if c.ranks is not None and c.claim != "reaches":
-        same = ", up to these multiples," if c.ranks.angles else ""
-        rest = f", and from then on is{same} one of those above"
-        lines.append(f"  and every trajectory that {_by_ranks(c, c.ranks, when['start'], rest)}")
-    if c.keep is not None:
-        until = ", until it is in the target" if c.claim == "reaches" else ""
-        kept = ", ".join(f"{expression(tree)} < 0" for tree in c.keep.trees)
-        lines.append(
-            f"  and along every trajectory of these, {'at every step' if c.discrete else 'at all times'}{until}: {kept}"
-        )
-    if c.data is not None:
-        lines.append(f"  {_consistent(c, c.data)}")
-    if c.claim == "invariant" and c.outer is not None:
-        said = (
-            f"every trajectory of the closed loop that starts in a state of the domain with N(x) <= {c.outer.level!r} "
-            "exists and is in such a state at all times, and in the interior of the domain; nothing is claimed of "
-            "where it goes"
-        )
-        return [f"claim: {said}; u stays in its bounds", *lines]
-    if c.ranks is not None and c.claim == "reaches":
-        said = _by_ranks(c, c.ranks, when["start"], "")
-        return [f"claim: every trajectory of the closed loop that {said}; nothing is claimed of later", *lines]
+    if c.outer or c.ranks or c.keep or c.data:
+        from . import clauses
+
+        lines += clauses.additions(c, when["start"])
+        if c.without_V:
+            return [f"claim: {clauses.without_V(c, when['start'])}", *lines]
     said = CLAIMS[c.claim].format(c=c, time=duration(c), when=when)
     return [f"claim: {said}; u stays in its bounds", *lines]
-
-
-def _by_ranks(c: Certificate, ranks: Ranks, start: str, rest: str) -> str:
-    """The statement of chapter ranks, with what comes after the target."""
-    target = f"V <= {c.c2!r}" if c.target is None else "the target"
-    angles = ", ".join(c.states[i] for i in ranks.angles)
-    places = f" up to multiples of 2 pi in {angles}" if angles else ""
-    others = f"each state but {angles}" if angles else "the state"
-    inside = f"{others} is in the interior of the domain and " if len(ranks.angles) < len(c.states) else ""
-    each = memoryview(ranks.ranks).cast("H")  # of two bytes, whose order does not matter to what is asked
-    count = sum(rank != MAX_RANK for rank in each)
-    return (
-        f"starts in a leaf of finite rank ({count} of {len(each)} leaves){start} is in {target}{places} after as many "
-        f"{'steps' if c.discrete else 'periods'} as the rank is, at the latest, {ranks.most} at most{rest}; until then "
-        f"{inside}u stays in its bounds"
-    )
-
-
-def _consistent(c: Certificate, data: Data) -> str:
-    """The statement of chapter data."""
-    priors = ", ".join(f"{name} in {_interval(pair)}" for name, pair in zip(data.parameters, data.priors, strict=True))
-    noise = ", ".join(f"{name} within {_number(w)}" for name, w in zip(c.states, data.noise, strict=True))
-    moved = [f"{name} + {_number(q)}" for name, q in zip(c.states, data.origin, strict=True) if q]
-    of = f"; measured are {', '.join(moved)}" if moved else ""
-    lasting = "" if data.period is None else f" of {_lasting(data.period)} units of time, with the input held"
-    return (
-        f"and so for every plant with constant {priors} that is consistent with {data.transitions} measured transitions"
-        f"{lasting}, in {len(data.runs)} runs ({noise}{of}; from a file with sha256 {data.sha256}): their parameters "
-        "lie in the ranges above; of other plants nothing is claimed"
-    )
-
-
-def _lasting(period: tuple[Fraction, Fraction]) -> str:
-    lo, hi = period
-    return _number(lo) if lo == hi else f"some time in {_interval(period)}"
 
 
 def _falls(c: Certificate) -> str:
@@ -160,7 +103,7 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         outer = None if c.outer is None else answer["margins"]["outer"]
         margins += [] if outer is None else [f"smallest bound of -N'F on a leaf of the outer set {outer:.3g}"]
         rest, verdict = f"margins: {'; '.join(margins)}", answer["result"]
-    takes_over = [] if c.then is None else [*_handed_over(c, c.then), *stated(c.then)]
+    takes_over = _taking_over(c, c.then) if c.then else []
     return [
         *stated(c),
         *takes_over,
@@ -172,6 +115,12 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
     ]
 
 
+def _taking_over(c: Certificate, then: Certificate) -> list[str]:
+    from . import clauses
+
+    return [*clauses.handed_over(c, then), *stated(then)]
+
+
 def stated(c: Certificate) -> list[str]:
     """The plant, the policy, V, and what is claimed of them, line by line."""
     inputs = zip(c.inputs, c.input_bounds, c.u_eq, strict=True)
@@ -180,12 +129,12 @@ def stated(c: Certificate) -> list[str]:
     return [
         f"plant {c.name}: {left} = f(x, u), states ({', '.join(c.states)}), inputs ({', '.join(c.inputs)})",
         *(
-            f"  for every {name}({'k' if c.discrete else 't'}) in {_interval(pair)}"
+            f"  for every {name}({'k' if c.discrete else 't'}) in {interval(pair)}"
             for name, pair in zip(c.uncertain, c.ranges, strict=True)
         ),
         *(f"  {name}{after} = {expression(tree)}" for name, tree in zip(c.states, c.dynamics.trees, strict=True)),
-        *(f"  domain {name} in {_interval(pair)}" for name, pair in zip(c.states, c.domain, strict=True)),
-        *(f"  input {name} in {_interval(pair)}, u_eq = {_number(u)}" for name, pair, u in inputs),
+        *(f"  domain {name} in {interval(pair)}" for name, pair in zip(c.states, c.domain, strict=True)),
+        *(f"  input {name} in {interval(pair)}, u_eq = {number(u)}" for name, pair, u in inputs),
         *(f"network {network.name}: {_network(network)}" for network in c.networks),
         f"policy: network {c.policy.network.name}, squash {c.policy.squash}, centred by {c.policy.centre}, "
         f"{_clip(c.policy)}"
@@ -197,19 +146,6 @@ def stated(c: Certificate) -> list[str]:
         *([] if c.centre is None else [f"c = {' '.join(map(repr, c.centre.tolist()))}"]),
         *([] if c.outer is None else [f"N(x) = {expression(c.outer.function.trees[0])}"]),
         *claim(c),
-    ]
-
-
-def _handed_over(c: Certificate, then: Certificate) -> list[str]:
-    """The statement of chapter handover; what is stated of the second certificate follows."""
-    left, each = ("x+ = g(k, x, u)", "step") if c.discrete else ("xdot = g(t, x, u)", "time")
-    return [
-        f"handover: a plant {left} is one of a certificate if at every {each}, state in its domain and input in its "
-        "bounds g is a value of its f, for some of what is uncertain, of which measured parameters are constant and "
-        "consistent with the measurements",
-        "  of every plant that is one of the certificate above and of the one below, every trajectory above enters "
-        f"V <= {c.c0!r}, which lies in V <= {then.c2!r} of the one below, and from then on is one of those below",
-        "certificate that takes over:",
     ]
 
 
@@ -288,9 +224,9 @@ def _clip(policy: Policy) -> str:
     return f"clipped to {', '.join(f'[{lo!r}, {hi!r}]' for lo, hi in ends)}, "
 
 
-def _interval(pair: tuple[Fraction, Fraction]) -> str:
-    return f"[{_number(pair[0])}, {_number(pair[1])}]"
+def interval(pair: tuple[Fraction, Fraction]) -> str:
+    return f"[{number(pair[0])}, {number(pair[1])}]"
 
 
-def _number(q: Fraction) -> str:
+def number(q: Fraction) -> str:
     return str(q) if q.denominator == 1 or len(str(q)) > 40 else f"{q} (about {float(q):.6g})"

@@ -169,11 +169,13 @@ class Walk(Motion):
         return [self.affine(row) + g for row, g in zip(here.x, moved, strict=True)]
 
     def settled(self, i: int, v: Taylor, at: str) -> list[arb]:
-        """State i as a row: what is not affine in the symbols of the leaf is its error."""
+        """State i as a row of numbers: what is not affine in the symbols of the leaf is its error, and so are the radii
+        of the balls, which would grow many times over with each step."""
         require(v.is_finite(), RULE, at, "the next state has no finite model")
         slopes = v.slopes(self.symbols)
-        error = arb((total(map(abs, slopes[self.n :])) + v.second + v.r).upper())
-        return [v.c, *slopes[: self.n], *(error if k == i else ZERO for k in range(self.n))]
+        first = [v.c, *slopes[: self.n]]
+        error = arb((total(map(abs, slopes[self.n :])) + v.second + v.r + total(arb(b.rad()) for b in first)).upper())
+        return [*(b.mid() for b in first), *(error if k == i else ZERO for k in range(self.n))]
 
 
 class Target:

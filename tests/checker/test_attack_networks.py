@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from flint import arb, ctx, fmpq
 
-from certify.checker import ball, document, limits, network, rules
+from certify.checker import ball, document, flow, limits, network, rules
 from certify.checker.case import Case
 from certify.checker.errors import Rejected
 from certify.checker.expression import Call, Tape, evaluate, parse
@@ -350,7 +350,7 @@ def test_products_of_errors_of_calls_do_not_stand_for_means() -> None:
     n, i, j = ring.symbols, *np.triu_indices(ring.symbols)
     of_calls = (i >= ring.calls) & (j >= ring.calls) & (j < n - 1)
     p = np.ones((n + len(i), 1))
-    mean = ring.of_mean(Taylor(np.zeros(1), p, network.ZERO))
+    mean = flow.of_mean(ring, Taylor(np.zeros(1), p, network.ZERO))
     assert ring.calls == 2 and n == 5 and of_calls.sum() == 3  # x, u; two calls; h
     assert not np.any(mean.q[of_calls]) and np.all(mean.q[~of_calls] == 1) and mean.r.top[0] >= 3
 

@@ -22,8 +22,9 @@ from certify.checker import tube
 from certify.checker.ball import Ball
 from certify.checker.case import Case
 from certify.checker.decrease import Models, are_finite, sides
-from certify.checker.document import Certificate, Multipliers, Path, Slab
+from certify.checker.document import Certificate, Multipliers
 from certify.checker.exact import exactly
+from certify.checker.sections import Path, Slab
 from tests.support.balls import with_ball
 from tests.support.certificates import Document, decode, edited, encode, make, parse, verdict
 from tests.support.jets import Jet, curved, seen

@@ -24,8 +24,9 @@ from hypothesis import strategies as st
 from certify.checker import tube, words
 from certify.checker.case import Case
 from certify.checker.decrease import Models, are_finite, are_usable, shows, sides
-from certify.checker.document import Certificate, Multipliers, Path
+from certify.checker.document import Certificate, Multipliers
 from certify.checker.exact import exactly
+from certify.checker.sections import Path
 from tests.checker.test_rules import (
     array,
     at,

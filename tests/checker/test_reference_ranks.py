@@ -160,6 +160,14 @@ def test_two_states_that_wind_inwards_in_several_steps() -> None:
     assert verdict(data) is None
 
 
+def test_many_steps_of_terms_that_cancel() -> None:
+    """x+ = 31/3 x + 59/3 u = x/2; the radii of balls that are passed on from step to step grow 20 times in each."""
+    loop = Loop([["+", ["*", "31/3", "x"], ["*", "59/3", "u"]]], HALF, NEAR)
+    tree, leaves = uniform([-2.0], [2.0], 5)
+    count = [0 if within(0.2)(box) else 99 for box in leaves]
+    assert verdicts(document(loop, (-2.0, 2.0), tree, count, count)) == (None, None)
+
+
 def test_an_angle_goes_round_and_over_the_seam() -> None:
     loop = Loop([["+", "x", "1/2", "u"]], [affine([[0.0]])], TURNING, angles=("x",))
     data, ranks, _ = certificate(loop, scaled(1.0, 0.5), cosine, (-3.25, 3.25), 6)

@@ -15,7 +15,8 @@ import numpy as np
 from flint import arb
 
 from certify.certificates import parse_certificate
-from certify.checker.document import Certificate, Slab
+from certify.checker.document import Certificate
+from certify.checker.sections import Slab
 from certify.effort import UNIT, Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.provers.tube.path import find_path

@@ -1,0 +1,246 @@
+"""Sections of a document that only some certificates have, and the readers of these: tube, outer, ranks, data, a second
+certificate, and the claims without V."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+from .document import (
+    MAX_CUTS,
+    MAX_ORDER,
+    MAX_RANK,
+    TAKING_OVER,
+    Array,
+    Certificate,
+    Intervals,
+    Multipliers,
+    Outer,
+    OuterTree,
+    Partition,
+    Ranked,
+    certificate,
+    constraints,
+    kept,
+    most_order,
+    multipliers_of,
+    periods_of,
+    quantity,
+)
+from .expression import parse
+from .networks import Network
+from .schema import Value
+
+MAX_TRANSITIONS, MAX_ROUNDS, MAX_PARTS = 2**16, 64, 4096  # of data; rounds of a part of the priors
+
+
+def taking_over(c: Certificate, value: Value) -> Certificate:
+    """The certificate that takes over: by induction on the claim's kind it has none of its own."""
+    then = certificate(value.raw, c.sha256, value.at, TAKING_OVER)
+    for one in (c, then):
+        value.must(one.ranks is None, "missing, and without ranks, where a claim has ranks")
+        value.must(isinstance(one.evidence, Partition), "missing where evidence is not replayed, and replayed itself")
+    return then
+
+
+def staying(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: Value, evidence: Value) -> Certificate:
+    """The rest of a certificate for a set that is not left."""
+    n, networks = len(stated["states"]), {net.name: net for net in stated["networks"]}
+    _, beyond, *others = claim.keys(f"kind outer{claim.maybe('keep')}")
+    claim.must(not stated["discrete"], "another where time is discrete")
+    beyond.must(beyond.raw is not None, "an object under this claim")
+    lyapunov.must(lyapunov.raw is None, "null under this claim")
+    levels.keys("")
+    kind, tree = evidence.keys("kind outer")
+    kind.choice("outer")
+    outer, keep = read_outer(beyond, stated["states"], networks), kept(others, stated)
+    return Certificate("invariant", **stated, evidence=read_outer_tree(tree, n), outer=outer, keep=keep)
+
+
+def reaching(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: Value, evidence: Value) -> Certificate:
+    """The rest of a certificate for a region that is reached."""
+    n, names = len(stated["states"]), stated["states"]
+    _, sample, target, ranks, *others = claim.keys(f"kind sample target ranks{claim.maybe('keep')}")
+    periods = periods_of(sample)
+    sample.must(periods is None or not stated["discrete"], "null where time is discrete")
+    lyapunov.must(lyapunov.raw is None, "null under this claim")
+    levels.keys("")
+    kind, order, found = evidence.keys("kind order ranks")
+    kind.choice("ranks")
+    return Certificate(
+        "reaches",
+        **stated,
+        evidence=Ranked(order.integer(1, most_order(stated, periods))),
+        sample=periods,
+        ranks=read_ranks(ranks, found, n, stated, periods),
+        target=constraints(target, names),
+        keep=kept(others, stated),
+    )
+
+
+@dataclass(frozen=True)
+class Path:
+    """The centre of a slab's ellipsoid at its end, the share of its ball that the motion takes, and the multipliers of
+    the tube's boundary and of the motion."""
+
+    centre: Array
+    share: float
+    edge: float
+    motion: float
+    joint: float
+
+
+@dataclass(frozen=True)
+class Slab:
+    """A piece of the tube up to the node `end`, in its time, with a ball that contains it and multipliers on it."""
+
+    middle: Array
+    end: Array
+    duration: float
+    J: Array
+    multipliers: Multipliers
+    path: Path | None
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """The states that are angles, by their numbers, and the most steps to the target; as evidence a partition tree of
+    the box lo <= x <= hi, and of each leaf its rank and the number of its steps."""
+
+    angles: tuple[int, ...]
+    most: int
+    lo: Array
+    hi: Array
+    tree: bytes
+    ranks: bytes
+    steps: bytes
+
+
+@dataclass(frozen=True)
+class Round:
+    """A box that holds the rest of another, by weights (2, K, T, n) of all transitions."""
+
+    box: Intervals
+    weights: Array
+
+
+@dataclass(frozen=True)
+class Data:
+    """Measurements on which ranges of parameters rest, and multipliers that show it.
+
+    A run has states (T + 1, n), within `noise` of the true ones, and the inputs (T, m) that are held in between, for a
+    time in `period`, or for a step where that is None; measured is `origin` + x. A transition is followed in so many
+    `pieces`, with a series in time of an `order`. The priors are partitioned by a tree; each of its `leaves` has
+    rounds, and so has what these leave of the priors.
+    """
+
+    sha256: str  # of the file that they come from
+    parameters: tuple[str, ...]
+    priors: Intervals
+    period: tuple[Fraction, Fraction] | None
+    origin: tuple[Fraction, ...]
+    noise: tuple[Fraction, ...]
+    runs: tuple[tuple[Array, Array], ...]
+    order: int
+    pieces: int
+    tree: bytes
+    leaves: tuple[tuple[Round, ...], ...]
+    rounds: tuple[Round, ...]
+
+    @property
+    def transitions(self) -> int:
+        return sum(len(inputs) for _, inputs in self.runs)
+
+
+def read_data(claim: Value, evidence: Value, stated: Mapping[str, Any]) -> Data:
+    n, m, discrete = len(stated["states"]), len(stated["inputs"]), stated["discrete"]
+    claim.must(not stated["dynamics"].calls, "missing where the equations call a network")
+    sha256, priors, period, origin, noise, runs = claim.keys("sha256 parameters period origin noise runs")
+    quantities = priors.listed(quantity, 1, len(stated["uncertain"]))
+    names = tuple(name for name, _ in quantities)
+    priors.must({*names} <= {*stated["uncertain"]} and len({*names}) == len(names), "different uncertain quantities")
+    times = periods_of(period)
+    period.must((times is None) is discrete and (times is None or times[0] > 0), "null in discrete time, else positive")
+    measured = runs.listed(lambda run: _run(run, n, m), 1, MAX_TRANSITIONS)
+    count = sum(len(inputs) for _, inputs in measured)
+    runs.must(count <= MAX_TRANSITIONS, f"of {MAX_TRANSITIONS} transitions at most")
+    errors = noise.listed(Value.rational, n)
+    noise.must(min(errors) >= 0, "at least 0")
+    order, pieces, tree, leaves, rounds = evidence.keys("order pieces tree leaves rounds")
+
+    def read_rounds(value: Value) -> tuple[Round, ...]:
+        return value.listed(lambda each: _round(each, len(names), count, n), 0, MAX_ROUNDS)
+
+    return Data(
+        sha256.text("[0-9a-f]{64}", "64 hexadecimal digits"),
+        names,
+        tuple(pair for _, pair in quantities),
+        times,
+        origin.listed(Value.rational, n),
+        errors,
+        measured,
+        order.integer(1, 1 if discrete else MAX_ORDER),
+        pieces.integer(1, 1 if discrete else MAX_CUTS),
+        tree.octets(),
+        leaves.listed(read_rounds, 1, MAX_PARTS),
+        read_rounds(rounds),
+    )
+
+
+def _round(value: Value, K: int, T: int, n: int) -> Round:
+    box, weights = value.keys("box weights")
+    lo, hi = box.array(2, K).tolist()
+    return Round(tuple(zip(map(Fraction, lo), map(Fraction, hi), strict=True)), weights.array(2, K, T, n))
+
+
+def _run(value: Value, n: int, m: int) -> tuple[Array, Array]:
+    steps, states, inputs = value.keys("steps states inputs")
+    count = steps.integer(1, MAX_TRANSITIONS)
+    return states.array(count + 1, n), inputs.array(count, m)
+
+
+def read_ranks(
+    claim: Value,
+    evidence: Value,
+    n: int,
+    stated: Mapping[str, Any],
+    periods: tuple[Fraction, Fraction] | None,
+) -> Ranks:
+    claim.must(stated["discrete"] or periods is not None, "missing where time does not go in steps")
+    angles, most = claim.keys("angles steps")
+    states = stated["states"]
+    named = angles.listed(lambda name: states.index(name.choice(*states)), 0, n)
+    angles.must(len(set(named)) == len(named), "different names")
+    lo, hi, tree, ranks, steps = evidence.keys("lo hi tree ranks steps")
+    octets = tree.octets(), ranks.octets(), steps.octets()
+    return Ranks(named, most.integer(1, MAX_RANK - 1), lo.array(n), hi.array(n), *octets)
+
+
+def read_slab(value: Value, n: int, claim: str) -> Slab:
+    middle, end, duration, J, multipliers, weight, path = value.keys("middle end duration J multipliers weight path")
+    nodes = middle.array(n, n), end.array(n, n)
+    by = multipliers_of(multipliers, weight, n, n + (claim == "reached"))
+    return Slab(*nodes, duration.binary64(), J.array(n, n), by, _path(path, n, claim))
+
+
+def _path(value: Value, n: int, claim: str) -> Path | None:
+    if claim != "reached":
+        value.must(value.raw is None, "null under this claim")
+        return None
+    centre, *numbers = value.keys("centre share edge motion joint")
+    return Path(centre.array(n), *(number.binary64() for number in numbers))
+
+
+def read_outer(value: Value, states: tuple[str, ...], networks: Mapping[str, Network]) -> Outer:
+    tree, level = value.keys("expression level")
+    n2 = level.binary64()
+    level.must(math.isfinite(n2), "finite")
+    return Outer(parse((tree.raw,), states, tree.at, networks), n2)
+
+
+def read_outer_tree(value: Value, n: int) -> OuterTree:
+    T, root, tree, faces = value.keys("T root tree faces")
+    return OuterTree(T.array(n, n), root.array(n), tree.octets(), faces.listed(Value.octets, 2 * n))
