@@ -45,6 +45,11 @@ def export_smt2(
             "export-smt2 needs a plant with exact equations, since its formulas have no ranges; found ranges of "
             f"{', '.join(plant.ranges)} in {plant.name}. Leave them out (for a disturbance in its file: half-width 0)."
         )
+    if plant.constraints:
+        raise InputError(
+            "export-smt2 needs a plant without constraints, since its formulas do not ask about them; found "
+            f"{', '.join(plant.constraints)} in {plant.name}. Leave the table [constraints] out of the plant's file."
+        )
     if plant.in_steps:
         raise InputError(
             f"export-smt2 must have a plant in continuous time; found {plant.name}, whose time is discrete."

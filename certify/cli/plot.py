@@ -28,7 +28,7 @@ def plot(
     """Check a certificate and draw its set for a paper."""
     import tempfile
 
-    from certify.certificates import parse_certificate, read_raw, run_checker, write_atomically
+    from certify.certificates import parse_any, read_raw, run_checker, write_atomically
     from certify.report.figures.paper import PaperOptions, paper_figure
 
     options = PaperOptions(columns, tuple(pairs or ()), out.suffix.removeprefix(".").lower())  # type: ignore[arg-type]
@@ -38,7 +38,7 @@ def plot(
         private.write_bytes(raw)
         answer = run_checker(private, patient=patient)
     accepted = answer["result"] == "ACCEPTED"
-    write_atomically(out, paper_figure(parse_certificate(raw, str(certificate)), accepted, options))
+    write_atomically(out, paper_figure(parse_any(raw, str(certificate)), accepted, options))
     stated = {"figure": str(out), "result": answer["result"]}
     say(json.dumps(stated) if as_json else f"{answer['result']}  {out}")
     raise typer.Exit({"ACCEPTED": 0, "TRUSTED": 3}.get(answer["result"], 1))

@@ -230,6 +230,7 @@ UNSUPPORTED = {
     "an outer set": ("claim.outer", {"expression": "x", "level": (1.0).hex()}),
     "boxes with ranks": ("claim.ranks", {"angles": [], "steps": 1}),
     "constraints": ("claim.keep", ["x"]),
+    "ranges that measurements bound": ("claim.data", {}),
     "an input that is held": ("claim.sample", ["0", "1/10"]),
     "plants in discrete time": ("plant.time", "discrete"),
     "uncertain quantities": ("plant.uncertain", [{"name": "q", "range": ["0", "1"]}]),
@@ -243,6 +244,22 @@ UNSUPPORTED = {
 def test_what_coqs_statement_cannot_say_is_refused(found: str) -> None:
     with pytest.raises(InputError, match=rf"found {found}.*a proof in Coq is there for"):
         read_claim(raw(rehash(edited(scalar(), *UNSUPPORTED[found]))))
+
+
+@pytest.mark.parametrize(
+    ("kind", "entries"),
+    [
+        ("reaches", ("kind", "sample", "target", "ranks")),
+        ("invariant", ("kind", "outer")),
+        ("practical", ("kind", "rate", "sample", "outer")),
+    ],
+)
+def test_claims_that_it_does_not_know_are_named(kind: str, entries: tuple[str, ...]) -> None:
+    """They have other entries, and two of them no V; a second certificate may take over from a practical one."""
+    data = edited(scalar(), "claim", dict.fromkeys(entries) | {"kind": kind})
+    other = data | {"lyapunov": None, "levels": {}} if kind != "practical" else data | {"then": data}
+    with pytest.raises(InputError, match=rf"found claims of kind {kind}\. a proof in Coq is there for"):
+        read_claim(raw(other))
 
 
 TANH: Document = {"kind": "map", "of": [1], "function": "tanh"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -38,6 +39,7 @@ def test_two_are_joined(two: list[str], tmp_path: Path, capsys: pytest.CaptureFi
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert "A second claim takes over there" in page and "That is all" not in page
     assert "converges to the origin, which is asymptotically stable" in page
+    assert "the second claim's set" in html.unescape(page)
     certificate = str(tmp_path / "out" / "certificate.json")
     for options in ([], ["--reference"]):
         assert _run(["check", certificate, *options], False) == 0

@@ -70,7 +70,8 @@ def test_a_box_that_gets_there(asked: list[str], tmp_path: Path, capsys: pytest.
     assert _run(["contains", file, "p=3.9", "v=2.9"], False) == 1
     assert _run(["report", file, "--out", str(tmp_path / "again.html")], False) == 0
     assert "PROVED · ACCEPTED" in (tmp_path / "again.html").read_text()
-    assert _run(["plot", file, "--out", str(tmp_path / "set.svg")], False) == 2  # there is no V
+    assert _run(["plot", file, "--out", str(tmp_path / "set.svg")], False) == 0
+    assert "steps to the region" in (tmp_path / "set.svg").read_text("utf-8")
 
 
 def test_what_is_not_so(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -60,7 +60,10 @@ def test_an_expression_is_proved(asked: list[str], tmp_path: Path, capsys: pytes
     capsys.readouterr()
     assert _run(["check", certificate], False) == 0 and "N(x) <=" in capsys.readouterr().out
     assert _run(["contains", certificate, "x=0", "y=0"], False) == 1
-    assert _run(["plot", certificate, "--out", str(tmp_path / "set.png")], False) == 2
+    for pair, status in (("x,y", 0), ("y,x", 0), ("x,x", 2)):
+        assert _run(["plot", certificate, "--out", str(tmp_path / "set.svg"), "--pairs", pair], False) == status
+    drawn = (tmp_path / "set.svg").read_text("utf-8")
+    assert "proved: never left" in drawn and "a constraint is violated" in drawn
     assert _run(["report", certificate], False) == 0
 
 

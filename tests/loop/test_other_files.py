@@ -53,6 +53,12 @@ def graph(folder: Path) -> Path:
     return folder / "p.onnx"
 
 
+def certificate(folder: Path) -> Path:
+    path = folder / "certificate.json"
+    path.write_text('{\n"schema": "certify-certificate/9",\n"claim": {"kind": "reaches"}\n}\n')
+    return path
+
+
 COMMAND = r"certify import .*{} --system PLANT --out {}-policy\.pt"
 OTHERS: dict[str, tuple[Callable[[Path], Path], str]] = {
     "stable-baselines3": (zipped, r"a zip file of stable-baselines3.*" + COMMAND.format(r"PPO\.zip", "PPO")),
@@ -62,6 +68,7 @@ OTHERS: dict[str, tuple[Callable[[Path], Path], str]] = {
     "a checkpoint": (lambda f: saved(f, {"a": Fraction(1)}), "more than plain tensors in it.*certify import"),
     "safetensors": (tensors, "a file of safetensors.*certify import"),
     "onnx": (graph, "an ONNX model.*certify import"),
+    "a certificate": (certificate, "it is a certificate, which has a policy inside.*Name the policy file"),
     "text": (text, "must hold a policy; it is text.*controllers train.*certify import"),
 }
 

@@ -157,11 +157,13 @@ def _claimed(data: Any, sha256: str) -> Claimed:
 
 
 def _require_supported(claim: Any, networks: Any, plant: Any, policy: Any, lyapunov: Any) -> None:
+    if claim["kind"] != "asymptotic":  # others have other entries, and some no V
+        raise _unsupported(f"claims of kind {claim['kind']}")
     found = {
-        f"claims of kind {claim['kind']}": claim["kind"] != "asymptotic",
         "an outer set": claim["outer"] is not None,
         "boxes with ranks": "ranks" in claim,
         "constraints": "keep" in claim,
+        "ranges that measurements bound": "data" in claim,
         "an input that is held over a period": claim["sample"] is not None,
         f"plants in {plant['time']} time": plant["time"] != "continuous",
         "more than one network": len(networks) > 1,
@@ -171,7 +173,11 @@ def _require_supported(claim: Any, networks: Any, plant: Any, policy: Any, lyapu
     }
     for what, there in found.items():
         if there:
-            raise InputError(f"the certificate must be one that Coq's statement covers; found {what[:80]}. {_WHAT_IS}.")
+            raise _unsupported(what)
+
+
+def _unsupported(what: str) -> InputError:
+    return InputError(f"the certificate must be one that Coq's statement covers; found {what[:80]}. {_WHAT_IS}.")
 
 
 def _network(policy: Mapping[str, Any], stated: Mapping[str, Any], n: int, m: int) -> PolicyNetwork:

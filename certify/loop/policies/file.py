@@ -41,6 +41,7 @@ _PARTS = {"map": {"function"}, "observe": {"names", "expressions"}}  # and what 
 _OPTIONAL = {"training", "beta", "valid"}
 _WHAT = "policy file"
 _START = 4096
+_HEAD = 100  # bytes of a file, within which a certificate says what it is
 _COMES_FROM = (
     "A policy file comes from controllers train, or from another program's file through certify import FILE "
     "--system PLANT --out policy.pt."
@@ -228,6 +229,11 @@ def _other(path: Path) -> str | None:
         return _to_import(path, "an ONNX model")
     if path.suffix == ".safetensors" or raw[8:9] == b"{":
         return _to_import(path, "a file of safetensors")
+    if b'"certify-certificate/' in raw[:_HEAD]:
+        return (
+            f"{_WHAT} {path} must hold a policy; it is a certificate, which has a policy inside and is no policy file. "
+            f"Name the policy file from which it was made: this command proves the claim anew."
+        )
     if is_text(raw):
         return f"{_WHAT} {path} must hold a policy; it is text. {_COMES_FROM}"
     return None

@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.lyapunov import extents
 from certify.report.figures.scene import Scene
 from certify.report.figures.style import (
     GROWTH_FILL,
     INK,
+    INNER,
     INNER_FILL,
     MUTED,
     RASTER_FROM,
@@ -76,6 +78,10 @@ def draw_line(axes: Any, scene: Scene, roa: SimulatedRoa | None) -> tuple[Key, .
         add_outer(axes, scene, x)
     axes.axvspan(-outer, outer, color=SET_FILL, lw=0)
     axes.axvspan(-inner, inner, color=INNER_FILL, lw=0)
+    if scene.taking_over is not None:
+        keys.append(Key("the second claim's set", INNER, 1.4, "--"))
+        for end in extents(*scene.taking_over)[0] * np.array([-1.0, 1.0]):
+            axes.axvline(float(end), color=INNER, lw=1.4, ls="--")
     axes.plot(x[:, 0], change, color=INK)
     axes.fill_between(x[:, 0], 0, change, where=change >= 0, color=GROWTH_FILL, lw=0)
     if roa is not None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from certify.lyapunov import extents
 from certify.report.figures.geometry import circle, ellipse, on_level, thin
 from certify.report.figures.partition import add_leaves
 from certify.report.figures.scene import Scene
@@ -16,6 +19,9 @@ def near_origin(scene: Scene) -> Picture:
 
     figure, axes = figure_of(4.2, 3.6)
     reach = 2.6 * scene.inner_reach
+    if scene.taking_over is not None:
+        reach = np.maximum(reach, 1.2 * extents(*scene.taking_over))
+        axes.plot(*ellipse(scene.taking_over[0], (0, 1), scene.taking_over[1]), color=INNER, lw=1.6, ls="--", zorder=4)
     leaves = None if scene.local_is_enough else scene.leaves
     if leaves is not None:
         add_leaves(axes, scene, leaves, (0, 1), within=reach)
@@ -36,9 +42,10 @@ def near_origin(scene: Scene) -> Picture:
     keeps = "which trajectories enter and do not leave"
     if not scene.timing.is_plain:
         keeps = f"which every trajectory enters and in which it {scene.there}".replace(" is there at ", " is at ")
+    after = "nothing is claimed about it" if scene.taking_over is None else "dashed: where the second claim begins"
     green = {
         "asymptotic": f"Green: the local set {inner}, {scene.word} at all radii at once.",
-        "practical": f"Green: the inner set {inner}, {keeps}; the dot marks the origin; nothing is claimed about it.",
+        "practical": f"Green: the inner set {inner}, {keeps}; the dot marks the origin; {after}.",
     }[scene.kind]
     return Picture(
         "Near the operating point" if any(scene.system.exact_x_eq()) else "Near the origin",

@@ -12,14 +12,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from certify.certificates import Certificate
+from certify.certificates import AnyCertificate, InvariantCertificate, ReachCertificate
 from certify.errors import InputError
+from certify.loop.plants import System
 from certify.report.figures import region_of, simulated_roa
 from certify.report.figures.line import draw_line
-from certify.report.figures.pairs import named_pairs
+from certify.report.figures.pairs import Pair, named_pairs
 from certify.report.figures.portrait import draw_plane, keys
+from certify.report.figures.ranks import draw_map, planes_of, reach_ground
 from certify.report.figures.scene import Scene
-from certify.report.figures.style import RC, Key
+from certify.report.figures.staying import Stage, draw_set
+from certify.report.figures.style import INK, PAPER, RC, SET, START, Key
 from certify.report.figures.trajectories import runs_from, starts
 
 if TYPE_CHECKING:
@@ -61,7 +64,7 @@ class PaperOptions:
             raise InputError(f"a figure must be one of {', '.join(FORMATS)}; found {self.format!r}. Name the file so.")
 
 
-def paper_figure(certificate: Certificate, accepted: bool, options: PaperOptions | None = None) -> bytes:
+def paper_figure(certificate: AnyCertificate, accepted: bool, options: PaperOptions | None = None) -> bytes:
     """The proved set in each pair of states, as a file's bytes; equal certificates give equal bytes.
 
     Parameters
@@ -80,41 +83,99 @@ def paper_figure(certificate: Certificate, accepted: bool, options: PaperOptions
         return _bytes(set_figure(certificate, accepted, options), options.format)
 
 
-def set_figure(certificate: Certificate, accepted: bool, options: PaperOptions | None = None) -> Figure:
+def set_figure(certificate: AnyCertificate, accepted: bool, options: PaperOptions | None = None) -> Figure:
     """The same as a matplotlib figure, to change and save.
+
+    Of a region it has the ranks of the boxes that lead there, of a set that is never left its extent.
 
     Raises
     ------
     InputError, CertificateFormatError : as `paper_figure`.
     """
     import matplotlib
-    from matplotlib.figure import Figure
 
     options = options or PaperOptions()
     if options.pairs and certificate.system.n < 2:
         raise InputError(f"pairs need two states or more; {certificate.system.name} has one. Leave --pairs out.")
-    pairs = named_pairs(certificate.system, options.pairs) or None
     with matplotlib.rc_context({**RC, **_SMALL}):
-        scene = Scene(certificate, accepted, pairs)
-        count = 1 if scene.n == 1 else len(scene.pairs)
-        across = min(count, 2 * options.columns if count > 2 * options.columns or count % 2 == 0 else 3)
-        across = min(across, 2 if options.columns == 1 else 4)
-        down = math.ceil(count / across)
-        width = _WIDTHS[options.columns]
-        panel = min(0.82 * width / across, 4.0)
-        figure = Figure(figsize=(width, 1.0), layout="constrained")
-        panels = figure.subplots(down, across, squeeze=False).ravel().tolist()
-        for spare in panels[count:]:
-            spare.set_visible(False)
-        legend = _draw(scene, panels[:count])
-        _put_legend(figure, legend, down * panel, _star(scene))
+        if isinstance(certificate, ReachCertificate):
+            return _reach_figure(certificate, accepted, options)
+        if isinstance(certificate, InvariantCertificate):
+            return _staying_figure(certificate, accepted, options)
+        scene = Scene(certificate, accepted, named_pairs(certificate.system, options.pairs) or None)
+        figure, panels, height = _panels(1 if scene.n == 1 else len(scene.pairs), options)
+        _put_legend(figure, _draw(scene, panels), height, _star(scene))
     return figure
+
+
+def _panels(count: int, options: PaperOptions) -> tuple[Figure, list[Any], float]:
+    """A figure with that many panels, the panels, and their height in inches."""
+    from matplotlib.figure import Figure
+
+    across = min(count, 2 * options.columns if count > 2 * options.columns or count % 2 == 0 else 3)
+    across = min(across, 2 if options.columns == 1 else 4)
+    down = math.ceil(count / across)
+    width = _WIDTHS[options.columns]
+    panel = min(0.82 * width / across, 4.0)
+    figure = Figure(figsize=(width, 1.0), layout="constrained")
+    panels = figure.subplots(down, across, squeeze=False).ravel().tolist()
+    for spare in panels[count:]:
+        spare.set_visible(False)
+    for axes in panels[:count]:
+        axes.locator_params(nbins=5)
+    return figure, panels[:count], down * panel
+
+
+def _planes(system: System, options: PaperOptions) -> list[Pair]:
+    return named_pairs(system, options.pairs) or planes_of(system.n)
+
+
+def _reach_figure(certificate: ReachCertificate, accepted: bool, options: PaperOptions) -> Figure:
+    """The numbers of steps to a region, with a scale of their colours."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    planes, ground = _planes(certificate.system, options), reach_ground(certificate, accepted, close=True)
+    figure, panels, height = _panels(len(planes), options)
+    for axes, pair in zip(panels, planes, strict=True):
+        show = draw_map(axes, ground, pair)
+    steps = "sampling instants" if ground.sampled else "steps"
+    scale = ScalarMappable(Normalize(0.0, ground.most), show["cmap"])
+    bar = figure.colorbar(scale, ax=panels, label=f"{steps} to the region, at most", aspect=30)
+    bar.locator = _whole()
+    bar.update_ticks()
+    legend = (
+        Key("the region, on a grid", SET, 1.6),
+        Key(f"nothing is {ground.word}", INK, 0.4, fill=PAPER),
+    )
+    _put_legend(figure, legend, height, ground.beside.removeprefix(", ") if ground.n > 2 else "")
+    return figure
+
+
+def _staying_figure(certificate: InvariantCertificate, accepted: bool, options: PaperOptions) -> Figure:
+    """The extent of a set that is never left."""
+    planes, stage = _planes(certificate.system, options), Stage.of(certificate)
+    figure, panels, height = _panels(len(planes), options)
+    broken = [draw_set(axes, stage, pair) for axes, pair in zip(panels, planes, strict=True)]
+    word = "proved" if accepted else "claimed"
+    legend = (
+        Key(f"{word}: never left, on a grid*", SET, 1.6, fill=f"{SET}40"),
+        *((Key("a constraint is violated*", START, 0.0, fill=f"{START}59"),) if any(broken) else ()),
+        Key("simulated runs*", INK, 0.6),
+    )
+    _put_legend(figure, legend, height, _STAR)
+    return figure
+
+
+def _whole() -> Any:
+    """Ticks at integers."""
+    from matplotlib.ticker import MaxNLocator
+
+    return MaxNLocator(integer=True)
 
 
 def _draw(scene: Scene, panels: Sequence[Any]) -> tuple[Key, ...]:
     """Fill the panels; the legend of all of them."""
-    for axes in panels:
-        axes.locator_params(nbins=5)
     roa = simulated_roa(scene)
     if scene.n == 1:
         return draw_line(panels[0], scene, roa)

@@ -168,6 +168,9 @@ def keys(scene: Scene, runs: Runs, region: Region | None, growing: bool) -> tupl
         found.insert(0, Key(f"{scene.word} outer set, N = {level}{shown}", START, 1.8, fill=START_FILL))
     if any(map(scene.sees_inner, scene.pairs)):
         found.append(Key(inner + (": section" if scene.n > 2 else ""), INNER, 1.4, fill=INNER_FILL))
+    if scene.taking_over is not None:
+        shown = ": section" if scene.n > 2 else ""
+        found.append(Key(f"the second claim's set, V′ = {below(scene.taking_over[1])}{shown}", INNER, 1.4, "--"))
     if growing:
         found.append(Key(f"{scene.falling} ≥ 0 on a grid*", GROWTH, 1.0, fill=GROWTH_FILL))
     found += keys_of_edges(scene)
@@ -245,6 +248,8 @@ def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region |
         inner = ellipse(scene.P, pair, scene.inner)
         axes.fill(*inner, color=INNER_FILL, lw=0, zorder=1.5)
         axes.plot(*inner, color=INNER, lw=1.4, zorder=3.5)
+    if scene.taking_over is not None:
+        axes.plot(*ellipse(scene.taking_over[0], pair, scene.taking_over[1]), color=INNER, lw=1.4, ls="--", zorder=3.6)
     corner, sides = scene.lo[[i, j]], scene.hi[[i, j]] - scene.lo[[i, j]]
     axes.add_patch(Rectangle(tuple(corner), *sides, fill=False, ec=INK, lw=1.0, zorder=4))
     axes.set_xlim(view.lo[0], view.hi[0])

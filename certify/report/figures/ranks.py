@@ -30,6 +30,7 @@ _LINE = (PAPER, 3.0), (SET, 1.6)  # an outline that is seen on every colour
 _BOX = (PAPER, 3.0), (START, 2.0)
 _RUNS = (PAPER, 1.4), (INK, 0.6)
 _POINTS = 480  # of a map along each side
+_SAMPLES = 100_000  # states that tell where a region is
 _STARTS, _LONGEST = 6, 4000  # simulated runs, and their steps
 _COLOURS = "viridis_r"  # light is near, and no colour is white
 
@@ -93,6 +94,23 @@ def reach_maps(certificate: ReachCertificate, accepted: bool, box: tuple[Array, 
     """A map of the ranks around a region for each pair of states, or of the line; with `box`, corners (n,), through its
     middle, and with simulated runs from it.
     """
+    more = (
+        " Magenta: the box that was asked about. Thin lines: simulated runs from it, until they are there; between two "
+        "boxes, several steps apart, they may pass states without a rank."
+    )
+    ground = reach_ground(certificate, accepted, box)
+    return [_picture(ground, pair, "" if box is None else more) for pair in planes_of(ground.n)]
+
+
+def planes_of(n: int) -> list[Pair]:
+    """The first pairs of n states, or (0, 0) for the line of one."""
+    return list(combinations(range(n), 2))[:MOST] if n > 1 else [(0, 0)]
+
+
+def reach_ground(
+    certificate: ReachCertificate, accepted: bool, box: tuple[Array, Array] | None = None, *, close: bool = False
+) -> Ground:
+    """The ranks around a region, as `reach_maps` draws them; `close` is where there are ranks or the region."""
     system = certificate.system
     ranked = Ranked(certificate.evidence.ranks, None, angles_in(system))
     middle = np.zeros(system.n) if box is None else 0.5 * (box[0] + box[1])
@@ -101,7 +119,12 @@ def reach_maps(certificate: ReachCertificate, accepted: bool, box: tuple[Array, 
         None if box is None else _runs(certificate, box, lambda x: beyond(x, np.zeros((*x.shape[:-1], system.m)), ()))
     )
 
-    lo, hi = (ranked.tree.lo, ranked.tree.hi) if box is None or path is None else _view(ranked.tree, box, path)
+    lo, hi = ranked.tree.lo, ranked.tree.hi
+    if box is not None and path is not None:
+        lo, hi = _view(ranked.tree, np.concatenate([np.stack(box), path.reshape(-1, system.n)]))
+    elif close:
+        x = np.random.default_rng(0).uniform(lo, hi, (_SAMPLES, system.n))
+        lo, hi = _view(ranked.tree, x[beyond(x, np.zeros((len(x), system.m)), ()).max(-1) <= 0])
 
     def outline(axes: Any, pair: Pair) -> None:
         a, b, states = _plane(lo, hi, middle, pair)
@@ -118,7 +141,7 @@ def reach_maps(certificate: ReachCertificate, accepted: bool, box: tuple[Array, 
             _drawn_box(axes, box, pair)
 
     shown = zip(system.states, system.exact_x_eq(), strict=True)
-    ground = Ground(
+    return Ground(
         ranked,
         float(certificate.claim.ranks.steps),
         [deviation(s.name, q, system.units.get(s.name, "")) for s, q in shown],
@@ -134,18 +157,30 @@ def reach_maps(certificate: ReachCertificate, accepted: bool, box: tuple[Array, 
         if box is None
         else ", all other states in the middle of the box that was asked about",
     )
-    pairs = list(combinations(range(system.n), 2))[:MOST] if system.n > 1 else [(0, 0)]
-    more = (
-        " Magenta: the box that was asked about. Thin lines: simulated runs from it, until they are there; between two "
-        "boxes, several steps apart, they may pass states without a rank."
-    )
-    more = more if box is not None else ""
-    return [_picture(ground, pair, more) for pair in pairs]
 
 
 def _picture(ground: Ground, pair: Pair, more: str = "") -> Picture:
     """The map of one plane, with the outline of the target on top."""
     figure, axes = figure_of(4.4, 3.6 if ground.n > 1 else 1.6, left=0.86, right=0.8)
+    _scale(figure, axes, ground.most, draw_map(axes, ground, pair))
+    steps = "sampling instants" if ground.sampled else "steps"
+    other = ground.beside if ground.n > 2 else ""
+    turned = [symbol(ground.names[k]) for k in ground.ranked.angles]
+    place = f" Full turns of {', '.join(turned)} are the same place." if turned else ""
+    unless = "" if ground.word == "proved" else ", if the claim is true"
+    title = f"Steps to {ground.target}, at most"
+    i, j = pair
+    return Picture(
+        title if ground.n <= 2 else f"{title}: {ground.labels[i]}, {ground.labels[j]}",
+        f"Colour: the number of {steps} after which every trajectory from there is in {ground.target}, the blue "
+        f"outline, at the latest{unless}{other}. White: nothing is {ground.word}.{place}{more}",
+        to_svg(figure),
+        simulated=bool(more),
+    )
+
+
+def draw_map(axes: Any, ground: Ground, pair: Pair) -> dict[str, Any]:
+    """Draw the ranks and the target's outline in a plane; returns how numbers become colours."""
     i, j = pair
     lo, hi = ground.lo, ground.hi
     _, _, states = _plane(lo, hi, ground.middle, pair)
@@ -161,28 +196,15 @@ def _picture(ground: Ground, pair: Pair, more: str = "") -> Picture:
     axes.set_xlim(*box[:2])
     axes.set_ylim(*box[2:])
     axes.set_xlabel(ground.labels[i])
-    _scale(figure, axes, ground.most, show)
-    steps = "sampling instants" if ground.sampled else "steps"
-    other = ground.beside if ground.n > 2 else ""
-    turned = [symbol(ground.names[k]) for k in ground.ranked.angles]
-    place = f" Full turns of {', '.join(turned)} are the same place." if turned else ""
-    unless = "" if ground.word == "proved" else ", if the claim is true"
-    title = f"Steps to {ground.target}, at most"
-    return Picture(
-        title if ground.n <= 2 else f"{title}: {ground.labels[i]}, {ground.labels[j]}",
-        f"Colour: the number of {steps} after which every trajectory from there is in {ground.target}, the blue "
-        f"outline, at the latest{unless}{other}. White: nothing is {ground.word}.{place}{more}",
-        to_svg(figure),
-        simulated=bool(more),
-    )
+    return show
 
 
-def _view(tree: RankTree, box: tuple[Array, Array], path: Array) -> tuple[Array, Array]:
-    """The part of the root box that has leaves with a rank, and simulated runs, with some room."""
+def _view(tree: RankTree, states: Array) -> tuple[Array, Array]:
+    """The part of the root box that has leaves with a rank, and these states (N, n), with some room."""
     lower, upper = leaves_within(tree.tree, tree.lo, tree.hi)
-    known = tree.proved
-    lo = np.min([box[0], lower[known].min(0), np.nanmin(path, (0, 1))], axis=0)
-    hi = np.max([box[1], upper[known].max(0), np.nanmax(path, (0, 1))], axis=0)
+    known, states = tree.proved, states[np.isfinite(states).all(-1)]
+    lo = np.concatenate([states, lower[known]]).min(0)
+    hi = np.concatenate([states, upper[known]]).max(0)
     room = 0.2 * (hi - lo)
     return np.maximum(lo - room, tree.lo), np.minimum(hi + room, tree.hi)
 

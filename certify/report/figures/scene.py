@@ -33,6 +33,7 @@ from certify.report.figures.sets import (
     slabs_of,
     start_of,
     system_of,
+    taking_over_of,
 )
 from certify.report.flow import Flow, cost_of, time_scales
 from certify.report.phrases import phrases_of
@@ -121,6 +122,7 @@ class Scene:
         self.reach = extents(self.P, self.outer)
         self.ranked = ranked_of(certificate)
         self.inner_reach = extents(self.P, self.inner)
+        self.taking_over = taking_over_of(certificate)
         self.start, self.slabs = start_of(certificate), slabs_of(certificate)
         self.start_reach = None if self.start is None else extents(self.start, 1.0)
         self.centre = None if self.start is None else centre_of(certificate)

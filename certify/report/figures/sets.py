@@ -46,6 +46,15 @@ def is_local_enough(certificate: Certificate) -> bool:
     return ball and certificate.claim.local == certificate.roa
 
 
+def taking_over_of(certificate: Certificate) -> tuple[Array, float] | None:
+    """P' (n, n) and c2' of {V' <= c2'}, where the claim of a second certificate begins; None without one, or if a
+    rejected file has something else there."""
+    then = certificate.then
+    if then is None or then.P.shape != certificate.P.shape or not is_ellipsoid(then):
+        return None
+    return then.P, then.roa
+
+
 def start_of(certificate: Certificate) -> Array | None:
     """P (n, n) of the ellipsoid {(x - c)'P(x - c) <= 1} from which a tube leads into {V <= c2}, c as `centre_of` says.
 

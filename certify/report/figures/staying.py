@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 from certify.certificates import InvariantCertificate
 from certify.loop.plants import corners
 from certify.loop.plants.floating_point import function_of
-from certify.report.figures.pairs import MOST, Pair
+from certify.report.figures.pairs import Pair
+from certify.report.figures.ranks import planes_of
 from certify.report.figures.style import INK, PAPER, SET, START, Picture, figure_of, to_svg
 from certify.report.flow import Flow, simulate, time_scales
 from certify.report.words import deviation
@@ -22,29 +24,52 @@ _STARTS, _STEPS, _SAMPLES = 8, 1500, 200_000
 _RUNS = (PAPER, 1.4), (INK, 0.6)
 
 
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A set with its loop: corners `lo` and `hi` (n,) of the domain, simulated `runs` (steps, runs, n) from states of
+    the set, and the states' `labels`."""
+
+    certificate: InvariantCertificate
+    lo: Array
+    hi: Array
+    runs: Array
+    labels: Sequence[str]
+
+    @classmethod
+    def of(cls, certificate: InvariantCertificate) -> Stage:
+        system = certificate.system
+        lo, hi = np.array([[float(end) for end in pair] for pair in system.domain]).T
+        shown = zip(system.states, system.exact_x_eq(), strict=True)
+        labels = [deviation(s.name, q, system.units.get(s.name, "")) for s, q in shown]
+        return cls(certificate, lo, hi, _runs(certificate, lo, hi), labels)
+
+
 def staying_pictures(certificate: InvariantCertificate, accepted: bool) -> list[Picture]:
     """The set's extent for each pair of states, or along the line of one."""
-    system, n = certificate.system, certificate.system.n
-    lo, hi = np.array([[float(end) for end in pair] for pair in system.domain]).T
-    runs = _runs(certificate, lo, hi)
-    shown = zip(system.states, system.exact_x_eq(), strict=True)
-    labels = [deviation(s.name, q, system.units.get(s.name, "")) for s, q in shown]
-    pairs = list(combinations(range(n), 2))[:MOST] if n > 1 else [(0, 0)]
-    return [_picture(certificate, accepted, labels, (lo, hi), runs, pair) for pair in pairs]
+    stage = Stage.of(certificate)
+    return [_picture(stage, accepted, pair) for pair in planes_of(certificate.system.n)]
 
 
-def _picture(
-    certificate: InvariantCertificate,
-    accepted: bool,
-    labels: Sequence[str],
-    box: tuple[Array, Array],
-    runs: Array,
-    pair: Pair,
-) -> Picture:
+def _picture(stage: Stage, accepted: bool, pair: Pair) -> Picture:
     """The set in one plane."""
-    (lo, hi), (i, j), n = box, pair, len(labels)
+    labels, n = stage.labels, len(stage.labels)
     figure, axes = figure_of(4.4, 3.6 if n > 1 else 1.6, left=0.86)
-    outer = certificate.claim.outer
+    broken = draw_set(axes, stage, pair)
+    extent = "the states of the set, whatever the others are, by samples of these" if n > 2 else "the set"
+    unless = "" if accepted else ", if the claim is true"
+    red = " Magenta: a constraint is violated there." if broken else ""
+    return Picture(
+        "The set that is never left" if n <= 2 else f"The set: {labels[pair[0]]}, {labels[pair[1]]}",
+        f"Blue: {extent}, which no trajectory leaves{unless}.{red} Thin lines: simulated runs from states of the set.",
+        to_svg(figure),
+        simulated=True,
+    )
+
+
+def draw_set(axes: Any, stage: Stage, pair: Pair) -> bool:
+    """Draw the set in a plane, with simulated runs; True if a constraint is violated somewhere in it."""
+    certificate, lo, hi, runs, labels = stage.certificate, stage.lo, stage.hi, stage.runs, stage.labels
+    (i, j), n, outer = pair, len(stage.labels), stage.certificate.claim.outer
     a, b, states = _plane(lo, hi, pair)
     with np.errstate(all="ignore"):
         value = np.nan_to_num(outer.function(states), nan=np.inf).min(0)
@@ -70,15 +95,7 @@ def _picture(
         axes.set_yticks([])
     axes.set_xlim(lo[i], hi[i])
     axes.set_xlabel(labels[i])
-    extent = "the states of the set, whatever the others are, by samples of these" if n > 2 else "the set"
-    unless = "" if accepted else ", if the claim is true"
-    red = " Magenta: a constraint is violated there." if np.any(kept >= 0) else ""
-    return Picture(
-        "The set that is never left" if n <= 2 else f"The set: {labels[i]}, {labels[j]}",
-        f"Blue: {extent}, which no trajectory leaves{unless}.{red} Thin lines: simulated runs from states of the set.",
-        to_svg(figure),
-        simulated=True,
-    )
+    return bool(np.any(kept >= 0))
 
 
 def _plane(lo: Array, hi: Array, pair: Pair) -> tuple[Array, Array, Array]:
