@@ -29,7 +29,13 @@ def text_of(notebook: Any) -> str:
 
 
 def test_there_are_notebooks() -> None:
-    assert [p.stem for p in NOTEBOOKS] == ["01_pendulum", "02_certificates", "03_own_plant", "04_more_states"]
+    assert [p.stem for p in NOTEBOOKS] == [
+        "01_pendulum",
+        "02_certificates",
+        "03_own_plant",
+        "04_more_states",
+        "05_unknown_plant",
+    ]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
@@ -102,3 +108,14 @@ def test_more_states() -> None:
     for name in ("cartpole", "quadrotor2d", "quadrotor3d"):
         assert f"{name}: PROVED" in text
     assert sum(map(len, images_of(notebook))) < 150_000 and len(images_of(notebook)) == 2
+
+
+@pytest.mark.slow
+def test_unknown_plant() -> None:
+    notebook = executed("05_unknown_plant")
+    text = text_of(notebook)
+    assert "data         mine.csv, 400 transitions" in text and "off by at most" in text and "K12" in text
+    assert "IDENTIFIED  linear: 400 transitions" in text
+    assert "PROVED  linear: for every constant A₁₁" in text and re.search(r"^checker +ACCEPTED", text, re.M)
+    assert "40 of 40 runs of the environment settle" in text
+    assert sum(map(len, images_of(notebook))) < 150_000 and len(images_of(notebook)) == 1

@@ -13,7 +13,11 @@ import numpy as np
 
 from certify import get_system
 
-REACH = {"pendulum": [1.5, 2.0], "cartpole": [1.0, 0.5, 1.0, 1.0]}  # of the states from which transitions begin
+REACH = {  # of the states from which transitions begin
+    "pendulum": [1.5, 2.0],
+    "cartpole": [1.0, 0.5, 1.0, 1.0],
+    "quadrotor2d": [1.0, 1.0, 0.5, 1.0, 1.0, 1.0],
+}
 PERIOD, STEPS = 0.02, 20
 
 
@@ -24,13 +28,15 @@ def main() -> None:
     parser.add_argument("out")
     parser.add_argument("--transitions", type=int, default=200)
     parser.add_argument("--noise", type=float, default=1e-3)
+    parser.add_argument("--reach", help="of states and then inputs, 1,0.1,2,2,10; by default far, and all inputs")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     plant, draw = get_system(given.plant), np.random.default_rng(given.seed)
     f, N, h = plant.function(), given.transitions, PERIOD / STEPS
-    x = draw.uniform(-1, 1, (N, plant.n)) * REACH[given.plant]
+    reach = [float(part) for part in given.reach.split(",")] if given.reach else REACH[given.plant]
+    x = draw.uniform(-1, 1, (N, plant.n)) * reach[: plant.n]
     lo, hi = np.array([[float(end) for end in pair] for pair in plant.input_bounds]).T
-    u = draw.uniform(lo, hi, (N, plant.m))
+    u = draw.uniform(*([-1, 1] * np.array(reach[plant.n :])[:, None]).T if given.reach else (lo, hi), (N, plant.m))
     y = x
     for _ in range(STEPS):  # Runge and Kutta's method, whose error here is far below the noise
         k1 = f(y, u)
