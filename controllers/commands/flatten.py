@@ -16,7 +16,7 @@ from controllers.storage import require_writable, set_aside
 
 if TYPE_CHECKING:
     from certify.loop.plants import System
-    from controllers.flattening.options import FlattenOptions, Gain
+    from controllers.flattening.options import Curvature, FlattenOptions, Gain
     from controllers.flattening.result import Figures, Flattened
     from controllers.options import Plant
 
@@ -41,7 +41,7 @@ def flatten(
             help="Half-widths of states where the policy is used, as in x=0.4,phi=0.2; others as where runs start.",
         ),
     ] = None,
-    time_limit: Annotated[float, typer.Option("--time-limit", help="Seconds after which training ends.")] = 180.0,
+    time_limit: Annotated[float, typer.Option("--time-limit", help="Seconds after which training ends.")] = 600.0,
     steps: Annotated[int, typer.Option("--steps", help="Gradient steps at most.")] = 2000,
     max_cost_change: Annotated[
         float, typer.Option("--max-cost-change", help="Share by which the median cost of a run may rise.")
@@ -53,6 +53,17 @@ def flatten(
             help="Gain at the origin: kept (as it is), or lqr (by the weights that judge runs).",
         ),
     ] = "kept",
+    curvature: Annotated[
+        str,
+        typer.Option(
+            "--curvature",
+            help="Curvature: removed, or kept as far as it lowers the cost of runs and a set stays provable.",
+        ),
+    ] = "removed",
+    volume: Annotated[
+        float | None,
+        typer.Option("--volume", help="Volume of that set; default: of the ellipsoid of twice the box."),
+    ] = None,
     Q: DiagonalQ = None,
     R: DiagonalR = None,
     states: Annotated[int, typer.Option("--states", help="Initial states of the runs that judge a policy.")] = 200,
@@ -82,6 +93,8 @@ def flatten(
             max_cost_change=max_cost_change,
             states=states,
             gain=cast("Gain", gain),
+            curvature=cast("Curvature", curvature),
+            volume=volume,
             Q=_weights(Q, "Q"),
             R=_weights(R, "R"),
             seed=seed,
@@ -123,18 +136,22 @@ def _progress(options: FlattenOptions) -> Iterator[Callable[[int, float, float],
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    kept = options.curvature == "kept"
     columns = (
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
-        TextColumn("change {task.fields[fit]}  departure {task.fields[departure]}"),
+        TextColumn(("cost" if kept else "change") + " {task.fields[fit]}  "),
+        TextColumn(("boxes" if kept else "departure") + " {task.fields[departure]}"),
     )
     with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task("", total=options.steps, fit="-", departure="-")
 
         def report(step: int, fit: float, departure: float) -> None:
             if step % 20 == 0:
-                progress.update(task, completed=step, fit=f"{math.sqrt(fit):.1%}", departure=f"{departure:.2g}")
+                progress.update(
+                    task, completed=step, fit=f"{fit if kept else math.sqrt(fit):.1%}", departure=f"{departure:.2g}"
+                )
 
         yield report
 
@@ -145,6 +162,7 @@ def _table(result: Flattened) -> dict[str, Any]:
 
     before, after = result.before, result.after
     rms, largest = (", ".join(f"{v:.3g}" for v in values) for values in (result.rms, result.largest))
+    forecast = {} if result.boxes is None else {"forecast": f"volume {result.volume:.3g} by {result.boxes:.2g} boxes"}
     return {
         "system": result.policy.system,
         "sha256": result.policy.network.sha256(),
@@ -152,6 +170,7 @@ def _table(result: Flattened) -> dict[str, Any]:
         "bend on the box": f"{100 * before.bend:.3g} % before, {100 * after.bend:.3g} % after",
         "runs before": runs(before),
         "runs after": runs(after),
+        **forecast,
         "change of inputs": f"rms {rms}; at most {largest}",
         "change of J(0)": f"{100 * result.gain_change:.2g} %",
         "trained": f"from factor {result.factor:g}, {result.steps} steps in {result.seconds:.0f} s ({result.ended})",

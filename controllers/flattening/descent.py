@@ -73,7 +73,7 @@ class Descent:
         box = torch.from_numpy(task.box)
         J, size = torch.from_numpy(task.J * task.box), torch.from_numpy(self.selection.size).float()
         largest = J.square().sum().clamp_min(SMALLEST)
-        slope = torch.from_numpy(self._slope())
+        slope = torch.from_numpy(task.slope())
 
         def loss(states: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             change = (student(states) - wanted) / size
@@ -83,12 +83,6 @@ class Descent:
             return fit + GAIN * gain + task.options.weight * bends, fit, bends
 
         return loss
-
-    def _slope(self) -> Array:
-        """d u / d net (m,) at the origin."""
-        folded = self.task.folded
-        squashed = folded.squashed(self.task.value)
-        return np.asarray(folded.scale * folded.squash_slope(squashed) * np.ones(self.task.system.m))
 
     def _add(self, network: PolicyNetwork) -> None:
         self.states = np.concatenate([self.states, self.task.visited(network)])

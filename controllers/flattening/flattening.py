@@ -34,6 +34,7 @@ from certify.loop.policies import Policy, PolicyNetwork
 from controllers.evaluation.curvature import curvature
 from controllers.flattening.contraction import contracted
 from controllers.flattening.descent import Descent, Report
+from controllers.flattening.keeping import Keeping, volume_of
 from controllers.flattening.options import FlattenOptions
 from controllers.flattening.result import Figures, Flattened
 from controllers.flattening.selection import Selection
@@ -69,9 +70,13 @@ def flatten(
     torch.set_num_threads(options.threads)
     task = Task(policy, options, chosen)
     selection = Selection(task, task.visited(task.goal))
-    factor, start = _contracted(task, selection)
-    descent = Descent(task, selection, began)
-    steps, ended = descent.run(start, report)
+    descent, keeping = Descent(task, selection, began), None
+    if options.curvature == "kept":
+        keeping = Keeping(task, selection, began)
+        factor, steps, ended = keeping.run(report)
+    else:
+        factor, start = _contracted(task, selection)
+        steps, ended = descent.run(start, report)
     if selection.best is None:
         before = selection.before
         raise OptionError(
@@ -84,6 +89,14 @@ def flatten(
     states = descent.states if task.goal is task.old else np.concatenate([descent.states, task.visited(task.old)])
     change = task.inputs(network, states) - task.inputs(task.old, states)
     settings = _settings(task, selection.before, after, factor, steps)
+    kept = None if keeping is None else keeping.found[network.sha256()]
+    if kept is not None:
+        settings |= {
+            "curvature": "kept",
+            "volume": volume_of(options, task.box),
+            "boxes": kept.boxes,
+            "P": kept.P.tolist(),
+        }
     return Flattened(
         policy=replace(policy, network=network, training=_record(task, network) | {"flattened": settings}),
         before=selection.before,
@@ -95,6 +108,8 @@ def flatten(
         steps=steps,
         ended=ended,
         seconds=time.monotonic() - began,
+        boxes=None if kept is None else kept.boxes,
+        volume=None if kept is None else volume_of(options, task.box),
     )
 
 

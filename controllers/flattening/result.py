@@ -32,7 +32,7 @@ class Flattened:
 
     `rms` and `largest` are (m,), in the input's units, over the states that both closed loops visit; `gain_change` is
     the Jacobian's change at 0 on the box, relative to what it was; `factor` is the contraction that training began
-    with.
+    with. With curvature kept, `boxes` is the number of boxes that a set of this volume is forecast to take.
     """
 
     policy: Policy
@@ -45,6 +45,8 @@ class Flattened:
     steps: int
     ended: Ended
     seconds: float
+    boxes: float | None = None
+    volume: float | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; what is not finite becomes None."""
@@ -62,6 +64,7 @@ class Flattened:
             "input_change": {"rms": list(self.rms), "max": list(self.largest)},
             "gain_change": self.gain_change,
             "factor": self.factor,
+            "forecast": None if self.boxes is None else {"volume": self.volume, "boxes": self.boxes},
             "steps": self.steps,
             "ended": self.ended,
             "seconds": {"total": self.seconds},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,28 +51,35 @@ class Selection:
             )
         self.corner = min(1.0, nearest_corner(task.old, task.system))  # no unit may have its corner nearer
         self.best: tuple[PolicyNetwork, Figures] | None = None
-        self._objective = math.inf
+        self.bound = math.inf  # that the next objective must be below
 
-    def keep(self, network: PolicyNetwork) -> bool:
-        """Remember a policy that is better than all before and within the bounds; True if it is one."""
+    def keep(self, network: PolicyNetwork, objective_of: Callable[[Figures], float] | None = None) -> bool:
+        """Remember a policy that is better than all before and within the bounds; True if it is one.
+
+        Parameters
+        ----------
+        objective_of : the objective by a policy's figures, where it is not `objective`, and not the departure but
+            `bound` says what is easier to prove than the old policy.
+        """
         if not all(np.all(np.isfinite(a)) for a in (a for step in network.network.affine for a in step.arrays)):
             return False
-        objective = self.objective(network)
-        if self.best is not None and objective >= self._objective:
+        figures = None if objective_of is None else self.task.figures(network)
+        objective = self.objective(network) if figures is None or objective_of is None else objective_of(figures)
+        if objective >= self.bound:
             return False
         if nearest_corner(network, self.task.system) < self.corner:
             return False
-        task, figures = self.task, self.task.figures(network)
+        task, figures = self.task, figures or self.task.figures(network)
         allowed = (1 + task.options.max_cost_change) * self.before.cost
         if not (
-            figures.departure < self.before.departure
+            (objective_of is not None or figures.departure < self.before.departure)
             and figures.settled >= max(1, self.before.settled)
             and figures.cost <= allowed
         ):
             return False
         if task.exactly_centred and task.old.centre == "none":
             require_centred(network, task.u_eq)
-        self.best, self._objective = (network, figures), objective
+        self.best, self.bound = (network, figures), objective
         return True
 
     def objective(self, network: PolicyNetwork) -> float:

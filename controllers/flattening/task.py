@@ -92,6 +92,11 @@ class Task:
             )
         return np.asarray(math.sqrt(mean) * np.abs(self.goal.scale))
 
+    def slope(self) -> Array:
+        """d u / d net (m,) of the goal at the origin."""
+        squashed = self.folded.squashed(self.value)
+        return np.asarray(self.folded.scale * self.folded.squash_slope(squashed) * np.ones(self.system.m))
+
     def gain_change(self, network: PolicyNetwork, J: Array) -> float:
         """The difference of a policy's Jacobian at the origin from J (m, n), on the box and relative to J."""
         size = max(float(np.linalg.norm(J * self.box)), SMALLEST)
