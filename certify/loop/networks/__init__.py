@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certify.loop.networks.floats import Gradients, Tangent, Tangents, tangent_at, values
+from certify.loop.networks.floats import Gradients, Tangent, Tangents, has_kink_at, mean_tangent, tangent_at, values
 from certify.loop.networks.layers import clipped, frozen, frozen_layers, like, sha256_of, tanh, through, widths
 from certify.loop.networks.steps import (
     Affine,
@@ -36,8 +36,10 @@ __all__ = [
     "clipped",
     "frozen",
     "frozen_layers",
+    "has_kink_at",
     "layered",
     "like",
+    "mean_tangent",
     "repeated",
     "sha256_of",
     "tangent_at",
