@@ -101,8 +101,8 @@ class Cone:
         return beside.less(least), beside.less(-most), ~(least >= beside.top), ~(-most >= beside.top)
 
     def within(self, decay: fmpq_mat, rest: fmpq_mat) -> fmpq_mat:
-        """The decay less mu (c c' - t^2 I) over d, the last entries, which is not negative on the cone. mu is any number >= 0,
-        here one for which the least eigenvalue of what is left over the rest is largest, about."""
+        """The decay less mu (c c' - t^2 I) over d, the last entries, which is not negative on the cone.
+        mu is any number >= 0, here one for which the least eigenvalue beyond the rest is largest, about."""
         if not self.narrow:
             return decay
         (square, wide), n = self.squares, len(self.c)
@@ -132,7 +132,7 @@ def are_whole(directions: Sequence[bytes], n: int, at: str) -> Failures:
 
 
 def cones(directions: Sequence[bytes], n: int, close: bool = False) -> Iterator[Cone]:
-    """Those that together have all d, (n,), after `are_whole`."""
+    """Yield cones that together have all d, (n,), after `are_whole`."""
     if not directions:
         yield CLOSE if close else ALL
     for k, tree in enumerate(directions):
@@ -230,8 +230,7 @@ def _best(M: fmpq_mat, C: fmpq_mat) -> fmpq:
         left, right = (A * scale * scale[:, None] for A in (left, right))
         if not (np.all(np.isfinite(left)) and np.all(np.isfinite(right)) and np.any(right)):
             return fmpq(0)
-        mu = 0.0
-        start = np.linalg.norm(left) / np.linalg.norm(right)
+        mu, start = 0.0, float(np.linalg.norm(left) / np.linalg.norm(right))
         for powers in (_COARSE, _FINE):
             tried = np.append(start * 2.0**powers, mu)
             least = np.linalg.eigvalsh(left - tried[:, None, None] * right)[:, 0]

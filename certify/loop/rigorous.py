@@ -204,8 +204,8 @@ def eigenvalues(loop: ClosedLoop) -> list[flint.acb] | None:
     """Rigorous enclosures of the eigenvalues of the closed loop's Jacobian at 0.
 
     Where the input is held, those of the linear maps over the shortest (if it is not 0) and the longest period.
-    None if Arb cannot isolate them, there is no Jacobian because of a kink, or the clip is not certain to be inactive at
-    the origin.
+    None if Arb cannot isolate them, there is no Jacobian because of a kink, or the clip is not certain to be inactive
+    at the origin.
     """
     if has_kink_at(loop.network.network, loop.network.origin):
         return None

@@ -1,24 +1,24 @@
-"""Kinks on a ball: honest certificates, loops that a kink lets diverge, models against sampled states, and forgeries."""
+"""Kinks on a ball: honest certificates, loops that diverge at a kink, models against sampled states, forgeries."""
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
 
-from certify.checker import kinks, rules
+from certify.checker import kinks, limits
 from certify.checker.ball import OnBall
 from certify.checker.case import Case
-from certify.checker.decrease import Models, are_finite
 from certify.checker.jets import Units, constant, unpacked
-from certify.checker.local import Local
 from certify.checker.near import Vector
 from certify.checker.networks import Affine, Clip, Map, Network
 from tests.support.certificates import LEAF, Document, edited, encode, parse, verdict
-from tests.support.kinked import even, kinked, mirrored, pi, with_directions
+from tests.support.kinked import even, kinked, mirrored, pi
 
 ONE = [["+", ["/", "x0", "2"], "u"]]
 TWO, P2 = ["x1", "u"], [[1.5, 0.5], [0.5, 1.0]]
@@ -91,7 +91,7 @@ def random_network(rng: np.random.Generator, n: int) -> tuple[Network, Callable[
     """A network of two hidden layers of relu, clip or tanh, some without biases, and the same in numpy."""
     sizes, steps, parts, last = [n, 5, 4, 2], list[Any](), list[Any](), 0
     free = rng.random() < 0.5
-    for i, (a, b) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+    for i, (a, b) in enumerate(pairwise(sizes)):
         W, bias = rng.normal(size=(b, a)), rng.normal(size=b) * (0.0 if free else 0.3)
         steps.append(Affine((last,), b, W, bias))
         last += 1
@@ -148,8 +148,6 @@ def test_models_hold_what_a_network_does_on_a_cone(seed: int, close: bool) -> No
     network, f, _ = random_network(rng, n)
     J = rng.normal(size=(n, n)) * 10.0 ** rng.uniform(-3, 0.5)
     nothing = constant(0, Units(np.zeros((n, n, 0))), 0)
-    from dataclasses import replace
-
     x = [replace(nothing, a=Vector(row)) for row in J]
     with np.errstate(all="ignore"):
         for cone in cones_of(rng, n, close):
@@ -210,3 +208,109 @@ def test_enough_of_the_random_loops_are_shown() -> None:
         data = kinked([["-", "u", "x0"], ["-", "u", "x1"]], layers, np.eye(2), 1.0, even(2, 3))
         shown += verdict(data) == "ACCEPTED"
     assert shown >= 5
+
+
+# ------------------------------------------------------------------------------------------------------------ forgeries
+
+PLANE = HONEST["a plane"]
+Edit = Callable[[list[str]], Any]
+
+
+def bytes_of(tree: str) -> bytes:
+    return base64.b64decode(tree)
+
+
+def text_of(tree: bytes) -> str:
+    return base64.b64encode(tree).decode()
+
+
+def first(change: Callable[[bytes], bytes]) -> Edit:
+    return lambda trees: [text_of(change(bytes_of(trees[0]))), *trees[1:]]
+
+
+FORGED: list[tuple[str, str, Edit]] = [
+    ("format", "a tree less", lambda trees: trees[:-1]),
+    ("format", "a tree more", lambda trees: [*trees, trees[0]]),
+    ("format", "an object", lambda trees: dict.fromkeys("abcd", trees[0])),
+    ("format", "null", lambda trees: None),
+    ("format", "bytes that are none", lambda trees: [*trees[:-1], "!"]),
+    ("format", "numbers", lambda trees: [255] * 4),
+    ("local", "nothing of a tree", first(lambda tree: b"")),
+    ("local", "a byte less", first(lambda tree: tree[:-1])),
+    ("local", "a byte more", first(lambda tree: tree + bytes([LEAF]))),
+    ("local", "an axis that there is not", first(lambda tree: bytes([2]) + tree[1:])),
+    ("local", "the face's own axis", first(lambda tree: bytes([0]) + tree[1:])),
+    ("local", "a whole face for a cone", first(lambda tree: bytes([LEAF]))),
+    ("local", "halves of a face", first(lambda tree: bytes([1, LEAF, LEAF]))),
+    ("local", "one cone", lambda trees: []),
+    ("local", "faces in another order", lambda trees: [trees[2], trees[3], trees[0], trees[1]]),
+    ("local", "a tree that is too deep", first(lambda tree: bytes([1]) * 3000 + bytes([LEAF]) * 3001)),
+]
+
+
+@pytest.mark.parametrize(("rule", "name", "change"), FORGED, ids=[name for _, name, _ in FORGED])
+def test_a_forged_tree_of_directions_is_refused(rule: str, name: str, change: Edit) -> None:
+    assert verdict(edited(PLANE(), "evidence.local.directions", change)) == rule
+
+
+def test_a_bias_that_is_nearly_0_is_not_0() -> None:
+    """For |x| below 2^-61 the input is 0, and x' = x/2."""
+    layers = mirrored([[-2.0]])
+    layers = [(layers[0][0], np.array([-(2.0**-60), -(2.0**-60)])), layers[1]]
+    assert verdict(kinked(ONE, layers, 1.0, 1.0, even(1, 0))) == "local"
+
+
+def test_an_input_that_a_clip_may_cut_is_refused() -> None:
+    data = kinked(ONE, mirrored([[-2.0]]), 1.0, 1.0, even(1, 0), clip=([-1.5], [1.5]))
+    assert verdict(data) == "local"
+
+
+@pytest.mark.parametrize(("bound", "found"), [("9/5", "inputs"), ("11/5", "ACCEPTED")])
+def test_inputs_are_bounded_with_all_that_kinks_may_add(bound: str, found: str) -> None:
+    data = kinked(ONE, mirrored([[-2.0]]), 1.0, 1.0, even(1, 0), input_bounds=[("-" + bound, bound)])
+    assert verdict(data) in (found, "inputs")
+
+
+def nearby(gain: float, directions: Any, time: str = "continuous") -> Document:
+    """x' = u - x + 1/100 or x+ = u + 1/100 with u = gain relu(x), around the level 1/25."""
+    term = ["+", "u", "1/100", *([["-", "x0"]] if time == "continuous" else [])]
+    data = kinked([term], relu(gain), 1.0, 1.0, None, claim="nearby", levels=(0.04, 0.04), time=time)
+    data["evidence"]["contraction"] = {
+        "J": encode(0.2 * (1 + 1e-9)), "weights": encode([2.0**-40]), "weight": encode(2.0**-40),
+        "directions": directions,
+    }  # fmt: skip
+    data["evidence"]["local"] = None
+    return grow_small(data)
+
+
+def grow_small(data: Document) -> Document:
+    """With leaves of a line, where c0 = c1 = c2 is asked of all."""
+    tree = bytes([0, 0, LEAF, LEAF, 0, LEAF, LEAF])
+    for _ in range(5):
+        if verdict(data) not in ("ring", "inputs"):
+            break
+        data["evidence"]["tree"] = text_of(tree)
+        tree = bytes([0]) + tree + tree
+    return data
+
+
+@pytest.mark.parametrize("time", ["continuous", "discrete"])
+@pytest.mark.parametrize("directions", [[], even(1, 0)], ids=["one cone", "half lines"])
+def test_two_trajectories_come_closer_across_a_kink(time: str, directions: Any) -> None:
+    assert verdict(nearby(0.7, directions, time)) == "ACCEPTED"
+    without = nearby(0.7, directions, time)
+    del without["evidence"]["contraction"]["directions"]
+    assert verdict(without) == "contraction"
+
+
+@pytest.mark.parametrize(("time", "gain"), [("continuous", 1.01), ("discrete", 1.01), ("discrete", -1.01)])
+@pytest.mark.parametrize("directions", [[], even(1, 0)], ids=["one cone", "half lines"])
+def test_trajectories_that_part_are_refused(time: str, gain: float, directions: Any) -> None:
+    assert verdict(nearby(gain, directions, time)) in ("contraction", "ring")
+
+
+def test_limits_count_the_cones() -> None:
+    data = PLANE()
+    few, many = (limits.Sizes(parse(edited(data, "evidence.local.directions", even(2, k)))).work() for k in (1, 6))
+    none = limits.Sizes(parse(edited(data, "evidence.local.directions", []))).work()
+    assert none < few < many and many > 20 * few

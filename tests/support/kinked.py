@@ -55,7 +55,7 @@ def pi(layers: Layers, x: np.ndarray) -> np.ndarray:
 
 
 def kinked(dynamics: Sequence[Any], layers: Layers, P: Any, level: float, directions: Any, **more: Any) -> Document:
-    """A claim that {V <= level} is attracted, by a ball alone (c1 = c2)."""
+    """A claim that {V <= level} is attracted, by a ball alone (c1 = c2); without directions there is none."""
     P = np.atleast_2d(np.asarray(P, dtype=float))
     n = len(P)
     names = [f"x{i}" for i in range(n)]
@@ -64,6 +64,8 @@ def kinked(dynamics: Sequence[Any], layers: Layers, P: Any, level: float, direct
     levels = settings.pop("levels", (level, level))
     data = make(dynamics, [(np.zeros((1, reads)), [0.0])], P, levels, **settings)
     data = with_policy(data, steps_of(layers))
+    if directions is None:
+        return data
     data["evidence"]["local"] = centred(around(P / level), np.vstack([np.zeros((2, n)), np.full((1, n), 2.0**-20)]))
     return with_directions(data, directions)
 

@@ -1,8 +1,8 @@
 """Kinks on a ball, in floats: entries of relu and of clips that may change sides there, known to first order, and cones
 of directions on each of which the rule's inequality is asked (checker/FORMAT.md, kinks).
 
-A kink adds at most |alpha.d| + beta ||d|| to m times what it reads, m the middle of the slopes of its chords. In few
-directions of d a kink is undecided: cones that are narrow there, and wide elsewhere, leave next to nothing of the kinks.
+A kink adds at most |alpha.d| + beta ||d|| to m times what it reads, m the middle of the slopes of its chords.
+In few directions of d a kink is undecided: cones that are narrow there, and wide elsewhere, leave next to nothing.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _COARSE, _FINE = np.arange(-4.0, 24.0), np.arange(-7.0, 8.0) / 8  # powers of 2 
 
 @dataclass(frozen=True, slots=True)
 class Kinks:
-    """Of N units, those that are kinks: |e_q(d)| is at most |alpha_q.d| + beta_q ||d|| and at most rho_q ||d||; alpha
+    """Kinks among N units: |e_q(d)| is at most |alpha_q.d| + beta_q ||d|| and at most rho_q ||d||; alpha
     (N, k), beta and rho (N,), 0 of other units."""
 
     alpha: Array
@@ -105,7 +105,7 @@ class Directions:
 
     @property
     def cones(self) -> list[Cone]:
-        """Those of all leaves, in their order."""
+        """The cones of all leaves, in their order."""
         return [cone for k in range(len(self.trees)) for cone in self._leaves(k)] or [ALL]
 
     def _leaves(self, k: int) -> Iterator[Cone]:
@@ -268,7 +268,7 @@ class OnCone(Algebra[Vector]):
         return Vector(v.y * w.y, G, np.concatenate([reach, own], 1), y * w.Q + z * v.Q + H, y * w.K + z * v.K + C)
 
     def observe(self, step: Observe, v: Vector) -> Vector:
-        """Jets of the expressions, whose terms beyond their tangents become those of units, without kinks before them."""
+        """Jets of the expressions, whose terms beyond their tangents become those of units; no kinks come before."""
         L, E, tilt = self.reached(v)
         algebra, none = Jets(1, self.J.shape[1], np.zeros((0, len(self.form.eye)))), np.zeros((1, 0))
         E = np.where((tilt > 0)[:, None], np.nan, E)

@@ -47,7 +47,7 @@ _AMPLE = 0.3  # a margin that is good enough for the multipliers of a floor
 _ROUNDS = 3  # rounds of multipliers and edge, each best for the other
 _WORTH = 0.01  # share of a floor: less is no gain
 _ROUNDING = 1e-12  # share of the decay: the checker's numbers are in doubt by it at d = 0 as well
-_MOST_CONES = 2048  # of directions
+_MOST_CONES = 4096  # of directions
 _LEFT = 0.25  # share of the decay in a cone's middle that has to be left in all of its directions
 _FAR_BELOW = 1e-3  # share of its limit below which a level is tried to be raised by kinks
 _WORTH_KINKS, _DOWN = 4.0, 0.1  # from a level without kinks to the first with them, and on; down to one that is good

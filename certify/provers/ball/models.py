@@ -200,7 +200,7 @@ class Driven:
 
     @property
     def tilts(self) -> Array:
-        """What kinks add at most to each input, over ||d||."""
+        """The most that kinks add to each input, over ||d||."""
         none: Array = np.zeros(len(self.shares))
         return none if self.kinks is None else np.abs(self.shares) @ self.kinks.rho
 

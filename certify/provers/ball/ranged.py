@@ -42,7 +42,8 @@ Four = tuple[float, float, float, float]
 @dataclass(frozen=True, slots=True)
 class RangedJet:
     """A value on M balls around the same middle: c, `moves` (N,) and `error` (M,) of v(0); a (M, k), `turns` (N, M, k)
-    and `slack` (M,) of the gradient; the rest as a Jet has it, and `tilts`, (m, M), what kinks among each e_j add at most, over ||d||."""
+    and `slack` (M,) of the gradient; the rest as a Jet has it.
+    Kinks among e_j add at most `tilts` ||d||, (m, M)."""
 
     c: float
     moves: Array
@@ -65,10 +66,10 @@ class RangedJet:
     @property
     def tilt(self) -> Array:
         """The largest turn of the gradient by y, and by kinks, (M,)."""
-        by_kinks = (np.abs(self.B) @ self.tilts)[0]
+        by_kinks: Array = (np.abs(self.B) @ self.tilts)[0]
         if not len(self.turns):
             return by_kinks
-        return np.asarray(np.sum(np.linalg.norm(self.turns, axis=2), axis=0)) + by_kinks
+        return np.asarray(np.sum(np.linalg.norm(self.turns, axis=2), axis=0) + by_kinks)
 
     @property
     def turned(self) -> Array:
