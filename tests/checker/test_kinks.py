@@ -87,7 +87,7 @@ def test_a_kink_at_a_distance_ends_the_set_where_the_chord_does(level: float, fo
 # ------------------------------------------------------------------------------------------------------------- sampling
 
 
-def random_network(rng: np.random.Generator, n: int) -> tuple[Network, Callable[[np.ndarray], np.ndarray], Any]:
+def random_network(rng: np.random.Generator, n: int) -> tuple[Network, Callable[..., np.ndarray], Any]:
     """A network of two hidden layers of relu, clip or tanh, some without biases, and the same in numpy."""
     sizes, steps, parts, last = [n, 5, 4, 2], list[Any](), list[Any](), 0
     free = rng.random() < 0.5
@@ -108,8 +108,9 @@ def random_network(rng: np.random.Generator, n: int) -> tuple[Network, Callable[
             parts.append((lambda x: np.maximum(x, 0)) if kind == "relu" else np.tanh)
         last += 1
 
-    def f(x: np.ndarray) -> np.ndarray:
-        for part in parts:
+    def f(x: np.ndarray, count: int | None = None) -> np.ndarray:
+        """The value, or a vector before it."""
+        for part in parts[:count]:
             x = part(x)
         return x
 
@@ -166,7 +167,35 @@ def test_models_hold_what_a_network_does_on_a_cone(seed: int, close: bool) -> No
                 assert np.all(gap <= np.linalg.norm(d - e, axis=1)[:, None] * lip + 1e-12)
 
 
-def beyond(f: Callable[[np.ndarray], np.ndarray], y: Any, J: np.ndarray, d: np.ndarray, signed: bool = False) -> Any:
+@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("close", [False, True])
+def test_a_kink_is_within_its_sector(seed: int, close: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """|e| <= |alpha.d| + beta ||d|| and <= rho ||d||, and with `close` so for differences."""
+    rng, seen, found = np.random.default_rng(seed), list[Any](), kinks.Cone.bent
+    monkeypatch.setattr(kinks.Cone, "bent", lambda *args: seen.append(found(*args)) or seen[-1])
+    n = int(rng.integers(1, 4))
+    network, f, _ = random_network(rng, n)
+    J = rng.normal(size=(n, n)) * 10.0 ** rng.uniform(-3, 0.5)
+    x = [replace(constant(0, Units(np.zeros((n, n, 0))), 0), a=Vector(row)) for row in J]
+    for cone in cones_of(rng, n, close):
+        seen.clear()
+        with np.errstate(all="ignore"):
+            OnBall(n, cone).value(network, x)
+        d, e = directions_in(cone, rng, n, 400), directions_in(cone, rng, n, 400) * float(close)
+        bent = [
+            k
+            for k, step in enumerate(network.steps)
+            if isinstance(step, Clip) or getattr(step, "function", "") == "relu"
+        ]
+        for k, one in zip(bent, seen, strict=True):
+            (v, y), (v0, y0) = ((f(at @ J.T, k), f(at @ J.T, k + 1)) for at in (d, e))
+            left, gap = np.abs(y - y0 - one.slope * (v - v0)), d - e
+            size = np.linalg.norm(gap, axis=1)[:, None]
+            assert np.all(left <= np.abs(gap @ one.first.alpha) + one.first.beta * size + 1e-13)
+            assert np.all(left <= one.first.rho * size + 1e-13)
+
+
+def beyond(f: Callable[..., np.ndarray], y: Any, J: np.ndarray, d: np.ndarray, signed: bool = False) -> Any:
     """The distance of the value at d from y(0) + a.d + d'Q d + K[d]."""
     K = unpacked(np.moveaxis(y.K.value, 0, -1), d.shape[1])
     known = d @ y.a.value + np.einsum("ti,ijm,tj->tm", d, y.Q.value, d) + np.einsum("mhij,th,ti,tj->tm", K, d, d, d)
