@@ -26,6 +26,8 @@ class LocalBall:
     (3, n) of the matrix inequality on it with the `weight` (n, n) from which all others follow.
 
     `edge` is the multiplier of V - c0 of a practical claim, `order` that of the series in time of a sampled one.
+    `directions` are trees of directions where relus and clips may have kinks on the ball (checker/FORMAT.md, kinks):
+    none or 2 n, None where no kink is allowed.
     """
 
     J: Array
@@ -33,16 +35,18 @@ class LocalBall:
     weight: Array
     edge: float = 0.0
     order: int = 1
+    directions: tuple[bytes, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Contraction:
     """Evidence that trajectories come closer: a ball x = J d, ||d|| <= 1, J (n, n), that contains {V <= c0}, and the
-    `weights` (n,) of one bound on it and the `weight` (n, n) of another."""
+    `weights` (n,) of one bound on it and the `weight` (n, n) of another; `directions` as a LocalBall has them."""
 
     J: Array
     weights: Array
     weight: Array
+    directions: tuple[bytes, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,20 +301,31 @@ def _ball(evidence: LocalBall | Slab) -> dict[str, str]:
     return {name: encode(getattr(evidence, name)) for name in _OF_A_BALL}
 
 
-def _contraction(ball: Contraction) -> dict[str, str]:
-    return {name: encode(getattr(ball, name)) for name in ("J", "weights", "weight")}
+def _contraction(ball: Contraction) -> dict[str, Any]:
+    return {name: encode(getattr(ball, name)) for name in ("J", "weights", "weight")} | _directions(ball)
 
 
-def _read_contraction(data: Mapping[str, str], n: int) -> Contraction:
-    return Contraction(decode(data["J"], (n, n)), decode(data["weights"], (n,)), decode(data["weight"], (n, n)))
+def _read_contraction(data: Mapping[str, Any], n: int) -> Contraction:
+    arrays = decode(data["J"], (n, n)), decode(data["weights"], (n,)), decode(data["weight"], (n, n))
+    return Contraction(*arrays, _read_directions(data))
+
+
+def _directions(ball: LocalBall | Contraction) -> dict[str, Any]:
+    if ball.directions is None:
+        return {}
+    return {"directions": [base64.b64encode(tree).decode("ascii") for tree in ball.directions]}
+
+
+def _read_directions(data: Mapping[str, Any]) -> tuple[bytes, ...] | None:
+    return tuple(map(base64.b64decode, data["directions"])) if "directions" in data else None
 
 
 def _local(ball: LocalBall) -> dict[str, Any]:
-    return {**_ball(ball), "edge": float(ball.edge).hex(), "order": ball.order}
+    return {**_ball(ball), "edge": float(ball.edge).hex(), "order": ball.order, **_directions(ball)}
 
 
 def _read_local(data: Mapping[str, Any], n: int) -> LocalBall:
-    return LocalBall(*_read_ball(data, n, n), float.fromhex(data["edge"]), int(data["order"]))
+    return LocalBall(*_read_ball(data, n, n), float.fromhex(data["edge"]), int(data["order"]), _read_directions(data))
 
 
 def _read_ball(data: Mapping[str, str], n: int, k: int) -> tuple[Array, Array, Array]:

@@ -7,20 +7,25 @@ on a line: x = m + J z + w sigma, d = (z, sigma).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .case import Case, Failures
 from .document import Intervals
+from .exact import Exact
 from .expression import Call, evaluate
 from .functions import FUNCTIONS
-from .jets import Jet, Units, between, constant, uncertain
+from .jets import First, Jet, Units, between, constant, no_kinks, uncertain
 from .near import ZERO, Above, Array, Cubic, Near, Square, Vector, all_near, mixed, near, size, stacked, triples, within
 from .network import norm2
 from .networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Product, Sum
+
+if TYPE_CHECKING:
+    from .kinks import Cone
 
 _MOST_JETS = 2**26  # numbers in the matrices and tensors of all jets
 _MOST_NUMBERS = 2**25  # in those of a layer and the paths to it
@@ -34,6 +39,9 @@ class Ball:
     case: Case
     J: Array
     at: str
+    cone: Cone | None = field(
+        default=None, kw_only=True
+    )  # of d, on which relus and clips have kinks; None if there are none
 
     @property
     def motion(self) -> tuple[list[Fraction], list[Fraction]] | None:
@@ -74,7 +82,7 @@ class Ball:
     def outputs(self) -> Jet:
         """The network's values, squashed if the policy is: a batch of jets, whose errors belong to the units."""
         net = self.case.net
-        h = OnBall(len(self.states[0].a.value)).value(net.network, self.states, net.origin, net.shift)
+        h = OnBall(len(self.states[0].a.value), self.cone).value(net.network, self.states, net.origin, net.shift)
         return h.function("tanh") if net.squash else h
 
     @cached_property
@@ -96,7 +104,8 @@ class Ball:
         """
         h, scale = self.outputs, Near(self.case.net.scale)
         at_0 = all_near(self.case.c.u_eq) if self.starts_at_u_eq else h.c * scale + self.case.net.offset
-        u = replace(h, c=at_0, a=h.a * scale, Q=Square(h.Q.value) * scale, K=Cubic(h.K.value) * scale)
+        a = (h.a * scale).wider(h.by_kinks(self.reach.error))
+        u = replace(h, c=at_0, a=a, Q=Square(h.Q.value) * scale, K=Cubic(h.K.value) * scale)
         E, lip = mixed(Square(h.units.U), Near(self.reach.error.top)), h.lipschitz * size(scale.value)
         return rows(replace(u, E=E, lip=lip), range(len(self.case.c.inputs)), self.units, 0, self.count)
 
@@ -122,10 +131,16 @@ class Ball:
 
         def called(call: Call, arguments: list[Jet]) -> list[Jet]:
             nonlocal units
-            h = OnBall(len(units.R)).value(call.network, arguments)
+            h = OnBall(len(units.R), self.cone).value(call.network, arguments)
             h = h.at(list(call.entries))
             first, units = units.count, units.with_more(reached(h, h.B.value, np.ones(len(call.entries))))
-            plain = replace(h, Q=Square(h.Q.value), K=Cubic(h.K.value), E=Square(np.zeros_like(h.E.value)))
+            plain = replace(
+                h,
+                a=h.a.wider(h.by_kinks(h.B.error)),
+                Q=Square(h.Q.value),
+                K=Cubic(h.K.value),
+                E=Square(np.zeros_like(h.E.value)),
+            )
             return rows(replace(plain, lip=h.lipschitz), range(len(call.entries)), units, first, self.count)
 
         F = evaluate(self.case.c.dynamics, self.constant, [*self.shared(states), *self.inputs, *quantities], called)
@@ -214,7 +229,10 @@ def is_too_large(network: Network, k: int, arguments: int) -> bool:
 def reached(h: Jet, reach: Array, scale: Array) -> Units:
     """The errors of the rows of a batch of jets, scaled, as sums over units: those of its family, which reach them by
     `reach` (N, m), and for each row what else it does not know."""
-    return Units(np.concatenate([h.units.U, h.remainder], 2), np.concatenate([reach, np.diag(scale)]).T)
+    first, count = h.units.first, h.remainder.shape[2]
+    first = None if first is None else first.beside(no_kinks(len(h.units.R), count))
+    R, L = np.concatenate([h.units.U, h.remainder], 2), np.concatenate([reach, np.diag(scale)]).T
+    return Units(R, L, first=first)
 
 
 def rows(u: Jet, of: Sequence[int], units: Units, first: int, count: int) -> list[Jet]:
@@ -233,6 +251,7 @@ class Rows:
     y: Near
     X: Vector
     own: int | None = None  # the number of the first
+    at_0: Array | None = None  # which y(0) are exactly 0, where kinks ask
 
 
 class OnBall(Algebra[Rows]):
@@ -244,8 +263,9 @@ class OnBall(Algebra[Rows]):
     Lipschitz constant lips_q.
     """
 
-    def __init__(self, k: int) -> None:
-        self.k = k
+    def __init__(self, k: int, cone: Cone | None = None) -> None:
+        self.k, self.cone = k, cone
+        self.first = None if cone is None else no_kinks(k, 0)
         self.H, self.C, self.R = np.zeros((k, k, 0)), np.zeros((len(triples(k)[0]), 0)), np.zeros((k, k, 0))
         self.lips = Above(np.zeros(0))
 
@@ -255,23 +275,29 @@ class OnBall(Algebra[Rows]):
         """The network's value at `origin` + the arguments, and a shift: a batch of jets, whose errors belong to the
         units."""
         x = self.entered(arguments)
-        x = x if origin is None or not np.any(origin) else replace(x, y=x.y + Near(origin))
+        if origin is not None and np.any(origin):
+            x = replace(x, y=x.y + Near(origin), at_0=None if x.at_0 is None else x.at_0 & (origin == 0))
         h = self.run(network, x)
         return self.jets(h if shift is None else replace(h, y=h.y + shift))
 
     def entered(self, jets: Sequence[Jet]) -> Rows:
         """Jets as a vector. What they have beyond a.d becomes units, unless there is nothing."""
-        y = stacked([v.v0 for v in jets])
+        y, at_0 = stacked([v.v0 for v in jets]), None
+        if self.cone is not None:
+            at_0 = np.array([v.v0.value == 0 and v.v0.error.v == 0 for v in jets])  # a bound of 0 is 0
         errors = stacked([Near(0.0, v.gradient.error) for v in jets]).error.norm()
         X = Vector(np.array([v.a.value for v in jets]), errors * np.ones(self.k))
         if not any(np.any(part) for v in jets for part in (v.Q.value, v.K.value, v.remainder, v.B.value)):
-            return Rows(y, X)
+            return Rows(y, X, at_0=at_0)
         H, C = np.stack([v.Q.value for v in jets], -1), np.stack([v.K.value for v in jets], -1)
         R = np.stack([(Square(v.remainder) + v.shares).majorant for v in jets], -1)
-        return Rows(y, X, self.with_units(H, C, R, Above(np.array([v.lipschitz.top for v in jets]))))
+        own = self.with_units(H, C, R, Above(np.array([v.lipschitz.top for v in jets])))
+        return Rows(y, X, own, at_0)
 
-    def with_units(self, H: Array, C: Array, R: Array, lips: Above) -> int:
+    def with_units(self, H: Array, C: Array, R: Array, lips: Above, first_order: First | None = None) -> int:
         """Add units; the number of the first."""
+        if self.first is not None:
+            self.first = self.first.beside(first_order or no_kinks(self.k, R.shape[2]))
         first = self.R.shape[2]
         self.H, self.C, self.R = (np.concatenate(pair, -1) for pair in ((self.H, H), (self.C, C), (self.R, R)))
         self.lips = self.lips.beside(lips)
@@ -291,7 +317,8 @@ class OnBall(Algebra[Rows]):
         a, Q, K = Vector(X.value[:, :k].T, X.error[:k].norm() * ones), *self.beyond(B)
         E = Square(np.zeros_like(Q.value), (B.error * Square(R).size[:, None]).sum() * ones)
         of_y = Near(np.zeros((0, len(ones)))), Vector(np.zeros((k, 0, len(ones))))  # a network knows nothing of y
-        return Jet(v.y, a, Q, K, E, Near(B.value), Units(R), *of_y, (B.size * self.lips[:N, None]).sum())
+        units = Units(R, first=None if self.first is None else self.first.of(N))
+        return Jet(v.y, a, Q, K, E, Near(B.value), units, *of_y, (B.size * self.lips[:N, None]).sum())
 
     def beyond(self, B: Near) -> tuple[Square, Cubic]:
         """Q and K of vectors that units reach by B (N, width)."""
@@ -303,20 +330,36 @@ class OnBall(Algebra[Rows]):
         X = X.mapped(step.weight, norm2(step))
         if v.own is not None:  # the units of the step just before arrive through W alone
             X = X.beside(step.weight)
-        return Rows(v.y.through(step.weight) + Near(step.bias), X)
+        at_0 = None if v.at_0 is None else (step.bias == 0) & ~np.any((step.weight != 0) & ~v.at_0, 1)
+        return Rows(v.y.through(step.weight) + Near(step.bias), X, at_0=at_0)
 
     def map(self, step: Map, v: Rows) -> Rows:
         value = self.jets(v)
+        if self.cone is not None and step.function == "relu":
+            return self.bent(step, v, value)
         phi = FUNCTIONS[step.function].expansion(value.v0, value.radius)
         bent, twisted, rest = value.beyond_tangent(phi)
         rest = rest.wider(bent.error + twisted.error)
         lips = value.lip_beyond_tangent(phi) + bent.error * 2 + twisted.error * 3
         X = self.columns(v, value.units.count).times(phi.f[1])
-        return Rows(phi.f[0], X, self.with_units(bent.value, twisted.value, rest.majorant, lips))
+        at_0 = None if v.at_0 is None else v.at_0 & (FUNCTIONS[step.function].exact(Fraction(0)) == 0)
+        return Rows(phi.f[0], X, self.with_units(bent.value, twisted.value, rest.majorant, lips), at_0)
+
+    def bent(self, step: Map | Clip, v: Rows, value: Jet) -> Rows:
+        """Entries that are known to first order."""
+        if self.cone is None:
+            raise TypeError("kinks are asked for on a cone")
+        found = self.cone.bent(step, value, v.at_0)
+        X, N, k = self.columns(v, value.units.count).times(Near(found.slope)), len(found.slope), self.k
+        nothing = np.zeros((k, k, N)), np.zeros((len(triples(k)[0]), N)), np.zeros((k, k, N)), Above(np.zeros(N))
+        at_0 = v.at_0 & (found.y.value == 0)  # relu(0) = 0, and a clip of 0 is exact
+        return Rows(found.y, X, self.with_units(*nothing, found.first), at_0)
 
     def clip(self, step: Clip, v: Rows) -> Rows:
         """Entries that are certainly not clipped stay, those that certainly are become constant, others NaN."""
         value = self.jets(v)
+        if self.cone is not None:
+            return self.bent(step, v, value)
         lo, hi = value.range.ends
         free, low, high = (lo > step.lo) & (hi < step.hi), hi < step.lo, lo > step.hi
         slope = np.where(free, 1.0, np.where(low | high, 0.0, np.nan))
@@ -325,10 +368,11 @@ class OnBall(Algebra[Rows]):
 
     def sum(self, step: Sum, vectors: Sequence[Rows]) -> Rows:
         units = self.R.shape[2]
-        y, X = vectors[0].y, self.columns(vectors[0], units)
+        y, X, at_0 = vectors[0].y, self.columns(vectors[0], units), vectors[0].at_0
         for v in vectors[1:]:
             y, X = y + v.y, X + self.columns(v, units)
-        return Rows(y, X)
+            at_0 = None if at_0 is None else at_0 & v.at_0
+        return Rows(y, X, at_0=at_0)
 
     def concat(self, step: Concat, vectors: Sequence[Rows]) -> Rows:
         parts, error = [self.columns(v, self.R.shape[2]) for v in vectors], ZERO
@@ -336,7 +380,8 @@ class OnBall(Algebra[Rows]):
             error = error + X.error * X.error
         y = np.concatenate([v.y.value for v in vectors])
         of_y = np.concatenate([v.y.error.top + 0 * v.y.value for v in vectors])
-        return Rows(Near(y, Above(of_y)), Vector(np.concatenate([X.value for X in parts]), error.root))
+        at_0 = None if self.cone is None else np.concatenate([v.at_0 for v in vectors])
+        return Rows(Near(y, Above(of_y)), Vector(np.concatenate([X.value for X in parts]), error.root), at_0=at_0)
 
     def product(self, step: Product, v: Rows, w: Rows) -> Rows:
         """The units are products of both without their values at d = 0, as of jets without constants."""
@@ -347,7 +392,7 @@ class OnBall(Algebra[Rows]):
         made = replace(first, c=none) * replace(second, c=none, units=first.units)
         X = y.X.times(x.y) + x.X.times(y.y)
         of_units = self.with_units(made.Q.value, made.K.value, made.remainder, made.lipschitz)
-        return Rows(x.y * y.y, X, of_units)
+        return Rows(x.y * y.y, X, of_units, None if v.at_0 is None or w.at_0 is None else v.at_0 | w.at_0)
 
     def repeated(self, v: Rows, width: int, units: int) -> Rows:
         """A vector of so many entries, all of them the same if it has a single one, with columns for all units."""
@@ -365,7 +410,11 @@ class OnBall(Algebra[Rows]):
             for j in range(len(v.y.value))
         ]
         made = evaluate(step.tape, lambda q: constant(q, u.units, 0), entries)
-        return self.entered(made)
+        found = self.entered(made)
+        if v.at_0 is None:
+            return found
+        known = evaluate(step.tape, Exact, [Exact(Fraction(0) if still else None) for still in v.at_0.tolist()])
+        return replace(found, at_0=np.array([x.value == 0 for x in known]))
 
 
 def wider(X: Vector, columns: int) -> Vector:

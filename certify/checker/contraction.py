@@ -4,7 +4,8 @@ stay in {V <= c0} converge."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from flint import fmpq, fmpq_mat
@@ -20,20 +21,43 @@ from .local import is_large_enough
 from .near import Above, Array, Tensor, size
 from .pairs import bound_of_pairs, in_binary64
 
+if TYPE_CHECKING:
+    from .kinks import Cone
+
 
 class Contracted(Ball):
     """The ball of the section `contraction`."""
 
-    def __init__(self, case: Case, evidence: Contraction) -> None:
-        super().__init__(case, evidence.J, "contraction")
+    def __init__(self, case: Case, evidence: Contraction, cone: Cone | None = None) -> None:
+        super().__init__(case, evidence.J, "contraction", cone=cone)
         object.__setattr__(self, "by", evidence)
+
+    @classmethod
+    def whole(cls, case: Case, evidence: Contraction) -> Contracted:
+        """The one of all d."""
+        if evidence.directions is None:
+            return cls(case, evidence)
+        from .kinks import CLOSE
+
+        return cls(case, evidence, CLOSE)
+
+    @property
+    def parts(self) -> Iterator[Contracted]:
+        """It, or it on each cone of d."""
+        if not self.by.directions:
+            yield self
+            return
+        from .kinks import cones
+
+        for cone in cones(self.by.directions, len(self.J), close=True):
+            yield Contracted(self.case, self.by, cone)
 
     by: Contraction
 
 
 def fits(ball_: Contracted) -> Failures:
     """The ball contains {V <= c0}, and its jets take neither too much memory nor too much time."""
-    yield from is_large_enough(ball_, "levels.floor", "c0", ball_.case.c.c0)
+    yield from is_large_enough(ball_, "levels.floor", "c0", ball_.case.c.c0, ball_.by.directions)
     if not np.all(ball_.by.weights > 0):
         yield "evidence.contraction.weights", "must be positive"
     yield from ball.fits(ball_)
@@ -44,10 +68,14 @@ def contracts(ball_: Contracted) -> Failures:
     """V(e + h g) - V(e), over h, is negative for any two points of the ball; e is their difference, g that of G, and h
     is 0 in continuous time, where this is 2 e'P g."""
     P, h, count = exactly(ball_.case.c.P), int(ball_.case.c.discrete), 0
-    for cell in ball_.case.cells:
-        G = ball_.change(cell)
+    for part, cell in ((part, cell) for part in ball_.parts for cell in ball_.case.cells):
+        G = part.change(cell)
         doubts = [g.lipschitz + g.slack for g in G]
         models = Models(ball_.J, G, rest=True) if are_finite(G) and all(np.isfinite(v.top) for v in doubts) else None
+        if models is not None and part.cone is not None:
+            from .kinks import Kinks
+
+            models.kinks = Kinks.of(part.cone, models, ball_.case.c.P)
         beyond = 0.0 if models is None or not h else _size_beyond(models, doubts, ball_.case.c.P)
         if models is None or not np.isfinite(beyond):
             yield ball_.at, "F has no finite model"
@@ -59,7 +87,8 @@ def contracts(ball_: Contracted) -> Failures:
             crossed = models.J.transpose() * P * corner.A
             form = crossed + crossed.transpose()
             if h:
-                form += corner.A.transpose() * P * corner.A + diagonal([rational(beyond) ** 2] * b.ncols())
+                most = rational(beyond) + (fmpq(0) if models.kinks is None else models.kinks.length)
+                form += corner.A.transpose() * P * corner.A + diagonal([most**2] * b.ncols())
                 rest = _rest(models, P * (models.J + corner.A), sizes, ball_.by)
             count += 1
             if not is_definite(-form - rest):
@@ -74,7 +103,8 @@ def _rest(models: Models, b: fmpq_mat, doubts: Sequence[fmpq], by: Contraction) 
     """A bound of twice the sum of b_i.e times what g_i has beyond a_i.e."""
     lengths = [root_above(sum((v * v for v in row), fmpq(0))) for row in b.tolist()]
     along = 2 * sum((length * doubt for length, doubt in zip(lengths, doubts, strict=True)), fmpq(0))
-    return _turning(models, b, by.weights.tolist()) + _twisting(models, b, by.weight) + diagonal([along] * b.ncols())
+    found = _turning(models, b, by.weights.tolist()) + _twisting(models, b, by.weight) + diagonal([along] * b.ncols())
+    return found if models.kinks is None else found + models.kinks.bound(models, b, by.weight)
 
 
 def _size_beyond(models: Models, doubts: Sequence[Above], P: Array) -> float:

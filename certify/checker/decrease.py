@@ -26,12 +26,13 @@ from .near import Above, Array, Near, Tensor, Vector, at_least_0, mixed, norm, s
 from .pairs import bound_of_pairs, in_binary64
 
 if TYPE_CHECKING:
+    from .kinks import Kinks
     from .sections import Path
 
 _NOTHING = fmpq(0)
 _SHARE = fmpq(1, 4)  # of 1 against d, around a level
 _SHORT = 6  # bits of a number that is chosen here
-_OF_ONE = 16  # the weight of 1 over that of all of d: any positive number would do
+OF_ONE = 16  # the weight of 1 over that of all of d: any positive number would do
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,7 @@ class Models:
             (c_y, a_y) for c_y, a_y in moves if np.any(c_y) or np.any(a_y)
         ]  # what else y does is in the errors
         self.others: list[fmpq_mat] = []
+        self.kinks: Kinks | None = None
 
     def corners(self, P: Array | None = None) -> Iterator[Models]:
         """The models at each y of which all entries are 1 or -1; the one there is where nothing moves f or A.
@@ -111,9 +113,10 @@ def are_finite(F: Sequence[Jet]) -> bool:
         for f in F
         for part in (f.c.value, f.error.top, f.a.value, f.slack.top, f.Q.value, f.remainder, f.B.value, f.twist.top)
     ]
-    return all(
-        np.all(np.isfinite(part)) for part in (*parts, norm(units.reach, (0, 1)).top, norm(units.R, (0, 1, 2)).top)
-    )
+    parts += [norm(units.reach, (0, 1)).top, norm(units.R, (0, 1, 2)).top]
+    if units.first is not None:
+        parts += [norm(units.first.alpha, (0, 1)).top, norm(units.first.beta).top, norm(units.first.rho).top]
+    return all(np.all(np.isfinite(part)) for part in parts)
 
 
 def shows(models: Models, P: fmpq_mat, R: fmpq_mat, by: Multipliers, path: Path | None = None) -> bool:
@@ -182,6 +185,8 @@ def sides(
     if first:
         rest = fmpq_mat([[at_0, *[0] * k], *([0, *row] for row in rest.tolist())])
     rest += of_others
+    if models.kinks is not None:
+        rest += models.kinks.bound(models, b, by.weight)
     if level is not None:
         form += level.edge * (U.transpose() * P * U)
         form[0, 0] -= level.edge * level.c0
@@ -202,6 +207,7 @@ def doubts(
     e = sum((root * v for root, v in zip(roots, models.error, strict=True)), fmpq(0))
     s = sum((root * v for root, v in zip(roots, models.slack, strict=True)), fmpq(0))
     if h > 0:
+        s += fmpq(0) if models.kinks is None else models.kinks.length
         for Y in models.others:  # its part with b_i is in `of_quantities`
             first = int(bool(models.f))
             lengths_of_1 = [(Y.transpose() * P * Y)[j, j] for j in range(Y.ncols())]
@@ -271,7 +277,7 @@ def of_quantities(models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:
     W = np.zeros((k, k))
     W[k - len(weight) :, k - len(weight) :] = weight
     if k > len(weight):
-        W[0, 0] = _OF_ONE * np.trace(weight)
+        W[0, 0] = OF_ONE * np.trace(weight)
     for p, *steps in zip(b.tolist(), *(Y.tolist() for Y in models.others), strict=True):
         row = fmpq_mat(1, k, p)
         size = _size(p, W)

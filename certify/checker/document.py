@@ -75,22 +75,24 @@ class Multipliers:
 @dataclass(frozen=True)
 class LocalBall:
     """The ball x = J d, ||d|| <= 1, and multipliers on it, the one of V - c0 among them; the order of the series in
-    time there."""
+    time there; with kinks, trees of directions."""
 
     J: Array
     multipliers: Multipliers
     edge: float
     order: int
+    directions: tuple[bytes, ...] | None = None
 
 
 @dataclass(frozen=True)
 class Contraction:
     """The ball x = J d, ||d|| <= 1, on which trajectories come closer, and on it the weights g of one bound, and the
-    weight of another."""
+    weight of another; with kinks, trees of directions."""
 
     J: Array
     weights: Array
     weight: Array
+    directions: tuple[bytes, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -360,18 +362,27 @@ def _policy(value: Value, networks: Mapping[str, Network], n: int, m: int, pract
 def _local(value: Value, n: int, claim: str, most: int) -> LocalBall | None:
     if claim in PRACTICAL and value.raw is None:
         return None
-    J, multipliers, weight, edge, order = value.keys("J multipliers weight edge order")
+    names = f"J multipliers weight edge order{value.maybe('directions')}"
+    J, multipliers, weight, edge, order, *directions = value.keys(names)
     k = edge.binary64()
     edge.must(0 <= k < math.inf and (k == 0 or claim in PRACTICAL), "0, or a multiplier under a practical claim")
-    return LocalBall(J.array(n, n), multipliers_of(multipliers, weight, n, n), k, order.integer(1, most))
+    by = multipliers_of(multipliers, weight, n, n)
+    return LocalBall(J.array(n, n), by, k, order.integer(1, most), _directions(directions, n))
+
+
+def _directions(found: list[Value], n: int) -> tuple[bytes, ...] | None:
+    if not found:
+        return None
+    found[0].must(found[0].raw == [] or isinstance(found[0].raw, list), "a list")
+    return found[0].listed(Value.octets, 2 * n) if found[0].raw else ()
 
 
 def _contraction(value: Value, n: int, claim: str) -> Contraction | None:
     if claim != "nearby":
         value.must(value.raw is None, "null under this claim")
         return None
-    J, weights, weight = value.keys("J weights weight")
-    return Contraction(J.array(n, n), weights.array(n), weight.array(n, n))
+    J, weights, weight, *directions = value.keys(f"J weights weight{value.maybe('directions')}")
+    return Contraction(J.array(n, n), weights.array(n), weight.array(n, n), _directions(directions, n))
 
 
 def _slabs(value: Value, n: int, claim: str) -> tuple[Slab, ...]:

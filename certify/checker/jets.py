@@ -36,8 +36,33 @@ def times(E: Square, k: Above) -> Square:
 
 
 @dataclass(frozen=True)
+class First:
+    """Kinks among N units: |e_q(d)| is at most |alpha_q.d| + beta_q ||d||, and at most rho_q ||d||; alpha (k, N), beta
+    and rho (N,), 0 of other units. In rule `contraction` so is the difference at any two d, d being theirs."""
+
+    alpha: Array
+    beta: Array
+    rho: Array
+
+    def beside(self, other: First) -> First:
+        """These, and then others."""
+        parts = zip((self.alpha, self.beta, self.rho), (other.alpha, other.beta, other.rho), strict=True)
+        return First(*(np.concatenate(pair, -1) for pair in parts))
+
+    def of(self, count: int) -> First:
+        """So many of them."""
+        return First(self.alpha[:, :count], self.beta[:count], self.rho[:count])
+
+
+def no_kinks(k: int, count: int) -> First:
+    """Units that are no kinks."""
+    return First(np.zeros((k, count)), np.zeros(count), np.zeros(count))
+
+
+@dataclass(frozen=True)
 class Units:
-    """The errors e_j that a family of jets has in common, |e_j(d)| <= d'U_j d, U (k, k, m).
+    """The errors e_j that a family of jets has in common, |e_j(d)| <= d'U_j d, U (k, k, m); with kinks, `first`, of
+    which U knows nothing, at most `tilts` ||d|| more.
 
     They are sums of those of units: e_j = sum_q L_jq e_q, L (m, N), |e_q(d)| <= d'R_q d, R (k, k, N). A family that was
     made of another one by further errors, after its own, has it as `base`.
@@ -46,6 +71,14 @@ class Units:
     R: Array
     L: Array | None = None  # None if each unit's error is one of the common ones
     base: Units | None = None
+    first: First | None = None
+
+    @cached_property
+    def tilts(self) -> Above:
+        """Upper bounds of what kinks add to each of the common errors, over ||d||; ZERO without any."""
+        if self.first is None:
+            return ZERO
+        return Above(self.first.rho) if self.L is None else Above(self.first.rho).through(self.L)
 
     @cached_property
     def U(self) -> Array:
@@ -71,7 +104,8 @@ class Units:
             raise TypeError("the errors of each of these families must be sums")
         (m, N), (others, own) = self.L.shape, more.L.shape
         L = np.block([[self.L, np.zeros((m, own))], [np.zeros((others, N)), more.L]])
-        return Units(np.concatenate([self.R, more.R], 2), L, self)
+        first = None if self.first is None or more.first is None else self.first.beside(more.first)
+        return Units(np.concatenate([self.R, more.R], 2), L, self, first)
 
     def is_made_of(self, other: Units) -> bool:
         """True if the other family is this one or one of its bases."""
@@ -124,8 +158,15 @@ class Jet:
 
     @cached_property
     def tilt(self) -> Above:
-        """Upper bound of y's effect on the gradient."""
-        return self.a_y.size.sum()
+        """Upper bound of the effect of y, and of kinks, on the gradient: what kinks add is one of some gradient at each
+        d."""
+        return self.a_y.size.sum() + self.by_kinks(self.B.size)
+
+    def by_kinks(self, size: Above) -> Above:
+        """Upper bound of what kinks add to sums of the common errors with magnitudes of this size, over ||d||."""
+        if self.units.first is None:
+            return ZERO
+        return (size * self.units.tilts[(slice(None), *[None] * (np.ndim(self.B.value) - 1))]).sum()
 
     @cached_property
     def v0(self) -> Near:
@@ -149,8 +190,8 @@ class Jet:
 
     @property
     def slack(self) -> Above:
-        """Upper bound of the gradient's distance from a + sum_j y_j a_j."""
-        return self.a.error + self.a_y.error.sum()
+        """Upper bound of the gradient's distance from a + sum_j y_j a_j, and of what the stored B has of kinks."""
+        return self.a.error + self.a_y.error.sum() + self.by_kinks(self.B.error)
 
     @cached_property
     def remainder(self) -> Array:

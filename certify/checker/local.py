@@ -8,18 +8,23 @@ from dataclasses import replace
 from fractions import Fraction
 from functools import cached_property
 from math import prod
+from typing import TYPE_CHECKING
 
 import numpy as np
 from flint import fmpq, fmpq_mat
 
 from . import ball
 from .ball import Ball
+from .boxes import LEAF
 from .case import AT_CORNERS, Case, Failures
 from .decrease import Level, Models, are_finite, are_usable, rational, sides, size_beyond
 from .document import Intervals
 from .exact import contains_ball, exactly, fraction, is_definite, root_above
 from .jets import Jet, uncertain
 from .near import Array, Near, norm
+
+if TYPE_CHECKING:
+    from .kinks import Cone
 
 _MOST_CORNERS = 2**16  # of all cells
 _MOST_WORK = 2**26  # corners times n^4, which is what an inequality takes
@@ -31,9 +36,29 @@ Enclosed = tuple[Way, list[Jet]]  # and f on the way
 class Local(Ball):
     """The ball of the section `local`."""
 
-    def __init__(self, case: Case) -> None:
-        super().__init__(case, case.local.J, "local ball")
+    def __init__(self, case: Case, cone: Cone | None = None) -> None:
+        super().__init__(case, case.local.J, "local ball", cone=cone)
         object.__setattr__(self, "margins", list[float]())
+
+    @classmethod
+    def whole(cls, case: Case) -> Local:
+        """The one of all d."""
+        if case.local.directions is None:
+            return cls(case)
+        from .kinks import ALL
+
+        return cls(case, ALL)
+
+    @property
+    def parts(self) -> Iterator[Local]:
+        """It, or it on each cone of d."""
+        if not self.case.local.directions:
+            yield self
+            return
+        from .kinks import cones
+
+        for cone in cones(self.case.local.directions, len(self.J)):
+            yield Local(self.case, cone)
 
     margins: list[float]  # 1 - the largest share of the decay that the rest takes at a corner, in floats for people
 
@@ -121,8 +146,13 @@ class Local(Ball):
             if models is None or not np.isfinite(most):
                 yield None
                 return
+            if self.cone is not None:
+                from .kinks import Kinks
+
+                models.kinks = Kinks.of(self.cone, models, c.P)
             for corner in models.corners(c.P):
-                yield sides(corner, P, R, by.multipliers, None, h, rational(most), level)
+                decay, rest = sides(corner, P, R, by.multipliers, None, h, rational(most), level)
+                yield (decay if self.cone is None else self.cone.within(decay, rest)), rest
 
 
 def _margin(decay: fmpq_mat, rest: fmpq_mat) -> float:
@@ -133,12 +163,20 @@ def _margin(decay: fmpq_mat, rest: fmpq_mat) -> float:
         return float("nan")
 
 
-def is_large_enough(ball: Ball, place: str, name: str, level: float, most: int = 64) -> Failures:
-    """The ball contains {V <= level}, whose name and place are these, and deciding an inequality at each corner of each
-    cell, of `most` of the numbers y, does not take too long."""
+def is_large_enough(
+    ball: Ball, place: str, name: str, level: float, directions: tuple[bytes, ...] | None, most: int = 64
+) -> Failures:
+    """The trees are trees; the ball contains {V <= level}, whose name and place are these; deciding an inequality at
+    each corner of each cell on each cone, of `most` of the numbers y, does not take too long."""
+    if directions:
+        from .kinks import are_whole
+
+        where = "local" if most < 64 else "contraction"
+        yield from are_whole(directions, len(ball.J), f"evidence.{where}.directions")
     if not contains_ball(exactly(ball.J), exactly(ball.case.c.P), Fraction(level)):
         yield place, f"the ball must contain {{V <= {name}}}"
     corners = prod(ball.case.partition.cells) * 2 ** min(ball.count, most)
+    corners *= max(1, sum(tree.count(LEAF) for tree in directions or ()))
     if corners > _MOST_CORNERS or corners * len(ball.J) ** 4 > _MOST_WORK:
         yield "evidence.cells", "there are too many cells for this rule"
     return 0
@@ -147,7 +185,7 @@ def is_large_enough(ball: Ball, place: str, name: str, level: float, most: int =
 def fits(local: Local) -> Failures:
     """`local`: the ball contains {V <= c1}, and its jets take neither too much memory nor too much time."""
     c = local.case.c
-    yield from is_large_enough(local, "levels.local", "c1", c.c1, AT_CORNERS)
+    yield from is_large_enough(local, "levels.local", "c1", c.c1, local.case.local.directions, AT_CORNERS)
     if not are_usable(local.case.local.multipliers):
         yield "evidence.local", "no multiplier may be negative, none of g 0 where some beta is"
     if c.step > 0 and Fraction(local.case.local.edge) * c.step > 1:
@@ -190,7 +228,7 @@ def keeps_constraints(local: Local) -> Failures:
 def decreases(local: Local) -> Failures:
     """`local`: D + 2 lambda V < 0 on the ball without its centre, or as far as V >= c0."""
     count = 0
-    for both in local.sides():
+    for both in (both for part in local.parts for both in part.sides()):
         if both is None:
             yield "levels.local", "F has no finite model on the local ball"
             return count

@@ -528,6 +528,14 @@ def lower(x: Near) -> Any:
     return np.where((least > 0) & (least < np.inf), least, np.nan)
 
 
+def least_share(x: Any, of: Above) -> Any:
+    """Lower bounds of min(1, x/y) for exact x > 0 and all 0 <= y <= `of`: 1 only where y is certainly below x, 0 where
+    x is not positive or nothing is known of y. A quotient above 2^-1000 has one rounding, 1 - 2^-50 another one."""
+    most = of.top
+    found = np.where((x > 0) & (x < np.inf) & (most >= x), x, 0.0) / np.where(most > 0, most, 1.0) * (1 - 2.0**-50)
+    return np.where((x > 0) & (most < x), 1.0, np.where(found > 2.0**-1000, found, 0.0))
+
+
 # ----------------------------------------------------------------------------------------------------------- functions
 
 

@@ -217,7 +217,7 @@ def _examine(tally: Tally, case: Case) -> None:
     """The rules about evidence."""
     c = case.c
     if case.covered:
-        origin = local.Local(case)
+        origin = local.Local.whole(case)
         tally.hold(ON_THE_BALL, origin)
         if np.isfinite(origin.margin):  # binary64 may not hold the sides of an inequality that rationals decide
             tally.local_margin = origin.margin
@@ -234,7 +234,7 @@ def _examine(tally: Tally, case: Case) -> None:
     if case.partition.contraction is not None:
         from . import contraction
 
-        tally.hold(contraction.OF_CONTRACTION, contraction.Contracted(case, case.partition.contraction))
+        tally.hold(contraction.OF_CONTRACTION, contraction.Contracted.whole(case, case.partition.contraction))
 
 
 def _examine_outer(tally: Tally, case: Case) -> None:

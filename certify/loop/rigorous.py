@@ -17,7 +17,18 @@ from numpy.typing import NDArray
 
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Algebra, Expression, Symbol, differentiate, evaluate, solution_series
-from certify.loop.networks import Affine, Clip, Concat, Map, Network, Observe, Product, Sum, repeated
+from certify.loop.networks import (
+    Affine,
+    Clip,
+    Concat,
+    Map,
+    Network,
+    Observe,
+    Product,
+    Sum,
+    has_kink_at,
+    repeated,
+)
 from certify.loop.networks import Algebra as Networks
 from certify.loop.policies import PolicyNetwork
 
@@ -193,8 +204,11 @@ def eigenvalues(loop: ClosedLoop) -> list[flint.acb] | None:
     """Rigorous enclosures of the eigenvalues of the closed loop's Jacobian at 0.
 
     Where the input is held, those of the linear maps over the shortest (if it is not 0) and the longest period.
-    None if Arb cannot isolate them, or the clip is not certain to be inactive at the origin.
+    None if Arb cannot isolate them, there is no Jacobian because of a kink, or the clip is not certain to be inactive
+    at the origin.
     """
+    if has_kink_at(loop.network.network, loop.network.origin):
+        return None
     with precision():
         if not _unclipped(loop):
             return None

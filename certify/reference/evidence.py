@@ -268,8 +268,15 @@ def read_order(value: Any, at: str, sampled: bool) -> int:
     return int(value)
 
 
+def require_no_kinks(value: Any, at: str) -> None:
+    """Refuse what this program does not know yet, by the rule that says that a file asks for too much."""
+    known = not (isinstance(value, dict) and "directions" in value)
+    require(known, "limits", "operations", f"{at}.directions: this program does not decide kinks on a ball")
+
+
 def read_local(value: Any, n: int, claim: str, sampled: bool) -> Ball:
     at = "evidence.local"
+    require_no_kinks(value, at)
     local = keys(value, at, "J", "multipliers", "weight", "edge", "order")
     edge, order = binary64(local["edge"], f"{at}.edge"), read_order(local["order"], f"{at}.order", sampled)
     good = edge >= 0 and (edge == 0 or claim in WITH_FLOOR)
@@ -282,6 +289,7 @@ def read_contraction(value: Any, n: int, claim: str) -> Contraction | None:
     if claim != "nearby":
         require(value is None, "format", at, f"null was expected with claim '{claim}'")
         return None
+    require_no_kinks(value, at)
     contraction = keys(value, at, "J", "weights", "weight")
     J, weight = (square(contraction[key], f"{at}.{key}", n) for key in ("J", "weight"))
     return Contraction(J, numbers(contraction["weights"], f"{at}.weights", n), weight)

@@ -208,14 +208,42 @@ def test_a_ball_that_meets_corners_has_tangents_and_a_level_beyond_them(name: st
     assert level is not None and level > (0.9 if name == "softsign" else 1.0) * corner**2
 
 
-def test_a_corner_at_the_operating_point_proves_nothing() -> None:
-    law = policy("relu")
-    first = law.biases[0] * (np.arange(8) > 0)
-    biases = (first, *law.biases[1:])
-    case = case_of(PLANT, law.with_layers(biases=biases))
+def free_of_biases(law: PolicyNetwork, units: int) -> PolicyNetwork:
+    """So many units of the first layer at their corners at the origin."""
+    first = law.biases[0] * (np.arange(len(law.biases[0])) >= units)
+    return law.with_layers(biases=(first, *law.biases[1:]))
+
+
+def test_a_corner_at_the_operating_point_proves_nothing_but_of_relu() -> None:
+    case = case_of(PLANT, free_of_biases(policy("elu"), 1))
     assert prove_local(case.problem, case.T, domain_limit(case.P, PLANT.domain)) is None
     result = certify_roa(PLANT, case.loop.network)
-    assert result.verdict is Verdict.UNKNOWN and "a unit of relu has its corner at the operating point" in result.reason
+    assert result.verdict is Verdict.UNKNOWN and "a unit of elu has its corner at the operating point" in result.reason
+
+
+def test_a_relu_with_its_corner_at_the_operating_point_has_directions(tmp_path: Any) -> None:
+    """A kink at the origin, and an unstable loop on one side of it."""
+    result = certify_roa(PLANT, free_of_biases(policy("relu"), 1), out=tmp_path)
+    assert result.verdict is Verdict.PROVED and result.volume is not None and result.volume > 10
+    local = json.loads((tmp_path / "certificate.json").read_text("utf-8"))["evidence"]["local"]
+    assert len(local["directions"]) == 4
+    assert decreases(result, result.levels.roa or 0.0)
+    read = read_certificate(tmp_path / "certificate.json")
+    assert read.to_json().encode() == result.raw
+
+
+@pytest.mark.parametrize("share", [1.0, 0.2])
+def test_a_relu_network_without_biases_is_proved_where_it_stabilises(share: float, tmp_path: Any) -> None:
+    """u = -Kx by two relus; with a fifth of one of them the pendulum falls over to that side."""
+    K = np.array([[2.8, 0.95]])
+    law = PolicyNetwork.of_layers(
+        (np.vstack([-K, K]), np.array([[1.0, -share]])), (np.zeros(2), np.zeros(1)), np.ones(1), np.zeros(1),
+        "identity", "none", activation="relu", clip=(np.array([-6.0]), np.array([6.0])),
+    )  # fmt: skip
+    result = certify_roa(PLANT, law, out=tmp_path)
+    assert (result.verdict is Verdict.PROVED) is (share == 1.0)
+    if share == 1.0:
+        assert result.volume is not None and result.volume > 100 and decreases(result, result.levels.roa or 0.0)
 
 
 # --------------------------------------------------------------------------------------------------------------- proofs

@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
-from certify.loop.networks.floats import Gradients, Tangent, Tangents, Values, evaluated, tangent_at, values
+from certify.loop.networks.floats import (
+    Gradients,
+    Tangent,
+    Tangents,
+    Values,
+    evaluated,
+    has_kink_at,
+    mean_tangent,
+    tangent_at,
+    values,
+)
 from certify.loop.networks.layers import clipped, frozen, frozen_layers, like, sha256_of, tanh, through, widths
 from certify.loop.networks.steps import (
     Affine,
@@ -38,8 +48,10 @@ __all__ = [
     "evaluated",
     "frozen",
     "frozen_layers",
+    "has_kink_at",
     "layered",
     "like",
+    "mean_tangent",
     "repeated",
     "sha256_of",
     "tangent_at",

@@ -12,6 +12,9 @@ from certify.loop.expressions import Expression, Symbol, numerical
 from certify.loop.networks.layers import clipped, like
 from certify.loop.networks.steps import Affine, Algebra, Array, Clip, Concat, Map, Network, Observe, Product, Sum
 
+_AT_KINK = 1e-12  # what a relu reads that counts as 0
+_NEAR, _DIRECTIONS = 1e-6, 512  # of states around one with a kink
+
 
 class Values(Algebra[Any]):
     """Arrays or tensors, entries along the last axis."""
@@ -116,6 +119,40 @@ class Tangents(Algebra[Tangent]):
 def tangent_at(network: Network, x: Array) -> Tangent:
     """The network's value (gives,) and Jacobian (gives, reads) at a state (reads,)."""
     return Tangents().run(network, Tangent(x, np.eye(network.reads)))
+
+
+class _AtKinks(Tangents):
+    """Tangents that notice an entry that is at a kink."""
+
+    def __init__(self) -> None:
+        self.found = False
+
+    def map(self, step: Map, v: Tangent) -> Tangent:
+        if step.function == "relu":
+            self.found |= bool(np.any(np.abs(v.y) <= _AT_KINK))
+        return super().map(step, v)
+
+    def clip(self, step: Clip, v: Tangent) -> Tangent:
+        self.found |= bool(np.any(np.minimum(np.abs(v.y - step.lo), np.abs(v.y - step.hi)) <= _AT_KINK))
+        return super().clip(step, v)
+
+
+def has_kink_at(network: Network, x: Array) -> bool:
+    """True if a relu or a clip has its kink at a state (reads,), so that the network has no derivative there."""
+    along = _AtKinks()
+    along.run(network, Tangent(x, np.eye(network.reads)))
+    return along.found
+
+
+def mean_tangent(network: Network, x: Array) -> Tangent:
+    """The network's value at a state (reads,), and the Jacobian (gives, reads) that is nearest to its changes in all
+    directions, by least squares: where it has a kink."""
+    d = np.random.default_rng(0).normal(size=(_DIRECTIONS, network.reads))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    d = _NEAR * np.concatenate([d, -d])
+    at = tangent_at(network, x).y
+    J = np.linalg.lstsq(d, values(network, x + d) - at, rcond=None)[0].T
+    return Tangent(at, J)
 
 
 class Gradients(Values):

@@ -30,7 +30,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.loop.networks import Affine, Clip, Map, Network, clipped, frozen, like, sha256_of, tangent_at, tanh, values
+from certify.loop.networks import (
+    Affine,
+    Clip,
+    Map,
+    Network,
+    clipped,
+    frozen,
+    has_kink_at,
+    like,
+    mean_tangent,
+    sha256_of,
+    tangent_at,
+    tanh,
+    values,
+)
 from certify.loop.policies.arithmetic import Arithmetic
 from certify.loop.policies.programmed import WHOSE, Programmed, chain
 
@@ -220,13 +234,14 @@ class PolicyNetwork(Programmed):
         return replace(self, network=network, offset=np.array(offset), centre="none")
 
     def jacobian_at_origin(self, u_eq: Sequence[Fraction]) -> Array:
-        """`d pi / d x` at 0 in float64, shape (m, n).
+        """`d pi / d x` at 0 in float64, shape (m, n); at a kink the matrix that is nearest to pi in all directions.
 
         Raises
         ------
         InputError : the clip may act at the origin.
         """
-        at = tangent_at(self.network, self.origin)
+        kinked = has_kink_at(self.network, self.origin)
+        at = mean_tangent(self.network, self.origin) if kinked else tangent_at(self.network, self.origin)
         squashed = self.squashed(self.beta(u_eq) if self.centre == "preactivation" else at.y)
         self.require_unclipped(u_eq if self.centre != "none" else (self.scale * squashed + self.offset).tolist())
         return np.asarray(self.scale[:, None] * ((self.squash_slope(squashed) * np.ones(self.m))[:, None] * at.J))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.loop.networks import tangent_at
+from certify.loop.networks import has_kink_at, mean_tangent, tangent_at
 from certify.loop.policies.network import PolicyNetwork
 
 Array = NDArray[np.float64]
@@ -73,7 +73,8 @@ def nonlinearity(network: PolicyNetwork, u_eq: Sequence[Fraction], states: Array
 def _line(policy: PolicyNetwork, states: Array, fitted: bool) -> tuple[Array, Array]:
     """The linear part of net at states (N, n) and at 0: (N, m) and (m,)."""
     if not fitted:
-        at = tangent_at(policy.network, np.zeros(policy.n))
+        at_0 = np.zeros(policy.n)
+        at = (mean_tangent if has_kink_at(policy.network, at_0) else tangent_at)(policy.network, at_0)
         return at.y + states @ at.J.T, np.asarray(at.y)
     affine = np.column_stack([states, np.ones(len(states))])
     found = np.linalg.lstsq(affine, policy.net(states), rcond=None)[0]

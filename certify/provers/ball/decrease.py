@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.provers.ball.kinks import bound_of
 from certify.provers.ball.models import Models
 
 Array = NDArray[np.float64]
@@ -91,6 +92,7 @@ def _corner(
     if models.spread is not None:
         error, slack = error + models.spread.error, models.spread.slack
     far, wide = _lengths(models.others, P) if h else (0.0, 0.0)
+    wide += _length_of_kinks(models, P) if h else 0.0
     if np.any(error) or np.any(slack) or far or wide:
         roots = np.sqrt(np.diag(P))
         e, s, p = float(roots @ error) + far, float(roots @ slack) + wide, h * np.abs(moved)
@@ -98,7 +100,34 @@ def _corner(
         both = float(lengths @ error + p @ slack) + h * e * s
         charge += 2 * float(lengths @ slack) + h * s * s + 2 * h * gamma * (e + s) + both / _SHARE
         start += 2 * float(p @ error) + h * e * e + _SHARE * both
-    return Corner(models, b, decay - charge * np.eye(len(decay)), b.T @ f, start, h * moved)
+    found = Corner(models, b, decay - charge * np.eye(len(decay)), b.T @ f, start, h * moved)
+    return found if models.kinks is None or not models.cone.narrow else _on_cone(found)
+
+
+def _on_cone(corner: Corner) -> Corner:
+    """The inequality as it is asked on a cone: less what kinks take, and less what is not negative there."""
+    cone = corner.models.cone
+    S = _of_kinks(corner, cone.weight)
+    decay = cone.left(corner.decay - S[1:, 1:])
+    return replace(corner, decay=decay, linear=corner.linear + S[1:, 0], start=corner.start + float(S[0, 0]))
+
+
+def _of_kinks(corner: Corner, weight: Array) -> Array:
+    """The bound of what kinks add, over (1, d): (1 + k, 1 + k)."""
+    k = len(weight)
+    W = np.zeros((1 + k, 1 + k))
+    if corner.models.kinks is None:
+        return W
+    W[1:, 1:], W[0, 0] = weight, _OF_ONE * np.trace(weight)
+    return bound_of(corner.models.kinks, corner.models.shares.T @ np.column_stack([corner.of_1, corner.b]), W)
+
+
+def _length_of_kinks(models: Models, P: Array) -> float:
+    """||G||_P has at most this times ||d|| of kinks."""
+    if models.kinks is None:
+        return 0.0
+    each = np.sqrt(np.maximum(np.sum(models.shares * (P @ models.shares), axis=0), 0.0))
+    return float(each @ models.kinks.rho)
 
 
 def _lengths(others: tuple[Array, Array] | None, P: Array) -> tuple[float, float]:
@@ -196,14 +225,15 @@ def rests_of(corners: Sequence[Corner], multipliers: Multipliers) -> list[Array]
 def of_others(corner: Corner, weight: Array) -> Array:
     """The bound of what the models' others add, over (1, d): (1 + k, 1 + k)."""
     k = len(weight)
+    found = np.zeros((1 + k, 1 + k)) if corner.models.cone.narrow else _of_kinks(corner, weight)
     if corner.models.others is None:
-        return np.zeros((1 + k, 1 + k))
+        return found
     moves, turns = corner.models.others
     W = np.zeros((1 + k, 1 + k))
     W[1:, 1:], W[0, 0] = weight, _OF_ONE * np.trace(weight)
     p = np.concatenate([np.column_stack([corner.of_1, corner.b])] * len(moves))
     steps = np.concatenate([moves[..., None], turns], axis=2).reshape(len(p), 1 + k)
-    return _by_weight(p, steps[:, :, None] * steps[:, None], W)
+    return found + _by_weight(p, steps[:, :, None] * steps[:, None], W)
 
 
 def rest_of(models: Models, b: Array, multipliers: Multipliers) -> Array:

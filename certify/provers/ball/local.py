@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from certify.certificates import LocalBall
 from certify.certificates.claims import Problem
 from certify.effort import UNLIMITED, Effort
-from certify.lyapunov import extents
+from certify.lyapunov import domain_limit, extents
 from certify.provers.ball.cells import cut, cuts_for
 from certify.provers.ball.decrease import (
     NOT_SHOWN,
@@ -28,7 +28,8 @@ from certify.provers.ball.decrease import (
     of_others,
     rests_of,
 )
-from certify.provers.ball.models import AT_CORNERS, Models, Paths, paths
+from certify.provers.ball.kinks import ALL, Cone, Directions, has_kinks
+from certify.provers.ball.models import AT_CORNERS, Models, Paths, corner_of, paths
 from certify.provers.ball.steps import Cell, Steps, steps_of
 
 Array = NDArray[np.float64]
@@ -46,6 +47,12 @@ _AMPLE = 0.3  # a margin that is good enough for the multipliers of a floor
 _ROUNDS = 3  # rounds of multipliers and edge, each best for the other
 _WORTH = 0.01  # share of a floor: less is no gain
 _ROUNDING = 1e-12  # share of the decay: the checker's numbers are in doubt by it at d = 0 as well
+_MOST_CONES = 4096  # of directions
+_LEFT = 0.05  # the least eigenvalue that a cone's decay has to have, scaled to a diagonal of 1
+_FAR_BELOW = 1e-3  # share of its limit below which a level is tried to be raised by kinks
+_WORTH_KINKS, _DOWN = 4.0, 0.1  # from a level without kinks to the first with them, and on; down to one that is good
+_TINY, _LOWEST = 1e-10, 1e-6  # shares of the largest level: where directions are chosen, and the lowest that is tried
+_SHARED = 0.1  # share of a rule's operations that one of many cones takes
 _ABOVE = 1 + 1e-3  # factor of the least floor that is shown
 
 
@@ -80,13 +87,38 @@ def prove_local(
         return rule.shown(level, _ENOUGH).margin > _MARGIN
 
     if between is None:
-        return _largest(good, limit, effort)
+        found = _largest(good, limit, effort)
+        return _beyond_kinks(rule, found, limit, effort) if found is None or found < _FAR_BELOW * limit else found
     low, high = between[0], min(between[1], limit)
     if not (low < high and good(low)):
         return None
     while high < limit and not effort.over and good(high):
         low, high = high, min(high * high / low, limit)
     return _closer(good, low, high, effort)
+
+
+def _beyond_kinks(rule: Rule, found: float | None, limit: float, effort: Effort) -> float | None:
+    """A large level up to `limit` that the rule proves with kinks, or the one that was found without."""
+    if not has_kinks(rule.steps.known.network):
+        return found
+
+    def good(level: float, kinked: Rule | None) -> bool:
+        if kinked is None or kinked.directions is None or effort.over:
+            return False
+        effort.charge(_SHARED * len(kinked.directions.cones) * rule.operations)
+        return kinked.shown(level, _ENOUGH).margin > _MARGIN
+
+    if found is not None:
+        low, high = found, min(_WORTH_KINKS * found, limit)
+        while low < limit and good(high, rule.with_kinks(high)):
+            low, high = high, min(high * _WORTH_KINKS, limit)
+        return low
+    kinked, level = rule.with_kinks(limit), limit
+    while not good(level, kinked):
+        level *= _DOWN
+        if kinked is None or level < _LOWEST * limit or effort.over:
+            return None
+    return level
 
 
 def prove_band(
@@ -145,12 +177,16 @@ def local_ball(
     uncertain quantity is cut for it; with a floor, for both that `prove_band` has found, or a higher floor."""
     if floor is None:
         rule = Rule.at_rest(problem, T)
-        by, edge = rule.shown(level).multipliers, 0.0
+        shown = rule.shown(level)
+        if not shown.margin > _MARGIN and (kinked := rule.with_kinks(level)) is not None:
+            rule, shown = kinked, kinked.shown(level)
+        by, edge = shown.multipliers, 0.0
     else:
         rule = Rule.anywhere(problem, T)
         found = rule.around(level)
         by, edge = found.multipliers, found.edge
-    ball = LocalBall(ball_around(problem, T, level), by.rows, by.weight, edge, rule.steps.order)
+    directions = None if rule.directions is None else rule.directions.trees
+    ball = LocalBall(ball_around(problem, T, level), by.rows, by.weight, edge, rule.steps.order, directions)
     return ball, rule.cuts or (1,) * len(problem.loop.system.ranges)
 
 
@@ -178,7 +214,8 @@ _NOWHERE = _Around(math.inf, 0.0, NOT_SHOWN.multipliers, 0)
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """The rule `local` on balls of one shape; `cuts` is None where it can show nothing on any."""
+    """The rule `local` on balls of one shape; `cuts` is None where it can show nothing on any. With `directions` relus
+    and clips have kinks."""
 
     problem: Problem
     T: Array
@@ -186,6 +223,7 @@ class Rule:
     cuts: tuple[int, ...] | None
     cells: Sequence[Cell]
     R: Array | None
+    directions: Directions | None = None
 
     @classmethod
     def at_rest(cls, problem: Problem, T: Array, known: Paths | None = None) -> Rule:
@@ -265,19 +303,56 @@ class Rule:
         at = int(np.argmin(worst))
         return _Around(float(worst[at]), float(edges[at]), by)
 
-    def models(self, J: Array, level: float) -> list[Models]:
+    def models(self, J: Array, level: float, cone: Cone | None = None) -> list[Models]:
         """The models of a step on a ball that holds {V <= level}, in each cell."""
-        return self.models_on(J[None], level)[0]
+        return self.models_on(J[None], level, cone)[0]
 
-    def models_on(self, balls: Array, level: float) -> list[list[Models]]:
+    def models_on(self, balls: Array, level: float, cone: Cone | None = None) -> list[list[Models]]:
         """The same on each of several balls, (N, n, n); if one has no finite models, none has."""
         reach = np.minimum(np.linalg.norm(balls, axis=2), extents(self.problem.V.P, level) * _WIDER)
-        return self.steps.models_on(balls, self.cells, reach)
+        return self.steps.models_on(balls, self.cells, reach, cone)
 
     def kept_on(self, balls: Array) -> tuple[Array, Array] | None:
         """The constraints' g on several balls, as `Steps.largest` has them."""
         with np.errstate(all="ignore"):
-            return self.steps.largest(balls, self.problem.keep, self.cells)
+            return self.steps.largest(balls, self.problem.keep, self.cells, self.whole)
+
+    @property
+    def whole(self) -> Cone | None:
+        """All of d, if there are kinks."""
+        return None if self.directions is None else ALL
+
+    def with_kinks(self, level: float) -> Rule | None:
+        """The rule with directions that leave some decay on each of their cones, on the ball of a level, or on a small
+        one if there is a kink at the origin; None if a few thousand do not, or the network has no kinks."""
+        known = self.steps.known
+        if not has_kinks(known.network):
+            return None
+        if corner_of(known) is not None:
+            level = _TINY * domain_limit(self.problem.V.P, self.problem.loop.system.domain)
+        found = self.directions_at(level)
+        return None if found is None else replace(self, directions=found)
+
+    def directions_at(self, level: float) -> Directions | None:
+        """Directions that leave some decay on each of their cones."""
+        J = ball_around(self.problem, self.T, level)
+
+        def leaves_decay(cone: Cone) -> bool:
+            if not cone.narrow:
+                return False
+            models = self.models(J, level, cone)
+            if not all(one.finite for one in models):
+                return False
+            decays = [c.decay for one in models for c in self._corners_of(one, J)]
+            if not all(np.all(np.isfinite(D)) and np.all(np.diag(D) > 0) for D in decays):
+                return False
+            scales = [1 / np.sqrt(np.diag(D)) for D in decays]
+            return all(np.linalg.eigvalsh(D * s * s[:, None])[0] > _LEFT for D, s in zip(decays, scales, strict=True))
+
+        with np.errstate(all="ignore"):
+            if not np.all(np.isfinite(J)):
+                return None
+            return Directions(len(J)).refined(leaves_decay, _MOST_CONES)
 
     def keeps(self, J: Array) -> bool:
         """True if every constraint holds on the ball."""
@@ -294,11 +369,15 @@ class Rule:
         J, found = ball_around(self.problem, self.T, level), list[Corner]()
         if not self.keeps(J):
             return None
-        for models in self.models(J, level):
-            if not (models.finite and models.admitted):
-                return None
-            found += corners_of(models, J, self.problem.V.P, self.R, self.steps.longest)
-        return found
+        every = self.models(J, level, self.whole)
+        if not all(models.finite and models.admitted for models in every):
+            return None
+        for cone in [] if self.directions is None else self.directions.cones:
+            found += [corner for models in self.models(J, level, cone) for corner in self._corners_of(models, J)]
+        return found or [corner for models in every for corner in self._corners_of(models, J)]
+
+    def _corners_of(self, models: Models, J: Array) -> list[Corner]:
+        return corners_of(models, J, self.problem.V.P, self.R, self.steps.longest)
 
 
 def _order(problem: Problem) -> int:

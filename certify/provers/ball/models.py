@@ -29,6 +29,7 @@ from certify.loop.networks.floats import evaluated, jacobian
 from certify.loop.plants import kept_constraints
 from certify.loop.policies import bounded_by_form
 from certify.provers.ball.jets import Jet, Jets, basis, beyond_tangent, product_beyond, remainder, sizes
+from certify.provers.ball.kinks import ALL, Cone, Kinks, OnCone
 from certify.provers.ball.ranged import RangedJet
 
 Array = NDArray[np.float64]
@@ -78,6 +79,7 @@ class Models:
     `spread` says what is uncertain of f and A, None that nothing is; `stays` whether the states are certain to stay in
     the domain over a sampling period; `rounding` (n,) is about what a checker does not know of f for its roundings.
     `others` are y beside those of `spread` that have no corners, `moves` and `turns` as there; see `with_others`.
+    `kinks` are those among the units, on the `cone`; None if none is allowed.
     """
 
     f: Array
@@ -93,6 +95,8 @@ class Models:
     spread: Spread | None = None
     stays: bool = True
     others: tuple[Array, Array] | None = None
+    kinks: Kinks | None = None
+    cone: Cone = ALL
 
     def with_others(self, P: Array) -> Models:
         """The same without those y that move neither f nor A, and of more than AT_CORNERS with those of the least
@@ -180,6 +184,8 @@ class Driven:
     curve: Array
     room: Array
     rounding: Array
+    kinks: Kinks | None = None
+    cone: Cone = ALL
 
     def models(
         self, F: Sequence[Jet | RangedJet], number: int, spread: Spread | None = None, stays: bool = True
@@ -191,7 +197,14 @@ class Driven:
         parts = form.matrices(Q), form.forms(K), form.matrices(E)
         f = np.array([v.c for v in F])
         wrong = np.abs(B) @ self.rounding
-        return Models(f, a, *parts, B @ self.shares, self.R, self.squares, inputs, wrong, spread, stays)
+        found = Models(f, a, *parts, B @ self.shares, self.R, self.squares, inputs, wrong, spread, stays)
+        return found if self.kinks is None else replace(found, kinks=self.kinks, cone=self.cone)
+
+    @property
+    def tilts(self) -> Array:
+        """The most that kinks add to each input, over ||d||."""
+        none: Array = np.zeros(len(self.shares))
+        return none if self.kinks is None else np.abs(self.shares) @ self.kinks.rho
 
 
 def of_all(driven: Sequence[Driven]) -> tuple[list[tuple[Array, Array, Array]], Array]:
@@ -199,6 +212,11 @@ def of_all(driven: Sequence[Driven]) -> tuple[list[tuple[Array, Array, Array]], 
     G, Q, K = (np.array([getattr(one, part) for one in driven]) for part in ("G", "Q", "K"))
     models = [(G[:, j], Q[:, j], K[:, j]) for j in range(G.shape[1])]
     return models, np.concatenate([one.errors for one in driven], axis=1)
+
+
+def tilts_of_all(driven: Sequence[Driven]) -> Array:
+    """For each input what kinks add to it on each ball, (m, N)."""
+    return np.array([one.tilts for one in driven]).T
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,14 +270,23 @@ class Paths:
         shared = dict[Any, Jet]()
         return [evaluate(e, values, algebra, shared) for e in expressions]
 
-    def driven(self, J: Array) -> Driven:
-        """The inputs on that ball."""
-        policy, loop = self._policy(J), self.loop
+    def driven(self, J: Array, cone: Cone | None = None) -> Driven:
+        """The inputs on that ball; with kinks for d in a cone."""
+        (policy, kinks), loop = (self._policy(J), None) if cone is None else self._on_cone(J, cone), self.loop
         scale, form = loop.network.scale[:, None], basis(J.shape[1])
         G, Q, K, each = scale * policy.G, scale * policy.Q, scale * policy.K, scale * policy.shares
         errors, R = np.abs(each) @ policy.R, form.matrices(policy.R)
         curve = sizes(G, Q, K, errors).curve
-        return Driven(G, Q, K, errors, each, R, R @ R, curve, _room(loop, self.u), self.rounding)
+        found = Driven(G, Q, K, errors, each, R, R @ R, curve, _room(loop, self.u), self.rounding)
+        if kinks is None or cone is None:
+            return found
+        return replace(found, curve=curve + np.abs(each) @ kinks.rho, kinks=kinks, cone=cone)
+
+    def _on_cone(self, J: Array, cone: Cone) -> tuple[_Policy, Kinks]:
+        ball = OnCone(J, cone)
+        v = ball.run(self.network, ball.argument(self.middle))
+        L, *_ = ball.reached(v)
+        return _Policy(v.G, v.Q, v.K, L, ball.R), ball.kinks
 
     def _policy(self, J: Array) -> _Policy:
         ball = _OnBall(self, J)

@@ -42,7 +42,8 @@ Four = tuple[float, float, float, float]
 @dataclass(frozen=True, slots=True)
 class RangedJet:
     """A value on M balls around the same middle: c, `moves` (N,) and `error` (M,) of v(0); a (M, k), `turns` (N, M, k)
-    and `slack` (M,) of the gradient; the rest as a Jet has it."""
+    and `slack` (M,) of the gradient; the rest as a Jet has it.
+    Kinks among e_j add at most `tilts` ||d||, (m, M)."""
 
     c: float
     moves: Array
@@ -55,6 +56,7 @@ class RangedJet:
     B: Array
     E: Array
     errors: Array
+    tilts: Array
 
     @property
     def away(self) -> Array:
@@ -63,10 +65,11 @@ class RangedJet:
 
     @property
     def tilt(self) -> Array:
-        """The largest turn of the gradient by y, (M,)."""
+        """The largest turn of the gradient by y, and by kinks, (M,)."""
+        by_kinks: Array = (np.abs(self.B) @ self.tilts)[0]
         if not len(self.turns):
-            return np.zeros_like(self.slack)
-        return np.asarray(np.sum(np.linalg.norm(self.turns, axis=2), axis=0))
+            return by_kinks
+        return np.asarray(np.sum(np.linalg.norm(self.turns, axis=2), axis=0) + by_kinks)
 
     @property
     def turned(self) -> Array:
@@ -111,6 +114,7 @@ class RangedJet:
             x.B + y.B,
             x.E + y.E,
             x.errors,
+            x.tilts,
         )
 
     def shifted(self, by: float) -> RangedJet:
@@ -132,6 +136,7 @@ class RangedJet:
             s * self.B,
             m * self.E,
             self.errors,
+            self.tilts,
         )
 
     def __mul__(self, other: RangedJet) -> RangedJet:
@@ -160,6 +165,7 @@ class RangedJet:
             x.c * y.B + y.c * x.B,
             E + (left + moved)[:, rows] * b.eye,
             x.errors,
+            x.tilts,
         )
 
     def compose(self, f: Four, e: Sequence[Array], fourth: Array) -> RangedJet:
@@ -193,6 +199,7 @@ class RangedJet:
             f1 * self.B,
             (abs(f1) + e1)[:, rows] * self.E + R + (moved + bent * self.turned)[:, rows] * basis(self.a.shape[1]).eye,
             self.errors,
+            self.tilts,
         )
 
 
@@ -284,7 +291,7 @@ _FUNCTIONS = {
 class RangedJets(Algebra[RangedJet]):
     """Ranged jets on M balls, in k variables and N uncertain quantities, with the errors that they share."""
 
-    def __init__(self, M: int, k: int, N: int, errors: Array) -> None:
+    def __init__(self, M: int, k: int, N: int, errors: Array, tilts: Array | None = None) -> None:
         b = basis(k)
         self._nothing = RangedJet(
             0.0,
@@ -298,6 +305,7 @@ class RangedJets(Algebra[RangedJet]):
             np.zeros((1, len(errors))),
             np.zeros((M, len(b.eye))),
             errors,
+            np.zeros((len(errors), M)) if tilts is None else tilts,
         )
 
     def constant(self, q: Fraction) -> RangedJet:

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, Symbol, evaluate, solution_series
 from certify.loop.plants.system import Interval
-from certify.provers.ball.models import Driven, Models, Paths, Spread, of_all
+from certify.provers.ball.kinks import Cone
+from certify.provers.ball.models import Driven, Models, Paths, Spread, of_all, tilts_of_all
 from certify.provers.ball.ranged import RangedJet, RangedJets
 
 Array = NDArray[np.float64]
@@ -58,11 +59,14 @@ class Steps:
         """The models of G on the ball x = J d for each cell; no state of interest there exceeds `reach`, (n,)."""
         return self.models_on(J[None], cells, reach[None])[0]
 
-    def models_on(self, balls: Array, cells: Sequence[Cell], reach: Array) -> list[list[Models]]:
-        """The same on each of several balls, (N, n, k), `reach` being (N, n); if one has no finite models, none has."""
-        if self.is_plain:
+    def models_on(
+        self, balls: Array, cells: Sequence[Cell], reach: Array, cone: Cone | None = None
+    ) -> list[list[Models]]:
+        """The same on each of several balls, (N, n, k), `reach` being (N, n); if one has no finite models, none has.
+        With a cone of d relus and clips have kinks."""
+        if self.is_plain and cone is None:
             return [[models] for models in self.known.models_on(balls)]
-        driven, sample = [self.known.driven(J) for J in balls], self.known.loop.system.sample
+        driven, sample = [self.known.driven(J, cone) for J in balls], self.known.loop.system.sample
         walks = [_Walk(self, balls, driven, cell) for cell in cells]
         # the terms after x_1 hold for the whole ranges, and so are the same for every cell
         later = None if sample is None else _later(walks[0], self.order, sample, reach)
@@ -70,12 +74,12 @@ class Steps:
         return [list(of_ball) for of_ball in zip(*in_cells, strict=True)]
 
     def largest(
-        self, balls: Array, constraints: Sequence[Expression], cells: Sequence[Cell]
+        self, balls: Array, constraints: Sequence[Expression], cells: Sequence[Cell], cone: Cone | None = None
     ) -> tuple[Array, Array] | None:
         """For each expression g its value (K,) at the middle, and by how much it is larger anywhere on each of several
         balls (N, n, k), in any cell, (N, K); where inputs are held, at any time of a period, in which quantities may be
         anywhere. None where one has no finite model."""
-        driven, sample = [self.known.driven(J) for J in balls], self.known.loop.system.sample
+        driven, sample = [self.known.driven(J, cone) for J in balls], self.known.loop.system.sample
         walks = [_Walk(self, balls, driven, cell) for cell in cells]
         if sample is None:
             found = [walk.of(constraints) for walk in walks]
@@ -120,7 +124,7 @@ class _Walk:
         sample = self.loop.system.sample
         self.varies = sample is not None and sample[0] < sample[1]
         models, errors = of_all(driven)
-        self.algebra = RangedJets(len(balls), balls.shape[2], len(cell) + self.varies, errors)
+        self.algebra = RangedJets(len(balls), balls.shape[2], len(cell) + self.varies, errors, tilts_of_all(driven))
         u = enumerate(steps.known.u)
         self._inputs = [self.algebra.input(j, float(value), *models[j]) for j, value in u]
 

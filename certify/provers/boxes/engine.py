@@ -235,6 +235,11 @@ class _Outwards:
             why = f"the linearisation does not dominate on any ball; try another --Q{smaller}"
             if (name := corner_of(paths(self.task.problem.loop))) is not None:
                 why = f"a unit of {name} has its corner at the operating point; give it another bias there"
+                if name == "relu":
+                    why = (
+                        "a unit of relu has its corner at the operating point, and V is not shown to fall in all "
+                        "directions there; try another P, or give it another bias there"
+                    )
             return Proof(None, None, Stop.LOCAL, why, seconds=self.seconds)
         if self.ring is None:
             ring = empty_ring(self.task.problem, self.engine.T, self.inner)

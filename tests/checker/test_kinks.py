@@ -1,0 +1,345 @@
+"""Kinks on a ball: honest certificates, loops that diverge at a kink, models against sampled states, forgeries."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from certify.checker import kinks, limits
+from certify.checker.ball import OnBall
+from certify.checker.case import Case
+from certify.checker.jets import Units, constant, unpacked
+from certify.checker.near import Vector
+from certify.checker.networks import Affine, Clip, Map, Network
+from tests.support.certificates import LEAF, Document, edited, encode, parse, verdict
+from tests.support.kinked import even, kinked, mirrored, pi
+
+ONE = [["+", ["/", "x0", "2"], "u"]]
+TWO, P2 = ["x1", "u"], [[1.5, 0.5], [0.5, 1.0]]
+
+
+def relu(gain: float, into: float = 1.0) -> Any:
+    """u = gain relu(into x)."""
+    return [(np.array([[into]]), np.zeros(1)), (np.array([[gain]]), np.zeros(1))]
+
+
+HONEST: dict[str, Callable[[], Document]] = {
+    "two halves of a line": lambda: kinked(ONE, mirrored([[-2.0]]), 1.0, 1.0, even(1, 0)),
+    "a slope in a sector, without cones": lambda: kinked([["-", "u", "x0"]], relu(0.9), 1.0, 1.0, []),
+    "the same on half lines": lambda: kinked([["-", "u", "x0"]], relu(0.9), 1.0, 1.0, even(1, 0)),
+    "a plane": lambda: kinked(TWO, mirrored([[-1.0, -1.5]]), P2, 1.0, even(2, 3)),
+    "discrete": lambda: kinked(["u"], mirrored([[0.5]]), 1.0, 1.0, even(1, 0), time="discrete"),
+    "discrete, in a sector": lambda: kinked(["u"], relu(-0.9), 1.0, 1.0, [], time="discrete"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HONEST)
+def test_honest_certificates_are_accepted(name: str) -> None:
+    assert verdict(HONEST[name]()) == "ACCEPTED"
+
+
+@pytest.mark.parametrize("name", HONEST)
+def test_without_directions_a_kink_at_the_origin_has_no_model(name: str) -> None:
+    data = HONEST[name]()
+    del data["evidence"]["local"]["directions"]
+    assert verdict(data) in ("local", "inputs")  # inputs come first
+
+
+DIVERGING: dict[str, Callable[[], Document]] = {
+    "to the left": lambda: kinked(ONE, relu(-2.0), 1.0, 1.0, even(1, 0)),
+    "to the right": lambda: kinked(ONE, relu(2.0, -1.0), 1.0, 1.0, even(1, 0)),
+    "just": lambda: kinked([["-", "u", "x0"]], relu(1.0 + 2.0**-40), 1.0, 1.0, even(1, 0)),
+    "not at all, but it stands still": lambda: kinked([["-", "u", "x0"]], relu(1.0), 1.0, 1.0, even(1, 0)),
+    "just, in a sector": lambda: kinked([["-", "u", "x0"]], relu(1.0 + 2.0**-40), 1.0, 1.0, []),
+    "on one side of a plane": lambda: kinked(TWO, relu_of([-1.0, -1.5]), P2, 1.0, even(2, 4)),
+    "discrete": lambda: kinked(["u"], relu(-1.0 - 2.0**-40), 1.0, 1.0, even(1, 0), time="discrete"),
+    "discrete, in a sector": lambda: kinked(["u"], relu(-1.0 - 2.0**-40), 1.0, 1.0, [], time="discrete"),
+    "a kink at a distance": lambda: kinked(ONE, shifted(-2.0, 0.5), 1.0, 4.1, []),
+}  # fmt: skip
+
+
+def relu_of(K: Any) -> Any:
+    return [(np.array([K]), np.zeros(1)), (np.array([[1.0]]), np.zeros(1))]
+
+
+def shifted(gain: float, at: float) -> Any:
+    """u = gain (relu(x + at) - at): of x' = x/2 + u V falls for x > 2 gain at alone."""
+    return [(np.array([[1.0]]), np.array([at])), (np.array([[gain]]), np.array([-gain * at]))]
+
+
+@pytest.mark.parametrize("name", DIVERGING)
+def test_a_loop_that_diverges_on_one_side_is_refused(name: str) -> None:
+    assert verdict(DIVERGING[name]()) == "local"
+
+
+@pytest.mark.parametrize(("level", "found"), [(0.24, "ACCEPTED"), (3.99, "ACCEPTED"), (4.01, "local"), (9.0, "local")])
+def test_a_kink_at_a_distance_ends_the_set_where_the_chord_does(level: float, found: str) -> None:
+    """x' = x/2 - 2 (relu(x + 1/2) - 1/2) falls for x > -2."""
+    assert verdict(kinked(ONE, shifted(-2.0, 0.5), 1.0, level, even(1, 0))) == found
+
+
+# ------------------------------------------------------------------------------------------------------------- sampling
+
+
+def random_network(rng: np.random.Generator, n: int) -> tuple[Network, Callable[..., np.ndarray], Any]:
+    """A network of two hidden layers of relu, clip or tanh, some without biases, and the same in numpy."""
+    sizes, steps, parts, last = [n, 5, 4, 2], list[Any](), list[Any](), 0
+    free = rng.random() < 0.5
+    for i, (a, b) in enumerate(pairwise(sizes)):
+        W, bias = rng.normal(size=(b, a)), rng.normal(size=b) * (0.0 if free else 0.3)
+        steps.append(Affine((last,), b, W, bias))
+        last += 1
+        parts.append(lambda x, W=W, bias=bias: x @ W.T + bias)
+        if i == 2:
+            break
+        kind = rng.choice(["relu", "clip", "tanh"], p=[0.6, 0.25, 0.15])
+        if kind == "clip":
+            lo, hi = -rng.uniform(0, 0.5, b), rng.uniform(0.01, 0.5, b)
+            steps.append(Clip((last,), b, lo, hi))
+            parts.append(lambda x, lo=lo, hi=hi: np.clip(x, lo, hi))
+        else:
+            steps.append(Map((last,), b, str(kind)))
+            parts.append((lambda x: np.maximum(x, 0)) if kind == "relu" else np.tanh)
+        last += 1
+
+    def f(x: np.ndarray, count: int | None = None) -> np.ndarray:
+        """The value, or a vector before it."""
+        for part in parts[:count]:
+            x = part(x)
+        return x
+
+    return Network("net", n, tuple(steps)), f, sizes
+
+
+def directions_in(cone: kinks.Cone, rng: np.random.Generator, n: int, count: int) -> np.ndarray:
+    """Points of the ball in a cone, many of them near its edge."""
+    d = rng.normal(size=(count, n))
+    if cone.narrow:
+        square, wide = (float(v) for v in cone.squares)
+        c, sine = cone.c / np.sqrt(square), np.sqrt(wide / square)
+        side = d - np.outer(d @ c, c)
+        length = np.linalg.norm(side, axis=1, keepdims=True)
+        side = np.divide(side, length, out=np.zeros_like(side), where=length > 0)
+        angle = np.arcsin(sine) * np.minimum(1.2 * rng.random((count, 1)), 1.0) * (1 - 1e-12)
+        d = np.cos(angle) * c + np.sin(angle) * side
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    return np.asarray(d * np.minimum(1.3 * rng.random((count, 1)), 1.0))
+
+
+def cones_of(rng: np.random.Generator, n: int, close: bool) -> list[kinks.Cone]:
+    if rng.random() < 0.2:
+        return list(kinks.cones((), n, close))
+    trees = [base64.b64decode(tree) for tree in even(n, int(rng.integers(0, 4 if n < 3 else 3)))]
+    every = list(kinks.cones(trees, n, close))
+    return [every[i] for i in rng.choice(len(every), min(len(every), 4), replace=False)]
+
+
+@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("close", [False, True])
+def test_models_hold_what_a_network_does_on_a_cone(seed: int, close: bool) -> None:
+    """Of the value less what is known, at each d; with `close` of its difference at any two d as well."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 4))
+    network, f, _ = random_network(rng, n)
+    J = rng.normal(size=(n, n)) * 10.0 ** rng.uniform(-3, 0.5)
+    nothing = constant(0, Units(np.zeros((n, n, 0))), 0)
+    x = [replace(nothing, a=Vector(row)) for row in J]
+    with np.errstate(all="ignore"):
+        for cone in cones_of(rng, n, close):
+            y = OnBall(n, cone).value(network, x)
+            d = directions_in(cone, rng, n, 400)
+            left = beyond(f, y, J, d)
+            size = np.linalg.norm(d, axis=1)
+            whole = y.E.majorant + y.shares.majorant
+            quadratic = np.einsum("ti,ijm,tj->tm", d, whole, d)
+            doubt = y.slack.top + y.by_kinks(y.B.size).top
+            assert np.all(left <= quadratic + size[:, None] * doubt + 1e-12)
+            if close:
+                e = directions_in(cone, rng, n, 400)
+                gap = np.abs(beyond(f, y, J, d, True) - beyond(f, y, J, e, True))
+                lip = y.lipschitz.top + doubt
+                assert np.all(gap <= np.linalg.norm(d - e, axis=1)[:, None] * lip + 1e-12)
+
+
+@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("close", [False, True])
+def test_a_kink_is_within_its_sector(seed: int, close: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """|e| <= |alpha.d| + beta ||d|| and <= rho ||d||, and with `close` so for differences."""
+    rng, seen, found = np.random.default_rng(seed), list[Any](), kinks.Cone.bent
+    monkeypatch.setattr(kinks.Cone, "bent", lambda *args: seen.append(found(*args)) or seen[-1])
+    n = int(rng.integers(1, 4))
+    network, f, _ = random_network(rng, n)
+    J = rng.normal(size=(n, n)) * 10.0 ** rng.uniform(-3, 0.5)
+    x = [replace(constant(0, Units(np.zeros((n, n, 0))), 0), a=Vector(row)) for row in J]
+    for cone in cones_of(rng, n, close):
+        seen.clear()
+        with np.errstate(all="ignore"):
+            OnBall(n, cone).value(network, x)
+        d, e = directions_in(cone, rng, n, 400), directions_in(cone, rng, n, 400) * float(close)
+        bent = [
+            k
+            for k, step in enumerate(network.steps)
+            if isinstance(step, Clip) or getattr(step, "function", "") == "relu"
+        ]
+        for k, one in zip(bent, seen, strict=True):
+            (v, y), (v0, y0) = ((f(at @ J.T, k), f(at @ J.T, k + 1)) for at in (d, e))
+            left, gap = np.abs(y - y0 - one.slope * (v - v0)), d - e
+            size = np.linalg.norm(gap, axis=1)[:, None]
+            assert np.all(left <= np.abs(gap @ one.first.alpha) + one.first.beta * size + 1e-13)
+            assert np.all(left <= one.first.rho * size + 1e-13)
+
+
+def beyond(f: Callable[..., np.ndarray], y: Any, J: np.ndarray, d: np.ndarray, signed: bool = False) -> Any:
+    """The distance of the value at d from y(0) + a.d + d'Q d + K[d]."""
+    K = unpacked(np.moveaxis(y.K.value, 0, -1), d.shape[1])
+    known = d @ y.a.value + np.einsum("ti,ijm,tj->tm", d, y.Q.value, d) + np.einsum("mhij,th,ti,tj->tm", K, d, d, d)
+    found = f(d @ J.T) - f(np.zeros((1, d.shape[1]))) - known
+    return found if signed else np.abs(found)
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_nothing_is_shown_that_samples_refute(seed: int) -> None:
+    """Random loops near the edge of what holds: where all inequalities hold on all cones, V falls at all samples."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 3))
+    width = int(rng.integers(1, 6))
+    biases = rng.normal(size=width) * rng.choice([0.0, 0.3])
+    W, v = rng.normal(size=(width, n)), rng.normal(size=(1, width)) * 0.5
+    layers = [(W, biases), (v, -np.maximum(biases, 0.0) @ v.T)]
+    A = rng.normal(size=(n, n)) - rng.uniform(0.5, 3) * np.eye(n)
+    terms = [["+", *[["*", str(int(64 * a)) + "/64", f"x{j}"] for j, a in enumerate(row)], "u"] for row in A]
+    A = np.trunc(64 * A) / 64
+    data = kinked(terms, layers, np.eye(n), float(rng.uniform(0.1, 2)), even(n, int(rng.integers(0, 5))))
+    case = Case(parse(data))
+    for tree in range(3):
+        if verdict(data) == "ACCEPTED":
+            break
+        data = edited(data, "evidence.local.directions", even(n, 4 + tree))
+    shown = verdict(data) == "ACCEPTED"
+    x = directions_in(kinks.ALL, rng, n, 4000) * np.sqrt(case.c.c1)
+    rise = np.sum(x * (x @ A.T + pi(layers, x)), axis=1)
+    if shown:
+        assert np.max(rise) < 0
+
+
+def test_enough_of_the_random_loops_are_shown() -> None:
+    """The test above would hold of a rule that shows nothing."""
+    rng, shown = np.random.default_rng(5), 0
+    for _ in range(10):
+        W = rng.normal(size=(4, 2))
+        layers = [(W, np.zeros(4)), (rng.normal(size=(1, 4)) * 0.1, np.zeros(1))]
+        data = kinked([["-", "u", "x0"], ["-", "u", "x1"]], layers, np.eye(2), 1.0, even(2, 3))
+        shown += verdict(data) == "ACCEPTED"
+    assert shown >= 5
+
+
+# ------------------------------------------------------------------------------------------------------------ forgeries
+
+PLANE = HONEST["a plane"]
+Edit = Callable[[list[str]], Any]
+
+
+def bytes_of(tree: str) -> bytes:
+    return base64.b64decode(tree)
+
+
+def text_of(tree: bytes) -> str:
+    return base64.b64encode(tree).decode()
+
+
+def first(change: Callable[[bytes], bytes]) -> Edit:
+    return lambda trees: [text_of(change(bytes_of(trees[0]))), *trees[1:]]
+
+
+FORGED: list[tuple[str, str, Edit]] = [
+    ("format", "a tree less", lambda trees: trees[:-1]),
+    ("format", "a tree more", lambda trees: [*trees, trees[0]]),
+    ("format", "an object", lambda trees: dict.fromkeys("abcd", trees[0])),
+    ("format", "null", lambda trees: None),
+    ("format", "bytes that are none", lambda trees: [*trees[:-1], "!"]),
+    ("format", "numbers", lambda trees: [255] * 4),
+    ("local", "nothing of a tree", first(lambda tree: b"")),
+    ("local", "a byte less", first(lambda tree: tree[:-1])),
+    ("local", "a byte more", first(lambda tree: tree + bytes([LEAF]))),
+    ("local", "an axis that there is not", first(lambda tree: bytes([2]) + tree[1:])),
+    ("local", "the face's own axis", first(lambda tree: bytes([0]) + tree[1:])),
+    ("local", "a whole face for a cone", first(lambda tree: bytes([LEAF]))),
+    ("local", "halves of a face", first(lambda tree: bytes([1, LEAF, LEAF]))),
+    ("local", "one cone", lambda trees: []),
+    ("local", "faces in another order", lambda trees: [trees[2], trees[3], trees[0], trees[1]]),
+    ("local", "a tree that is too deep", first(lambda tree: bytes([1]) * 3000 + bytes([LEAF]) * 3001)),
+]
+
+
+@pytest.mark.parametrize(("rule", "name", "change"), FORGED, ids=[name for _, name, _ in FORGED])
+def test_a_forged_tree_of_directions_is_refused(rule: str, name: str, change: Edit) -> None:
+    assert verdict(edited(PLANE(), "evidence.local.directions", change)) == rule
+
+
+def test_a_bias_that_is_nearly_0_is_not_0() -> None:
+    """For |x| below 2^-61 the input is 0, and x' = x/2."""
+    layers = mirrored([[-2.0]])
+    layers = [(layers[0][0], np.array([-(2.0**-60), -(2.0**-60)])), layers[1]]
+    assert verdict(kinked(ONE, layers, 1.0, 1.0, even(1, 0))) == "local"
+
+
+def test_an_input_that_a_clip_may_cut_is_refused() -> None:
+    data = kinked(ONE, mirrored([[-2.0]]), 1.0, 1.0, even(1, 0), clip=([-1.5], [1.5]))
+    assert verdict(data) == "local"
+
+
+@pytest.mark.parametrize(("bound", "found"), [("9/5", "inputs"), ("11/5", "ACCEPTED")])
+def test_inputs_are_bounded_with_all_that_kinks_may_add(bound: str, found: str) -> None:
+    data = kinked(ONE, mirrored([[-2.0]]), 1.0, 1.0, even(1, 0), input_bounds=[("-" + bound, bound)])
+    assert verdict(data) in (found, "inputs")
+
+
+def nearby(gain: float, directions: Any, time: str = "continuous") -> Document:
+    """x' = u - x + 1/100 or x+ = u + 1/100 with u = gain relu(x), around the level 1/25."""
+    term = ["+", "u", "1/100", *([["-", "x0"]] if time == "continuous" else [])]
+    data = kinked([term], relu(gain), 1.0, 1.0, None, claim="nearby", levels=(0.04, 0.04), time=time)
+    data["evidence"]["contraction"] = {
+        "J": encode(0.2 * (1 + 1e-9)), "weights": encode([2.0**-40]), "weight": encode(2.0**-40),
+        "directions": directions,
+    }  # fmt: skip
+    data["evidence"]["local"] = None
+    return grow_small(data)
+
+
+def grow_small(data: Document) -> Document:
+    """With leaves of a line, where c0 = c1 = c2 is asked of all."""
+    tree = bytes([0, 0, LEAF, LEAF, 0, LEAF, LEAF])
+    for _ in range(5):
+        if verdict(data) not in ("ring", "inputs"):
+            break
+        data["evidence"]["tree"] = text_of(tree)
+        tree = bytes([0]) + tree + tree
+    return data
+
+
+@pytest.mark.parametrize("time", ["continuous", "discrete"])
+@pytest.mark.parametrize("directions", [[], even(1, 0)], ids=["one cone", "half lines"])
+def test_two_trajectories_come_closer_across_a_kink(time: str, directions: Any) -> None:
+    assert verdict(nearby(0.7, directions, time)) == "ACCEPTED"
+    without = nearby(0.7, directions, time)
+    del without["evidence"]["contraction"]["directions"]
+    assert verdict(without) == "contraction"
+
+
+@pytest.mark.parametrize(("time", "gain"), [("continuous", 1.01), ("discrete", 1.01), ("discrete", -1.01)])
+@pytest.mark.parametrize("directions", [[], even(1, 0)], ids=["one cone", "half lines"])
+def test_trajectories_that_part_are_refused(time: str, gain: float, directions: Any) -> None:
+    assert verdict(nearby(gain, directions, time)) in ("contraction", "ring")
+
+
+def test_limits_count_the_cones() -> None:
+    data = PLANE()
+    few, many = (limits.Sizes(parse(edited(data, "evidence.local.directions", even(2, k)))).work() for k in (1, 6))
+    none = limits.Sizes(parse(edited(data, "evidence.local.directions", []))).work()
+    assert none < few < many and many > 20 * few
