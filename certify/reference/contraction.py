@@ -20,12 +20,23 @@ from collections.abc import Sequence
 from flint import arb, arb_mat, fmpq_mat
 
 from .balls import ZERO, columns_scaled, norm, total
-from .decrease import certainly_positive, diagonal, forms_of, length_of, whatever_y, with_cubic
+from .decrease import (
+    certainly_positive,
+    diagonal,
+    forms_of,
+    length_of,
+    length_of_kinks,
+    of_kinks,
+    weight_on,
+    whatever_y,
+    with_cubic,
+)
 from .document import Certificate
 from .evidence import Contraction
 from .fields import exact
 from .flow import Steps
-from .local import cells
+from .kinks import ALL
+from .local import cells, cones
 from .loop import Field, Loop
 from .model import Model
 from .rational import identity, positive_definite
@@ -37,22 +48,28 @@ RULE = "contraction"
 def contraction(loop: Loop, evidence: Contraction, parts: Sequence[int]) -> None:
     """The ball contains {V <= c0}, and the loop contracts on it in each cell of the ranges."""
     c, J, g = loop.c, evidence.J, evidence.weights
-    weight = arb_mat(evidence.weight)
     if c.floor is None:
         raise Refused("format", "levels.floor", "the claim needs a floor")
+    sides = cones(evidence.directions, c.n, RULE)
     holds = positive_definite(J.transpose() * c.P * J - exact(c.floor) * identity(c.n))
     require(holds, RULE, "ball", "it does not contain {V <= c0}: J'PJ - c0 I is not positive definite")
     require(all(v > 0 for v in g), RULE, "ball", "a weight is not positive")
-    steps = Steps(loop, loop.steady(J, RULE, "ball"))
-    for number, cell in enumerate(cells(c.plant.ranges, parts)):
-        at = f"cell {number}" if parts else "ball"
-        G = steps.change(cell, RULE, at)
-        approaches = whatever_y(G, lambda change: contracts(c, J, list(map(arb, g)), weight, change))
-        require(approaches, RULE, at, "trajectories do not certainly approach each other: its matrix is not definite")
+    known = loop.steady(J, RULE, "ball", None if sides[0] is None else ALL)
+    for side, cone in enumerate(sides):
+        where = f" cone {side}" if evidence.directions else ""
+        steps = Steps(loop, known if cone in (None, ALL) else loop.on_cone(J, cone, RULE, f"ball{where}", steady=True))
+        for number, cell in enumerate(cells(c.plant.ranges, parts)):
+            at = (f"cell {number}" if parts else "ball") + where
+            G = steps.change(cell, RULE, at)
+            approaches = whatever_y(G, lambda change: contracts(c, J, list(map(arb, g)), evidence.weight, change))
+            words = "trajectories do not certainly approach each other: its matrix is not definite"
+            require(approaches, RULE, at, words)
 
 
-def contracts(c: Certificate, J: fmpq_mat, g: Sequence[arb], weight: arb_mat, G: Field) -> bool:
+def contracts(c: Certificate, J: fmpq_mat, g: Sequence[arb], weight: fmpq_mat, G: Field) -> bool:
     """True if any two points of the ball certainly approach each other, G being models of F or, in steps, of F - x.
+
+    On a cone of d these are any two of it: a line between two states consists of pieces in cones.
 
     They have no y: at one d and d', and for given quadratic parts and what is beyond them, what is bounded is a convex
     function of the gradients, as P is positive definite.
@@ -77,7 +94,8 @@ def contracts(c: Certificate, J: fmpq_mat, g: Sequence[arb], weight: arb_mat, G:
         turned += columns_scaled(N, inverse) * N
     left = -form - turned / 2
     for column, f in zip(columns, G.components, strict=True):
-        left -= 3 * with_cubic(column, f, weight)
+        left -= 3 * with_cubic(column, f, arb_mat(weight))
+    left -= of_kinks(columns, G, weight_on(G.cone, weight))
     along += total(2 * norm(column.entries()) * v for column, v in zip(columns, wrong, strict=True))
     return certainly_positive(left - diagonal([along] * n))
 
@@ -89,7 +107,7 @@ def longest_rest(P: fmpq_mat, G: Field, wrong: Sequence[arb]) -> arb:
     """
     squares, cubes = forms_of(G)
     of_P = arb_mat(P)
-    moved = total(arb(P[i, i]).sqrt() * v for i, v in enumerate(wrong))
+    moved = total(arb(P[i, i]).sqrt() * v for i, v in enumerate(wrong)) + length_of_kinks(P, G)
     return 2 * length_of(squares, of_P) + 3 * length_of(cubes, of_P) + moved
 
 

@@ -26,6 +26,7 @@ from flint import arb, arb_mat, fmpq, fmpq_mat
 from .balls import ONE, ZERO, certainly_definite, columns_scaled, finite, identity, norm, total
 from .evidence import Ball, Path
 from .fields import exact
+from .kinks import Cone, multiplier
 from .limits import AT_CORNERS
 from .loop import Field
 from .model import Model
@@ -90,7 +91,9 @@ def decreases(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq = NO_STEP)
     gamma = length_beyond(P, G, A.nrows()) if h > 0 else ZERO
     along = doubts(P, G, h, columns, gamma)[1] + arb(h) * gamma * gamma
     errors = of_others(columns, [[da for _, da in each] for each in G.others], arb_mat(ball.weight))
-    return certainly_positive(-known - beyond_second(ball, columns, G) - errors - along * identity(A.ncols()))
+    errors += of_kinks(columns, G, weight_on(G.cone, ball.weight))
+    left = -known - beyond_second(ball, columns, G) - errors - along * identity(A.ncols())
+    return positive_on(G.cone, left)
 
 
 def decreases_around(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq, level: fmpq) -> bool:
@@ -113,7 +116,8 @@ def decreases_around(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq, le
     at_1 = (arb(h) * (of_P * f)).entries()
     b = [arb_mat(n + 1, 1, [p, *column.entries()]) for p, column in zip(at_1, columns, strict=True)]
     others = [[arb_mat(n + 1, 1, [dv, *da.entries()]) for dv, da in each] for each in G.others]
-    return certainly_positive(whole - of_others(b, others, with_one(arb_mat(ball.weight))))
+    whole -= of_others(b, others, with_one(arb_mat(ball.weight)))
+    return positive_on(G.cone, whole - of_kinks(b, G, with_one(weight_on(G.cone, ball.weight))))
 
 
 def doubts(
@@ -129,7 +133,7 @@ def doubts(
     roots = [arb(P[i, i]).sqrt() for i in range(P.nrows())] if h > 0 else []
     s = total(root * g.slack for root, g in zip(roots, components, strict=h > 0))
     far, wide = lengths_of_others(P, G) if h > 0 else (ZERO, ZERO)
-    s += wide
+    s += wide + (length_of_kinks(P, G) if h > 0 else ZERO)
     turn += arb(h) * (s * s + 2 * gamma * s)
     if moved is None:
         return ZERO, turn
@@ -157,6 +161,39 @@ def of_others(b: Sequence[arb_mat], others: Sequence[Sequence[arb_mat]], weight:
         for p, a in zip(b, each, strict=True):
             result += balanced(p, a * a.transpose(), weight)
     return result
+
+
+def of_kinks(b: Sequence[arb_mat], G: Field, weight: arb_mat) -> arb_mat:
+    """S_kinks: 2 sum_q (p_q.d) e_q, p_q = sum_i b_i sum_j B_ij L_jq, |e_q| <= |alpha_q.d| + beta_q ||d||. The b_i may
+    have an entry of 1 before those of d."""
+    size, n = weight.nrows(), G.units.n
+    result = arb_mat(size, size)
+    if not G.units.kinks:
+        return result
+    above, square = size - n, nothing(b)
+    for i in range(above, size):
+        square[i, i] = ONE
+    p = arb_mat([column.entries() for column in b]).transpose() * arb_mat([list(g.B) for g in G.components]) * G.units.L
+    columns = p.transpose().tolist()
+    for q, kink in G.units.kinks.items():
+        column = arb_mat(size, 1, columns[q])
+        alpha = arb_mat(size, 1, [ZERO] * above + kink.alpha.entries())
+        result += balanced(column, alpha * alpha.transpose(), weight)
+        result += balanced(column, kink.beta * kink.beta * square, weight)
+    return result
+
+
+def length_of_kinks(P: fmpq_mat, G: Field) -> arb:
+    """A number s: with ||v|| = (v'Pv)^(1/2) what kinks add to G is never longer than s ||d||."""
+    if not G.units.kinks:
+        return ZERO
+    moved = (arb_mat([list(g.B) for g in G.components]) * G.units.L).transpose()
+    lengths = row_products(moved * arb_mat(P), moved)
+    return total(root(lengths[q]) * kink.rho for q, kink in G.units.kinks.items())
+
+
+def weight_on(cone: Cone | None, weight: fmpq_mat) -> arb_mat:
+    return arb_mat(weight) if cone is None or cone.is_all else cone.weight
 
 
 def with_one(weight: arb_mat) -> arb_mat:
@@ -232,6 +269,22 @@ def certainly_positive(left: arb_mat) -> bool:
     for i in range(n):
         middle[i][i] -= total(arb(rows[i][j].rad()) * w[j] for j in range(n)) / w[i]
     return certainly_definite(arb_mat(middle))
+
+
+def positive_on(cone: Cone | None, left: arb_mat) -> bool:
+    """True if the form of each matrix is certainly positive on the cone but for 0, by one mu >= 0 or by none.
+
+    On the cone c.d >= t ||d||, so that (c.d)^2 - t^2 d.d is not negative there. A matrix may have a row for 1 first.
+    """
+    if certainly_positive(left):
+        return True
+    if cone is None or cone.is_all or not finite(left.entries()):
+        return False
+    n, above = cone.axis.nrows(), left.nrows() - cone.axis.nrows()
+    inner = [[ZERO] * above + row for row in cone.slack.tolist()]
+    slack = arb_mat([[ZERO] * (above + n)] * above + inner)
+    left = (left + left.transpose()) / 2
+    return certainly_positive(left - multiplier(left, slack, cone) * slack)
 
 
 def decreases_along(ball: Ball, path: Path, P: fmpq_mat, R: fmpq_mat, F: Field) -> bool:

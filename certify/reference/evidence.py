@@ -34,6 +34,7 @@ class Ball:
 
     In a slab with a path g has one more number than the others, for the motion, and `weight` a row and a column more.
     `edge` is the multiplier of V - c0 where the claim has a floor, `order` that of the series in time with a sample.
+    `directions` are trees of cones of d, of which none stands for all d; None where kinks have no models.
     """
 
     J: fmpq_mat
@@ -43,18 +44,20 @@ class Ball:
     weight: fmpq_mat
     edge: float = 0.0
     order: int = 1
+    directions: tuple[bytes, ...] | None = None
 
 
 @dataclass(frozen=True)
 class Contraction:
     """All x = J d with ||d|| <= 1, where any two trajectories approach each other.
 
-    The weights g and `weight` select one of many bounds.
+    The weights g and `weight` select one of many bounds; `directions` are those of a ball.
     """
 
     J: fmpq_mat
     weights: array[float]
     weight: fmpq_mat
+    directions: tuple[bytes, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -268,20 +271,21 @@ def read_order(value: Any, at: str, sampled: bool) -> int:
     return int(value)
 
 
-def require_no_kinks(value: Any, at: str) -> None:
-    """Refuse what this program does not know yet, by the rule that says that a file asks for too much."""
-    known = not (isinstance(value, dict) and "directions" in value)
-    require(known, "limits", "operations", f"{at}.directions: this program does not decide kinks on a ball")
-
-
 def read_local(value: Any, n: int, claim: str, sampled: bool) -> Ball:
     at = "evidence.local"
-    require_no_kinks(value, at)
-    local = keys(value, at, "J", "multipliers", "weight", "edge", "order")
+    local = keys(value, at, "J", "multipliers", "weight", "edge", "order", maybe=("directions",))
     edge, order = binary64(local["edge"], f"{at}.edge"), read_order(local["order"], f"{at}.order", sampled)
     good = edge >= 0 and (edge == 0 or claim in WITH_FLOOR)
     require(good, "format", f"{at}.edge", f"{edge!r} is not allowed with claim '{claim}'")
-    return replace(read_ball(local, at, n), edge=edge, order=order)
+    return replace(read_ball(local, at, n), edge=edge, order=order, directions=read_directions(local, at, n))
+
+
+def read_directions(value: dict[str, Any], at: str, n: int) -> tuple[bytes, ...] | None:
+    if "directions" not in value:
+        return None
+    trees = entries(value["directions"], f"{at}.directions")
+    require(len(trees) in (0, 2 * n), "format", f"{at}.directions", f"a list of 0 or of {2 * n} was expected")
+    return tuple(decoded(tree, f"{at}.directions.{k}") for k, tree in enumerate(trees))
 
 
 def read_contraction(value: Any, n: int, claim: str) -> Contraction | None:
@@ -289,10 +293,10 @@ def read_contraction(value: Any, n: int, claim: str) -> Contraction | None:
     if claim != "nearby":
         require(value is None, "format", at, f"null was expected with claim '{claim}'")
         return None
-    require_no_kinks(value, at)
-    contraction = keys(value, at, "J", "weights", "weight")
+    contraction = keys(value, at, "J", "weights", "weight", maybe=("directions",))
     J, weight = (square(contraction[key], f"{at}.{key}", n) for key in ("J", "weight"))
-    return Contraction(J, numbers(contraction["weights"], f"{at}.weights", n), weight)
+    weights, directions = numbers(contraction["weights"], f"{at}.weights", n), read_directions(contraction, at, n)
+    return Contraction(J, weights, weight, directions)
 
 
 def read_cells(value: Any, at: str, k: int) -> tuple[int, ...]:

@@ -93,13 +93,13 @@ def settled(c: Certificate) -> Callable[[Model], Model]:
     return Model.at_rest if c.ends_at_origin else lambda v: v
 
 
-def steps_on(loop: Loop, known: Known, ball: Ball, at: str) -> Steps:
-    """Rule `flow` on a ball; without a sample nothing is asked."""
+def steps_on(loop: Loop, known: Known, ball: Ball, at: str, within: Mapping[str, Model] | None = None) -> Steps:
+    """Rule `flow` on a ball; without a sample nothing is asked. On a cone the states `within` are those of the ball."""
     c = loop.c
     if c.sample is None:
         return Steps(loop, known)
     states = {name: known.names[name] for name in c.plant.states}
-    within = reached_on(loop, known, at)
+    within = reached_on(loop, known, at) if within is None else within
     held = {name: known.names[name] for name in c.plant.inputs} | loop.anything(known)
     hi = arb(c.step)
     period = known.moving(c.sample, c.k, loop.symbols)

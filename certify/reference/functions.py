@@ -81,7 +81,7 @@ def unsure(v: Model, phi: Expansion) -> tuple[arb, arb]:
     _, p, half, _ = phi.at
     by_y, square = 2 * abs(half) * v.sway, v.doubt * v.doubt
     slack = (2 * abs(half) * v.off + 3 * phi.twisted * square) * v.slope
-    slack += (abs(p) + by_y) * v.slack + by_y * v.tilt
+    slack += (abs(p) + by_y) * v.slack + by_y * v.tilt + phi.moved[1] * v.kinked
     return abs(p) * v.off + phi.bent * square, slack
 
 

@@ -33,6 +33,9 @@ class Model:
     y_j `da_j`, for every y in [-1, 1]^N; without `dv` there is no y in them.
 
     `lip`, where it is asked for, is a Lipschitz constant on the ball of what there is beyond v(0) + a'.d + d'Qd + K[d].
+
+    With kinks e_j has besides a part of at most `rhos`_j ||d||, as if the gradient differed by that much from place to
+    place; where there is a `lip`, its Lipschitz constant is no more. Behind the last of `rhos` there are none.
     """
 
     v: arb
@@ -47,6 +50,7 @@ class Model:
     lip: arb | None = None
     off: arb = ZERO
     slack: arb = ZERO
+    rhos: tuple[arb, ...] = ()
 
     @classmethod
     def affine(cls, v: arb, a: Sequence[arb], errors: tuple[arb_mat, ...] = (), lip: arb | None = None) -> Model:
@@ -61,8 +65,17 @@ class Model:
 
     @cached_property
     def tilt(self) -> arb:
-        """A bound of the norm of sum_j y_j da_j."""
+        """A bound of the norm of sum_j y_j da_j, and of what kinks add to the gradient."""
+        return self.tilt_of_y + self.kinked
+
+    @cached_property
+    def tilt_of_y(self) -> arb:
         return total(norm(part.entries()) for part in self.da)
+
+    @cached_property
+    def kinked(self) -> arb:
+        """sum_j |B_j| rho_j."""
+        return total(abs(weight) * rho for weight, rho in zip(self.B, self.rhos, strict=False))
 
     @cached_property
     def doubt(self) -> arb:
@@ -119,13 +132,13 @@ class Model:
 
     def is_finite(self) -> bool:
         parts = (self.a, self.Q, self.K, self.E, *self.errors, *self.da)
-        single = finite([self.v, self.off, self.slack, *self.B, *self.dv])
+        single = finite([self.v, self.off, self.slack, *self.B, *self.dv, *self.rhos])
         single = single and (self.lip is None or self.lip.is_finite())
         return single and all(finite(part.entries()) for part in parts)
 
     def whatever(self) -> Model:
         """The same without y, whose every value is within the errors."""
-        return replace(self, dv=(), da=(), off=self.doubt, slack=self.turn) if self.dv else self
+        return replace(self, dv=(), da=(), off=self.doubt, slack=self.slack + self.tilt_of_y) if self.dv else self
 
     def without(self, j: int) -> bool:
         """True if none of its numbers depends on y_j."""
@@ -154,15 +167,19 @@ class Model:
             da = tuple(p + q for p, q in zip(self.da, other.da, strict=True))
         lip = None if self.lip is None or other.lip is None else self.lip + other.lip
         off, slack = self.off + other.off, self.slack + other.slack
-        return Model(v, a, Q, K, E, B, self.named(other), dv, da, lip, off, slack)
+        return Model(v, a, Q, K, E, B, self.named(other), dv, da, lip, off, slack, self.kinks_of(other))
+
+    def kinks_of(self, other: Model) -> tuple[arb, ...]:
+        """`rhos` of both, as `errors`."""
+        return max(self.rhos, other.rhos, key=len)
 
     def named(self, other: Model) -> tuple[arb_mat, ...]:
         """`errors` of both: calls add to them in the order of the equations, so that one has those of the other."""
         return max(self.errors, other.errors, key=len)
 
-    def among(self, errors: tuple[arb_mat, ...]) -> Model:
+    def among(self, errors: tuple[arb_mat, ...], rhos: tuple[arb, ...]) -> Model:
         """The same with all the errors that there are."""
-        return replace(self, B=(*self.B, *((ZERO,) * (len(errors) - len(self.B)))), errors=errors)
+        return replace(self, B=(*self.B, *((ZERO,) * (len(errors) - len(self.B)))), errors=errors, rhos=rhos)
 
     def sign(self) -> int:
         """1 or -1 where it certainly has this sign on all of the ball, else 0."""
@@ -178,13 +195,13 @@ class Model:
 
     def __neg__(self) -> Model:
         v, a, B, dv, da = -self.v, -self.a, *(tuple(-p for p in part) for part in (self.B, self.dv, self.da))
-        return Model(v, a, -self.Q, -self.K, self.E, B, self.errors, dv, da, self.lip, self.off, self.slack)
+        return replace(self, v=v, a=a, Q=-self.Q, K=-self.K, B=B, dv=dv, da=da)
 
     def scaled(self, k: arb) -> Model:
         size, lip = abs(k), None if self.lip is None else abs(k) * self.lip
         B, dv, da = (tuple(k * p for p in part) for part in (self.B, self.dv, self.da))
         v, a, Q, K, E = k * self.v, k * self.a, k * self.Q, k * self.K, size * self.E
-        return Model(v, a, Q, K, E, B, self.errors, dv, da, lip, size * self.off, size * self.slack)
+        return Model(v, a, Q, K, E, B, self.errors, dv, da, lip, size * self.off, size * self.slack, self.rhos)
 
     def __mul__(self, other: Model) -> Model:
         """v w: of the products of a part of v - v(0) with one of w - w(0), those of up to three d are in Q and K."""
@@ -201,13 +218,14 @@ class Model:
         E += v.radius * w.whole + (w.slope + w.bend + w.twist) * v.whole
         off = v.size * w.off + w.size * v.off + v.sway * w.sway
         slack = v.size * w.slack + v.off * w.slope + w.size * v.slack + w.off * v.slope
-        slack += v.sway * w.tilt + w.sway * v.tilt
+        slack += v.sway * w.tilt + w.sway * v.tilt + v.doubt * w.kinked + w.doubt * v.kinked
         symbols = max(len(v.dv), len(w.dv))
         each = list(zip(v.of_y(symbols), w.of_y(symbols), strict=True))
         dv = tuple(v.v * q + w.v * p for (p, _), (q, _) in each)
         da = tuple(v.v * b + w.v * a + p * w.a + q * v.a for (p, a), (q, b) in each)
         lip = lipschitz.of_product(v, w, 2 * of_Q + 3 * of_K)
-        return Model(v.v * w.v, v.v * w.a + w.v * v.a, Q, K, E, B, v.named(w), dv, da, lip, off, slack)
+        a, named = v.v * w.a + w.v * v.a, v.named(w)
+        return Model(v.v * w.v, a, Q, K, E, B, named, dv, da, lip, off, slack, v.kinks_of(w))
 
     def times_square(self, other: Model) -> arb_mat:
         """(a.d)(d'Qd), a of this model and Q of the other."""

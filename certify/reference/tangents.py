@@ -11,33 +11,35 @@ What the models of units leave out is an error of its own, which reaches every e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from flint import arb, arb_mat, fmpq
 
-from .balls import ONE, ZERO, absolute, beta, columns_scaled, finite
+from .balls import ONE, ZERO, absolute, beta, columns_scaled, finite, total
 from .document import Certificate
 from .expressions import Call
 from .function import net_at_0
 from .functions import Beyond, beyond_tangent, expansion, unsure
+from .kinks import Cone, Entry, Kink, entry
 from .model import Model
 from .networks import Affine, Clip, Concat, Map, Observe, Product, Sum, paired
 from .refusal import Refused
-from .symmetric import half, whole
+from .symmetric import half, no_form, whole
 
 
 @dataclass(frozen=True)
 class Units:
     """The errors of all units: e_q, |e_q| <= d'R_q d, of which input or entry j sees sum_q L_jq e_q.
 
-    Each row of R has half of a symmetric matrix, for n variables.
+    Each row of R has half of a symmetric matrix, for n variables. Units that are kinks, by their numbers, have R = 0.
     """
 
     n: int
     L: arb_mat
     R: list[list[arb]]
+    kinks: Mapping[int, Kink] = field(default_factory=dict)
 
     @cached_property
     def wholes(self) -> list[arb_mat]:
@@ -55,14 +57,23 @@ class Units:
         sums: list[list[arb]] = (absolute(self.L) * arb_mat(self.R)).tolist()
         return tuple(whole(row, self.n) for row in sums)
 
+    def rhos(self) -> tuple[arb, ...]:
+        """sum_q |L_jq| rho_q of each input; none without kinks."""
+        if not self.kinks:
+            return ()
+        return tuple(total(abs(row[q]) * kink.rho for q, kink in self.kinks.items()) for row in self.L.tolist())
+
     def is_finite(self) -> bool:
-        return finite(self.L.entries()) and all(finite(row) for row in self.R)
+        known = all(kink.is_finite() for kink in self.kinks.values())
+        return known and finite(self.L.entries()) and all(finite(row) for row in self.R)
 
     def beside(self, other: Units) -> Units:
         """The units of both, each seen by its own entries."""
         ours, theirs = [ZERO] * len(self.R), [ZERO] * len(other.R)
         rows = [[*row, *theirs] for row in self.L.tolist()] + [[*ours, *row] for row in other.L.tolist()]
-        return Units(self.n, arb_mat(len(rows), len(ours + theirs), [v for row in rows for v in row]), self.R + other.R)
+        L = arb_mat(len(rows), len(ours + theirs), [v for row in rows for v in row])
+        kinks = {**self.kinks, **{len(ours) + q: kink for q, kink in other.kinks.items()}}
+        return Units(self.n, L, self.R + other.R, kinks)
 
 
 @dataclass
@@ -75,6 +86,19 @@ class Stack:
     C: list[list[arb]] = field(default_factory=list)
     R: list[list[arb]] = field(default_factory=list)
     lip: list[arb] = field(default_factory=list)
+    kinks: dict[int, Kink] = field(default_factory=dict)
+
+    def bend(self, kink: Kink | None) -> None:
+        """A unit that is a kink, or nothing."""
+        if kink is not None:
+            self.kinks[len(self.R)] = kink
+        none = arb_mat(self.n, self.n)
+        self.append(Beyond(none, no_form(self.n), none, ZERO if self.steady else None))
+
+    def swings(self, L: arb_mat) -> list[arb]:
+        """sum_q |L_iq| rho_q over the kinks, for each row."""
+        seen = [(q, kink.rho) for q, kink in self.kinks.items() if q < L.ncols()]
+        return [total(abs(row[q]) * rho for q, rho in seen) for row in L.tolist()]
 
     def append(self, unit: Beyond) -> None:
         self.H.append(half(unit.H))
@@ -128,12 +152,14 @@ class Vector:
 class OnBall:
     """Networks between tangents. A `memo` has those of all balls around the same centre.
 
-    `changes` counts what has been made of vectors, in the same order on each ball.
+    `changes` counts what has been made of vectors, in the same order on each ball. With a cone kinks have models.
     """
 
-    def __init__(self, given: Sequence[Model], memo: dict[int, Tangent] | None = None) -> None:
+    def __init__(
+        self, given: Sequence[Model], memo: dict[int, Tangent] | None = None, cone: Cone | None = None
+    ) -> None:
         n = given[0].a.nrows()
-        self.memo, self.changes = memo, 0
+        self.memo, self.changes, self.cone = memo if cone is None else None, 0, cone
         self.roots = list[list[arb]]()
         self.stack = Stack(n, given[0].lip is not None)
         self.first = self.rooted(given, [not bends(v) for v in given])
@@ -180,6 +206,8 @@ class OnBall:
 
     def map(self, step: Map, v: Vector) -> Vector:
         models = self.models(v)
+        if self.cone is not None and step.function == "relu":
+            return self.kinked(v, [entry(self.cone, y, ZERO, None) for y in models])
         each = [expansion(y, step.function) for y in models]
         for y, phi in zip(models, each, strict=True):
             self.stack.append(beyond_tangent(y, phi))
@@ -189,13 +217,24 @@ class OnBall:
         values, slopes = [phi.at[0] for phi in each], [phi.at[1] for phi in each]
         return self.made(lambda: self.widened(v.tangent).scaled(slopes, values, True), off, slack)
 
+    def kinked(self, v: Vector, each: Sequence[Entry]) -> Vector:
+        """Entries with a slope and a unit each, which is a kink or nothing."""
+        for one in each:
+            self.stack.bend(one.kink)
+        slopes, values = [one.slope for one in each], [one.value for one in each]
+        off, slack = [one.off for one in each], [one.slack for one in each]
+        return self.made(lambda: self.widened(v.tangent).scaled(slopes, values, True), off, slack)
+
     def widened(self, y: Tangent) -> Tangent:
         """The same with a column for each unit before those of a map."""
         missing = len(self.stack.R) - len(y.at_0) - y.ways.ncols()
         return y if missing == 0 else replace(y, L=beside(y.ways, arb_mat(len(y.at_0), missing)), own=False)
 
     def clip(self, step: Clip, v: Vector) -> Vector:
-        """Each entry as it is or as an end, if one of both is certain."""
+        """Each entry as it is or as an end, if one of both is certain; else, with a cone, it is a kink."""
+        if self.cone is not None:
+            each = zip(self.models(v), map(arb, step.lo), map(arb, step.hi), strict=True)
+            return self.kinked(v, [entry(self.cone, *one) for one in each])
         factors, values = list[arb](), list[arb]()
         for y, lo, hi in zip(self.models(v), map(arb, step.lo), map(arb, step.hi), strict=True):
             below, above = y.v - y.reach, y.v + y.reach
@@ -244,6 +283,7 @@ class OnBall:
 
         off = [x.size * y.off + y.size * x.off for x, y in pairs]
         slack = [x.size * y.slack + x.off * y.slope + y.size * x.slack + y.off * x.slope for x, y in pairs]
+        slack = [s + x.doubt * y.kinked + y.doubt * x.kinked for s, (x, y) in zip(slack, pairs, strict=True)]
         result = self.made(make, off, slack)
         for x, y in pairs:
             both = replace(x, v=ZERO) * replace(y, v=ZERO)
@@ -259,10 +299,12 @@ class OnBall:
     def observe(self, step: Observe, v: Vector) -> Vector:
         """The expressions of models of the entries, whose errors are those of the units."""
         units = Units(self.stack.n, arb_mat(0, 0), list(self.stack.R))
+        rhos = tuple(self.stack.kinks[q].rho if q in self.stack.kinks else ZERO for q in range(len(self.stack.R)))
         errors, rows = tuple(units.wholes), self.aligned(v.tangent)[1].tolist()
         nothing = arb_mat(self.stack.n, self.stack.n)
         models = [
-            replace(y, E=nothing, B=tuple(row), errors=errors) for y, row in zip(self.models(v), rows, strict=True)
+            replace(y, E=nothing, B=tuple(row), errors=errors, rhos=rhos)
+            for y, row in zip(self.models(v), rows, strict=True)
         ]
         some = models[0]
 
@@ -282,7 +324,7 @@ class OnBall:
     # ------------------------------------------------------------------------------------------------- the results
 
     def models(self, v: Vector) -> list[Model]:
-        """Sums over the units with L, and of their bounds with its magnitudes."""
+        """Sums over the units with L, and of their bounds with its magnitudes. Kinks are one error of each together."""
         n, y, stack = self.stack.n, v.tangent, self.stack
         a, seen = (y.G * arb_mat(self.roots[: y.G.ncols()])).tolist(), y.ways.ncols()
         each = list(zip(y.at_0, a, v.doubts(), strict=True))
@@ -294,20 +336,35 @@ class OnBall:
         lips: list[arb | None] = [None] * len(a)
         if stack.steady:
             lips = list((y.magnitudes * arb_mat(seen, 1, stack.lip[:seen])).entries())
-        return [
+        models = [
             Model(x, arb_mat(n, 1, row), whole(q, n), arb_mat(1, len(k), k), whole(e, n), lip=lip, off=off, slack=slack)
             for (x, row, (off, slack)), q, k, e, lip in zip(each, Q, K, E, lips, strict=True)
         ]
+        if not stack.kinks:
+            return models
+        none, swings = (arb_mat(n, n),), stack.swings(y.ways)
+        return [replace(v, B=(ONE,), errors=none, rhos=(s,)) for v, s in zip(models, swings, strict=True)]
 
-    def results(self, v: Vector, wanted: Sequence[int], before: Sequence[arb_mat] = ()) -> tuple[list[Model], Units]:
-        """Some entries, each with an error of its own, B = 1, behind those `before`; and the units behind these."""
+    def results(
+        self, v: Vector, wanted: Sequence[int], before: Sequence[arb_mat] = (), rhos: Sequence[arb] = ()
+    ) -> tuple[list[Model], Units]:
+        """Some entries, each with an error of its own, B = 1, behind those `before`, of which kinks add `rhos`; and the
+        units behind these."""
         models, (_, L) = self.models(v), self.aligned(v.tangent)
         rows = L.tolist()
-        units = Units(self.stack.n, arb_mat(len(wanted), L.ncols(), [x for i in wanted for x in rows[i]]), self.stack.R)
+        L = arb_mat(len(wanted), L.ncols(), [x for i in wanted for x in rows[i]])
+        units = Units(self.stack.n, L, self.stack.R, self.stack.kinks)
+        rhos = tuple(rhos) if self.cone is None else (*rhos, *(units.rhos() or (ZERO,) * len(wanted)))
         errors, nothing = (*before, *units.errors()), arb_mat(self.stack.n, self.stack.n)
         own = range(len(before), len(errors))
         return [
-            replace(models[i], E=nothing, B=tuple(ONE if q == k else ZERO for q in range(len(errors))), errors=errors)
+            replace(
+                models[i],
+                E=nothing,
+                B=tuple(ONE if q == k else ZERO for q in range(len(errors))),
+                errors=errors,
+                rhos=rhos,
+            )
             for i, k in zip(wanted, own, strict=True)
         ], units
 
@@ -315,13 +372,16 @@ class OnBall:
 class Calls:
     """The calls of one evaluation of the equations: their units stand beside the policy's."""
 
-    def __init__(self, units: Units, errors: Sequence[arb_mat]) -> None:
-        self.units, self.errors = units, tuple(errors)
+    def __init__(
+        self, units: Units, errors: Sequence[arb_mat], rhos: Sequence[arb] = (), cone: Cone | None = None
+    ) -> None:
+        self.units, self.errors, self.rhos, self.cone = units, tuple(errors), tuple(rhos), cone
 
     def __call__(self, call: Call, given: Sequence[Model]) -> list[Model]:
-        algebra = OnBall(given)
-        models, units = algebra.results(call.network.run(algebra, algebra.first), call.entries, self.errors)
-        self.units, self.errors = self.units.beside(units), models[0].errors
+        algebra = OnBall(given, cone=self.cone)
+        value = call.network.run(algebra, algebra.first)
+        models, units = algebra.results(value, call.entries, self.errors, self.rhos)
+        self.units, self.errors, self.rhos = self.units.beside(units), models[0].errors, models[0].rhos
         return models
 
 
@@ -332,11 +392,11 @@ class Policy:
         self.c, self.memo, self.net_at_0 = c, dict[int, Tangent](), net_at_0(c)
         self.beta = beta(c) if c.policy.centre == "preactivation" else []
 
-    def on(self, states: Sequence[Model], at_origin: bool) -> tuple[list[Model], Units]:
-        """The inputs before their clip, given models of the states on the ball."""
+    def on(self, states: Sequence[Model], at_origin: bool, cone: Cone | None = None) -> tuple[list[Model], Units]:
+        """The inputs before their clip, given models of the states on the ball, on a cone of it with kinks."""
         policy = self.c.policy
         read = [x.shifted(arb(v)) for x, v in zip(states, policy.origin, strict=True)]
-        algebra = OnBall(read, self.memo if at_origin else None)
+        algebra = OnBall(read, self.memo if at_origin else None, cone)
         net = policy.network.run(algebra, algebra.first)
         before = [self.before_squash(j, v, at_origin) for j, v in enumerate(net.tangent.at_0)]
         y = replace(net, tangent=replace(net.tangent, at_0=before))
