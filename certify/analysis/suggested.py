@@ -79,16 +79,16 @@ def by_clipping(result: RoaResult, asked: tuple[System, PolicyNetwork], effort: 
     free = network.clip is None and network.squash == "identity" and system.n <= FEW
     if result.stop is not Stop.INPUTS or not free or result.problem is None or result.levels.roa is None:
         return None
-    bounds = tuple(np.array([float(end) for end in ends]) for ends in zip(*system.input_bounds, strict=True))
+    lo, hi = np.array([[float(end) for end in ends] for ends in system.input_bounds]).T
     try:
-        loop = ClosedLoop(result.system, replace(result.network, clip=bounds))
+        loop = ClosedLoop(result.system, replace(result.network, clip=(lo, hi)))
         there = _share(loop, result.problem.V, result.levels.roa, effort)
     except InputError:
         return None
     here = _converging(result)
     if there is None or here is None or there < here:
         return None
-    ends = ",".join(f"{lo:g}..{hi:g}" for lo, hi in zip(*bounds, strict=True))
+    ends = ",".join(f"{float(least):g}..{float(most):g}" for least, most in system.input_bounds)
     why = (
         f"the policy asks for more than the actuator gives; if the actuator saturates there, clip the policy at {ends}"
     )
