@@ -19,6 +19,7 @@ from certify.effort import UNIT, UNLIMITED, Effort
 from certify.loop.plants import get_system
 from certify.loop.policies import load_policy
 from tests.support.loops import pendulum_network
+from tests.support.marks import slow_after
 
 POLICIES = Path(__file__).parent.parent.parent / "examples" / "policies"
 
@@ -71,7 +72,7 @@ def test_seconds_follow_the_pace() -> None:
     assert effort.part(1.0).seconds_for(UNIT) < 0.01 and effort.seconds_for(UNIT) < 0.01
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("jobs", slow_after(1, [2, 1]))
 def test_a_busy_machine_gives_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jobs: int) -> None:
     """One run on its own; one beside other work, with clocks that jump."""
     system, network = get_system("pendulum"), pendulum_network((8, 8))

@@ -296,7 +296,7 @@ def test_a_search_in_pieces_is_the_search_in_one(tmp_path: Path) -> None:
         attempt = begun(found)
         attempt.restore(found.state)
         levels.append(attempt.level)
-        attempt.advance(Budget(boxes=60, batch=8))
+        attempt.advance(Budget(boxes=200, batch=8))
         state = attempt.state()
         if state is None:
             break

@@ -18,6 +18,7 @@ from certify.lyapunov import Symbolic
 from certify.reference import limits as reference_limits
 from certify.reference.document import read
 from tests.support.certificates import LEAF, Document, dump, edited, parse, verdict
+from tests.support.marks import slow_after
 from tests.support.outer import packed, unpacked
 from tests.support.reference import judge
 from tests.support.staying import (
@@ -111,7 +112,7 @@ def test_what_rises_at_the_level_is_refused_though_it_falls_below() -> None:
     assert verdict(data) == judge(data) == "outer"
 
 
-@pytest.mark.parametrize("share", ["1/1000000", "1/1000"])
+@pytest.mark.parametrize("share", slow_after(1, ["1/1000000", "1/1000"]))
 def test_evidence_of_another_loop_does_not_cover_what_is_planted(share: str) -> None:
     """Trees that the search makes for the sets without what is planted."""
     by = float(share.partition("/")[0]) / float(share.partition("/")[2])
@@ -230,6 +231,7 @@ def _holds(system: System, N: Symbolic, level: float) -> bool:
     return bool(value[on_faces].min() > level and max(falls) < 0.05 and kept)
 
 
+@pytest.mark.slow
 def test_accepted_claims_of_chance_are_true() -> None:
     """And of those that hold by a margin many are accepted, by both."""
     generator, accepted, true = np.random.default_rng(11), 0, 0

@@ -257,7 +257,7 @@ LIES: dict[str, Lie] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", LIES)
+@pytest.mark.parametrize("what", slow_after(7, LIES))
 def test_answers_that_cannot_be_are_an_internal_error(
     what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

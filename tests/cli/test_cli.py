@@ -330,7 +330,9 @@ def test_the_policy_may_be_the_first_word(tmp_path: Path, capsys: pytest.Capture
 def test_what_to_try_next_names_a_policy_that_was_the_first_word(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    status, out, _ = run(capsys, "roa", SHIPPED, "--max-boxes", "3", "--out", tmp_path, "--json", "--quiet")
+    status, out, _ = run(
+        capsys, *("roa", SHIPPED, "--max-boxes", "3", "--effort", "0.1"), "--out", tmp_path, "--json", "--quiet"
+    )
     command = json.loads(out)["diagnosis"]["next"]["command"]
     assert status == 0 and command.startswith(f"certify roa {SHIPPED} ") and "--max-boxes 30" in command
 
