@@ -10,7 +10,7 @@ from .words import expression, interval, number
 
 
 def additions(c: Certificate, start: str) -> list[str]:
-    """What the claim says besides, line by line; `start` is when a trajectory starts."""
+    """The rest of the claim, line by line; `start` is when a trajectory starts."""
     lines = []
     if c.outer is not None and not c.without_V:
         lines.append(beyond(c, c.outer))

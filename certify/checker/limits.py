@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from math import prod
 
 from .case import AT_CORNERS, Case, Failures
-from .document import Array, Certificate, OuterTree, Partition, Trusted
+from .document import Array, Certificate, Partition
 from .expression import Tape
 from .networks import Map, Network
 
@@ -23,7 +23,10 @@ def is_bearable(case: Case) -> Failures:
     """`limits`: neither too many numbers at once, nor too many operations in all."""
     both = [Sizes(c) for c in (case.c, case.c.then) if c is not None]
     count, work = sum(sizes.numbers() for sizes in both), sum(sizes.work() for sizes in both)
-    work += both[0].of_handover()
+    if case.c.then is not None:
+        from . import demands
+
+        work += demands.of_handover(both[0], case.c.then)
     most = MOST_IN_PATIENCE if case.patient else MOST_WORK
     if count > MOST_NUMBERS:
         yield "numbers", f"the file asks for {in_short(count)} at once; the checker allows {in_short(MOST_NUMBERS)}"
@@ -95,15 +98,15 @@ class Sizes:
         self.t = 2 * self.d**2 + self.d * (self.d + 1) * (self.d + 2) // 6
         self.a = c.dynamics.size + c.policy.network.operations
         self.a += sum(tape.size for tape in (c.keep, c.target) if tape is not None)
-        self.net = Net(_called(c.dynamics), [c.policy.network])
+        self.net = Net(called(c.dynamics), [c.policy.network])
 
     # ------------------------------------------------------------------------------------------------------ numbers
 
     def numbers(self) -> int:
         """Held at once."""
-        found = 4 * self.net.entries + self.of_function() + self.of_measured()
+        found = 4 * self.net.entries + self.of_features()[0]
         if not isinstance(self.evidence, Partition):
-            return found + self.of_following()
+            return found
         order = max(self.evidence.order, self.evidence.local.order if self.evidence.local else 1)
         values = (4 * order if self.c.sample else 1) * self.a + 2 * self.n + 8
         if self.asked and not self.c.outer:
@@ -111,36 +114,22 @@ class Sizes:
         if self.evidence.local or self.evidence.contraction or self.evidence.tube:
             found += values * (self.t + self.d * self.y + self.m + self.z) + self.d**4 // 4
             found += self.net.held_on_a_ball(self.d, self.t)
-        return found + self.of_following()
+        return found
 
-    def of_function(self) -> int:
-        """Numbers for N and the loop on leaves of its tree."""
-        if self.c.outer is None:
-            return 0
-        tape, area = self.c.outer.function, (self.s + 1) ** 2
-        N, of_tape = Net(_called(tape)), tape.size
-        found = 4 * N.entries + sum(2 * rows * area for rows, *_ in N.steps) + 8 * of_tape * area
-        return found + N.held_on_leaves(self.s + 1) + self.on_leaves(1, self.s)
+    def of_features(self) -> tuple[int, int]:
+        """Numbers and operations of what only some certificates have."""
+        c = self.c
+        if not (c.outer or c.ranks or c.data or c.start is not None):
+            return 0, 0
+        from . import demands
+
+        return demands.numbers(self), demands.work(self)
 
     def on_leaves(self, order: int, symbols: int) -> int:
         """Numbers on as many leaves as are examined at once."""
         values = (4 * order if self.c.sample else 1) * self.a + 2 * self.n + 8
         held = self.net.held_on_leaves(symbols + self.m + self.z)
         return values * (symbols + 1) ** 2 + 2**14 * (self.n + self.m + self.z) + held
-
-    def of_following(self) -> int:
-        """Numbers for leaves that are followed by steps."""
-        if self.c.ranks is None or isinstance(self.evidence, Trusted | OuterTree):
-            return 0
-        return 2**4 * len(self.c.ranks.tree) + self.on_leaves(self.evidence.order, self.s + self.n)
-
-    def of_measured(self) -> int:
-        """Numbers for transitions that are followed."""
-        data = self.c.data
-        if data is None:
-            return 0
-        symbols = self.n + len(data.parameters)
-        return self.c.dynamics.size * 4 * data.order * (symbols + 1) ** 2 + 8 * data.transitions * self.n * symbols
 
     # --------------------------------------------------------------------------------------------------------- work
 
@@ -149,15 +138,15 @@ class Sizes:
         found = 2**15 * self.a + self.net.folded
         found += 0 if self.c.without_V else self.inverse(self.bits(self.c.P))
         if not (self.c.practical or self.c.without_V):
-            found += 2**12 * self.net.entries + 2**19 * Net(_called(self.c.dynamics)).entries
-        found += self.of_ranks() + self.of_outer() + self.of_data()
+            found += 2**12 * self.net.entries + 2**19 * Net(called(self.c.dynamics)).entries
+        found += self.of_features()[1]
         if not isinstance(self.evidence, Partition):
             return found
         seen = min(2 * self.bits(self.evidence.T) + self.bits(self.c.P) + 16, 2**16 // self.n)
         found += self.inverse(seen) + 2**8 * len(self.evidence.tree)
         if self.asked:
             found += self.of_leaves(self.evidence.tree.count(LEAF), self.evidence.order, self.s)
-        return found + self.of_balls() + self.of_tube()
+        return found + self.of_balls()
 
     @property
     def asked(self) -> bool:
@@ -200,38 +189,6 @@ class Sizes:
         found = self.boxes(leaves, models, self.a * (order + 1), symbols, calls)
         return found + self.policies(leaves, order, symbols)
 
-    def of_ranks(self) -> int:
-        """Steps from leaves, and the leaves that their images meet."""
-        ranks = self.c.ranks
-        if ranks is None or isinstance(self.evidence, Trusted | OuterTree):
-            return 0
-        leaves = len(ranks.steps)
-        of_all = self.of_leaves(leaves + sum(ranks.steps), self.evidence.order, self.s + self.n)
-        return 2**9 * len(ranks.tree) + 2**17 * leaves + of_all
-
-    def of_data(self) -> int:
-        """Transitions, and sums of them, in all rounds."""
-        data = self.c.data
-        if data is None:
-            return 0
-        rounds = len(data.rounds) + sum(map(len, data.leaves))
-        k, followed, a = len(data.parameters), rounds * data.transitions, self.c.dynamics.size
-        times = 2 * data.order**3 + 8 if data.period else 1
-        models = data.pieces * (a * times + 4 * self.n)
-        found = self.boxes(followed, models, a * (data.order + 1), self.n + k, 0)
-        found += 2**6 * k * followed * self.n * (self.n + k + 2**6)
-        return found + 2**17 * rounds * data.order * data.pieces * (a + 4 * self.n)  # however few transitions are left
-
-    def of_handover(self) -> int:
-        """The inequality of two matrices."""
-        c, then = self.c, self.c.then
-        if then is None or len(then.states) != self.n:
-            return 0
-        from .handover import difference
-
-        numerators, _ = difference(c, then).numer_denom()
-        return self.inverse(min(max(v.height_bits() for v in numerators.entries()), 2**16 // self.n))
-
     @property
     def ball(self) -> int:
         """The networks on a ball, once."""
@@ -273,28 +230,6 @@ class Sizes:
         found = leaves * (self.ball + cells * self.equations + corners * each)
         return found + 2**8 * sum(map(len, directions))
 
-    def of_tube(self) -> int:
-        of_each = self.ball + self.equations + 3 * (self.inequality + self.decision(self.n))
-        tube = self._partition.tube
-        nodes = [P for slab in tube for P in (slab.middle, slab.end)] + ([] if self.c.start is None else [self.c.start])
-        return len(tube) * of_each + sum(self.inverse(self.bits(P)) for P in nodes)
-
-    def of_outer(self) -> int:
-        evidence = self.evidence.outer if isinstance(self.evidence, Partition) else self.evidence
-        if self.c.outer is None or not isinstance(evidence, OuterTree):
-            return 0
-        tape = self.c.outer.function
-        N, of_tape = Net(_called(tape)), tape.size
-        calls, values = 200 * N.reads, max(N.widest, 2 * of_tape)
-        faces, leaves = sum(tree.count(LEAF) for tree in evidence.faces), evidence.tree.count(LEAF)
-        found = N.folded + self.inverse(self.bits(evidence.T))
-        found += 2**8 * sum(map(len, (evidence.tree, *evidence.faces)))
-        found += self.boxes(faces, of_tape, values, self.n, calls) + faces * N.models((self.n + 4) ** 2)
-        found += (faces + leaves) * N.on_a_leaf(self.n + 1) // 8 + (1 + faces + leaves) * N.paths
-        models, calls = self.a + 8 * of_tape + 4 * self.n, calls + self.n * self.s**2 + 160 * self.net.reads
-        found += self.boxes(leaves, models, max(values, self.a), self.s, calls)
-        return found + leaves * N.models((self.s + 4) ** 2) + self.policies(leaves, 1, self.s)
-
     @property
     def _partition(self) -> Partition:
         if not isinstance(self.evidence, Partition):
@@ -302,6 +237,6 @@ class Sizes:
         return self.evidence
 
 
-def _called(tape: Tape) -> list[Network]:
+def called(tape: Tape) -> list[Network]:
     """The networks that equations call, once for each call."""
     return [call.network for call in tape.calls.values()]

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import product
+from itertools import islice, product
 
 from flint import arb, arb_mat
 
+from .affine import Form, batch
 from .balls import ZERO, bounded_by_form, total, within_bounds
 from .document import Certificate, Ranks
 from .evidence import Ranked, Ranking, Tree
@@ -35,18 +36,31 @@ def ranks(c: Certificate, evidence: Tree | Ranked) -> int:
     cover = Cover(c, c.ranks, ranking)
     walk = Walk(c, evidence.order)
     target = Target(c, c.ranks)
-    for box in cut(cover.lo, cover.hi, ranking.tree):
-        rank, steps, at = cover.ranks[box.number], cover.steps[box.number], f"ranks leaf {box.number}"
-        if rank == UNRANKED:
-            continue
-        rows = walk.start(box)
-        for _ in range(steps):
-            rows = walk.step(rows, at)
-        if target.holds(rows, at):
-            continue
-        require(rank > 0, RULE, at, "its rank is 0, and it is not certain to lie in the target")
-        cover.leads_to(rows, rank - steps, at)
+    asked = (box for box in cut(cover.lo, cover.hi, ranking.tree) if cover.ranks[box.number] != UNRANKED)
+    size = batch(c.policy.network, walk.d)
+    while some := list(islice(asked, size)):
+        try:
+            follow(some, cover, walk, target)
+        except Refused:  # maybe of a leaf that is not the first
+            for box in some:
+                follow([box], cover, walk, target)
     return len(cover.ranks)
+
+
+def follow(some: Sequence[Box], cover: Cover, walk: Walk, target: Target) -> None:
+    """The rules for some leaves, whose policies are enclosed together, or a refusal."""
+    places = [f"ranks leaf {box.number}" for box in some]
+    steps = [cover.steps[box.number] for box in some]
+    each = [walk.start(box) for box in some]
+    for done in range(max(steps)):
+        left = [b for b, count in enumerate(steps) if count > done]
+        for b, u in zip(left, walk.inputs([each[b] for b in left]), strict=True):
+            each[b] = walk.step(each[b], places[b], u)
+    for box, rows, count, at in zip(some, each, steps, places, strict=True):
+        rank = cover.ranks[box.number]
+        if not target.holds(rows, at):
+            require(rank > 0, RULE, at, "its rank is 0, and it is not certain to lie in the target")
+            cover.leads_to(rows, rank - count, at)
 
 
 class Cover:
@@ -143,10 +157,16 @@ class Walk(Motion):
             rows.append([(arb(a) + arb(b)) / 2, *(radius if k == i else ZERO for k in range(self.d))])
         return rows
 
-    def step(self, rows: Rows, at: str) -> Rows:
-        """The states after one step more, or a refusal."""
+    def inputs(self, each: Sequence[Rows]) -> list[list[Form]]:
+        """The inputs on each of some boxes."""
+        x = arb_mat([[v for rows in each for v in rows[i]] for i in range(self.n)])
+        u = self.policy(x, len(each))
+        return [[forms[b] for forms in u] for b in range(len(each))]
+
+    def step(self, rows: Rows, at: str, u: list[Form]) -> Rows:
+        """The states after one step more, in which these are the inputs, or a refusal."""
         c = self.c
-        here = Stage(at, rows, [each[0] for each in self.policy(arb_mat(rows), 1)])
+        here = Stage(at, rows, u)
         good = self.bounded or within_bounds(c, here.ranges())
         require(good, "inputs", at, "an input is not certain to stay in its bounds")
         within = None if c.sample is None else self.reached(here)

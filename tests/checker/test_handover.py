@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from flint import fmpq
 
-from certify.checker import document, handover, limits, rules
+from certify.checker import demands, document, handover, limits, rules
 from certify.checker.case import Case
 from certify.checker.errors import Rejected
 from certify.checker.words import report
@@ -369,7 +369,7 @@ def test_both_certificates_count() -> None:
     c, other = document.certificate(json.loads(raw), ""), read(raw)
     assert c.then is not None and other.then is not None
     sizes = [limits.Sizes(one) for one in (c, c.then)]
-    own = sum(each.work() for each in sizes) + sizes[0].of_handover()
+    own = sum(each.work() for each in sizes) + demands.of_handover(sizes[0], c.then)
     theirs = sum(map(reference_limits.operations, (other, other.then))) + reference_limits.handing_over(other)
     assert own == theirs > sizes[0].work() + sizes[1].work()
     reference_limits.limits(other, theirs)

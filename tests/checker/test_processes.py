@@ -434,7 +434,7 @@ CHAPTERS = {  # the core page's table: the modules that a chapter is about
         r"^\| \[(\w+)\]\(format/\1\.md\) \| [^|]* \|([^|]*)\|$", (PACKAGE / "FORMAT.md").read_text(), re.M
     )
 }
-FEATURES = {"sections", "clauses"}.union(*CHAPTERS.values())  # those two are of several features
+FEATURES = {"sections", "clauses", "demands"}.union(*CHAPTERS.values())  # those three are of several features
 
 
 def test_each_feature_has_a_chapter_and_a_page_of_the_site() -> None:
@@ -451,9 +451,9 @@ def test_each_feature_has_a_chapter_and_a_page_of_the_site() -> None:
     ("name", "used"),
     [
         ("rotor", set()),
-        ("enlarged", {"tube", "sections"}),
+        ("enlarged", {"tube", "sections", "demands"}),
         ("sampled", {"flow"}),
-        ("outer, a network", {"outer", "sections", "clauses"}),
+        ("outer, a network", {"outer", "sections", "demands"}),
     ],
 )
 def test_an_answer_rests_on_the_modules_that_it_needs(name: str, used: set[str], tmp_path: Path) -> None:

@@ -820,7 +820,7 @@ def test_boxes_hold_all_trajectories(order: int, calls: int) -> None:
     chance, walk = random.Random(order), Walk(c, max(order, 1))
     rows = [walk.start(Box(0, [0.5, -0.5], [0.6, -0.4]))]
     for _ in range(3):
-        rows.append(walk.step(rows[-1], "here"))
+        rows.append(walk.step(rows[-1], "here", *walk.inputs([rows[-1]])))
     nearest = 0.0
     for _ in range(150):
         d = [chance.choice([-1.0, 1.0, chance.uniform(-1, 1)]) for _ in range(2)]

@@ -1,0 +1,102 @@
+"""Sums of rule `limits` for what only some certificates have: outer, ranks, data, a tube, a second certificate."""
+
+from __future__ import annotations
+
+from .document import Certificate, OuterTree, Partition, Trusted
+from .limits import LEAF, Net, Sizes, called
+
+
+def numbers(sizes: Sizes) -> int:
+    """Held at once."""
+    return of_function(sizes) + of_following(sizes) + of_measured(sizes)
+
+
+def work(sizes: Sizes) -> int:
+    """Elementary operations."""
+    return of_ranks(sizes) + of_outer(sizes) + of_data(sizes) + of_tube(sizes)
+
+
+def of_function(sizes: Sizes) -> int:
+    """Numbers for N and the loop on leaves of its tree."""
+    if sizes.c.outer is None:
+        return 0
+    tape, area = sizes.c.outer.function, (sizes.s + 1) ** 2
+    N, of_tape = Net(called(tape)), tape.size
+    found = 4 * N.entries + sum(2 * rows * area for rows, *_ in N.steps) + 8 * of_tape * area
+    return found + N.held_on_leaves(sizes.s + 1) + sizes.on_leaves(1, sizes.s)
+
+
+def of_following(sizes: Sizes) -> int:
+    """Numbers for leaves that are followed by steps."""
+    if sizes.c.ranks is None or isinstance(sizes.evidence, Trusted | OuterTree):
+        return 0
+    return 2**4 * len(sizes.c.ranks.tree) + sizes.on_leaves(sizes.evidence.order, sizes.s + sizes.n)
+
+
+def of_measured(sizes: Sizes) -> int:
+    """Numbers for transitions that are followed."""
+    data = sizes.c.data
+    if data is None:
+        return 0
+    symbols = sizes.n + len(data.parameters)
+    return sizes.c.dynamics.size * 4 * data.order * (symbols + 1) ** 2 + 8 * data.transitions * sizes.n * symbols
+
+
+def of_ranks(sizes: Sizes) -> int:
+    """Steps from leaves, and the leaves that their images meet."""
+    ranks = sizes.c.ranks
+    if ranks is None or isinstance(sizes.evidence, Trusted | OuterTree):
+        return 0
+    leaves = len(ranks.steps)
+    of_all = sizes.of_leaves(leaves + sum(ranks.steps), sizes.evidence.order, sizes.s + sizes.n)
+    return 2**9 * len(ranks.tree) + 2**17 * leaves + of_all
+
+
+def of_data(sizes: Sizes) -> int:
+    """Transitions, and sums of them, in all rounds."""
+    data = sizes.c.data
+    if data is None:
+        return 0
+    rounds = len(data.rounds) + sum(map(len, data.leaves))
+    k, followed, a = len(data.parameters), rounds * data.transitions, sizes.c.dynamics.size
+    times = 2 * data.order**3 + 8 if data.period else 1
+    models = data.pieces * (a * times + 4 * sizes.n)
+    found = sizes.boxes(followed, models, a * (data.order + 1), sizes.n + k, 0)
+    found += 2**6 * k * followed * sizes.n * (sizes.n + k + 2**6)
+    return found + 2**17 * rounds * data.order * data.pieces * (a + 4 * sizes.n)  # however few transitions are left
+
+
+def of_handover(sizes: Sizes, then: Certificate) -> int:
+    """The inequality of two matrices."""
+    if len(then.states) != sizes.n:
+        return 0
+    from .handover import difference
+
+    numerators, _ = difference(sizes.c, then).numer_denom()
+    return sizes.inverse(min(max(v.height_bits() for v in numerators.entries()), 2**16 // sizes.n))
+
+
+def of_tube(sizes: Sizes) -> int:
+    if not isinstance(sizes.evidence, Partition):
+        return 0
+    of_each = sizes.ball + sizes.equations + 3 * (sizes.inequality + sizes.decision(sizes.n))
+    tube, start = sizes.evidence.tube, sizes.c.start
+    nodes = [P for slab in tube for P in (slab.middle, slab.end)] + ([] if start is None else [start])
+    return len(tube) * of_each + sum(sizes.inverse(sizes.bits(P)) for P in nodes)
+
+
+def of_outer(sizes: Sizes) -> int:
+    evidence = sizes.evidence.outer if isinstance(sizes.evidence, Partition) else sizes.evidence
+    if sizes.c.outer is None or not isinstance(evidence, OuterTree):
+        return 0
+    tape = sizes.c.outer.function
+    N, of_tape = Net(called(tape)), tape.size
+    calls, values = 200 * N.reads, max(N.widest, 2 * of_tape)
+    faces, leaves = sum(tree.count(LEAF) for tree in evidence.faces), evidence.tree.count(LEAF)
+    found = N.folded + sizes.inverse(sizes.bits(evidence.T))
+    found += 2**8 * sum(map(len, (evidence.tree, *evidence.faces)))
+    found += sizes.boxes(faces, of_tape, values, sizes.n, calls) + faces * N.models((sizes.n + 4) ** 2)
+    found += (faces + leaves) * N.on_a_leaf(sizes.n + 1) // 8 + (1 + faces + leaves) * N.paths
+    models, calls = sizes.a + 8 * of_tape + 4 * sizes.n, calls + sizes.n * sizes.s**2 + 160 * sizes.net.reads
+    found += sizes.boxes(leaves, models, max(values, sizes.a), sizes.s, calls)
+    return found + leaves * N.models((sizes.s + 4) ** 2) + sizes.policies(leaves, 1, sizes.s)
