@@ -420,6 +420,16 @@ def test_ranges_are_rounded_outwards_within_the_priors() -> None:
         assert low <= lo and hi <= high and high - low <= (hi - lo) * Fraction(100_001, 100_000)
 
 
+def test_an_end_of_a_prior_that_no_measurement_moves_may_be_any_number(tmp_path: Path) -> None:
+    """2.1 and 2.9 are no binary64 numbers: the box that the certificate states reaches just beyond them, and the range
+    has to hold it, as `certify roa --data` asks."""
+    result = identified(tmp_path, transitions()[:6], STRUCTURE.replace("b = [1, 4]", "b = [2.1, 2.9]"), noise="0.02")
+    lo, hi = result.ranges["b"]
+    low, high = result.system.ranges["b"]
+    assert lo < Fraction("2.1") and hi > Fraction("2.9")  # neither end was moved
+    assert low <= lo and hi <= high and high - low < Fraction("0.8000001")
+
+
 # The command
 
 

@@ -19,12 +19,17 @@ from certify.loop.plants.source import PlantFile, read_plant_file
 from certify.loop.plants.system import Interval
 
 _COST = Fraction(1, 10**5)  # of a range's width, which rounding may add
+_FINER = 10**10  # rounding of an end just beyond its prior's
 _ENTRY = re.compile(r"(\s*[^=]+=\s*)\[[^\[\]]*\](\s*(?:#.*)?)")
 _MOST_DIGITS = 400
 
 
 def rounded(ranges: Mapping[str, Interval], priors: Mapping[str, Interval]) -> dict[str, Interval]:
-    """Ranges with ends of few decimal digits that hold those that are given, within the priors."""
+    """Ranges with ends of few decimal digits that hold those that are given, within the priors where these do.
+
+    An end of a prior that is no binary64 number, such as 0.05, and was not moved lies just inside the range, which
+    holds the binary64 number beyond it.
+    """
     found = dict[str, Interval]()
     for name, (lo, hi) in ranges.items():
         digits = 0
@@ -33,7 +38,11 @@ def rounded(ranges: Mapping[str, Interval], priors: Mapping[str, Interval]) -> d
         scale = 10**digits
         low, high = Fraction(lo * scale // 1, scale), Fraction(-(-hi * scale // 1), scale)
         least, most = priors[name]
-        found[name] = max(least, low), min(most, high)
+        near = scale * _FINER
+        found[name] = (
+            max(least, low) if least <= lo else Fraction(lo * near // 1, near),
+            min(most, high) if hi <= most else Fraction(-(-hi * near // 1), near),
+        )
     return found
 
 
