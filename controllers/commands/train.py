@@ -299,7 +299,7 @@ def _prospects(policy: Policy, out: Path, system: System, named: str, plant: Pla
 
 
 def _provable(policy: Policy, out: Path, system: System, plant: Plant, found: dict[str, Any]) -> dict[str, Any]:
-    """What is found of a policy, with the set that is forecast to be proved before the command to type next."""
+    """The prospects found so far, with the set that is forecast to be proved before the command to type next."""
     from controllers.evaluation.forecast import forecast_of
 
     forecast = forecast_of(policy.network, system, plant.initial_states)
