@@ -14,19 +14,24 @@ from typing import TYPE_CHECKING, Any
 
 from certify.analysis.changes import PlantChanges
 from certify.analysis.declaration import declared
-from certify.analysis.inputs import Tell, ellipsoid_beside, function_in
+from certify.analysis.inputs import Tell, ellipsoid_beside, ellipsoid_trained, function_in
 from certify.analysis.options import RoaOptions
 from certify.errors import InputError, OptionError
 
 if TYPE_CHECKING:
     from certify.analysis.identifying.linear import LinearStructure
     from certify.loop.plants import System
+    from certify.loop.policies import Policy
 
 _LISTS = "without", "inputs", "states"
 
 
-def options_of(texts: Mapping[str, Any], plant: System, tell: Tell) -> RoaOptions:
+def options_of(texts: Mapping[str, Any], plant: System, tell: Tell, policy: Policy | None = None) -> RoaOptions:
     """The options of a run from texts by their fields; the file of a second function is read for this plant.
+
+    Parameters
+    ----------
+    policy : one for this very plant; where nothing else is said of P, it is that of its training, if its record has it.
 
     Raises
     ------
@@ -41,6 +46,10 @@ def options_of(texts: Mapping[str, Any], plant: System, tell: Tell) -> RoaOption
         shaped = read.get("candidate", "auto") == "auto" and not {"Q", "R", "level"} & read.keys()
         if shaped and read.get("claim") != "invariant" and isinstance(beyond, StoredLyapunov):
             read["P"] = ellipsoid_beside(beyond, plant)
+    elif policy is not None and not {"Q", "R", "level", "candidate", "claim", "engine", "rate"} & read.keys():
+        read["P"] = ellipsoid_trained(policy, plant)
+        if read["P"] is not None:
+            tell("P is that of the policy's training, from its record; --candidate auto tries others")
     return RoaOptions(**read)
 
 

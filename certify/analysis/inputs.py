@@ -193,11 +193,20 @@ def ellipsoid_beside(stored: StoredLyapunov, plant: System) -> Array | None:
     A file that says something else than a symmetric matrix says nothing: P is a hint, and what is proved with it is
     proved like any other.
     """
+    return _hint(stored.training.get("learned"), plant)
+
+
+def ellipsoid_trained(stored: Policy, plant: System) -> Array | None:
+    """P (n, n) of the ellipsoid that a policy was trained for (`controllers flatten --curvature kept`), by its record;
+    None if that does not say. It is a hint too."""
+    return _hint(stored.training.get("flattened"), plant)
+
+
+def _hint(record: Any, plant: System) -> Array | None:
     from certify.lyapunov.function import Quadratic
 
-    learned = stored.training.get("learned")
     try:
-        P = Quadratic(learned["P"]).P if isinstance(learned, dict) else None
+        P = Quadratic(record["P"]).P if isinstance(record, dict) and "P" in record else None
     except (InputError, KeyError, ValueError, TypeError):
         return None
     return P if P is not None and len(P) == plant.n else None

@@ -61,7 +61,9 @@ def roa(
     changes = changes_of(changed)
     stored = policy_in(path, importing, system, changes, note)
     plant = plant_of(stored, system, changes, note)
-    options = options_of(typed | {"engine": _engine(context, typed.get("engine", "bounds"))}, plant, note)
+    trained = stored if system is None and not changed else None
+    engine = _engine(context, typed.get("engine", "bounds"))
+    options = options_of(typed | ({} if engine == "bounds" else {"engine": engine}), plant, note, trained)
     if contains is not None:
         region(contains, plant, CONTAINS)  # an error in it is reported before the run
     if options.claim == "invariant":

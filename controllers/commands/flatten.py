@@ -26,6 +26,25 @@ DiagonalQ = Annotated[
 ]
 DiagonalR = Annotated[str | None, typer.Option("--R", help="Diagonal of the LQR's R, as --Q.")]
 
+Box = Annotated[
+    str | None,
+    typer.Option(
+        "--box", help="Half-widths of states where the policy is used, as in x=0.4,phi=0.2; others as where runs start."
+    ),
+]
+GainAtOrigin = Annotated[
+    str, typer.Option("--gain", help="Gain at the origin: kept (as it is), or lqr (by the weights that judge runs).")
+]
+Kept = Annotated[
+    str,
+    typer.Option(
+        "--curvature", help="Curvature: removed, or kept as far as it lowers the cost of runs and a set stays provable."
+    ),
+]
+KeptVolume = Annotated[
+    float | None, typer.Option("--volume", help="Volume of that set; default: of the ellipsoid of twice the box.")
+]
+
 
 def flatten(
     context: typer.Context,
@@ -34,36 +53,15 @@ def flatten(
     weight: Annotated[
         float, typer.Option("--weight", help="Weight of easier proofs beside doing the same as before.")
     ] = 1.0,
-    box: Annotated[
-        str | None,
-        typer.Option(
-            "--box",
-            help="Half-widths of states where the policy is used, as in x=0.4,phi=0.2; others as where runs start.",
-        ),
-    ] = None,
+    box: Box = None,
     time_limit: Annotated[float, typer.Option("--time-limit", help="Seconds after which training ends.")] = 600.0,
     steps: Annotated[int, typer.Option("--steps", help="Gradient steps at most.")] = 2000,
     max_cost_change: Annotated[
         float, typer.Option("--max-cost-change", help="Share by which the median cost of a run may rise.")
     ] = 0.05,
-    gain: Annotated[
-        str,
-        typer.Option(
-            "--gain",
-            help="Gain at the origin: kept (as it is), or lqr (by the weights that judge runs).",
-        ),
-    ] = "kept",
-    curvature: Annotated[
-        str,
-        typer.Option(
-            "--curvature",
-            help="Curvature: removed, or kept as far as it lowers the cost of runs and a set stays provable.",
-        ),
-    ] = "removed",
-    volume: Annotated[
-        float | None,
-        typer.Option("--volume", help="Volume of that set; default: of the ellipsoid of twice the box."),
-    ] = None,
+    gain: GainAtOrigin = "kept",
+    curvature: Kept = "removed",
+    volume: KeptVolume = None,
     Q: DiagonalQ = None,
     R: DiagonalR = None,
     states: Annotated[int, typer.Option("--states", help="Initial states of the runs that judge a policy.")] = 200,

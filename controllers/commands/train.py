@@ -121,7 +121,7 @@ class _Task:
         """The data that are written, how the policy is, and the command to type next."""
         found = _prospects(policy, out, self.system, self.named, self.plant, as_json)
         if self.box is None:
-            return found
+            return _provable(policy, out, self.system, self.plant, found)
         if data is None:
             return found | {"next": "again with --write-data data.csv, for certify identify: there are no equations"}
         count = black_box.write_data(data, trainer, self.box)
@@ -302,6 +302,23 @@ def _prospects(policy: Policy, out: Path, system: System, named: str, plant: Pla
         )
     shown = {"nonlinearity": found.to_dict()} if as_json else {"linear part": beside_a_gain(found)}
     return {"departure": departure, **shown, "next": prove}
+
+
+def _provable(policy: Policy, out: Path, system: System, plant: Plant, found: dict[str, Any]) -> dict[str, Any]:
+    """The prospects found so far, with the set that is forecast to be proved before the command to type next."""
+    from controllers.evaluation.forecast import forecast_of
+
+    forecast = forecast_of(policy.network, system, plant.initial_states)
+    if forecast is None:
+        return found
+    said = (
+        f"volume {forecast.volume:.2g} at effort 1, by a forecast: {forecast.size:.2g} times the box of initial states"
+    )
+    following = found.pop("next")
+    if forecast.size < 1 and following.startswith("certify"):
+        flat = out.with_name(f"{out.stem}_flat.pt")
+        following = f"controllers flatten {out} --out {flat}, since less than its box is in reach"
+    return found | {"provable": said, "next": following}
 
 
 train.__signature__ = _signature()  # type: ignore[attr-defined]

@@ -6,6 +6,7 @@ import inspect
 import json
 import typing
 from collections.abc import Mapping
+from dataclasses import replace
 from fractions import Fraction
 from itertools import cycle
 from pathlib import Path
@@ -27,6 +28,7 @@ from certify.cli.main import _run, command_line
 from certify.cli.options import FIRST
 from certify.loop.plants import System
 from certify.loop.plants.system import Interval
+from certify.loop.policies import load_policy
 from docs.hooks import on_page_markdown
 
 ROOT = Path(__file__).parent.parent.parent
@@ -225,3 +227,22 @@ def test_help_names_each_import_option_once(capsys: pytest.CaptureFixture[str]) 
         found = parameters(command)
         assert found["kind"].opts == [kind]
         assert len({one for each in found.values() for one in each.opts}) == len(found), json.dumps(command)
+
+
+def test_the_p_of_a_policys_training_is_tried_where_nothing_else_is_said() -> None:
+    """It is a hint: a candidate, weights or a claim outrank it, and a record that says nonsense says nothing."""
+    plant, told = get_system("pendulum"), list[str]()
+    stored = load_policy(SHIPPED)
+    P = [[2.0, 0.5], [0.5, 1.0]]
+
+    def read(texts: dict[str, str], record: object) -> object:
+        policy = replace(stored, training={"flattened": record})
+        return options_of(texts, plant, told.append, policy).P
+
+    np.testing.assert_array_equal(read({}, {"P": P}), np.array(P))
+    assert "--candidate auto tries others" in told[0]
+    for texts in ({"candidate": "auto"}, {"Q": "1,1"}, {"level": "0.1"}, {"claim": "practical"}):
+        assert read(texts, {"P": P}) is None
+    for record in (None, {}, {"P": "nonsense"}, {"P": [[1.0]]}, {"P": [[1.0, 0.0], [1.0, 1.0]]}):
+        assert read({}, record) is None
+    assert options_of({}, plant, told.append).P is None

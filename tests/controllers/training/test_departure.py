@@ -15,6 +15,7 @@ from certify.errors import InputError
 from certify.loop.plants import get_system
 from certify.loop.policies import PolicyNetwork, load_policy
 from controllers.cli import app
+from controllers.evaluation.forecast import forecast_of
 from controllers.options import get_plant, preset
 from controllers.training.departure import departure, departure_of, linearised
 from controllers.training.interface import Interface
@@ -197,7 +198,10 @@ def test_the_command_line_trains_with_it_and_records_it(tmp_path):
     said, network = json.loads(done.stdout), load_policy(tmp_path / "p.pt").network
     assert said["departure"] == departure_of(network, get_plant("pendulum").initial_states)
     assert said["nonlinearity"]["states"] == 1000 and said["nonlinearity"]["rms"] >= 0
-    assert said["next"].startswith("certify roa --policy" if said["departure"] <= 1 else "controllers flatten")
+    forecast = forecast_of(network, get_system("pendulum"), get_plant("pendulum").initial_states)
+    easy = said["departure"] <= 1 and (forecast is None or forecast.size >= 1)
+    assert said["next"].startswith("certify roa --policy" if easy else "controllers flatten")
+    assert ("provable" in said) == (forecast is not None)
     refused = runner.invoke(app, ["train", "pendulum", "--proof-box", "1", "--out", str(tmp_path / "q.pt"), "--json"])
     assert refused.exit_code == 2
     assert "--proof-box must be 2 numbers for pendulum" in json.loads(refused.stdout)["error"]
