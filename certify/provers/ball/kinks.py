@@ -24,6 +24,7 @@ from certify.provers.ball.jets import Jet, Jets, basis, beyond_tangent, product_
 
 Array = NDArray[np.float64]
 _NONE = 1e-12  # what a unit reads that counts as 0 there
+_FINEST = 2.0**-14  # half width of a leaf: what does not hold there does not hold on narrower cones
 _SIDE = 1 + 1e-6  # factor of what an entry moves beside its cone's middle, for the checker's rounding
 _COARSE, _FINE = np.arange(-4.0, 24.0), np.arange(-7.0, 8.0) / 8  # powers of 2 to choose a multiplier from
 
@@ -44,6 +45,7 @@ class Cone:
 
     c: Array
     r: Array
+    close: bool = False  # for the difference of any two d, not of d and 0
 
     @property
     def narrow(self) -> bool:
@@ -132,7 +134,7 @@ class Directions:
                         tree.append(LEAF)
                         count += 1
                         continue
-                    if not np.any(r) or count + len(boxes) >= most:
+                    if not np.any(r > _FINEST) or count + len(boxes) >= most:
                         return None
                     axis = int(np.argmax(r))
                 tree.append(axis)
@@ -243,8 +245,12 @@ class OnCone(Algebra[Vector]):
         below, above = self.cone.reach(v.G, off)
         p, q = sectors(v.y, below, above, lo, hi)
         p, q = np.where(at_0, np.where(below > 0, 0.0, 1.0), p), np.where(at_0, np.where(above > 0, 1.0, 0.0), q)
+        far = np.maximum(below, above)
+        if self.cone.close:  # all slopes between any two points; curves have at most three times their size
+            p, q, off = np.where(p < 1, 0.0, p), np.where(q > 0, 1.0, q), tilt + 3 * (off - tilt)
+            far = np.linalg.norm(v.G, axis=1) + off
         w = (q - p) / 2
-        self._with(np.zeros_like(E), (w[:, None] * v.G, w * off, w * np.maximum(below, above)))
+        self._with(np.zeros_like(E), (w[:, None] * v.G, w * off, w * far))
         return self._units(y, (p + q) / 2, v, L)
 
     def sum(self, step: Sum, *vectors: Vector) -> Vector:

@@ -31,6 +31,7 @@ from certify.provers.ball.decrease import (
 from certify.provers.ball.kinks import ALL, Cone, Directions, has_kinks
 from certify.provers.ball.models import AT_CORNERS, Models, Paths, corner_of, paths
 from certify.provers.ball.steps import Cell, Steps, steps_of
+from certify.provers.base import FEW
 
 Array = NDArray[np.float64]
 _LEAST = 1e-280  # a level, below which binary64 holds nothing more
@@ -118,6 +119,8 @@ def _beyond_kinks(rule: Rule, found: float | None, limit: float, effort: Effort)
         level *= _DOWN
         if kinked is None or level < _LOWEST * limit or effort.over:
             return None
+    if level < limit and len(rule.T) > FEW:  # no ring is expected to lead on
+        return _closer(lambda one: good(one, kinked), level, min(level / _DOWN, limit), effort)
     return level
 
 
@@ -150,7 +153,7 @@ def prove_band(
 
     def floor(level: float) -> float:
         if level not in floors:
-            found = rule.around(level)
+            found = _around(rule, level)[1]
             effort.charge(max(found.rounds * rule.operations, rule.operations_of_models))
             floors[level] = max(found.floor, _NOTHING * limit)
         return floors[level]
@@ -163,6 +166,15 @@ def prove_band(
         level, least = level * _LOWER, floor(level)
     c1 = _largest(lambda level: floor(level) <= above * least, top, effort, _LOWER)
     return (floor(top), top) if c1 is None else (floor(c1), c1)
+
+
+def _around(rule: Rule, level: float, floor: float = math.inf) -> tuple[Rule, _Around]:
+    """The rule, with kinks where it shows no floor up to that without, and the least floor on the ball of a level."""
+    found = rule.around(level)
+    if found.floor < level and found.floor <= floor:
+        return rule, found
+    kinked = rule.with_kinks(level)
+    return (rule, found) if kinked is None else (kinked, kinked.around(level))
 
 
 def local_margin(problem: Problem, T: Array, level: float, known: Paths) -> float:
@@ -182,8 +194,7 @@ def local_ball(
             rule, shown = kinked, kinked.shown(level)
         by, edge = shown.multipliers, 0.0
     else:
-        rule = Rule.anywhere(problem, T)
-        found = rule.around(level)
+        rule, found = _around(Rule.anywhere(problem, T), level, floor)
         by, edge = found.multipliers, found.edge
     directions = None if rule.directions is None else rule.directions.trees
     ball = LocalBall(ball_around(problem, T, level), by.rows, by.weight, edge, rule.steps.order, directions)
@@ -351,6 +362,8 @@ class Rule:
 
         with np.errstate(all="ignore"):
             if not np.all(np.isfinite(J)):
+                return None
+            if not all(models.finite and models.admitted for models in self.models(J, level, ALL)):
                 return None
             return Directions(len(J)).refined(leaves_decay, _MOST_CONES)
 
