@@ -27,7 +27,6 @@ from .decrease import (
     length_of,
     length_of_kinks,
     of_kinks,
-    weight_on,
     whatever_y,
     with_cubic,
 )
@@ -95,7 +94,7 @@ def contracts(c: Certificate, J: fmpq_mat, g: Sequence[arb], weight: fmpq_mat, G
     left = -form - turned / 2
     for column, f in zip(columns, G.components, strict=True):
         left -= 3 * with_cubic(column, f, arb_mat(weight))
-    left -= of_kinks(columns, G, weight_on(G.cone, weight))
+    left -= of_kinks(columns, G, arb_mat(weight))
     along += total(2 * norm(column.entries()) * v for column, v in zip(columns, wrong, strict=True))
     return certainly_positive(left - diagonal([along] * n))
 

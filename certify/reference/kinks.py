@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from flint import arb, arb_mat, fmpq
 
 from .balls import ONE, ZERO, finite, norm, total
+from .refusal import Refused
 
 if TYPE_CHECKING:
     from .model import Model
@@ -109,7 +110,7 @@ class Entry:
     slope: arb
     off: arb
     slack: arb
-    kink: Kink | None
+    kink: Kink | None = None
 
 
 def entry(cone: Cone, v: Model, lo: arb, hi: arb | None) -> Entry:
@@ -122,7 +123,7 @@ def entry(cone: Cone, v: Model, lo: arb, hi: arb | None) -> Entry:
     p, q = sector(v, lo, hi, below, above)
     value = v.v.max(lo) if hi is None else v.v.max(lo).min(hi)
     if p == q:
-        return Entry(value, p, p * v.doubt, p * v.slack, None)
+        return Entry(value, p, p * v.doubt, p * v.slack)
     if v.lip is not None:
         p, q = ZERO, ONE
     m = arb(((p + q) / 2).mid())
@@ -131,6 +132,16 @@ def entry(cone: Cone, v: Model, lo: arb, hi: arb | None) -> Entry:
         known = v.turn + 2 * v.bend + 3 * v.twist + v.lip
         size = norm(v.a.entries()) + known
     return Entry(value, m, v.doubt, m * v.slack, Kink(w * v.a, largest(w * known), largest(w * size)))
+
+
+def on_one_side(v: Model, lo: arb, hi: arb) -> Entry:
+    """The same without kinks, where v itself or one of the ends is all that there is on the ball; else a refusal."""
+    below, above = v.v - v.reach, v.v + v.reach
+    if below > lo and above < hi:
+        return Entry(v.v, ONE, v.off, v.slack)
+    if above < lo or below > hi:
+        return Entry(lo if above < lo else hi, ZERO, ZERO, ZERO)
+    raise Refused("local", "ball", "a clip in a network may begin to act")
 
 
 def sector(v: Model, lo: arb, hi: arb | None, below: arb, above: arb) -> tuple[arb, arb]:

@@ -14,12 +14,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import zip_longest
+from typing import TypeVar
 
 from flint import arb, arb_mat
 
 from . import functions, lipschitz
 from .balls import ZERO, finite, identity, norm, total
 from .symmetric import linear_times_square, no_form, squared_norm
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -167,15 +170,8 @@ class Model:
             da = tuple(p + q for p, q in zip(self.da, other.da, strict=True))
         lip = None if self.lip is None or other.lip is None else self.lip + other.lip
         off, slack = self.off + other.off, self.slack + other.slack
-        return Model(v, a, Q, K, E, B, self.named(other), dv, da, lip, off, slack, self.kinks_of(other))
-
-    def kinks_of(self, other: Model) -> tuple[arb, ...]:
-        """`rhos` of both, as `errors`."""
-        return max(self.rhos, other.rhos, key=len)
-
-    def named(self, other: Model) -> tuple[arb_mat, ...]:
-        """`errors` of both: calls add to them in the order of the equations, so that one has those of the other."""
-        return max(self.errors, other.errors, key=len)
+        errors, rhos = longer(self.errors, other.errors), longer(self.rhos, other.rhos)
+        return Model(v, a, Q, K, E, B, errors, dv, da, lip, off, slack, rhos)
 
     def among(self, errors: tuple[arb_mat, ...], rhos: tuple[arb, ...]) -> Model:
         """The same with all the errors that there are."""
@@ -208,7 +204,7 @@ class Model:
         v, w = self, other
         n, outer = v.a.nrows(), v.a * w.a.transpose()
         Q = v.v * w.Q + w.v * v.Q + (outer + outer.transpose()) / 2
-        K = v.v * w.K + w.v * v.K + v.times_square(w) + w.times_square(v)
+        K = v.v * w.K + w.v * v.K + times_square(v, w) + times_square(w, v)
         B = tuple(v.v * q + w.v * p for p, q in zip_longest(v.B, w.B, fillvalue=ZERO))
         known = v.slope * w.twist + w.slope * v.twist + (v.bend + v.twist) * (w.bend + w.twist)
         of_Q = v.doubt * w.bend + w.doubt * v.bend + v.turn * w.slope + w.turn * (v.slope - v.turn)
@@ -224,14 +220,20 @@ class Model:
         dv = tuple(v.v * q + w.v * p for (p, _), (q, _) in each)
         da = tuple(v.v * b + w.v * a + p * w.a + q * v.a for (p, a), (q, b) in each)
         lip = lipschitz.of_product(v, w, 2 * of_Q + 3 * of_K)
-        a, named = v.v * w.a + w.v * v.a, v.named(w)
-        return Model(v.v * w.v, a, Q, K, E, B, named, dv, da, lip, off, slack, v.kinks_of(w))
-
-    def times_square(self, other: Model) -> arb_mat:
-        """(a.d)(d'Qd), a of this model and Q of the other."""
-        nothing = self.slope.is_zero() or other.bend.is_zero()
-        return no_form(self.a.nrows()) if nothing else linear_times_square(self.a, other.Q)
+        a, errors, rhos = v.v * w.a + w.v * v.a, longer(v.errors, w.errors), longer(v.rhos, w.rhos)
+        return Model(v.v * w.v, a, Q, K, E, B, errors, dv, da, lip, off, slack, rhos)
 
     def function(self, name: str) -> Model:
         """phi of v."""
         return functions.function_of(self, name)
+
+
+def times_square(v: Model, w: Model) -> arb_mat:
+    """(a.d)(d'Qd), a of v and Q of w."""
+    nothing = v.slope.is_zero() or w.bend.is_zero()
+    return no_form(v.a.nrows()) if nothing else linear_times_square(v.a, w.Q)
+
+
+def longer(one: tuple[T, ...], other: tuple[T, ...]) -> tuple[T, ...]:
+    """Errors of both: calls add to them in the order of the equations, so that one has those of the other."""
+    return max(one, other, key=len)

@@ -22,10 +22,9 @@ from .document import Certificate
 from .expressions import Call
 from .function import net_at_0
 from .functions import Beyond, beyond_tangent, expansion, unsure
-from .kinks import Cone, Entry, Kink, entry
+from .kinks import Cone, Entry, Kink, entry, on_one_side
 from .model import Model
 from .networks import Affine, Clip, Concat, Map, Observe, Product, Sum, paired
-from .refusal import Refused
 from .symmetric import half, no_form, whole
 
 
@@ -95,10 +94,14 @@ class Stack:
         none = arb_mat(self.n, self.n)
         self.append(Beyond(none, no_form(self.n), none, ZERO if self.steady else None))
 
-    def swings(self, L: arb_mat) -> list[arb]:
-        """sum_q |L_iq| rho_q over the kinks, for each row."""
+    def with_kinks(self, models: list[Model], L: arb_mat) -> list[Model]:
+        """The same, each with one error that is all it sees of the kinks, within sum_q |L_iq| rho_q ||d||."""
+        if not self.kinks:
+            return models
         seen = [(q, kink.rho) for q, kink in self.kinks.items() if q < L.ncols()]
-        return [total(abs(row[q]) * rho for q, rho in seen) for row in L.tolist()]
+        swings = [total(abs(row[q]) * rho for q, rho in seen) for row in L.tolist()]
+        none = (arb_mat(self.n, self.n),)
+        return [replace(v, B=(ONE,), errors=none, rhos=(s,)) for v, s in zip(models, swings, strict=True)]
 
     def append(self, unit: Beyond) -> None:
         self.H.append(half(unit.H))
@@ -208,22 +211,27 @@ class OnBall:
         models = self.models(v)
         if self.cone is not None and step.function == "relu":
             return self.kinked(v, [entry(self.cone, y, ZERO, None) for y in models])
-        each = [expansion(y, step.function) for y in models]
-        for y, phi in zip(models, each, strict=True):
+        each = list[Entry]()
+        for y in models:
+            phi = expansion(y, step.function)
             self.stack.append(beyond_tangent(y, phi))
-        off, slack = (
-            [*part] for part in zip(*(unsure(y, phi) for y, phi in zip(models, each, strict=True)), strict=True)
-        )
-        values, slopes = [phi.at[0] for phi in each], [phi.at[1] for phi in each]
-        return self.made(lambda: self.widened(v.tangent).scaled(slopes, values, True), off, slack)
+            each.append(Entry(*phi.at[:2], *unsure(y, phi)))
+        return self.sloped(v, each, True)
 
     def kinked(self, v: Vector, each: Sequence[Entry]) -> Vector:
-        """Entries with a slope and a unit each, which is a kink or nothing."""
+        """Entries with a unit each, which is a kink or nothing."""
         for one in each:
             self.stack.bend(one.kink)
+        return self.sloped(v, each, True)
+
+    def sloped(self, v: Vector, each: Sequence[Entry], own: bool) -> Vector:
+        """Every entry times its slope, but for the values, and then units for each, which are there by now."""
         slopes, values = [one.slope for one in each], [one.value for one in each]
-        off, slack = [one.off for one in each], [one.slack for one in each]
-        return self.made(lambda: self.widened(v.tangent).scaled(slopes, values, True), off, slack)
+
+        def make() -> Tangent:
+            return (self.widened(v.tangent) if own else v.tangent).scaled(slopes, values, own)
+
+        return self.made(make, [one.off for one in each], [one.slack for one in each])
 
     def widened(self, y: Tangent) -> Tangent:
         """The same with a column for each unit before those of a map."""
@@ -232,24 +240,10 @@ class OnBall:
 
     def clip(self, step: Clip, v: Vector) -> Vector:
         """Each entry as it is or as an end, if one of both is certain; else, with a cone, it is a kink."""
+        each = list(zip(self.models(v), map(arb, step.lo), map(arb, step.hi), strict=True))
         if self.cone is not None:
-            each = zip(self.models(v), map(arb, step.lo), map(arb, step.hi), strict=True)
             return self.kinked(v, [entry(self.cone, *one) for one in each])
-        factors, values = list[arb](), list[arb]()
-        for y, lo, hi in zip(self.models(v), map(arb, step.lo), map(arb, step.hi), strict=True):
-            below, above = y.v - y.reach, y.v + y.reach
-            if below > lo and above < hi:
-                factors.append(ONE)
-                values.append(y.v)
-            elif above < lo or below > hi:
-                factors.append(ZERO)
-                values.append(lo if above < lo else hi)
-            else:
-                raise Refused("local", "ball", "a clip in a network may begin to act")
-        doubts = [(k * off, k * slack) for k, (off, slack) in zip(factors, v.doubts(), strict=True)]
-        return self.made(
-            lambda: v.tangent.scaled(factors, values, False), *([*part] for part in zip(*doubts, strict=True))
-        )
+        return self.sloped(v, [on_one_side(*one) for one in each], False)
 
     def sum(self, step: Sum, *vectors: Vector) -> Vector:
         def make() -> Tangent:
@@ -314,13 +308,6 @@ class OnBall:
         results = step.expressions.evaluate(dict(zip(step.names, models, strict=True)), constant)
         return self.rooted(results, [False] * step.size)
 
-    def weighted(self, v: Vector, factors: Sequence[arb], at_0: list[arb]) -> Vector:
-        """Every entry times a factor, with these values."""
-        doubts = [(abs(k) * off, abs(k) * slack) for k, (off, slack) in zip(factors, v.doubts(), strict=True)]
-        return self.made(
-            lambda: v.tangent.scaled(factors, at_0, False), *([*part] for part in zip(*doubts, strict=True))
-        )
-
     # ------------------------------------------------------------------------------------------------- the results
 
     def models(self, v: Vector) -> list[Model]:
@@ -340,10 +327,7 @@ class OnBall:
             Model(x, arb_mat(n, 1, row), whole(q, n), arb_mat(1, len(k), k), whole(e, n), lip=lip, off=off, slack=slack)
             for (x, row, (off, slack)), q, k, e, lip in zip(each, Q, K, E, lips, strict=True)
         ]
-        if not stack.kinks:
-            return models
-        none, swings = (arb_mat(n, n),), stack.swings(y.ways)
-        return [replace(v, B=(ONE,), errors=none, rhos=(s,)) for v, s in zip(models, swings, strict=True)]
+        return stack.with_kinks(models, y.ways)
 
     def results(
         self, v: Vector, wanted: Sequence[int], before: Sequence[arb_mat] = (), rhos: Sequence[arb] = ()
@@ -403,8 +387,11 @@ class Policy:
         if policy.squash == "tanh":
             y = algebra.map(Map((), self.c.m, "tanh"), y)
         values = [self.input_at(j, v, at_origin) for j, v in enumerate(y.tangent.at_0)]
-        u = algebra.weighted(y, [arb(s) for s in policy.scale], values)
-        return algebra.results(u, range(self.c.m))
+        each = [
+            Entry(value, scale, abs(scale) * off, abs(scale) * slack)
+            for value, scale, (off, slack) in zip(values, map(arb, policy.scale), y.doubts(), strict=True)
+        ]
+        return algebra.results(algebra.sloped(y, each, False), range(self.c.m))
 
     def before_squash(self, j: int, net: arb, at_origin: bool) -> arb:
         """The value before the squash at the centre, where the network is `net`; `preactivation` gives beta at 0."""
