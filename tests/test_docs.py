@@ -123,7 +123,7 @@ def test_commands_exist_with_their_options(page: Path) -> None:
             assert words[1] in commands, line
             known = {name for parameter in commands[words[1]].params for name in parameter.opts}
             until = next((k for k, word in enumerate(words) if word in ("|", "||", "&&", ">")), len(words))
-            given = {word for word in words[2:until] if word.startswith("--")}
+            given = {word.partition("=")[0] for word in words[2:until] if word.startswith("--")}
             assert given <= known | {"--help"}, f"{line}: {sorted(given - known)}"
 
 
