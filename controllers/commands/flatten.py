@@ -72,7 +72,8 @@ def flatten(
     """Fine-tune a policy so that it does the same and is easier to prove.
 
     Layers, squash, centring, scale, offset and clip stay. Nothing is written unless as many runs settle as before, the
-    median cost stays within its bound, and what a proof must absorb of the hidden units is less than it was.
+    median cost stays within its bound, and what a proof must absorb of the hidden units is less than it was; with
+    --curvature kept, unless the cost and the boxes that a proof is forecast to take are less together.
     """
     with errors(context, as_json):
         from certify.loop.policies import load_policy, save_policy
