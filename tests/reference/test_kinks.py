@@ -388,6 +388,47 @@ def test_with_a_clause_disabled_a_forgery_gets_through(clause: str, monkeypatch:
     assert judge(data) is None
 
 
+def test_the_length_of_kinks_in_the_steps_of_a_contraction(monkeypatch: pytest.MonkeyPatch) -> None:
+    """x+ = -6/5 x + w on one side, about the mean of which the kink is all that matters."""
+    data = loop(
+        [["+", "x", "u", "w"]], relus(LEFT_AND_RIGHT, [-2.2, 0.0]), [[1.0]], (0.03125, 0.25, 0.25), claim="nearby",
+        uncertain=[("w", "-1/64", "1/64")], cells=[1], edge=0.125, time="discrete",
+    )  # fmt: skip
+    section = {"J": encode([[0.18]]), "weights": encode([1e-9]), "weight": encode([[1.0]]), "directions": []}
+    data = edited(data, "evidence.contraction", section)
+    assert judge(data) == "local"
+    monkeypatch.setattr(decrease, "length_of_kinks", lambda P, G: arb(0))
+    assert judge(data) == "contraction"
+    monkeypatch.setattr(contraction, "length_of_kinks", lambda P, G: arb(0))
+    assert judge(data) is None
+
+
+def test_a_kink_of_what_bends() -> None:
+    """v = a.d + d'Qd: e(d) of relu and of a clip, and differences of it, within their bounds."""
+    generator, closest = np.random.default_rng(3), [0.0, 0.0]
+    for _ in range(200):
+        n, hi = int(generator.integers(1, 4)), None if generator.integers(2) else 0.5
+        a, Q = generator.normal(size=n) * generator.choice([0.0, 0.1, 1.0]), generator.normal(size=(n, n))
+        Q += Q.T
+        v0 = float(generator.choice([0.0, -0.3, 0.4]))
+        d = generator.normal(size=(n, 300))
+        d *= generator.choice([1.0, 0.9, 0.3], 300) / np.linalg.norm(d, axis=0)
+        v = a @ d + form(Q, d, d)
+        for steady in (False, True):
+            bent = arb_mat([[arb(x) for x in row] for row in Q])
+            model = replace(Model.affine(arb(v0), list(map(arb, a)), lip=arb(0) if steady else None), Q=bent)
+            found = entry(kinks.ALL, model, arb(0), None if hi is None else arb(hi))
+            if found.kink is None:
+                continue
+            left = np.clip(v0 + v, 0, hi) - np.clip(v0, 0, hi) - float(found.slope) * v
+            e, left = (d[:, 1:] - d[:, :-1], left[1:] - left[:-1]) if steady else (d, left)
+            size, alpha = np.linalg.norm(e, axis=0), np.array([float(x) for x in found.kink.alpha.entries()])
+            bound = np.minimum(abs(alpha @ e) + float(found.kink.beta) * size, float(found.kink.rho) * size) + 1e-12
+            assert (abs(left) <= bound).all()
+            closest[steady] = max(closest[steady], float(np.max(abs(left) / bound)))
+    assert min(closest) > 0.9
+
+
 # ----------------------------------------------------------------------------------------------------- random networks
 
 
