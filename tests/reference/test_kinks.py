@@ -12,11 +12,12 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
+from itertools import permutations
 from typing import Any
 
 import numpy as np
 import pytest
-from flint import arb, arb_mat, fmpq
+from flint import arb, arb_mat, fmpq, fmpq_mat
 
 from certify.reference import contraction, decrease, kinks, local, tangents
 from certify.reference.decrease import positive_on
@@ -24,10 +25,12 @@ from certify.reference.document import read
 from certify.reference.kinks import Cone, Entry, entry, sector
 from certify.reference.limits import operations
 from certify.reference.local import cones
+from certify.reference.loop import Loop
 from certify.reference.model import Model
 from certify.reference.refusal import Refused
 from tests.support.balls import around, centred
 from tests.support.certificates import Document, dump, edited, encode, make
+from tests.support.models import triples
 from tests.support.network_loops import affine, hashed, joined, mapped
 from tests.support.reference import judge
 
@@ -385,6 +388,47 @@ def test_with_a_clause_disabled_a_forgery_gets_through(clause: str, monkeypatch:
     assert judge(data) is None
 
 
+def test_the_length_of_kinks_in_the_steps_of_a_contraction(monkeypatch: pytest.MonkeyPatch) -> None:
+    """x+ = -6/5 x + w on one side, about the mean of which the kink is all that matters."""
+    data = loop(
+        [["+", "x", "u", "w"]], relus(LEFT_AND_RIGHT, [-2.2, 0.0]), [[1.0]], (0.03125, 0.25, 0.25), claim="nearby",
+        uncertain=[("w", "-1/64", "1/64")], cells=[1], edge=0.125, time="discrete",
+    )  # fmt: skip
+    section = {"J": encode([[0.18]]), "weights": encode([1e-9]), "weight": encode([[1.0]]), "directions": []}
+    data = edited(data, "evidence.contraction", section)
+    assert judge(data) == "local"
+    monkeypatch.setattr(decrease, "length_of_kinks", lambda P, G: arb(0))
+    assert judge(data) == "contraction"
+    monkeypatch.setattr(contraction, "length_of_kinks", lambda P, G: arb(0))
+    assert judge(data) is None
+
+
+def test_a_kink_of_what_bends() -> None:
+    """v = a.d + d'Qd: e(d) of relu and of a clip, and differences of it, within their bounds."""
+    generator, closest = np.random.default_rng(3), [0.0, 0.0]
+    for _ in range(200):
+        n, hi = int(generator.integers(1, 4)), None if generator.integers(2) else 0.5
+        a, Q = generator.normal(size=n) * generator.choice([0.0, 0.1, 1.0]), generator.normal(size=(n, n))
+        Q += Q.T
+        v0 = float(generator.choice([0.0, -0.3, 0.4]))
+        d = generator.normal(size=(n, 300))
+        d *= generator.choice([1.0, 0.9, 0.3], 300) / np.linalg.norm(d, axis=0)
+        v = a @ d + form(Q, d, d)
+        for steady in (False, True):
+            bent = arb_mat([[arb(x) for x in row] for row in Q])
+            model = replace(Model.affine(arb(v0), list(map(arb, a)), lip=arb(0) if steady else None), Q=bent)
+            found = entry(kinks.ALL, model, arb(0), None if hi is None else arb(hi))
+            if found.kink is None:
+                continue
+            left = np.clip(v0 + v, 0, hi) - np.clip(v0, 0, hi) - float(found.slope) * v
+            e, left = (d[:, 1:] - d[:, :-1], left[1:] - left[:-1]) if steady else (d, left)
+            size, alpha = np.linalg.norm(e, axis=0), np.array([float(x) for x in found.kink.alpha.entries()])
+            bound = np.minimum(abs(alpha @ e) + float(found.kink.beta) * size, float(found.kink.rho) * size) + 1e-12
+            assert (abs(left) <= bound).all()
+            closest[steady] = max(closest[steady], float(np.max(abs(left) / bound)))
+    assert min(closest) > 0.9
+
+
 # ----------------------------------------------------------------------------------------------------- random networks
 
 
@@ -469,14 +513,15 @@ def lyapunov(A: np.ndarray) -> np.ndarray:
     """P of A'P + P A = -I."""
     n = len(A)
     eye = np.eye(n)
-    P: np.ndarray = np.linalg.solve(np.kron(A.T, eye) + np.kron(eye, A.T), -eye.ravel()).reshape(n, n)
-    return (P + P.T) / 2
+    P = np.linalg.solve(np.kron(A.T, eye) + np.kron(eye, A.T), -eye.ravel()).reshape(n, n)
+    result: np.ndarray = (P + P.T) / 2
+    return result
 
 
 def partial(A: Any, B: Any, steps: Steps, P: Any, c: float, time: str, directions: Any) -> Callable[[float], Document]:
     """x' = A x + B u, or x + (A x + B u) / 8 the next state, by the rate."""
     n, names = len(A), "xyz"
-    f = [
+    f: list[Any] = [
         ["+", *(["*", str(Fraction(A[i, j])), names[j]] for j in range(n)), ["*", str(Fraction(B[i])), "u"]]
         for i in range(n)
     ]
@@ -486,6 +531,101 @@ def partial(A: Any, B: Any, steps: Steps, P: Any, c: float, time: str, direction
         f, steps, P, (c, c), directions=directions, rate=rate, time=time, beta=1e-3,
         domain=[("-99", "99")] * n, input_bounds=[("-999", "999")],
     )  # fmt: skip
+
+
+# -------------------------------------------------------------------------------------------------------------- models
+
+
+def system(kind: str, generator: np.random.Generator) -> tuple[Document, Callable[[np.ndarray, float], np.ndarray]]:
+    """x' = sin(x) u + y, y' = x relu-network(y, w, u) - y + tanh(u), and these numbers in floats."""
+    steps, inner = drawn(kind, 2, generator), drawn("relu", 3, generator)
+    if generator.integers(2):
+        b = generator.choice([0.0, 0.1], 3)
+        seen = ["+", ["*", "1/2", "a"], ["*", "a", "c"]]
+        observe = {"kind": "observe", "of": [2], "names": ["a", "b", "c"], "expressions": [seen, "b", "c"]}
+        steps = [affine(0, generator.normal(size=(3, 2)), b), mapped(1, "relu"), observe, mapped(3, "relu")]
+        steps += [affine(4, generator.normal(size=(1, 3)))]
+    network = {"name": "g", "reads": 3, "steps": inner}
+    called = ["*", ["+", "x", "w"], ["network", "g", 0, "y", "w", "u"]]
+    dynamics = [["+", ["*", ["sin", "x"], "u"], "y"], ["+", called, ["-", "y"], ["tanh", "u"]]]
+    data = loop(
+        dynamics, steps, np.eye(2), (0.01, 0.04, 0.04), claim="practical", networks=[network],
+        uncertain=[("w", "-1/32", "1/16")], cells=[1],
+    )  # fmt: skip
+
+    def F(x: np.ndarray, w: float) -> np.ndarray:
+        u = (observed(steps, x) - observed(steps, np.zeros((2, 1))))[0]
+        g = value(inner, np.stack([x[1], np.full_like(u, w), u]))[0]
+        return np.stack([np.sin(x[0]) * u + x[1], (x[0] + w) * g - x[1] + np.tanh(u)])
+
+    return data, F
+
+
+def observed(steps: Steps, x: np.ndarray) -> np.ndarray:
+    """A network that may have the expressions of `system`."""
+    for k, step in enumerate(steps):
+        if step["kind"] == "observe":
+            a, b, c = value(steps[:k], x)
+            rest = [{**each, "of": [i - k - 1 for i in each["of"]]} for each in steps[k + 1 :]]
+            return value(rest, np.stack([a / 2 + a * c, b, c]))
+    return value(steps, x)
+
+
+def known_part(f: Model, d: np.ndarray, y: float) -> np.ndarray:
+    """The polynomial of a model at columns d, and y."""
+    n = len(d)
+    a = floats(f.a)[:, 0] + (y * floats(f.da[0])[:, 0] if f.da else 0)
+    result = float(f.v) + (y * float(f.dv[0]) if f.dv else 0) + a @ d + form(floats(f.Q), d, d)
+    for place, k in zip(triples(n), floats(f.K)[0], strict=True):
+        result = result + k * orders_of(place) * np.prod(d[list(place)], axis=0)
+    return np.asarray(result)
+
+
+def orders_of(place: tuple[int, ...]) -> int:
+    return len(set(permutations(place)))
+
+
+def floats(A: arb_mat) -> np.ndarray:
+    return np.array([[float(v.mid()) for v in row] for row in A.tolist()])
+
+
+@pytest.mark.parametrize("steady", [False, True])
+@pytest.mark.parametrize("kind", ["relu", "clip", "layers", "product", "tanh", "sum"])
+def test_models_on_a_cone_hold_the_truth(kind: str, steady: bool) -> None:
+    """F less a model's polynomial, at states of the cone, is within what the model and the kinks say, and so are
+    differences of it, where there are Lipschitz constants."""
+    generator, closest, J = np.random.default_rng(len(kind) + steady), 0.0, 0.2 * np.eye(2)
+    for _ in range(6):
+        data, F = system(kind, generator)
+        c = read(dump(data))
+        whole, all_cones = Loop(c), cones([base64.b64decode(t) for t in trees(2, 2)], 2, "local")
+        cone = [*all_cones, kinks.ALL][int(generator.integers(17))]
+        assert cone is not None
+        exactly = fmpq_mat([[fmpq(*float(v).as_integer_ratio()) for v in row] for row in J])
+        known = whole.on_cone(exactly, cone, "local", "ball", steady=steady)
+        field = whole.within(known, c.plant.ranges, "local", "ball")
+        d = generator.normal(size=(400, 2)) if cone.is_all else inside(cone, generator, 400)
+        d = (d / np.linalg.norm(d, axis=1)[:, None] * generator.choice([1.0, 0.6, 0.2, 0.01], 400)[:, None]).T
+        y = float(generator.choice([-1.0, -0.3, 0.7, 1.0]))
+        truth, rows = F(J @ d, 1 / 64 + y * 3 / 64), floats(field.units.L)
+        for f, value_of in zip(field.components, truth, strict=True):
+            ways, left = np.array([float(v.mid()) for v in f.B]) @ rows, value_of - known_part(f, d, y)
+            if steady:
+                assert f.lip is not None
+                e, left = d[:, 1:] - d[:, :-1], left[1:] - left[:-1]
+                bound = float((f.slack + f.lip).upper()) * np.linalg.norm(e, axis=0)
+            else:
+                e, size = d, np.linalg.norm(d, axis=0)
+                bound = float(f.off.upper()) + float(f.slack.upper()) * size + form(floats(f.E), d, d)
+                wholes = [floats(R) for R in field.units.wholes]
+                bound = bound + sum(abs(w) * form(R, d, d) for w, R in zip(ways, wholes, strict=True))
+            for q, kink in field.units.kinks.items():
+                along, size = abs(floats(kink.alpha)[:, 0] @ e), np.linalg.norm(e, axis=0)
+                most = np.minimum(along + float(kink.beta.upper()) * size, float(kink.rho.upper()) * size)
+                bound = bound + abs(ways[q]) * most
+            assert (abs(left) <= bound + 1e-12).all()
+            closest = max(closest, float(np.max(abs(left) / (bound + 1e-12))))
+    assert closest > 0.2
 
 
 # -------------------------------------------------------------------------------------------------------------- limits
