@@ -125,6 +125,10 @@ def test_bad_parameters(pendulum: System, change: dict[str, object], message: st
         pendulum.with_parameters(change)  # type: ignore[arg-type]
 
 
+def test_a_domain_may_be_given_in_floats(pendulum: System) -> None:
+    assert pendulum.with_domain({"theta": (-1.5, 0.1)}).domain[0] == (Fraction(-3, 2), Fraction(0.1))
+
+
 def test_domain_must_surround_the_origin(pendulum: System) -> None:
     assert pendulum.with_domain({"theta": (Fraction(-1), Fraction(2))}).domain[0] == (-1, 2)
     with pytest.raises(InputError, match="interior"):

@@ -173,14 +173,17 @@ class System:
         domain = tuple((lo + shift, hi + shift) for (lo, hi), shift in zip(self.domain, shifts, strict=True))
         return replace(self, parameters=parameters, domain=domain)
 
-    def with_domain(self, bounds: Mapping[str, Interval]) -> System:
+    def with_domain(self, bounds: Mapping[str, tuple[Fraction | float, Fraction | float]]) -> System:
         """The same plant on another box; unknown state names are rejected."""
         names = [s.name for s in self.states]
         for name in bounds:
             if name not in names:
                 raise InputError(f"{self.name} has no state {name!r}; it has: {', '.join(names)}.")
-        domain = tuple(bounds.get(name, old) for name, old in zip(names, self.domain, strict=True))
-        return replace(self, domain=domain)
+        given = {
+            name: (exact(lo, f"{name} of the domain"), exact(hi, f"{name} of the domain"))
+            for name, (lo, hi) in bounds.items()
+        }
+        return replace(self, domain=tuple(given.get(name, old) for name, old in zip(names, self.domain, strict=True)))
 
     def with_ranges(self, ranges: Mapping[str, Interval | None]) -> System:
         """The same plant where some parameters are uncertain and some disturbances act; None takes a range away.
