@@ -29,7 +29,7 @@ from certify.reference.loop import Loop
 from certify.reference.model import Model
 from certify.reference.refusal import Refused
 from tests.support.balls import around, centred
-from tests.support.certificates import Document, dump, edited, encode, make
+from tests.support.certificates import Document, dump, edited, encode, make, verdict
 from tests.support.models import triples
 from tests.support.network_loops import affine, hashed, joined, mapped
 from tests.support.reference import judge
@@ -359,6 +359,7 @@ def called(q: str) -> Document:
 def test_a_value_at_the_centre_is_as_uncertain_behind_a_kink_as_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """relu(w) moves by as much as w, whichever slope m the kink is given."""
     assert judge(called("19/10")) is None and judge(called("2")) == "local" and judge(called("3")) == "local"
+    assert [verdict(called(q)) for q in ("19/10", "2", "3")] == ["ACCEPTED", "local", "local"]
 
     def less(*arguments: Any) -> Entry:
         found = entry(*arguments)
@@ -632,7 +633,7 @@ def test_models_on_a_cone_hold_the_truth(kind: str, steady: bool) -> None:
 
 
 def test_the_count_of_operations() -> None:
-    """k (K + c Z + C (I + 2^8 (y n + H)(d + 1)^2)) and 2^8 a byte of the trees, by hand for the planar loop."""
+    """k (K + w Z + C (I + 2^8 (y n + H)(d + 1)^2)) and 2^8 a byte of the trees, by hand for the planar loop."""
 
     def count(directions: Any) -> int:
         return operations(read(dump(loop(PLANAR, TWO, P, directions=directions))))
