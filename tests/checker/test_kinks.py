@@ -19,6 +19,7 @@ from certify.checker.near import Vector
 from certify.checker.networks import Affine, Clip, Map, Network
 from tests.support.certificates import LEAF, Document, edited, encode, parse, verdict
 from tests.support.kinked import even, kinked, mirrored, pi
+from tests.support.network_loops import affine, hashed, joined, mapped, with_policy
 
 ONE = [["+", ["/", "x0", "2"], "u"]]
 TWO, P2 = ["x1", "u"], [[1.5, 0.5], [0.5, 1.0]]
@@ -61,7 +62,28 @@ DIVERGING: dict[str, Callable[[], Document]] = {
     "discrete": lambda: kinked(["u"], relu(-1.0 - 2.0**-40), 1.0, 1.0, even(1, 0), time="discrete"),
     "discrete, in a sector": lambda: kinked(["u"], relu(-1.0 - 2.0**-40), 1.0, 1.0, [], time="discrete"),
     "a kink at a distance": lambda: kinked(ONE, shifted(-2.0, 0.5), 1.0, 4.1, []),
+    "a kink times an uncertain argument": lambda: times_an_argument("5/2"),
+    "a kink under a tanh whose place rounding hides": lambda: under_a_tanh("1/10"),
 }  # fmt: skip
+
+
+def times_an_argument(gain: str) -> Document:
+    """x' = q relu(x) - gain x, q in [0, 3], the product by a network that equations call."""
+    tree = [["+", ["*", f"-{gain}", "x0"], ["network", "N", 0, "x0", "q"], "u"]]
+    more: Any = {"uncertain": [("q", "0", "3")], "cells": [1]}
+    data = kinked(tree, [(np.zeros((1, 1)), np.zeros(1))], 1.0, 1.0, [], **more)
+    steps = [affine(0, [[1.0, 0.0]]), mapped(1, "relu"), affine(0, [[0.0, 1.0]]), joined("product", 2, 3)]
+    data["networks"].append({"name": "N", "reads": 2, "steps": steps})
+    return hashed(data)
+
+
+def under_a_tanh(gain: str) -> Document:
+    """x' = tanh(|x|/2) - gain x on a small ball; in binary64 the tanh reads a number near -4 at 0 instead of 0."""
+    tree = [["+", ["*", f"-{gain}", "x0"], "u"]]
+    data = kinked(tree, [(np.zeros((1, 1)), np.zeros(1))], 2.0**60, 1.0, [], squash="tanh")
+    first = affine(0, np.eye(10, 1), [0.0, 2.0**53, *np.ones(8)])
+    last = affine(3, [[-0.5, *np.ones(10)]], [-(2.0**53 + 8)])
+    return with_policy(data, [first, mapped(1, "relu"), joined("concat", 0, 2), last])
 
 
 def relu_of(K: Any) -> Any:
