@@ -214,20 +214,20 @@ class Sizes:
             corners = cells * 2 ** min(self.y, AT_CORNERS)
             each = self.inequality + 2**8 * self.y * self.n * (self.d + 1) ** 2
             found += self.ball + times * self.equations + corners * each + self.decision(self.n)
-            found += self.of_cones(evidence.local.directions, cells, corners)
+            found += self.of_cones(evidence.local.directions, times, corners)
         if evidence.contraction:
             corners = cells * 2**self.y
             found += self.ball + cells * self.equations + corners * self.inequality + self.decision(self.n)
             found += self.of_cones(evidence.contraction.directions, cells, corners)
         return found
 
-    def of_cones(self, directions: Sequence[bytes] | None, cells: int, corners: int) -> int:
-        """Models and inequalities on cones, which kinks are asked for on."""
+    def of_cones(self, directions: Sequence[bytes] | None, times: int, corners: int) -> int:
+        """Models, of the equations so many times, and inequalities on cones, which kinks are asked for on."""
         if directions is None:
             return 0
         leaves = max(1, sum(tree.count(LEAF) for tree in directions))
         each = self.inequality + 2**8 * (self.y * self.n + self.net.units) * (self.d + 1) ** 2
-        found = leaves * (self.ball + cells * self.equations + corners * each)
+        found = leaves * (self.ball + times * self.equations + corners * each)
         return found + 2**8 * sum(map(len, directions))
 
     @property

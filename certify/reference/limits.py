@@ -317,20 +317,20 @@ def on_balls(c: Certificate, z: Sizes, evidence: Tree) -> int:
         each = inequality(z) + 2**8 * z.y * z.n * (z.d + 1) ** 2
         corners = cells * 2 ** min(z.y, AT_CORNERS)
         work += times * equations_on_a_ball(z) + once + corners * each
-        work += on_cones(z, evidence.ball.directions, cells, corners)
+        work += on_cones(z, evidence.ball.directions, times, corners)
     if evidence.contraction is not None:
         work += cells * equations_on_a_ball(z) + once + cells * 2**z.y * inequality(z)
         work += on_cones(z, evidence.contraction.directions, cells, cells * 2**z.y)
     return work
 
 
-def on_cones(z: Sizes, directions: Sequence[bytes] | None, cells: int, corners: int) -> int:
-    """Models and inequalities on each cone, beside those on all of a ball."""
+def on_cones(z: Sizes, directions: Sequence[bytes] | None, times: int, corners: int) -> int:
+    """Models, of the equations so many times, and inequalities on each cone, beside those on all of a ball."""
     if directions is None:
         return 0
     cones = sum(tree.count(LEAF) for tree in directions) if directions else 1
     each = inequality(z) + 2**8 * (z.y * z.n + z.nets.units) * (z.d + 1) ** 2
-    once = networks_on_a_ball(z) + cells * equations_on_a_ball(z)
+    once = networks_on_a_ball(z) + times * equations_on_a_ball(z)
     return cones * (once + corners * each) + 2**8 * sum(map(len, directions))
 
 

@@ -365,3 +365,11 @@ def test_limits_count_the_cones() -> None:
     few, many = (limits.Sizes(parse(edited(data, "evidence.local.directions", even(2, k)))).work() for k in (1, 6))
     none = limits.Sizes(parse(edited(data, "evidence.local.directions", []))).work()
     assert none < few < many and many > 20 * few
+
+
+def test_limits_count_the_flow_of_each_cone() -> None:
+    """Thousand cones with series of order 8 take hours: a period's models are made anew on each."""
+    tree = ["+", ["-", "x0"], ["*", "1/1000000", *["x0"] * 12], ["*", "1/8", "u"]]
+    dynamics = [tree, ["+", ["-", "x1"], ["*", "1/8", "u"]]]
+    data = kinked(dynamics, relu_of([0.1, 0.1]), np.eye(2), 0.0625, even(2, 8), sample=("1/32", "1/16"))
+    assert verdict(edited(data, "evidence.local.order", 8)) == "limits"
