@@ -18,7 +18,7 @@ from .case import Case, Failures
 from .document import Intervals
 from .exact import Exact
 from .expression import Call, evaluate
-from .functions import FUNCTIONS
+from .functions import FUNCTIONS, Undecided
 from .jets import First, Jet, Units, between, constant, no_kinks, uncertain
 from .near import ZERO, Above, Array, Cubic, Near, Square, Vector, all_near, mixed, near, size, stacked, triples, within
 from .network import norm2
@@ -346,7 +346,7 @@ class OnBall(Algebra[Rows]):
         rest = rest.wider(bent.error + twisted.error)
         lips = value.lip_beyond_tangent(phi) + bent.error * 2 + twisted.error * 3
         X = self.columns(v, value.units.count).times(phi.f[1])
-        at_0 = None if v.at_0 is None else v.at_0 & (FUNCTIONS[step.function].exact(Fraction(0)) == 0)
+        at_0 = None if v.at_0 is None else v.at_0 & (FUNCTIONS[step.function].at_0 == 0)
         return Rows(phi.f[0], X, self.with_units(bent.value, twisted.value, rest.majorant, lips), at_0)
 
     def bent(self, step: Map | Clip, v: Rows, value: Jet) -> Rows:
@@ -417,7 +417,10 @@ class OnBall(Algebra[Rows]):
         found = self.entered(made)
         if v.at_0 is None:
             return found
-        known = evaluate(step.tape, Exact, [Exact(Fraction(0) if still else None) for still in v.at_0.tolist()])
+        try:
+            known = evaluate(step.tape, Exact, [Exact(Fraction(0) if still else None) for still in v.at_0.tolist()])
+        except Undecided:  # nothing is known to be 0
+            return replace(found, at_0=np.zeros(step.size, dtype=bool))
         return replace(found, at_0=np.array([x.value == 0 for x in known]))
 
 

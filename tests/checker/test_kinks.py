@@ -311,6 +311,22 @@ def test_a_bias_that_is_nearly_0_is_not_0() -> None:
     assert verdict(kinked(ONE, layers, 1.0, 1.0, even(1, 0))) == "local"
 
 
+@pytest.mark.parametrize(
+    ("after", "found"),
+    [
+        ([affine(2, 0.1, [1.0]), mapped(3, "sqrt"), affine(4, 1.0, [-1.0])], "ACCEPTED"),
+        ([mapped(2, "sqrt")], "inputs"),
+        ([{"kind": "observe", "of": [2], "names": ["a"], "expressions": [["/", "1", "a"]]}], "inputs"),
+        ([{"kind": "observe", "of": [2], "names": ["a"], "expressions": [["sqrt", "a"]]}], "inputs"),
+    ],
+)
+def test_what_is_not_defined_at_0_is_refused_and_stops_no_checker(after: list[Document], found: str) -> None:
+    """Of expressions that are asked whether they are 0 at d = 0; a root of 1 is defined."""
+    tree = [["+", ["*", "-3", "x0"], ["/", "u", "8"]]]
+    data = kinked(tree, relu(0.1), 1.0, 1.0, even(1, 0), centre="output")
+    assert verdict(with_policy(data, [affine(0, 1.0), mapped(1, "relu"), *after])) == found
+
+
 def test_an_input_that_a_clip_may_cut_is_refused() -> None:
     data = kinked(ONE, mirrored([[-2.0]]), 1.0, 1.0, even(1, 0), clip=([-1.5], [1.5]))
     assert verdict(data) == "local"
