@@ -63,6 +63,7 @@ DIVERGING: dict[str, Callable[[], Document]] = {
     "discrete, in a sector": lambda: kinked(["u"], relu(-1.0 - 2.0**-40), 1.0, 1.0, [], time="discrete"),
     "a kink at a distance": lambda: kinked(ONE, shifted(-2.0, 0.5), 1.0, 4.1, []),
     "a kink times an uncertain argument": lambda: times_an_argument("5/2"),
+    "held inputs, with no enclosure on the cones": lambda: held("16/5"),
     "a kink under a tanh whose place rounding hides": lambda: under_a_tanh("1/10"),
 }  # fmt: skip
 
@@ -75,6 +76,15 @@ def times_an_argument(gain: str) -> Document:
     steps = [affine(0, [[1.0, 0.0]]), mapped(1, "relu"), affine(0, [[0.0, 1.0]]), joined("product", 2, 3)]
     data["networks"].append({"name": "N", "reads": 2, "steps": steps})
     return hashed(data)
+
+
+def held(gain: str) -> Document:
+    """x1' = 18/25 (x1 - gain u), u = x1 held for a time of 1: x1 is multiplied by e^.72 - gain (e^.72 - 1) < -1, though a
+    straight step would shrink it. The search for the a-priori enclosure ends on the ball, and ends too early on cones.
+    """
+    slow = ["+", ["*", "-1/50", "x0"], ["*", "1/10", ["-", "x1", "u"]]]
+    tree = ["*", "18/25", ["-", "x1", ["*", gain, "u"]]]
+    return kinked([slow, tree], mirrored([[0.0, 1.0]]), np.eye(2), 0.0625, even(2, 6), sample=("1", "1"))
 
 
 def under_a_tanh(gain: str) -> Document:
