@@ -80,7 +80,7 @@ def times_an_argument(gain: str) -> Document:
 
 def held(gain: str) -> Document:
     """x1' = 18/25 (x1 - gain u), u = x1 held for a time of 1: x1 is multiplied by e^.72 - gain (e^.72 - 1) < -1, though
-    a straight step would shrink it. The search for the a-priori enclosure ends on the ball, and ends too early on cones.
+    a straight step would shrink it. The search for the a-priori enclosure finds one on the ball, and none on cones.
     """
     slow = ["+", ["*", "-1/50", "x0"], ["*", "1/10", ["-", "x1", "u"]]]
     tree = ["*", "18/25", ["-", "x1", ["*", gain, "u"]]]
