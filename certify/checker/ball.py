@@ -18,7 +18,7 @@ from .case import Case, Failures
 from .document import Intervals
 from .exact import Exact
 from .expression import Call, evaluate
-from .functions import FUNCTIONS
+from .functions import FUNCTIONS, Undecided
 from .jets import First, Jet, Units, between, constant, no_kinks, uncertain
 from .near import ZERO, Above, Array, Cubic, Near, Square, Vector, all_near, mixed, near, size, stacked, triples, within
 from .network import norm2
@@ -104,7 +104,7 @@ class Ball:
         """
         h, scale = self.outputs, Near(self.case.net.scale)
         at_0 = all_near(self.case.c.u_eq) if self.starts_at_u_eq else h.c * scale + self.case.net.offset
-        a = (h.a * scale).wider(h.by_kinks(self.reach.error))
+        a = (h.a * scale).wider(h.by_kinks(self.reach.error + h.B.error * size(scale.value)))
         u = replace(h, c=at_0, a=a, Q=Square(h.Q.value) * scale, K=Cubic(h.K.value) * scale)
         E, lip = mixed(Square(h.units.U), Near(self.reach.error.top)), h.lipschitz * size(scale.value)
         return rows(replace(u, E=E, lip=lip), range(len(self.case.c.inputs)), self.units, 0, self.count)
@@ -314,11 +314,15 @@ class OnBall(Algebra[Rows]):
         B, ones = Near(X.value[:, k:].T, X.error[k:, None]), np.ones(len(X.value))
         N = len(B.value)
         R = self.R[..., :N]
-        a, Q, K = Vector(X.value[:, :k].T, X.error[:k].norm() * ones), *self.beyond(B)
+        a, Q, K = Vector(X.value[:, :k].T, (X.error[:k].norm() + self.doubt_of_kinks(B)) * ones), *self.beyond(B)
         E = Square(np.zeros_like(Q.value), (B.error * Square(R).size[:, None]).sum() * ones)
         of_y = Near(np.zeros((0, len(ones)))), Vector(np.zeros((k, 0, len(ones))))  # a network knows nothing of y
         units = Units(R, first=None if self.first is None else self.first.of(N))
         return Jet(v.y, a, Q, K, E, Near(B.value), units, *of_y, (B.size * self.lips[:N, None]).sum())
+
+    def doubt_of_kinks(self, B: Near) -> Above:
+        """Upper bound of what kinks add by the errors of B, over ||d||: their R is 0, so that E does not have it."""
+        return ZERO if self.first is None else (B.error * Above(self.first.rho[: len(B.value), None])).sum()
 
     def beyond(self, B: Near) -> tuple[Square, Cubic]:
         """Q and K of vectors that units reach by B (N, width)."""
@@ -342,7 +346,7 @@ class OnBall(Algebra[Rows]):
         rest = rest.wider(bent.error + twisted.error)
         lips = value.lip_beyond_tangent(phi) + bent.error * 2 + twisted.error * 3
         X = self.columns(v, value.units.count).times(phi.f[1])
-        at_0 = None if v.at_0 is None else v.at_0 & (FUNCTIONS[step.function].exact(Fraction(0)) == 0)
+        at_0 = None if v.at_0 is None else v.at_0 & (FUNCTIONS[step.function].at_0 == 0)
         return Rows(phi.f[0], X, self.with_units(bent.value, twisted.value, rest.majorant, lips), at_0)
 
     def bent(self, step: Map | Clip, v: Rows, value: Jet) -> Rows:
@@ -413,7 +417,10 @@ class OnBall(Algebra[Rows]):
         found = self.entered(made)
         if v.at_0 is None:
             return found
-        known = evaluate(step.tape, Exact, [Exact(Fraction(0) if still else None) for still in v.at_0.tolist()])
+        try:
+            known = evaluate(step.tape, Exact, [Exact(Fraction(0) if still else None) for still in v.at_0.tolist()])
+        except Undecided:  # nothing is known to be 0
+            return replace(found, at_0=np.zeros(step.size, dtype=bool))
         return replace(found, at_0=np.array([x.value == 0 for x in known]))
 
 

@@ -141,7 +141,8 @@ class Local(Ball):
         level = None if self.at_rest else Level(rational(c.c0), rational(by.edge))
         for cell in self.case.cells:
             G = self.G(cell)
-            models = Models(self.J, G, self.at_rest) if are_finite(G) else None
+            known = c.sample is None or self.way is not None  # on a cone it may not be found, though it is on all
+            models = Models(self.J, G, self.at_rest) if known and are_finite(G) else None
             most = size_beyond(models, c.P) if models is not None and h > 0 else 0.0
             if models is None or not np.isfinite(most):
                 yield None

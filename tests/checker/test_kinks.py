@@ -19,6 +19,7 @@ from certify.checker.near import Vector
 from certify.checker.networks import Affine, Clip, Map, Network
 from tests.support.certificates import LEAF, Document, edited, encode, parse, verdict
 from tests.support.kinked import even, kinked, mirrored, pi
+from tests.support.network_loops import affine, hashed, joined, mapped, with_policy
 
 ONE = [["+", ["/", "x0", "2"], "u"]]
 TWO, P2 = ["x1", "u"], [[1.5, 0.5], [0.5, 1.0]]
@@ -61,7 +62,38 @@ DIVERGING: dict[str, Callable[[], Document]] = {
     "discrete": lambda: kinked(["u"], relu(-1.0 - 2.0**-40), 1.0, 1.0, even(1, 0), time="discrete"),
     "discrete, in a sector": lambda: kinked(["u"], relu(-1.0 - 2.0**-40), 1.0, 1.0, [], time="discrete"),
     "a kink at a distance": lambda: kinked(ONE, shifted(-2.0, 0.5), 1.0, 4.1, []),
+    "a kink times an uncertain argument": lambda: times_an_argument("5/2"),
+    "held inputs, with no enclosure on the cones": lambda: held("16/5"),
+    "a kink under a tanh whose place rounding hides": lambda: under_a_tanh("1/10"),
 }  # fmt: skip
+
+
+def times_an_argument(gain: str) -> Document:
+    """x' = q relu(x) - gain x, q in [0, 3], the product by a network that equations call."""
+    tree = [["+", ["*", f"-{gain}", "x0"], ["network", "N", 0, "x0", "q"], "u"]]
+    more: Any = {"uncertain": [("q", "0", "3")], "cells": [1]}
+    data = kinked(tree, [(np.zeros((1, 1)), np.zeros(1))], 1.0, 1.0, [], **more)
+    steps = [affine(0, [[1.0, 0.0]]), mapped(1, "relu"), affine(0, [[0.0, 1.0]]), joined("product", 2, 3)]
+    data["networks"].append({"name": "N", "reads": 2, "steps": steps})
+    return hashed(data)
+
+
+def held(gain: str) -> Document:
+    """x1' = 18/25 (x1 - gain u), u = x1 held for a time of 1: x1 is multiplied by e^.72 - gain (e^.72 - 1) < -1, though
+    a straight step would shrink it. The search for the a-priori enclosure finds one on the ball, and none on cones.
+    """
+    slow = ["+", ["*", "-1/50", "x0"], ["*", "1/10", ["-", "x1", "u"]]]
+    tree = ["*", "18/25", ["-", "x1", ["*", gain, "u"]]]
+    return kinked([slow, tree], mirrored([[0.0, 1.0]]), np.eye(2), 0.0625, even(2, 6), sample=("1", "1"))
+
+
+def under_a_tanh(gain: str) -> Document:
+    """x' = tanh(|x|/2) - gain x on a small ball; in binary64 the tanh reads a number near -4 at 0 instead of 0."""
+    tree = [["+", ["*", f"-{gain}", "x0"], "u"]]
+    data = kinked(tree, [(np.zeros((1, 1)), np.zeros(1))], 2.0**60, 1.0, [], squash="tanh")
+    first = affine(0, np.eye(10, 1), [0.0, 2.0**53, *np.ones(8)])
+    last = affine(3, [[-0.5, *np.ones(10)]], [-(2.0**53 + 8)])
+    return with_policy(data, [first, mapped(1, "relu"), joined("concat", 0, 2), last])
 
 
 def relu_of(K: Any) -> Any:
@@ -289,6 +321,22 @@ def test_a_bias_that_is_nearly_0_is_not_0() -> None:
     assert verdict(kinked(ONE, layers, 1.0, 1.0, even(1, 0))) == "local"
 
 
+@pytest.mark.parametrize(
+    ("after", "found"),
+    [
+        ([affine(2, 0.1, [1.0]), mapped(3, "sqrt"), affine(4, 1.0, [-1.0])], "ACCEPTED"),
+        ([mapped(2, "sqrt")], "inputs"),
+        ([{"kind": "observe", "of": [2], "names": ["a"], "expressions": [["/", "1", "a"]]}], "inputs"),
+        ([{"kind": "observe", "of": [2], "names": ["a"], "expressions": [["sqrt", "a"]]}], "inputs"),
+    ],
+)
+def test_what_is_not_defined_at_0_is_refused_and_stops_no_checker(after: list[Document], found: str) -> None:
+    """Of expressions that are asked whether they are 0 at d = 0; a root of 1 is defined."""
+    tree = [["+", ["*", "-3", "x0"], ["/", "u", "8"]]]
+    data = kinked(tree, relu(0.1), 1.0, 1.0, even(1, 0), centre="output")
+    assert verdict(with_policy(data, [affine(0, 1.0), mapped(1, "relu"), *after])) == found
+
+
 def test_an_input_that_a_clip_may_cut_is_refused() -> None:
     data = kinked(ONE, mirrored([[-2.0]]), 1.0, 1.0, even(1, 0), clip=([-1.5], [1.5]))
     assert verdict(data) == "local"
@@ -343,3 +391,11 @@ def test_limits_count_the_cones() -> None:
     few, many = (limits.Sizes(parse(edited(data, "evidence.local.directions", even(2, k)))).work() for k in (1, 6))
     none = limits.Sizes(parse(edited(data, "evidence.local.directions", []))).work()
     assert none < few < many and many > 20 * few
+
+
+def test_limits_count_the_flow_of_each_cone() -> None:
+    """Thousand cones with series of order 8 take hours: a period's models are made anew on each."""
+    tree = ["+", ["-", "x0"], ["*", "1/1000000", *["x0"] * 12], ["*", "1/8", "u"]]
+    dynamics = [tree, ["+", ["-", "x1"], ["*", "1/8", "u"]]]
+    data = kinked(dynamics, relu_of([0.1, 0.1]), np.eye(2), 0.0625, even(2, 8), sample=("1/32", "1/16"))
+    assert verdict(edited(data, "evidence.local.order", 8)) == "limits"
