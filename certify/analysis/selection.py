@@ -113,7 +113,7 @@ class Race:
             if known is None and self.proved and self.effort.over:
                 continue
             self.contenders.append(known or Contender(trial, self.begin(trial, self.proved)))
-            self._heat(self.contenders[-1], self.heat if heat is None else heat)
+            self.advance(self.contenders[-1], self.heat if heat is None else heat)
 
     def knock_out(self) -> None:
         """Heats among the better half, each round twice as long as the one before, until one is left.
@@ -126,10 +126,14 @@ class Race:
             if len(contenders) == 1:
                 break
             for contender in contenders:
-                self._heat(contender, heat)
+                self.advance(contender, heat)
             contenders = [c for c in self.open if c in contenders]
 
-    def _heat(self, contender: Contender, operations: float) -> None:
+    def advance(self, contender: Contender, operations: float, each: float = 0.0) -> None:
+        """A heat, which ends after its first part where no effort would gain anything; none where a first gain is
+        expected to take more than these operations, at so many for each box."""
+        if contender.attempt.expected * each > operations:
+            return
         for share in (1.0,) if isinstance(contender.attempt, Once) else (_FIRST_LOOK, 1 - _FIRST_LOOK):
             over = self.effort.over
             part = self.effort.part(_LEAST if over else share * operations, even_if_over=over)

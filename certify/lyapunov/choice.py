@@ -42,6 +42,7 @@ def choose_candidate(
     Q: tuple[float, ...] | None = None,
     R: tuple[float, ...] | None = None,
     effort: Effort = UNLIMITED,
+    decays: tuple[float, ...] | None = None,
 ) -> Chosen:
     """The candidate `name` for the closed loop.
 
@@ -53,6 +54,7 @@ def choose_candidate(
         a notice.
     Q, R : diagonals, (n,) and (m,); None means ones.
     effort : where it ends, `optimised` takes what it has.
+    decays : of `optimised`, its margins over the slowest decay of A, if not the usual ones.
 
     Raises
     ------
@@ -80,7 +82,7 @@ def choose_candidate(
     try:
         starts = [P] if Q is not None else [choose_candidate(loop, one).P for one in SOLVED]
         start = largest_sampled(loop, starts, effort=effort) if len(starts) > 1 else P
-        return Chosen(optimise_repeatedly(loop, start, effort), "optimised")
+        return Chosen(optimise_repeatedly(loop, start, effort, decays=decays), "optimised")
     except BackendError as error:
         return Chosen(P, "lyapunov", f"candidate lyapunov instead of optimised: {error}")
 

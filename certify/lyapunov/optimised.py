@@ -40,6 +40,7 @@ _KEEP = 200  # rays of a search that are remembered for their crossing, and for 
 _ROWS = 500  # states that each margin hands to the solver
 _ROUNDS = 30
 DECAYS, FURTHER = (0.2, 0.02), (0.05,)  # the latter for rounds after the first where ranges take part of the margin
+FIRM = (0.3,)  # of every round, for a set of which boxes prove more
 _REPEATS, _WORTH = 12, 1.05  # of the whole search, and growth of the volume that is worth another
 _SMALL = 0.01  # growth of the log of the volume, or trust radius, at which to stop
 _STEP = 1e-4  # relative, of the difference quotient along a ray
@@ -112,19 +113,23 @@ def _optimise(
 
 
 def optimise_repeatedly(
-    loop: ClosedLoop, start: Array, effort: Effort = UNLIMITED, known: Array | None = None
+    loop: ClosedLoop,
+    start: Array,
+    effort: Effort = UNLIMITED,
+    known: Array | None = None,
+    decays: tuple[float, ...] | None = None,
 ) -> Array:
     """`optimise_candidate` from its own result again, with other samples, while that gains volume and effort is left.
 
     A trust region that has shrunk around one optimum opens again: on a planar quadrotor three rounds enlarge the
-    sampled set of the first 30-fold.
+    sampled set of the first 30-fold. `decays` are those of every round, if not the usual ones.
 
     Raises
     ------
     BackendError : of the first round.
     """
-    P, _ = _optimise(loop, start, DECAYS, 0, effort, known)
-    decays = FURTHER if loop.system.ranges else DECAYS
+    P, _ = _optimise(loop, start, decays or DECAYS, 0, effort, known)
+    decays = decays or (FURTHER if loop.system.ranges else DECAYS)
     for seed in range(1, _REPEATS):
         if effort.over:
             break

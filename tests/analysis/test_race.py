@@ -5,16 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 import certify.analysis.stages.candidate
 import certify.lyapunov.corners
-from certify.analysis.candidates.trials import Trial, corrected, trial
+from certify.analysis.candidates.trials import Trial, corrected, firm, optimised, trial
 from certify.analysis.options import RoaOptions
 from certify.analysis.run import certify_roa
 from certify.analysis.selection import Race
+from certify.analysis.stages.candidate import _Choice
+from certify.analysis.stages.state import Tools
 from certify.certificates import TrustedSolver
 from certify.certificates.claims import Asymptotic
 from certify.certificates.verdict import Stop
@@ -150,3 +154,72 @@ def test_a_start_that_the_solver_only_nearly_mends_is_no_candidate(monkeypatch: 
     monkeypatch.setattr(certify.lyapunov.corners, "smallest_trace", lambda *_: np.eye(2))
     last = trial(loop, V, "optimised", RoaOptions())
     assert corrected(loop, last, [], RoaOptions(), Effort(0.1 * UNIT)) is None
+
+
+class Slow(Reaches):
+    """An attempt of which each heat proves the same share more; boxes until then are told as given."""
+
+    done = False
+
+    def __init__(self, target: float, share: float, expected: float) -> None:
+        super().__init__(target, share, 0.1)
+        self.expected, self.heats = expected, 0
+
+    def advance(self, budget: Budget, report: Report | None = None) -> None:
+        self.heats += 1
+        self.level = min(1.0, self.share * self.heats) * self.target
+
+
+@pytest.mark.parametrize(
+    ("ranged", "of_large", "of_firm", "expected", "began"),
+    [
+        (True, 0.04, 0.2, 1.0, ["optimised", "firm"]),  # two parts of a heat prove little, two more prove most
+        (True, 0.04, 0.2, 1e9, ["optimised", "firm", "robust", "between"]),  # too far off to go on
+        (True, 0.04, 0.1, 1.0, ["optimised", "firm", "robust", "between"]),
+        (True, 0.3, 0.2, 1.0, ["optimised", "robust", "between"]),  # enough is proved of the largest
+        (False, 0.04, 0.2, 1.0, ["optimised", "robust", "between"]),
+    ],
+)
+def test_a_large_margin_is_tried_where_ranges_leave_next_to_nothing_of_the_largest_set(
+    ranged: bool,
+    of_large: float,
+    of_firm: float,
+    expected: float,
+    began: list[str],
+    pendulum: System,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    system = pendulum.with_ranges({"m": (Fraction(14, 100), Fraction(16, 100))}) if ranged else pendulum
+    loop, options, names = ClosedLoop(system, load_policy(SHIPPED).network), RoaOptions(), list[str]()
+    largest = trial(loop, solve_lyapunov(loop.linearise()[0], np.eye(2)), "optimised", options)
+    shares = {"optimised": of_large, "firm": of_firm}
+
+    def begin(one: Trial, proved: bool) -> Slow:
+        names.append(one.name)
+        return Slow(one.task.target, shares.get(one.name, 0.2), expected)
+
+    effort = Effort(UNIT)
+    tools = Tools(tmp_path, Any, effort, Any, {})  # type: ignore[arg-type]
+    made = {"firm": 0.9, "robust": 0.8}
+    for name, share in made.items():
+        one = replace(largest, name=name, volume=share * largest.volume)
+        monkeypatch.setattr(certify.analysis.stages.candidate, name, lambda *_, one=one: one)
+    between = replace(largest, name="between")
+    monkeypatch.setattr(certify.analysis.stages.candidate, "blends", lambda *_: [between])
+    run = Race(begin, effort, 0.04 * UNIT, 100)  # type: ignore[arg-type]
+    state: Any = SimpleNamespace(loop=loop, options=options)
+    _Choice(state, tools, effort, run)._among([largest], largest)
+    assert names == began
+
+
+def test_the_candidate_of_a_large_margin_is_smaller_and_decays_at_every_corner(pendulum: System) -> None:
+    system = pendulum.with_ranges({"m": (Fraction(14, 100), Fraction(16, 100))})
+    loop = ClosedLoop(system, load_policy(SHIPPED).network)
+    found, large = (make(loop, RoaOptions(), Effort(UNIT)) for make in (firm, optimised))
+    assert found is not None and large is not None and (found.name, large.name) == ("firm", "optimised")
+    assert 0.3 * large.volume < found.volume < large.volume
+    slowest = Corners(loop).slowest
+    for A in Corners(loop).rates:
+        decay = -np.linalg.eigvals(np.linalg.solve(found.P, A.T @ found.P + found.P @ A)).real.max() / 2
+        assert decay > 0.25 * slowest

@@ -24,6 +24,7 @@ from certify.analysis.candidates.trials import (
     by_reach,
     corrected,
     economical,
+    firm,
     named,
     optimised,
     peak,
@@ -54,6 +55,7 @@ _GRACE, _LEAST = 1.0 * UNIT, 0.05  # operations, or of the whole, for a local le
 _FOR_PROOF = 0.4  # share of the whole in which no further candidate is optimised
 _WORTH = 1.05  # growth of a volume that another candidate must promise
 _SMALL = 0.1  # share of the volume within a candidate's reach: if less is proved, another one is worth its effort
+_MOST = 0.5  # the same: where more is proved, others are not worth theirs
 _NEAR = 1e-3  # the same: where less is proved, its own correction is not
 _MISLED = 0.9  # share of its reach: a violation below it is one that the samples missed
 _REACHED = 0.9  # share of its target: a level above it leaves nothing to a candidate that is easier to prove
@@ -183,15 +185,19 @@ class _Choice:
             with self.tools.timing("candidate"):
                 trials = [*solved(loop, found, state.options, self._granted()), *trials]
         if state.interruptible:
-            return self._among(trials)
+            return self._among(trials, large)
         race.enter(by_reach(trials)[:1])
         return self._improve() if loop.network.is_moved else None
 
-    def _among(self, trials: list[Trial]) -> None:
-        """The best of these, of `robust`, and of what lies between the two that are largest and best proved."""
+    def _among(self, trials: list[Trial], large: Trial | None) -> None:
+        """The best of these, of `robust`, and of what lies between the two that are largest and best proved; or `firm`
+        if that proves most of its set."""
         loop, race = self.loop, self.race
+        if large is not None and loop.system.ranges and self._is_firm(large):
+            return race.knock_out()
         certain = self._made(partial(robust, loop), share_of_robust(loop))
-        race.enter([*trials, *([] if certain is None else [certain])])
+        begun = {id(c.trial) for c in race.contenders}
+        race.enter([one for one in [*trials, *([] if certain is None else [certain])] if id(one) not in begun])
         self._improve()
         unproved = [c for c in race.open if c.trial.name == "optimised"]
         others = [c for c in race.contenders if c.trial.name != "optimised" and c.proved]
@@ -201,6 +207,19 @@ class _Choice:
                 between = list(blends(loop, unproved[0].trial, best, self.state.options, self._granted()))
             race.enter(between, None if race.gained else 0.0)  # without a gain their local levels tell
         race.knock_out()
+
+    def _is_firm(self, large: Trial) -> bool:
+        """True if most is proved of the candidate of a large margin, tried where next to nothing is of the largest."""
+        race = self.race
+        race.enter([large])
+        if race.best.attempt.done or race.best.proved >= _SMALL * large.volume:
+            return False
+        made = self._made(partial(firm, self.loop))
+        entered = None if made is None else self._enter_alone(made, _HEAT)
+        if entered is None:
+            return False
+        race.advance(entered, _SEARCH * self.effort.left, operations_of_box(self.loop))
+        return entered.proved > _MOST * entered.trial.volume
 
     def _economical(self, found: Mapping[str, Array]) -> Trial | None:
         """The candidate for the boxes that the effort left can bound and check, if they limit what is proved with the
