@@ -45,6 +45,13 @@ KeptVolume = Annotated[
     float | None, typer.Option("--volume", help="Volume of that set; default: of the ellipsoid of twice the box.")
 ]
 
+Distance = Annotated[
+    float,
+    typer.Option(
+        "--distance", help="Least distance from the linear feedback of the policy's gain to keep, rms on the box."
+    ),
+]
+
 
 def flatten(
     context: typer.Context,
@@ -62,6 +69,7 @@ def flatten(
     gain: GainAtOrigin = "kept",
     curvature: Kept = "removed",
     volume: KeptVolume = None,
+    distance: Distance = 0.0,
     Q: DiagonalQ = None,
     R: DiagonalR = None,
     states: Annotated[int, typer.Option("--states", help="Initial states of the runs that judge a policy.")] = 200,
@@ -94,6 +102,7 @@ def flatten(
             gain=cast("Gain", gain),
             curvature=cast("Curvature", curvature),
             volume=volume,
+            distance=distance,
             Q=_weights(Q, "Q"),
             R=_weights(R, "R"),
             seed=seed,

@@ -94,6 +94,7 @@ def flatten(
         settings |= {
             "curvature": "kept",
             "volume": volume_of(options, task.box),
+            "distance": options.distance,
             "boxes": kept.boxes,
             "P": kept.P.tolist(),
         }

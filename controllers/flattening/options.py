@@ -23,6 +23,8 @@ class FlattenOptions:
     curvature : `removed` lowers the departure; `kept` lowers the cost of runs and the boxes that the proof of a set is
         forecast to take, and counts four of the steps as one.
     volume : of that set; None means that of the ellipsoid whose half-axes are twice those of the box.
+    distance : from the saturated linear feedback of the policy's own gain, root mean square on the plant's box of
+        initial states, relative to that feedback's own change, which curvature that is kept must have at least.
     box : half-widths (n,) of the box on which the departure is taken; None means the plant's box of initial states.
     steps, batch, rate : gradient steps, states in each, and the first step of Adam relative to a layer's weights.
     time_limit : seconds after which no more gradient steps are taken, those before them included.
@@ -41,6 +43,7 @@ class FlattenOptions:
     weight: float = 1.0
     curvature: Curvature = "removed"
     volume: float | None = None
+    distance: float = 0.0
     box: tuple[float, ...] | None = None
     steps: int = 2000
     batch: int = 512
@@ -57,7 +60,7 @@ class FlattenOptions:
     def __post_init__(self) -> None:
         for name in ("weight", "batch", "rate", "time_limit", "states", "threads"):
             self._require(name, 0 < getattr(self, name) < math.inf, "positive and finite")
-        for name in ("steps", "max_cost_change"):
+        for name in ("steps", "max_cost_change", "distance"):
             self._require(name, 0 <= getattr(self, name) < math.inf, "at least 0 and finite")
         self._require("seed", 0 <= self.seed < 2**63, "at least 0 and below 2^63")
         self._require("gain", self.gain in get_args(Gain), f"one of {get_args(Gain)}")
@@ -65,6 +68,9 @@ class FlattenOptions:
         if self.volume is not None:
             self._require("volume", 0 < self.volume < math.inf, "positive and finite")
             self._require("volume", self.curvature == "kept", 'left out unless `curvature` is "kept"')
+        self._require(
+            "distance", not self.distance or self.curvature == "kept", 'left out unless `curvature` is "kept"'
+        )
         if self.box is not None:
             self._require("box", all(0 < width < math.inf for width in self.box), "positive and finite half-widths")
         for name, weights in (("Q", self.Q), ("R", self.R)):

@@ -1,8 +1,7 @@
 """A set {x'Px <= 1} that is trained together with the policy, and a forecast of the boxes that its proof takes.
 
 The forecast is that of the candidate `economical` (`certify.analysis.candidates.economical`) in torch, so that a
-gradient goes through the policy, the plant and P at once. Its boxes are larger, as those are that prove a policy which
-bends little.
+gradient goes through the policy, the plant and P at once.
 """
 
 from __future__ import annotations
@@ -20,22 +19,21 @@ from certify.lyapunov import diagonalising_coordinates, solve_lyapunov
 from controllers.flattening.student import Student
 
 Array = NDArray[np.float64]
-_SHARE = 0.25  # half-width of a box, of its distance from the origin
 _NEAREST = 0.1  # distance from the origin, of 1, from which on boxes are drawn
 _OVERHEAD = 8.0  # boxes for each that is forecast, times 2^(n/2)
 _LEAST = 1e-2  # m, of where nothing would be proved
 
 
 class ProvableSet(torch.nn.Module):
-    """{x'Px <= 1} of this volume, by P = L L' with a triangular L of fixed determinant.
+    """{x'Px <= 1} of a given volume, by P = L L' with a triangular L of fixed determinant.
 
     Parameters
     ----------
     loop : in continuous time, its input follows at once, its policy has its equilibrium at 0.
-    volume : in the product of the states' units.
+    volume, share : see `aim`.
     """
 
-    def __init__(self, loop: ClosedLoop, volume: float) -> None:
+    def __init__(self, loop: ClosedLoop, volume: float, share: float) -> None:
         super().__init__()
         system: System = loop.system
         self.n, self.m, self.f = system.n, system.m, system.function("torch")
@@ -43,12 +41,17 @@ class ProvableSet(torch.nn.Module):
         L = np.linalg.cholesky(solve_lyapunov(loop.mean_rate(), np.diag(sides**-2.0)))
         self.below = torch.nn.Parameter(torch.tensor(np.tril(L, -1) / np.diag(L)[:, None]).float())
         self.diagonal = torch.nn.Parameter(torch.tensor(np.log(np.diag(L))).float())
+        self.sides = torch.tensor(sides).float()
+        self.aim(volume, share)
+        self.turn(loop)
+
+    def aim(self, volume: float, share: float) -> None:
+        """Ask for this volume, in the product of the states' units, by boxes whose half-widths are this share of their
+        distance from the origin."""
         ball = math.pi ** (self.n / 2) / math.gamma(self.n / 2 + 1)
         self.shrink = math.log(ball / volume) / self.n  # L's mean logarithm
-        self.sides = torch.tensor(sides).float()
-        boxes = _OVERHEAD * 2 ** (self.n / 2) * self.n * ball * -math.log(_NEAREST) / (2 * _SHARE) ** self.n
-        self.log_unit = math.log(boxes)
-        self.turn(loop)
+        boxes = _OVERHEAD * 2 ** (self.n / 2) * self.n * ball * -math.log(_NEAREST) / (2 * share) ** self.n
+        self.share, self.log_unit = share, math.log(boxes)
 
     def factor(self) -> Tensor:
         """L (n, n)."""
@@ -82,7 +85,7 @@ class ProvableSet(torch.nn.Module):
         L = self.factor()
         inverse = torch.linalg.inv(L)
         x = z @ inverse
-        axes = (inverse.T @ self.basis).T[None] * (_SHARE * r)[:, None, None]  # half-axes in rows
+        axes = (inverse.T @ self.basis).T[None] * (self.share * r)[:, None, None]  # half-axes in rows
         u, errors = student.on_boxes(x, axes)
         F, along = self.f(x, u), 2 * z @ L.T
         moved = (self.f(x, u + errors[:, j : j + 1] * one) - F for j, one in enumerate(torch.eye(self.m)))

@@ -78,6 +78,15 @@ class Student(torch.nn.Module):
         u: Tensor = self.folded.clipped(self.scale * form[0] + self.offset)
         return u, forms.errors(self.scale * form[0])
 
+    def distance(self, x: Tensor) -> Tensor:
+        """The root mean square of the distance from the saturated linear feedback of the same gain at states (B, n),
+        relative to this feedback's own change."""
+        linear = self._input(x @ self.jacobian().to(x.dtype).T + self.value)
+        at_0 = self._input(self.value[None])
+        apart, own = (((a - b) / self.scale).square().mean() for a, b in ((self(x), linear), (linear, at_0)))
+        found: Tensor = apart.sqrt() / own.sqrt()
+        return found
+
     def jacobian(self) -> Tensor:
         """The Jacobian (m, n) of net at the origin, in float64."""
         if self.network.is_chain:

@@ -13,9 +13,11 @@ from certify.errors import OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import get_system
 from certify.loop.policies import Policy, PolicyNetwork
+from certify.loop.policies.nonlinearity import nonlinearity
 from certify.lyapunov import domain_limit, volume
 from certify.provers.bounds import policy_enclosure
-from controllers.flattening import keeping, provable
+from controllers.evaluation.curvature import nonlinearity_on
+from controllers.flattening import keeping
 from controllers.flattening.contraction import contracted
 from controllers.flattening.flattening import flatten
 from controllers.flattening.options import FlattenOptions
@@ -47,10 +49,9 @@ def test_errors_on_boxes_are_those_of_the_proofs_bounds(network):
     assert 0.6 < ratio < 1.1
 
 
-def test_boxes_are_those_that_the_candidate_forecasts(monkeypatch):
-    monkeypatch.setattr(provable, "_SHARE", 0.1)
+def test_boxes_are_those_that_the_candidate_forecasts():
     loop = ClosedLoop(PENDULUM, curved())
-    found = ProvableSet(loop, 2.0)
+    found = ProvableSet(loop, 2.0, 0.1)
     assert volume(found.P(), 1.0) == pytest.approx(2.0, rel=1e-5)
     size, short = found.log_boxes(_student(curved()), torch.Generator().manual_seed(0), 2000)
     assert short.item() == 0.0
@@ -58,15 +59,15 @@ def test_boxes_are_those_that_the_candidate_forecasts(monkeypatch):
 
 
 def test_less_curvature_takes_fewer_boxes_and_a_set_beyond_the_domain_is_told():
-    found = ProvableSet(ClosedLoop(PENDULUM, curved()), 20.0)
+    found = ProvableSet(ClosedLoop(PENDULUM, curved()), 20.0, 0.25)
     sizes = [
         found.log_boxes(_student(contracted(curved(), f)), torch.Generator().manual_seed(0), 500)[0].item()
         for f in (1.0, 0.5, 0.25)
     ]
     assert sizes[0] > sizes[1] > sizes[2]
-    inside = ProvableSet(ClosedLoop(PENDULUM, curved()), 1.0)
+    inside = ProvableSet(ClosedLoop(PENDULUM, curved()), 1.0, 0.25)
     assert inside.outside().item() == 0.0 and domain_limit(inside.P(), PENDULUM.domain) > 1
-    beyond = ProvableSet(ClosedLoop(PENDULUM, curved()), 1000.0)
+    beyond = ProvableSet(ClosedLoop(PENDULUM, curved()), 1000.0, 0.25)
     assert beyond.outside().item() > 0.0 and domain_limit(beyond.P(), PENDULUM.domain) < 1
 
 
@@ -76,7 +77,7 @@ def result():
 
 
 def test_it_costs_no_more_and_takes_fewer_boxes(result):
-    before = ProvableSet(ClosedLoop(PENDULUM, curved()), 20.0)
+    before = ProvableSet(ClosedLoop(PENDULUM, curved()), 20.0, 0.25)
     size, _ = before.log_boxes(_student(curved()), torch.Generator().manual_seed(0), 500)
     assert result.after.settled == result.before.settled == 20 and result.after.cost <= result.before.cost
     assert result.boxes < 0.5 * np.exp(size.item())
@@ -86,6 +87,25 @@ def test_it_costs_no_more_and_takes_fewer_boxes(result):
     assert volume(P, 1.0) == pytest.approx(20.0, rel=1e-5) and record["boxes"] == result.boxes
     assert record["curvature"] == "kept" and result.volume == record["volume"] == 20.0
     assert result.as_json()["forecast"] == {"volume": 20.0, "boxes": result.boxes}
+
+
+def test_a_distance_from_the_linear_feedback_is_kept_if_it_is_asked_for(result):
+    """Beside so large a weight of the boxes no bend pays."""
+    assert result.policy.training["flattened"]["distance"] == 0
+    straightening = replace(QUICK, weight=20.0, distance=0.2)
+    far = flatten(Policy(curved(), "pendulum"), straightening)
+    assert far.factor == pytest.approx(0.5**0.5) and far.policy.training["flattened"]["distance"] == 0.2
+    assert 0.2 <= nonlinearity_on(far.policy.network, ORIGIN, np.array([np.pi / 2, 2.0])).rms < 0.3
+    with pytest.raises(OptionError, match="no policy within the bounds"):
+        flatten(Policy(curved(), "pendulum"), replace(straightening, steps=8, distance=50.0))
+    with pytest.raises(OptionError, match='`distance` must be left out unless `curvature` is "kept"'):
+        FlattenOptions(distance=0.1)
+
+
+def test_the_distance_in_training_is_that_which_is_reported():
+    x = np.random.default_rng(0).uniform(-1, 1, (500, 2))
+    found = _student(curved()).distance(torch.tensor(x).float()).item()
+    assert found == pytest.approx(nonlinearity(curved(), ORIGIN, x).rms, rel=1e-4)
 
 
 def test_equal_options_give_equal_policies(result):
