@@ -16,7 +16,6 @@ from certify.loop.policies import Policy, PolicyNetwork
 from certify.loop.policies.nonlinearity import nonlinearity
 from certify.lyapunov import domain_limit, volume
 from certify.provers.bounds import policy_enclosure
-from controllers.evaluation.curvature import nonlinearity_on
 from controllers.flattening import keeping
 from controllers.flattening.contraction import contracted
 from controllers.flattening.flattening import flatten
