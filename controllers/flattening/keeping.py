@@ -131,7 +131,7 @@ class Keeping:
         return factor, done, "steps"
 
     def _stage(self, stage: int) -> tuple[float, float]:
-        """What the set aims at: volume, and share of boxes."""
+        """The volume and the size of boxes that the set aims at."""
         of_volume, share = _STAGES[stage]
         return of_volume * self.volume, share
 

@@ -16,7 +16,6 @@ from certify.loop.policies import Policy, PolicyNetwork
 from certify.loop.policies.nonlinearity import nonlinearity
 from certify.lyapunov import domain_limit, volume
 from certify.provers.bounds import policy_enclosure
-from controllers.evaluation.curvature import nonlinearity_on
 from controllers.flattening import keeping
 from controllers.flattening.contraction import contracted
 from controllers.flattening.flattening import flatten
@@ -89,17 +88,10 @@ def test_it_costs_no_more_and_takes_fewer_boxes(result):
     assert result.as_json()["forecast"] == {"volume": 20.0, "boxes": result.boxes}
 
 
-def test_a_distance_from_the_linear_feedback_is_kept_if_it_is_asked_for(result):
-    """Beside so large a weight of the boxes no bend pays."""
-    assert result.policy.training["flattened"]["distance"] == 0
-    straightening = replace(QUICK, weight=20.0, distance=0.2)
-    far = flatten(Policy(curved(), "pendulum"), straightening)
-    assert far.factor == pytest.approx(0.5**0.5) and far.policy.training["flattened"]["distance"] == 0.2
-    assert 0.2 <= nonlinearity_on(far.policy.network, ORIGIN, np.array([np.pi / 2, 2.0])).rms < 0.3
-    with pytest.raises(OptionError, match="no policy within the bounds"):
-        flatten(Policy(curved(), "pendulum"), replace(straightening, steps=8, distance=50.0))
+def test_a_distance_goes_with_curvature_that_is_kept():
     with pytest.raises(OptionError, match='`distance` must be left out unless `curvature` is "kept"'):
         FlattenOptions(distance=0.1)
+    assert FlattenOptions(curvature="kept", distance=0.1).distance == 0.1
 
 
 def test_the_distance_in_training_is_that_which_is_reported():
