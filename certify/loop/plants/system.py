@@ -179,11 +179,8 @@ class System:
         for name in bounds:
             if name not in names:
                 raise InputError(f"{self.name} has no state {name!r}; it has: {', '.join(names)}.")
-        given = {
-            name: (exact(lo, f"{name} of the domain"), exact(hi, f"{name} of the domain"))
-            for name, (lo, hi) in bounds.items()
-        }
-        return replace(self, domain=tuple(given.get(name, old) for name, old in zip(names, self.domain, strict=True)))
+        box = (bounds.get(name, old) for name, old in zip(names, self.domain, strict=True))
+        return replace(self, domain=tuple((exact(lo, "domain"), exact(hi, "domain")) for lo, hi in box))
 
     def with_ranges(self, ranges: Mapping[str, Interval | None]) -> System:
         """The same plant where some parameters are uncertain and some disturbances act; None takes a range away.

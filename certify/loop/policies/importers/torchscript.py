@@ -211,7 +211,7 @@ def _called(program: _Program, function: ast.FunctionDef, given: list[Any], dept
 
 
 def _through(program: _Program, body: list[ast.stmt], values: dict[str, Any], depth: int, at: str) -> tuple[Any] | None:
-    """What these statements return; None if they end without a return."""
+    """The value that these statements return, alone in a tuple; None if they end without a return."""
     for statement in body:
         match statement:
             case ast.Assign(targets=[ast.Name(id=name)]) if name not in _RESERVED:
