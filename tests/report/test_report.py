@@ -740,8 +740,8 @@ def test_summary_of_a_proof(pendulum_case: Case) -> None:
     text = rendered(result)
     assert text.startswith("PROVED  pendulum")
     for shown in (below(result["levels"]["roa"]), below(result["levels"]["local"]), below(result["volume"]),
-                  result["policy"]["sha256"][:16] + "…", "2-16-16-1", f"{result['leaves']:,} leaves", "ACCEPTED", "rad/s",
-                  above(result["extents"][1]), below(result["semi_axes"][0])):  # fmt: skip
+                  result["policy"]["sha256"][:16] + "…", "2-16-16-1", f"{result['leaves']:,} leaves", "ACCEPTED",
+                  "rad/s", above(result["extents"][1]), below(result["semi_axes"][0])):  # fmt: skip
         assert shown in text
     assert all(stage in text for stage in ("candidate", "local", "ring", "write", "check"))
 
