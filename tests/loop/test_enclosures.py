@@ -174,8 +174,14 @@ EVALUATED = {"models": on_models, **{way: partial(on_tape, way=way) for way in W
 coefficient = st.floats(-1, 1).map(lambda v: round(v, 6))
 
 
-@pytest.mark.parametrize("way", EVALUATED)
-@pytest.mark.parametrize("expression", EXPRESSIONS, ids=str)
+@pytest.mark.parametrize(
+    ("expression", "way"),
+    [
+        pytest.param(e, way, marks=[pytest.mark.slow] if way == "compiled" and k > 3 else [], id=f"{e}-{way}")
+        for k, e in enumerate(EXPRESSIONS)
+        for way in EVALUATED
+    ],
+)
 @given(
     st.lists(coefficient, min_size=6, max_size=6),
     st.sampled_from([1.0, 0.1, 1e-3, 1e-9, 0.0]),

@@ -16,6 +16,7 @@ from certify.provers.ball.kinks import ALL, Cone, Directions, OnCone, has_kinks
 from certify.provers.ball.local import Rule, local_ball, prove_local
 from tests.support.cases import case_of
 from tests.support.corners import plant, regulator
+from tests.support.marks import slow_after
 
 
 def sides(*gain: float, share: float = 1.0, bias: float = 0.0) -> PolicyNetwork:
@@ -109,7 +110,7 @@ RUNS: dict[str, tuple[Any, PolicyNetwork, dict[str, Any]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", slow_after(2, RUNS))
 def test_a_run_is_proved_and_accepted(name: str, tmp_path: Any) -> None:
     system, law, options = RUNS[name]
     result = certify_roa(system, law, out=tmp_path, **options)

@@ -30,6 +30,7 @@ from certify.provers.bounds.policy import LayersEnclosure, StepsEnclosure, polic
 from tests.provers.test_activations import boxes, folded
 from tests.provers.test_activations import policy as layers
 from tests.provers.test_models import beyond
+from tests.support.marks import slow_after
 from tests.support.programs import PROGRAMS, policy
 
 PLANT = get_system("pendulum")
@@ -144,7 +145,7 @@ def test_rationals_know_what_steps_make_of_0() -> None:
     assert late == (None,)  # sqrt(1.01)
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
+@pytest.mark.parametrize("name", slow_after(3, PROGRAMS))
 def test_they_prove_loops_that_both_checkers_accept(name: str) -> None:
     result = certify_roa(PLANT, policy(name))
     assert result.verdict is Verdict.PROVED and result.volume is not None and result.volume > 30
@@ -164,6 +165,7 @@ def _accepts(path: Any, module: str) -> bool:
     return done.returncode == 0 and "ACCEPTED" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_practical_claim_of_an_observed_policy() -> None:
     law = replace(policy("observed"), centre="none", offset=np.array([0.05]))
     result = certify_roa(PLANT, law)
