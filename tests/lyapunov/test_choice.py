@@ -47,7 +47,7 @@ def test_weights_must_be_positive_and_of_the_right_number(
 def test_the_optimised_candidate_falls_back_with_a_notice(
     pendulum: System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise BackendError("cvxpy is not installed.")
 
     monkeypatch.setattr(choice, "optimise_repeatedly", fail)
