@@ -106,15 +106,15 @@ def _beyond_kinks(rule: Rule, found: float | None, limit: float, effort: Effort)
     def good(level: float, kinked: Rule | None) -> bool:
         if kinked is None or kinked.directions is None or effort.over:
             return False
-        effort.charge(_SHARED * len(kinked.directions.cones) * rule.operations)
+        effort.charge(kinked.operations)
         return kinked.shown(level, _ENOUGH).margin > _MARGIN
 
     if found is not None:
         low, high = found, min(_WORTH_KINKS * found, limit)
-        while low < limit and good(high, rule.with_kinks(high)):
+        while low < limit and good(high, rule.with_kinks(high, effort)):
             low, high = high, min(high * _WORTH_KINKS, limit)
         return low
-    kinked, level = rule.with_kinks(limit), limit
+    kinked, level = rule.with_kinks(limit, effort), limit
     while not good(level, kinked):
         level *= _DOWN
         if kinked is None or level < _LOWEST * limit or effort.over:
@@ -153,8 +153,7 @@ def prove_band(
 
     def floor(level: float) -> float:
         if level not in floors:
-            found = _around(rule, level)[1]
-            effort.charge(max(found.rounds * rule.operations, rule.operations_of_models))
+            found = _around(rule, level, effort)[1]
             floors[level] = max(found.floor, _NOTHING * limit)
         return floors[level]
 
@@ -168,13 +167,19 @@ def prove_band(
     return (floor(top), top) if c1 is None else (floor(c1), c1)
 
 
-def _around(rule: Rule, level: float, floor: float = math.inf) -> tuple[Rule, _Around]:
+def _around(rule: Rule, level: float, effort: Effort = UNLIMITED, floor: float = math.inf) -> tuple[Rule, _Around]:
     """The rule, with kinks where it shows no floor up to that without, and the least floor on the ball of a level."""
-    found = rule.around(level)
-    if found.floor < level and found.floor <= floor:
-        return rule, found
-    kinked = rule.with_kinks(level)
-    return (rule, found) if kinked is None else (kinked, kinked.around(level))
+
+    def around(one: Rule) -> tuple[Rule, _Around]:
+        found = one.around(level)
+        effort.charge(max(found.rounds * one.operations, one.operations_of_models))
+        return one, found
+
+    found = around(rule)
+    if found[1].floor < level and found[1].floor <= floor:
+        return found
+    kinked = rule.with_kinks(level, effort)
+    return found if kinked is None else around(kinked)
 
 
 def local_margin(problem: Problem, T: Array, level: float, known: Paths) -> float:
@@ -194,7 +199,7 @@ def local_ball(
             rule, shown = kinked, kinked.shown(level)
         by, edge = shown.multipliers, 0.0
     else:
-        rule, found = _around(Rule.anywhere(problem, T), level, floor)
+        rule, found = _around(Rule.anywhere(problem, T), level, floor=floor)
         by, edge = found.multipliers, found.edge
     directions = None if rule.directions is None else rule.directions.trees
     ball = LocalBall(ball_around(problem, T, level), by.rows, by.weight, edge, rule.steps.order, directions)
@@ -257,10 +262,12 @@ class Rule:
 
     @property
     def operations(self) -> float:
-        """Operations of a look at one ball, about, as an `Effort` counts them."""
+        """Operations of a look at one ball, on all its cones, about, as an `Effort` counts them."""
+        looks = 1.0 if self.directions is None else _SHARED * len(self.directions.cones)
         n, units = len(self.T), self.problem.loop.network.network.units
         corners = max(1, len(self.cells)) * 2 ** min(len(self.problem.loop.system.ranges), AT_CORNERS)
-        return float(self.operations_of_models + corners * _WEIGHINGS * (_WEIGHING + 30.0 * units * n**2 + 15.0 * n**5))
+        each = self.operations_of_models + corners * _WEIGHINGS * (_WEIGHING + 30.0 * units * n**2 + 15.0 * n**5)
+        return looks * float(each)
 
     @property
     def operations_of_models(self) -> float:
@@ -333,7 +340,7 @@ class Rule:
         """All of d, if there are kinks."""
         return None if self.directions is None else ALL
 
-    def with_kinks(self, level: float) -> Rule | None:
+    def with_kinks(self, level: float, effort: Effort = UNLIMITED) -> Rule | None:
         """The rule with directions that leave some decay on each of their cones, on the ball of a level, or on a small
         one if there is a kink at the origin; None if a few thousand do not, or the network has no kinks."""
         known = self.steps.known
@@ -341,16 +348,17 @@ class Rule:
             return None
         if corner_of(known) is not None:
             level = _TINY * domain_limit(self.problem.V.P, self.problem.loop.system.domain)
-        found = self.directions_at(level)
+        found = self.directions_at(level, effort)
         return None if found is None else replace(self, directions=found)
 
-    def directions_at(self, level: float) -> Directions | None:
-        """Directions that leave some decay on each of their cones."""
+    def directions_at(self, level: float, effort: Effort) -> Directions | None:
+        """Directions that leave some decay on each of their cones; None also where the effort ends before."""
         J = ball_around(self.problem, self.T, level)
 
         def leaves_decay(cone: Cone) -> bool:
-            if not cone.narrow:
+            if not cone.narrow or effort.over:
                 return False
+            effort.charge(_SHARED * self.operations)
             models = self.models(J, level, cone)
             if not all(one.finite for one in models):
                 return False
