@@ -35,7 +35,7 @@ _BELOW_LEAVES, _LEVELS = 2, 5  # weaker certificates: below a refused leaf so lo
 _LONG = 1_000_000  # bytes of a certificate, from which on several processes check it
 _MOST_JOBS = 64
 _QUICK = 2**27  # operations of the reference, as FORMAT.md counts them: at most some five seconds
-_WITH_KINKS = 2**31
+_WITH_KINKS = 2**31  # the same for certificates with kinks on a ball: about a minute
 _HIGHER = 1.5  # the next floor, after one that is refused
 
 

@@ -46,8 +46,8 @@ def options_of(texts: Mapping[str, Any], plant: System, tell: Tell, policy: Poli
         shaped = read.get("candidate", "auto") == "auto" and not {"Q", "R", "level"} & read.keys()
         if shaped and read.get("claim") != "invariant" and isinstance(beyond, StoredLyapunov):
             read["P"] = ellipsoid_beside(beyond, plant)
-    elif policy is not None and not {"Q", "R", "level", "candidate", "claim", "engine", "rate"} & read.keys():
-        read["P"] = ellipsoid_trained(policy, plant)
+    elif policy is not None and not {"Q", "R", "level", "candidate", "claim", "rate"} & read.keys():
+        read["P"] = ellipsoid_trained(policy, plant) if read.get("engine", "bounds") == "bounds" else None
         if read["P"] is not None:
             tell("P is that of the policy's training, from its record; --candidate auto tries others")
     return RoaOptions(**read)

@@ -74,7 +74,7 @@ def by_centring(
 
 def by_clipping(result: RoaResult, asked: tuple[System, PolicyNetwork], effort: Effort) -> Step | None:
     """The step of a policy that asks for more than the actuator gives, where one that is clipped at the input bounds
-    converges from more states in simulation."""
+    converges from as many states in simulation."""
     system, network = asked
     free = network.clip is None and network.squash == "identity" and system.n <= FEW
     if result.stop is not Stop.INPUTS or not free or result.problem is None or result.levels.roa is None:

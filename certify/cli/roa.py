@@ -63,8 +63,7 @@ def roa(
     plant = plant_of(stored, system, changes, note)
     trained = stored if system is None and not changed else None
     engine = _engine(context, typed.get("engine", "bounds"))
-    typed = {name: value for name, value in typed.items() if name != "engine"}
-    options = options_of(typed | ({} if engine == "bounds" else {"engine": engine}), plant, note, trained)
+    options = options_of(typed | {"engine": engine}, plant, note, trained)
     if contains is not None:
         region(contains, plant, CONTAINS)  # an error in it is reported before the run
     if options.claim == "invariant":

@@ -103,6 +103,10 @@ REFUSED: dict[str, tuple[str, list[Any]]] = {
     "a sum with erf that is read elsewhere": ("Erf .*is not read", [
         N("Div", ["h", "root"], ["d"]), N("Erf", ["d"], ["e"]), N("Add", ["e", "one"], ["g"]),
         N("Mul", ["h", "g"], ["f"]), N("Mul", ["f", "half"], ["w"]), N("Add", ["w", "g"], ["v"])]),
+    "erf of nothing": ("Erf .*is not read", [N("Erf", [], ["e"]), N("Add", ["e", "one"], ["v"])]),
+    "erf that multiplies a product of itself": ("Erf .*is not read", [
+        N("Div", ["h", "root"], ["d"]), N("Erf", ["d"], ["e"]), N("Add", ["e", "one"], ["g"]),
+        N("Mul", ["h", "w"], ["w"]), N("Mul", ["w", "g"], ["v"])]),
     "another form of gelu": ("must be the exact one or its tanh form", [N("Gelu", ["h"], ["v"], approximate="erf")]),
 }  # fmt: skip
 

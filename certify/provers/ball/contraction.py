@@ -13,13 +13,12 @@ import numpy as np
 from certify.certificates import Contraction
 from certify.certificates.claims import Problem
 from certify.errors import InputError
-from certify.provers.ball.kinks import ALL, Cone, Directions, bound_of, has_kinks
+from certify.provers.ball.kinks import ALL, Cone, Directions, bound_of, has_kinks, is_left
 from certify.provers.ball.local import Array, ball_around
 from certify.provers.ball.models import Paths, paths
 from certify.provers.ball.steps import steps_of
 
 _MOST_CONES = 1024  # of directions
-_LEFT = 0.05  # the least eigenvalue that a cone's decay has to have, scaled to a diagonal of 1
 _LEAST = 1e-12  # share of the decay: a weight must not be 0
 
 
@@ -72,9 +71,7 @@ def _directions(problem: Problem, known: Paths, J: Array) -> tuple[bytes, ...] |
         b = P @ J + steps.longest * P @ models.A
         crossed = (P @ J).T @ models.A
         decay = -(crossed + crossed.T) - steps.longest * models.A.T @ P @ models.A
-        decay = decay - bound_of(models.kinks, models.shares.T @ b, np.eye(len(J)))
-        scale = 1 / np.sqrt(np.abs(np.diag(decay)))
-        return bool(np.all(np.diag(decay) > 0) and np.linalg.eigvalsh(decay * scale * scale[:, None])[0] > _LEFT)
+        return is_left(decay - bound_of(models.kinks, models.shares.T @ b, np.eye(len(J))))
 
     found = Directions(len(J)) if contracts(ALL) else Directions(len(J)).refined(contracts, _MOST_CONES)
     return None if found is None else found.trees

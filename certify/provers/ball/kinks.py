@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 _NONE = 1e-12  # what a unit reads that counts as 0 there
 _FINEST = 2.0**-14  # half width of a leaf: what does not hold there does not hold on narrower cones
 _SIDE = 1 + 1e-6  # factor of what an entry moves beside its cone's middle, for the checker's rounding
+_LEFT = 0.05  # the least eigenvalue that a cone's decay has to have, scaled to a diagonal of 1
 _COARSE, _FINE = np.arange(-4.0, 24.0), np.arange(-7.0, 8.0) / 8  # powers of 2 to choose a multiplier from
 
 
@@ -303,6 +304,14 @@ def sectors(y: Array, below: Array, above: Array, lo: Array, hi: Array) -> tuple
 def _share(length: Array, far: Array) -> Array:
     """min(1, length/far), 1 only where that is certain beyond all rounding."""
     return np.asarray(np.where(far * CERTAIN < length, 1.0, np.clip(length / far, 0.0, 1.0)))
+
+
+def is_left(decay: Array) -> bool:
+    """True if a decay (k, k) is positive definite beyond what a ball of more than no size takes of it."""
+    if not (np.all(np.isfinite(decay)) and np.all(np.diag(decay) > 0)):
+        return False
+    scale = 1 / np.sqrt(np.diag(decay))
+    return bool(np.linalg.eigvalsh(decay * scale * scale[:, None])[0] > _LEFT)
 
 
 def bound_of(kinks: Kinks, p: Array, weight: Array) -> Array:

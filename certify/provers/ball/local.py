@@ -28,7 +28,7 @@ from certify.provers.ball.decrease import (
     of_others,
     rests_of,
 )
-from certify.provers.ball.kinks import ALL, Cone, Directions, has_kinks
+from certify.provers.ball.kinks import ALL, Cone, Directions, has_kinks, is_left
 from certify.provers.ball.models import AT_CORNERS, Models, Paths, corner_of, paths
 from certify.provers.ball.steps import Cell, Steps, steps_of
 from certify.provers.base import FEW
@@ -49,7 +49,6 @@ _ROUNDS = 3  # rounds of multipliers and edge, each best for the other
 _WORTH = 0.01  # share of a floor: less is no gain
 _ROUNDING = 1e-12  # share of the decay: the checker's numbers are in doubt by it at d = 0 as well
 _MOST_CONES = 4096  # of directions
-_LEFT = 0.05  # the least eigenvalue that a cone's decay has to have, scaled to a diagonal of 1
 _FAR_BELOW = 1e-3  # share of its limit below which a level is tried to be raised by kinks
 _WORTH_KINKS, _DOWN = 4.0, 0.1  # from a level without kinks to the first with them, and on; down to one that is good
 _TINY, _LOWEST = 1e-10, 1e-6  # shares of the largest level: where directions are chosen, and the lowest that is tried
@@ -362,11 +361,7 @@ class Rule:
             models = self.models(J, level, cone)
             if not all(one.finite for one in models):
                 return False
-            decays = [c.decay for one in models for c in self._corners_of(one, J)]
-            if not all(np.all(np.isfinite(D)) and np.all(np.diag(D) > 0) for D in decays):
-                return False
-            scales = [1 / np.sqrt(np.diag(D)) for D in decays]
-            return all(np.linalg.eigvalsh(D * s * s[:, None])[0] > _LEFT for D, s in zip(decays, scales, strict=True))
+            return all(is_left(c.decay) for one in models for c in self._corners_of(one, J))
 
         with np.errstate(all="ignore"):
             if not np.all(np.isfinite(J)):

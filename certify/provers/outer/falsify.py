@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -219,15 +220,10 @@ class Falsifier(Sampler):
 class Hazards(Sampler):
     """A search of the domain for states that no set may have: an input or a constraint is violated."""
 
-    def __init__(
-        self,
-        loop: ClosedLoop,
-        function: Neural | Symbolic,
-        effort: Effort = UNLIMITED,
-        beyond: tuple[Quadratic, float] | None = None,
-    ) -> None:
-        super().__init__(loop, function, effort, beyond)
-        self.constraints = Constraints(loop) if loop.system.constraints else None
+    @cached_property
+    def constraints(self) -> Constraints | None:
+        """Those of the plant, in floats; None without any."""
+        return Constraints(self.loop) if self.system.constraints else None
 
     def violation(self, x: Array) -> Array:
         """A number (B,) that is at least 0 where one is violated."""

@@ -244,9 +244,9 @@ def _walk(graph_: Any, name: str, output: str, what: str) -> Chain:
         constants[tensor.name] = _constant(tensor, what)
     chains: dict[str, Chain | _Root] = {name: ()}
     wide = _given_width(graph_, name)
-    said = {node.output[0]: node for node in graph_.node if node.op_type == "Constant" and len(node.output) == 1}
-    numbers = constants | {made: _attribute({a.name: a for a in node.attribute}, what) for made, node in said.items()}
-    for node in with_gelu(list(graph_.node), numbers, output):
+    said = [node for node in graph_.node if node.op_type == "Constant" and len(node.output) == 1]
+    numbers = {node.output[0]: _attribute({a.name: a for a in node.attribute}, what) for node in said}
+    for node in with_gelu(list(graph_.node), constants | numbers, output):
         at = f"{node.op_type} {node.name}".strip()
         if node.domain not in _STANDARD or len(node.output) != 1:
             raise InputError(f"{what} must hold {_KNOWN}; found {node.domain}.{at}.")
@@ -265,7 +265,7 @@ def _walk(graph_: Any, name: str, output: str, what: str) -> Chain:
                 f"{at} in {what} has {', '.join(unknown)}, which is not read; the operations are {_KNOWN}."
             )
         if node.op_type == "Constant":
-            constants[node.output[0]] = _attribute(flags, what)
+            constants[node.output[0]] = numbers[node.output[0]]
             continue
         given = [None if not i else chains[i] if i in chains else constants.get(i) for i in node.input]
         if any(i and v is None for i, v in zip(node.input, given, strict=True)):

@@ -56,59 +56,70 @@ def with_gelu(nodes: list[Any], constants: dict[str, Any], output: str) -> list[
     """
     from onnx import helper
 
-    made = {node.output[0]: node for node in nodes if node.output}
-    gelus = dict[str, Any]()
-    for node in nodes:
-        x = _under_the_root(made.get(node.input[0]), constants) if node.op_type == "Erf" else None
-        end = None if x is None else _end_of_gelu(node.output[0], x, nodes, made, constants)
-        if end is not None:
-            gelus[end] = helper.make_node("Gelu", [x], [end], name=node.name)
+    if not any(node.op_type == "Erf" for node in nodes):
+        return nodes
+    found = _Written(nodes, constants)
+    gelus = {end: helper.make_node("Gelu", [x], [end]) for end, x in map(found.gelu, nodes) if end is not None}
     kept, wanted = list[Any](), {output}
-    for node in reversed([gelus.get(node.output[0], node) if node.output else node for node in nodes] if gelus else []):
+    for node in reversed([gelus.get(node.output[0], node) if node.output else node for node in nodes]):
         if wanted.intersection(node.output):
             kept.append(node)
             wanted.update(node.input)
     return kept[::-1] if gelus else nodes
 
 
-def _is(name: str, wanted: float, constants: dict[str, Any], within: float = 0.0) -> bool:
-    """True for a constant number that is `wanted` up to a relative error."""
-    value = constants.get(name)
-    return value is not None and np.size(value) == 1 and abs(float(np.ravel(value)[0]) - wanted) <= within * wanted
+class _Written:
+    """A graph as written: the node that makes a value, and those that read it."""
 
+    def __init__(self, nodes: list[Any], constants: dict[str, Any]) -> None:
+        self.constants = constants
+        self.made = {name: node for node in nodes for name in node.output}
+        self.read = dict[str, list[Any]]()
+        for node in nodes:
+            for name in set(node.input):
+                self.read.setdefault(name, []).append(node)
 
-def _under_the_root(node: Any, constants: dict[str, Any]) -> str | None:
-    """The name of x where a node is x / sqrt 2."""
-    if node is None or node.op_type not in ("Div", "Mul") or len(node.input) != 2:
-        return None
-    x, by = node.input if node.op_type == "Div" or node.input[1] in constants else node.input[::-1]
-    wanted = math.sqrt(2) if node.op_type == "Div" else math.sqrt(0.5)
-    return str(x) if x not in constants and _is(by, wanted, constants, _ROUNDED) else None
+    def gelu(self, node: Any) -> tuple[str | None, str]:
+        """The value that is GELU of x where the node is the Erf in it, None if there is none; and x."""
+        x = self._under_the_root(self.made.get(node.input[0])) if node.op_type == "Erf" and node.input else None
+        return (None, "") if x is None or not node.output else (self._product(node.output[0], x), x)
 
+    def _is(self, name: str, wanted: float, within: float = 0.0) -> bool:
+        """True for a constant number that is `wanted` up to a relative error."""
+        value = self.constants.get(name)
+        return value is not None and np.size(value) == 1 and abs(float(np.ravel(value)[0]) - wanted) <= within * wanted
 
-def _end_of_gelu(erf: str, x: str, nodes: list[Any], made: dict[str, Any], constants: dict[str, Any]) -> str | None:
-    """The name of the product of 1 + erf, x and 1/2; None where what follows is another expression."""
-
-    def after(name: str) -> Any:
-        users = [node for node in nodes if name in node.input]
-        return users[0] if len(users) == 1 and len(users[0].input) == 2 else None
-
-    def factors(name: str) -> list[str]:
-        node = made.get(name)
-        if name != x and node is not None and node.op_type == "Mul" and x in node.input:
-            return [part for inner in node.input for part in factors(inner)]
-        return ["x" if name == x else "half" if _is(name, 0.5, constants) else "another"]
-
-    def other(node: Any, name: str) -> str:
-        return str(node.input[1] if node.input[0] == name else node.input[0])
-
-    node, name, found = after(erf), erf, list[str]()
-    if node is None or node.op_type != "Add" or not _is(other(node, name), 1.0, constants):
-        return None
-    while sorted(found) != ["half", "x"]:
-        name = node.output[0]
-        node = after(name)
-        if node is None or node.op_type != "Mul" or "another" in found or len(found) > 1:
+    def _under_the_root(self, node: Any) -> str | None:
+        """The name of x where a node is x / sqrt 2."""
+        if node is None or node.op_type not in ("Div", "Mul") or len(node.input) != 2:
             return None
-        found += factors(other(node, name))
-    return str(node.output[0])
+        x, by = node.input if node.op_type == "Div" or node.input[1] in self.constants else node.input[::-1]
+        wanted = math.sqrt(2) if node.op_type == "Div" else math.sqrt(0.5)
+        return str(x) if x not in self.constants and self._is(by, wanted, _ROUNDED) else None
+
+    def _product(self, erf: str, x: str) -> str | None:
+        """The name of the product of 1 + erf, x and 1/2; None where what follows is another expression."""
+        name, beside = self._after("Add", erf)
+        if name is None or not self._is(beside, 1.0):
+            return None
+        found = list[str]()
+        while sorted(found) != ["half", "x"]:
+            name, beside = self._after("Mul", name)
+            if name is None or len(found) > 1:
+                return None
+            found += self._factors(beside, x)
+        return name
+
+    def _after(self, kind: str, name: str) -> tuple[str | None, str]:
+        """The value of the one node that reads a value, if it is of this kind, and what it reads beside it."""
+        users = self.read.get(name, [])
+        if len(users) != 1 or users[0].op_type != kind or len(users[0].input) != 2 or not users[0].output:
+            return None, ""
+        one, other = users[0].input
+        return str(users[0].output[0]), str(other if one == name else one)
+
+    def _factors(self, name: str, x: str) -> list[str]:
+        """The factors of a value, as far as they are x and 1/2."""
+        node = self.made.get(name)
+        inputs = [name] if node is None or name == x or node.op_type != "Mul" else list(node.input)
+        return ["x" if one == x else "half" if self._is(one, 0.5) else "another" for one in inputs]
