@@ -15,12 +15,14 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certify.loop.activations import CERTAIN, fourth_of_tanh
-from certify.loop.expressions import Algebra
+from certify.loop.expressions import Algebra, evaluate
+from certify.loop.networks import Observe
 from certify.provers.bounds.taylor import EXP_END
 
 Array = NDArray[np.float64]
@@ -291,3 +293,15 @@ class Jets(Algebra[Jet]):
         """An input's model, without its error, which is e of its number."""
         *_, nothing, errors = self._parts
         return Jet(value, a, Q, K, np.eye(len(errors))[number][None], nothing, errors)
+
+
+def observed(step: Observe, y: Array, G: Array, Q: Array, K: Array, E: Array) -> tuple[Array, ...]:
+    """Values (M,), gradients, Q, K and E, a row each, of an observation's M expressions at entries that have such."""
+    algebra, none = Jets(1, G.shape[1], np.zeros((0, E.shape[1]))), np.zeros((1, 0))
+    entries = [
+        Jet(float(y[i]), G[i][None], Q[i][None], K[i][None], none, E[i][None], none.T @ E[:1]) for i in range(len(y))
+    ]
+    values, shared = dict(zip(step.symbols, entries, strict=True)), dict[Any, Jet]()
+    made = [evaluate(e, values, algebra, shared) for e in step.expressions]
+    parts = (np.concatenate([getattr(jet, part) for jet in made]) for part in ("a", "Q", "K", "E"))
+    return np.array([jet.c for jet in made]), *parts

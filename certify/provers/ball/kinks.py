@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from certify.certificates.tree import LEAF
 from certify.loop.activations import CERTAIN
-from certify.loop.expressions import evaluate
 from certify.loop.networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Product, Sum
-from certify.provers.ball.jets import Jet, Jets, basis, beyond_tangent, product_beyond, remainder, sizes
+from certify.provers.ball.jets import basis, beyond_tangent, observed, product_beyond, remainder, sizes
 
 Array = NDArray[np.float64]
 _NONE = 1e-12  # what a unit reads that counts as 0 there
@@ -277,19 +276,9 @@ class OnCone(Algebra[Vector]):
     def observe(self, step: Observe, v: Vector) -> Vector:
         """Jets of the expressions, whose terms beyond their tangents become those of units; no kinks come before."""
         L, E, tilt = self.reached(v)
-        algebra, none = Jets(1, self.J.shape[1], np.zeros((0, len(self.form.eye)))), np.zeros((1, 0))
-        E = np.where((tilt > 0)[:, None], np.nan, E)
-        entries = [
-            Jet(float(v.y[i]), v.G[i][None], v.Q[i][None], v.K[i][None], none, E[i][None], none.T @ E[:1])
-            for i in range(len(v.y))
-        ]
-        values, shared = dict(zip(step.symbols, entries, strict=True)), dict[Any, Jet]()
-        made = [evaluate(e, values, algebra, shared) for e in step.expressions]
-        G, Q, K, rest = (np.concatenate([getattr(jet, part) for jet in made]) for part in ("a", "Q", "K", "E"))
+        y, G, Q, K, rest = observed(step, v.y, v.G, v.Q, v.K, np.where((tilt > 0)[:, None], np.nan, E))
         self._with(rest)
-        own = np.eye(len(made))
-        y = np.array([jet.c for jet in made])
-        return Vector(y, G, np.concatenate([np.zeros((len(made), L.shape[1])), own], 1), Q, K)
+        return Vector(y, G, np.concatenate([np.zeros((len(y), L.shape[1])), np.eye(len(y))], 1), Q, K)
 
 
 def sectors(y: Array, below: Array, above: Array, lo: Array, hi: Array) -> tuple[Array, Array]:

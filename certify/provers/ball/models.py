@@ -28,7 +28,7 @@ from certify.loop.networks import Affine, Algebra, Clip, Concat, Map, Network, O
 from certify.loop.networks.floats import evaluated, jacobian
 from certify.loop.plants import kept_constraints
 from certify.loop.policies import bounded_by_form
-from certify.provers.ball.jets import Jet, Jets, basis, beyond_tangent, product_beyond, remainder, sizes
+from certify.provers.ball.jets import Jet, Jets, basis, beyond_tangent, observed, product_beyond, remainder, sizes
 from certify.provers.ball.kinks import ALL, Cone, Kinks, OnCone
 from certify.provers.ball.ranged import RangedJet
 
@@ -372,14 +372,7 @@ class _OnBall(Algebra[_Part]):
     def observe(self, step: Observe, v: _Part) -> _Part:
         """Jets of the expressions, whose terms beyond their tangents become those of units."""
         G, _, E = self._reached(v)
-        algebra, none = Jets(1, self.J.shape[1], np.zeros((0, len(self.form.eye)))), np.zeros((1, 0))
-        entries = [
-            Jet(float(v.at.y[i]), G[i][None], v.Q[i][None], v.K[i][None], none, E[i][None], none.T @ E[:1])
-            for i in range(len(G))
-        ]
-        values, shared = dict(zip(step.symbols, entries, strict=True)), dict[Any, Jet]()
-        made = [evaluate(e, values, algebra, shared) for e in step.expressions]
-        Q, K, rest = (np.concatenate([getattr(jet, part) for jet in made]) for part in ("Q", "K", "E"))
+        _, _, Q, K, rest = observed(step, v.at.y, G, v.Q, v.K, E)
         self.R = np.concatenate([self.R, rest])
         return _Part(next(self._vectors), Q, K)
 
