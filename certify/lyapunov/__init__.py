@@ -9,6 +9,7 @@ from certify.lyapunov.function import LyapunovFunction, Quadratic
 from certify.lyapunov.importing import ImportedLyapunov, import_lyapunov
 from certify.lyapunov.level_sets import (
     are_inside,
+    ball_volume,
     diagonalising_coordinates,
     domain_limit,
     extents,
@@ -39,6 +40,7 @@ __all__ = [
     "StoredLyapunov",
     "Symbolic",
     "are_inside",
+    "ball_volume",
     "choose_candidate",
     "diagonalising_coordinates",
     "domain_limit",

@@ -111,6 +111,11 @@ def volume(P: Array, level: float) -> float:
     return _down(Fraction(int(mantissa)) * Fraction(2) ** int(exponent))
 
 
+def ball_volume(n: int) -> float:
+    """Volume of the unit ball in n dimensions, in floats."""
+    return float(math.pi ** (n / 2) / math.gamma(n / 2 + 1))
+
+
 def is_positive_definite(P: Array) -> bool:
     """True if the symmetric part of P is positive definite, in exact arithmetic; entries must be finite.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,7 +14,7 @@ from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
-from certify.lyapunov import SOLVED, choose_candidate, volume
+from certify.lyapunov import SOLVED, ball_volume, choose_candidate, volume
 from certify.provers.boxes.rule import operations_of_box
 
 _MANY = 6  # states, beyond which boxes hardly count
@@ -51,5 +50,4 @@ def forecast_of(network: PolicyNetwork, system: System, box: Sequence[float]) ->
     except InputError:  # it is not stable
         return None
     largest = max(volume(P, forecast.level(P, boxes)) for P in found)
-    ball = math.pi ** (n / 2) / math.gamma(n / 2 + 1)
-    return Forecasted(largest, float((largest / (ball * np.prod(box))) ** (1 / n)))
+    return Forecasted(largest, float((largest / (ball_volume(n) * np.prod(box))) ** (1 / n)))

@@ -23,7 +23,7 @@ from certify.analysis.candidates.economical import is_forecast
 from certify.errors import OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.policies import PolicyNetwork
-from certify.lyapunov import solve_lyapunov
+from certify.lyapunov import ball_volume, solve_lyapunov
 from controllers.evaluation.curvature import nonlinearity_on
 from controllers.flattening.contraction import contracted
 from controllers.flattening.descent import CHECKS, Report
@@ -81,9 +81,7 @@ def require_forecast(task: Task) -> None:
 
 def volume_of(options: FlattenOptions, box: Array) -> float:
     """The volume of the set to be proved: by default that of the ellipsoid of twice the box of initial states."""
-    n = len(box)
-    ball = math.pi ** (n / 2) / math.gamma(n / 2 + 1)
-    return options.volume if options.volume is not None else float(ball * np.prod(2 * box))
+    return options.volume if options.volume is not None else float(ball_volume(len(box)) * np.prod(2 * box))
 
 
 class Keeping:

@@ -13,15 +13,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from certify.analysis.candidates.economical import LEAST, NEAREST, OVERHEAD
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System
-from certify.lyapunov import diagonalising_coordinates, solve_lyapunov
+from certify.lyapunov import ball_volume, diagonalising_coordinates, solve_lyapunov
 from controllers.flattening.student import Student
 
 Array = NDArray[np.float64]
-_NEAREST = 0.1  # distance from the origin, of 1, from which on boxes are drawn
-_OVERHEAD = 8.0  # boxes for each that is forecast, times 2^(n/2)
-_LEAST = 1e-2  # m, of where nothing would be proved
 
 
 class ProvableSet(torch.nn.Module):
@@ -48,9 +46,9 @@ class ProvableSet(torch.nn.Module):
     def aim(self, volume: float, share: float) -> None:
         """Ask for this volume, in the product of the states' units, by boxes whose half-widths are this share of their
         distance from the origin."""
-        ball = math.pi ** (self.n / 2) / math.gamma(self.n / 2 + 1)
+        ball = ball_volume(self.n)
         self.shrink = math.log(ball / volume) / self.n  # L's mean logarithm
-        boxes = _OVERHEAD * 2 ** (self.n / 2) * self.n * ball * -math.log(_NEAREST) / (2 * share) ** self.n
+        boxes = OVERHEAD * 2 ** (self.n / 2) * self.n * ball * -math.log(NEAREST) / (2 * share) ** self.n
         self.share, self.log_unit = share, math.log(boxes)
 
     def factor(self) -> Tensor:
@@ -80,7 +78,7 @@ class ProvableSet(torch.nn.Module):
         """The logarithm of the number of boxes, from this many that are drawn, and the mean of what m is short of at
         those where nothing would be proved, which is 0 if there are none."""
         z = torch.randn(count, self.n, generator=generator)
-        r = torch.exp(math.log(_NEAREST) * torch.rand(count, generator=generator))
+        r = torch.exp(math.log(NEAREST) * torch.rand(count, generator=generator))
         z = z / torch.linalg.vector_norm(z, dim=1, keepdim=True) * r[:, None]
         L = self.factor()
         inverse = torch.linalg.inv(L)
@@ -91,5 +89,5 @@ class ProvableSet(torch.nn.Module):
         moved = (self.f(x, u + errors[:, j : j + 1] * one) - F for j, one in enumerate(torch.eye(self.m)))
         asked = torch.stack([(along * change).sum(1).abs() for change in moved]).sum(0)
         m = -(along * F).sum(1) / asked.clamp_min(1e-9)
-        power = torch.logsumexp(-self.n / 2 * m.clamp_min(_LEAST).log(), 0) - math.log(count)
-        return self.log_unit + power, (_LEAST - m).clamp_min(0).mean() / _LEAST
+        power = torch.logsumexp(-self.n / 2 * m.clamp_min(LEAST).log(), 0) - math.log(count)
+        return self.log_unit + power, (LEAST - m).clamp_min(0).mean() / LEAST

@@ -27,10 +27,10 @@ from certify.provers.bounds import operations_of_policy, policy_enclosure
 
 Array = NDArray[np.float64]
 STATES, FEW_STATES = 2000, 500  # for a candidate, and for a comparison of some
+NEAREST = 0.1  # distance from the origin, of 1, from which on they are sampled
+OVERHEAD = 8.0  # boxes for each that is forecast, times 2^(n/2)
+LEAST = 1e-2  # m, of where nothing would be proved
 _SHARE = 0.1  # the size of their boxes
-_NEAREST = 0.1  # distance from the origin, of 1, from which on they are sampled
-_OVERHEAD = 8.0  # boxes for each that is forecast, times 2^(n/2)
-_LEAST = 1e-2  # m, of where nothing would be proved
 _ROUNDS, _TRUST, _MOST_TRUST, _LEAST_TRUST = 12, 0.15, 0.3, 0.01  # of the entries of X, P = L (1 + X) L'
 _STEPS = 60  # of a minimisation
 _SCALINGS, _CORRECTIONS = 6, 2  # of a level from the domain's limit, and from one near by
@@ -67,12 +67,12 @@ class Forecast:
     def __init__(self, loop: ClosedLoop, effort: Effort = UNLIMITED, states: int = STATES, seed: int = 0) -> None:
         generator, self.loop, self.effort, n = np.random.default_rng(seed), loop, effort, loop.system.n
         z = generator.standard_normal((states, n))
-        self.radii = np.exp(generator.uniform(math.log(_NEAREST), 0.0, states))
+        self.radii = np.exp(generator.uniform(math.log(NEAREST), 0.0, states))
         self.z = z / np.linalg.norm(z, axis=1, keepdims=True) * self.radii[:, None]
         self.enclosure, self.f = policy_enclosure(loop), loop.system.function()
         sphere = 2 * math.pi ** (n / 2) / math.gamma(n / 2)
-        alike = sphere * -math.log(_NEAREST) / (2 * _SHARE) ** n  # boxes of this share between the radii
-        self.unit = _OVERHEAD * 2 ** (n / 2) * alike
+        alike = sphere * -math.log(NEAREST) / (2 * _SHARE) ** n  # boxes of this share between the radii
+        self.unit = OVERHEAD * 2 ** (n / 2) * alike
 
     def sampled(self, P: Array, level: float) -> _Sampled:
         """The states of {x'Px <= level}, each with the errors on its box."""
@@ -95,7 +95,7 @@ class Forecast:
 
     def _count(self, margins: Array) -> float:
         """The number of boxes by the samples' m."""
-        return float(self.unit * np.mean(np.maximum(margins, _LEAST) ** (-self.loop.system.n / 2)))
+        return float(self.unit * np.mean(np.maximum(margins, LEAST) ** (-self.loop.system.n / 2)))
 
     def level(self, P: Array, boxes: float, about: float = math.inf) -> float:
         """The level inside the domain that about so many boxes prove, near that which it is `about`."""
@@ -122,13 +122,13 @@ class Forecast:
             fall, each = -np.einsum("kij,ij->k", along, M), np.einsum("kuij,ij->ku", asked, M)
             size = np.abs(each).sum(1)
             m = fall / size
-            inside = m > _LEAST
-            weight = np.maximum(m, _LEAST) ** (-n / 2)
+            inside = m > LEAST
+            weight = np.maximum(m, LEAST) ** (-n / 2)
             total = weight.sum()
-            by = np.where(inside, -n / 2 * weight / np.maximum(m, _LEAST), 0.0) / total - ~inside
+            by = np.where(inside, -n / 2 * weight / np.maximum(m, LEAST), 0.0) / total - ~inside
             gradient = np.einsum("k,kij->ij", -by / size, along)
             gradient -= np.einsum("ku,kuij->ij", (by * m / size)[:, None] * np.sign(each), asked)
-            return float(math.log(total) + np.maximum(_LEAST - m, 0.0).sum()), gradient[rows] * often
+            return float(math.log(total) + np.maximum(LEAST - m, 0.0).sum()), gradient[rows] * often
 
         from scipy.optimize import minimize  # which a proof that asks no forecast does not load
 

@@ -169,7 +169,7 @@ class Course:
             most = self.flow.most
             down, up = below + most * np.minimum(mean.least, 0.0), above + most * np.maximum(mean.most, 0.0)
             kept = kept & mean.exists & self.in_domain(down, up)
-            values = {**mean.during}
+            values = dict(mean.during)
         for expression in self.keep:
             kept = kept & (upper_bound(evaluate(expression, values, models, {}))[0] < 0)
         return _form(after, n), kept & np.all([np.isfinite(v.c + v.radius()) for v in after], axis=0)
