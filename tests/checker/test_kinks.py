@@ -20,6 +20,7 @@ from certify.checker.networks import Affine, Clip, Map, Network
 from tests.support.certificates import LEAF, Document, edited, encode, parse, verdict
 from tests.support.kinked import even, kinked, mirrored, pi
 from tests.support.network_loops import affine, hashed, joined, mapped, with_policy
+from tests.support.reference import judge
 
 ONE = [["+", ["/", "x0", "2"], "u"]]
 TWO, P2 = ["x1", "u"], [[1.5, 0.5], [0.5, 1.0]]
@@ -42,7 +43,8 @@ HONEST: dict[str, Callable[[], Document]] = {
 
 @pytest.mark.parametrize("name", HONEST)
 def test_honest_certificates_are_accepted(name: str) -> None:
-    assert verdict(HONEST[name]()) == "ACCEPTED"
+    data = HONEST[name]()
+    assert verdict(data) == "ACCEPTED" and judge(data) is None
 
 
 @pytest.mark.parametrize("name", HONEST)
@@ -107,7 +109,8 @@ def shifted(gain: float, at: float) -> Any:
 
 @pytest.mark.parametrize("name", DIVERGING)
 def test_a_loop_that_diverges_on_one_side_is_refused(name: str) -> None:
-    assert verdict(DIVERGING[name]()) == "local"
+    data = DIVERGING[name]()
+    assert verdict(data) == judge(data) == "local"
 
 
 @pytest.mark.parametrize(("level", "found"), [(0.24, "ACCEPTED"), (3.99, "ACCEPTED"), (4.01, "local"), (9.0, "local")])
@@ -311,7 +314,9 @@ FORGED: list[tuple[str, str, Edit]] = [
 
 @pytest.mark.parametrize(("rule", "name", "change"), FORGED, ids=[name for _, name, _ in FORGED])
 def test_a_forged_tree_of_directions_is_refused(rule: str, name: str, change: Edit) -> None:
-    assert verdict(edited(PLANE(), "evidence.local.directions", change)) == rule
+    data = edited(PLANE(), "evidence.local.directions", change)
+    assert verdict(data) == rule
+    assert judge(data) == ("limits" if name == "a tree that is too deep" else rule)  # its own limit is lower
 
 
 def test_a_bias_that_is_nearly_0_is_not_0() -> None:
