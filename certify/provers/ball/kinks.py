@@ -296,7 +296,7 @@ def _share(length: Array, far: Array) -> Array:
 
 
 def is_left(decay: Array) -> bool:
-    """True if a decay (k, k) is positive definite beyond what a ball of more than no size takes of it."""
+    """True if the decay (k, k) that is left on a cone is positive definite, by a margin that larger balls need."""
     if not (np.all(np.isfinite(decay)) and np.all(np.diag(decay) > 0)):
         return False
     scale = 1 / np.sqrt(np.diag(decay))
