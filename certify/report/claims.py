@@ -265,6 +265,10 @@ CLAIMS = {
 }
 
 
+_ON_CONES = (
+    "by models on cones of directions, which together are all directions; the chords of relus and clips that may "
+    "change sides are bounded there"
+)
 _AROUND_A_LEVEL = (
     "Local",
     "$fall for all x with c₀ ≤ V(x) ≤ c₁$each",
@@ -320,10 +324,12 @@ def _with_outer(words: Words) -> Words:
 
 @dataclass(frozen=True, slots=True)
 class Additions:
-    """The parts that a claim may have: `ball` in its evidence, a set `beyond` {V <= c2}, boxes that are `ranked`, with
-    names of `angles`, constraints that are `kept`, and a claim that takes over at the floor, `then`."""
+    """The parts that a claim may have: `ball` in its evidence, `kinked` if that has directions, a set `beyond`
+    {V <= c2}, boxes that are `ranked`, with names of `angles`, constraints that are `kept`, and a claim that takes
+    over at the floor, `then`."""
 
     ball: bool = False
+    kinked: bool = False
     beyond: bool = False
     ranked: bool = False
     angles: tuple[str, ...] = ()
@@ -344,7 +350,9 @@ def words_for(kind: str, timing: TimingInWords = PLAIN, has: Additions = NONE) -
     if kind not in CLAIMS:
         raise CertificateFormatError(f"reports know the claims {', '.join(CLAIMS)}; found {kind!r}.")
     words = _with_outer(CLAIMS[kind]) if has.beyond else CLAIMS[kind]
-    words = replace(words, parts=tuple(_in_steps(kind, _with_ball(kind, words.parts, has.ball), timing)))
+    parts = _with_ball(kind, words.parts, has.ball)
+    parts = _on_cones(kind, parts) if has.kinked else parts
+    words = replace(words, parts=tuple(_in_steps(kind, parts, timing)))
     words = with_ranks(words, has.angles) if has.ranked else words
     words = with_constraints(words, ranked=has.ranked, beyond=has.beyond) if has.kept else words
     words = words if has.then is None else with_handover(words, has.then)
@@ -357,6 +365,12 @@ def _with_ball(kind: str, parts: tuple[Part, ...], ball: bool) -> tuple[Part, ..
     if kind not in PRACTICAL or not ball:
         return parts
     return tuple(one for part in parts for one in ((_AROUND_A_LEVEL, RING) if part[0] == "Ring" else (part,)))
+
+
+def _on_cones(kind: str, parts: tuple[Part, ...]) -> tuple[Part, ...]:
+    """The parts of a claim whose ball has relus or clips that may change sides."""
+    near = "" if kind in PRACTICAL else "; they hold at all smaller radii: there is no hole around the origin"
+    return tuple((*part[:2], _ON_CONES + near) if part[0] == "Local" else part for part in parts)
 
 
 def _in_steps(kind: str, parts: tuple[Part, ...], timing: TimingInWords) -> Iterator[Part]:

@@ -156,13 +156,24 @@ def test_without_anything_new_the_words_are_those_of_continuous_time() -> None:
     )
 
 
+@pytest.mark.parametrize("kind", ["asymptotic", "practical"])
+def test_of_kinks_no_linearisation_is_said(kind: str) -> None:
+    """And that there is no hole only where the ball is around an equilibrium."""
+    plain, kinked = (words_for(kind, has=Additions(ball=True, kinked=one)).parts for one in (False, True))
+    changed = [(old, new) for old, new in zip(plain, kinked, strict=True) if old != new]
+    assert [old[0] for old, _ in changed] == ["Local"]
+    how = changed[0][1][2]
+    assert "cones of directions" in how and "linearisation" not in how and ("no hole" in how) == (kind == "asymptotic")
+
+
 @pytest.mark.parametrize("rate", [0.0, 0.3])
+@pytest.mark.parametrize("kinked", [False, True])
 @pytest.mark.parametrize("timing", TIMINGS)
 @pytest.mark.parametrize("kind", ["asymptotic", "practical"])
-def test_every_place_is_filled(kind: str, timing: str, rate: float) -> None:
+def test_every_place_is_filled(kind: str, timing: str, kinked: bool, rate: float) -> None:
     how = TIMINGS[timing]
     how = TimingInWords(how.discrete, how.sample, rate)
-    words = words_for(kind, how, Additions(ball=True))
+    words = words_for(kind, how, Additions(ball=True, kinked=kinked))
     for text in every_text(words):
         assert "$" not in text and "  " not in text
         if timing != "plain":

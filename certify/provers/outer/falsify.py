@@ -222,7 +222,7 @@ class Hazards(Sampler):
 
     @cached_property
     def constraints(self) -> Constraints | None:
-        """Those of the plant, in floats; None without any."""
+        """The constraints of the plant, in floats; None without any."""
         return Constraints(self.loop) if self.system.constraints else None
 
     def violation(self, x: Array) -> Array:

@@ -38,7 +38,8 @@ def additions_of(certificate: Certificate) -> Additions:
     """The parts that its claim has beside its levels, and a ball in its evidence."""
     evidence, claim = certificate.evidence, certificate.claim
     return Additions(
-        ball=isinstance(evidence, PartitionTree) and evidence.local is not None,
+        ball=(ball := evidence.local if isinstance(evidence, PartitionTree) else None) is not None,
+        kinked=ball is not None and ball.directions is not None,
         beyond=claim.outer is not None,
         ranked=claim.ranks is not None,
         angles=() if claim.ranks is None else claim.ranks.angles,
