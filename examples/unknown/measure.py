@@ -17,6 +17,7 @@ REACH = {  # of the states from which transitions begin
     "pendulum": [1.5, 2.0],
     "cartpole": [1.0, 0.5, 1.0, 1.0],
     "quadrotor2d": [1.0, 1.0, 0.5, 1.0, 1.0, 1.0],
+    "quadrotor3d": [1.0, 1.0, 1.0, 0.4, 0.4, 0.5, *[1.0] * 6],
 }
 PERIOD, STEPS = 0.02, 20
 
@@ -27,6 +28,7 @@ def main() -> None:
     parser.add_argument("plant", choices=sorted(REACH))
     parser.add_argument("out")
     parser.add_argument("--transitions", type=int, default=200)
+    parser.add_argument("--length", type=int, help="of runs, in transitions that follow each other; by default none do")
     parser.add_argument("--noise", type=float, default=1e-3)
     parser.add_argument("--reach", help="of states and then inputs, 1,0.1,2,2,10; by default far, and all inputs")
     parser.add_argument("--seed", type=int, default=0)
@@ -34,21 +36,30 @@ def main() -> None:
     plant, draw = get_system(given.plant), np.random.default_rng(given.seed)
     f, N, h = plant.function(), given.transitions, PERIOD / STEPS
     reach = [float(part) for part in given.reach.split(",")] if given.reach else REACH[given.plant]
-    x = draw.uniform(-1, 1, (N, plant.n)) * reach[: plant.n]
+    runs, length = (N, 1) if given.length is None else (N // given.length, given.length)
     lo, hi = np.array([[float(end) for end in pair] for pair in plant.input_bounds]).T
-    u = draw.uniform(*([-1, 1] * np.array(reach[plant.n :])[:, None]).T if given.reach else (lo, hi), (N, plant.m))
-    y = x
-    for _ in range(STEPS):  # Runge and Kutta's method, whose error here is far below the noise
-        k1 = f(y, u)
-        k2 = f(y + h / 2 * k1, u)
-        k3 = f(y + h / 2 * k2, u)
-        y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + f(y + h * k3, u))
-    off = draw.uniform(-given.noise, given.noise, (2, N, plant.n))
-    states = [s.name for s in plant.states]
+    lo, hi = ([-1, 1] * np.array(reach[plant.n :])[:, None]).T if given.reach else (lo, hi)
+    x, u = [draw.uniform(-1, 1, (runs, plant.n)) * reach[: plant.n]], draw.uniform(lo, hi, (length, runs, plant.m))
+    for held in u:
+        y = x[-1]
+        for _ in range(STEPS):  # Runge and Kutta's method, whose error here is far below the noise
+            k1 = f(y, held)
+            k2 = f(y + h / 2 * k1, held)
+            k3 = f(y + h / 2 * k2, held)
+            y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + f(y + h * k3, held))
+        x.append(y)
+    seen = np.array(x) + draw.uniform(-given.noise, given.noise, np.shape(x))
+    states, inputs = [s.name for s in plant.states], [s.name for s in plant.inputs]
     with open(given.out, "w", newline="") as file:
         table = csv.writer(file)
-        table.writerow([*states, *(s.name for s in plant.inputs), *(f"{s}_next" for s in states)])
-        table.writerows(np.hstack([x + off[0], u, y + off[1]]).tolist())
+        if given.length is None:
+            table.writerow([*states, *inputs, *(f"{s}_next" for s in states)])
+            table.writerows(np.hstack([seen[0], u[0], seen[1]]).tolist())
+            return
+        table.writerow(["run", *states, *inputs])
+        u = np.concatenate([u, u[-1:]])  # a file has an input beside the last state too, which nobody reads
+        for run in range(runs):
+            table.writerows([run, *state, *held] for state, held in zip(seen[:, run], u[:, run], strict=True))
 
 
 if __name__ == "__main__":

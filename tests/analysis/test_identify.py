@@ -647,12 +647,18 @@ def test_ranges_that_do_not_hold_what_is_left_are_refused(
     assert "the range of c must hold all that the data leave" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", slow_after(1, ["pendulum", "cartpole"]))
-def test_the_examples_find_the_plants_that_ship(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+EXACT = {"quadrotor3d": {"m": "0.486", "jx": "10000/49", "jy": "10000/49", "jz": "1250/11"}}
+
+
+@pytest.mark.parametrize("length", [[], ["--length", "10"]], ids=["transitions", "runs"])
+@pytest.mark.parametrize("name", slow_after(1, ["pendulum", "cartpole", "quadrotor3d"]))
+def test_the_examples_find_the_plants_that_ship(
+    tmp_path: Path, name: str, length: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     data, ships = tmp_path / "data.csv", get_system(name).parameters
-    monkeypatch.setattr(sys, "argv", ["measure.py", name, str(data), "--transitions", "100"])
+    monkeypatch.setattr(sys, "argv", ["measure.py", name, str(data), "--transitions", "100", *length])
     runpy.run_path(str(EXAMPLES / "unknown" / "measure.py"), run_name="__main__")
     found = certify.identify(data, EXAMPLES / "unknown" / f"{name}.toml", noise="1e-3", sample_time="0.02")
-    true = TRUE if name == "pendulum" else {p: float(q) for p, q in ships.items()}
-    assert len(found.ranges) == 3
+    true = TRUE if name == "pendulum" else EXACT.get(name) or {p: float(q) for p, q in ships.items()}
+    assert len(found.ranges) == 3 + (name == "quadrotor3d")
     assert all(lo <= Fraction(true[p]) <= hi and found.shrink(p) > 5 for p, (lo, hi) in found.ranges.items())
