@@ -5,6 +5,7 @@ Verdicts rest on `certify.loop.rigorous` and on the checker; the rounded numbers
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.loop.expressions import Expression, evaluate_exactly, nodes, symbols_of
+from certify.loop.expressions import Expression, Symbol, evaluate_exactly, nodes, symbols_of
 from certify.loop.plants import Matrix, System, in_floats, linearise
 from certify.loop.policies import PolicyNetwork, require_centred
 
@@ -79,8 +80,8 @@ class ClosedLoop:
                 if acting:
                     raise InputError(
                         f"the loop must rest at the operating point of {system.name} whatever {' and '.join(acting)} "
-                        f"may be; {symbol}' depends on that there. Ask for --claim practical or nearby, which do not "
-                        "need it."
+                        f"may be; {symbol}' {_depends(expression, at_zero, system)}. Ask for --claim practical or "
+                        "nearby, which do not need it."
                     ) from error
                 raise InputError(f"{wanted}; {symbol}' is not decided in rationals: {error}.") from error
             if value != 0:
@@ -142,3 +143,17 @@ class ClosedLoop:
     def plant_jacobians(self) -> tuple[Matrix, Matrix]:
         """(df/dx, df/du) at the origin and u_eq, exact."""
         return linearise(self.system)
+
+
+def _depends(expression: Expression, at_zero: Mapping[Symbol, Fraction], system: System) -> str:
+    """How an equation at the operating point depends on what is uncertain: by its value, or only as it is written."""
+    try:
+        values = [
+            evaluate_exactly(expression, {**at_zero, **{name: ends[side] for name, ends in system.uncertain}})
+            for side in (0, 1)
+        ]
+    except InputError:
+        return "depends on that there"
+    if any(values):
+        return "depends on that there"
+    return "is 0 there at both ends of the ranges, but its terms cancel only when (a - b)/m is written, not a/m - b/m"

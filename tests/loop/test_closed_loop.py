@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 
 import flint
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, Symbol, symbols
-from certify.loop.plants import System, get_system, with_input_errors
+from certify.loop.plants import System, get_system, load_system, with_input_errors
 from certify.loop.policies import PolicyNetwork
 from certify.loop.rigorous import eigenvalues, evaluate_policy, evaluate_vdot
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
@@ -112,3 +113,20 @@ def test_a_loop_that_rests_nowhere_for_all_values_is_told_so() -> None:
     system = with_input_errors(get_system("pendulum"), {"u": Fraction(1, 10)})
     with pytest.raises(InputError, match=r"whatever error_u may be; theta_dot' depends on that there. Ask for --claim"):
         ClosedLoop(system, pendulum_network((8, 8))).require_rest()
+
+
+def test_terms_that_cancel_only_if_written_so_are_told_from_others(tmp_path: Path) -> None:
+    """(1 + u)/m - 1/m is 0 at u = 0 whatever m is, which an evaluation term by term does not see."""
+    text = (
+        'name = "p"\nstates = ["x"]\ninputs = ["u"]\npositive = ["m"]\n[parameters]\nm = [1, 2]\n[dynamics]\n'
+        'x = "{}"\n[u_eq]\nu = 0\n[domain]\nx = [-1, 1]\n[input_bounds]\nu = [-3, 3]\n'
+    )
+    loops = []
+    for equation in ("-x + (1 + u)/m - 1/m", "-x + (1 + u - 1)/m", "-x + (1 + u)/m - 1"):
+        (tmp_path / "p.toml").write_text(text.format(equation))
+        loops.append(ClosedLoop(load_system(tmp_path / "p.toml"), scalar_tanh()[1]))
+    with pytest.raises(InputError, match=r"x' is 0 there at both ends of the ranges, but its terms cancel only"):
+        loops[0].require_rest()
+    loops[1].require_rest()
+    with pytest.raises(InputError, match="x' depends on that there"):
+        loops[2].require_rest()
