@@ -55,7 +55,7 @@ STEPS = plant(x + RATE / 10, time="discrete")
 
 
 def proved(folder: Path, system: System | None = None, **options: object) -> RoaResult:
-    given: dict[str, object] = {"effort": 0.4} | options
+    given: dict[str, object] = {"effort": 0.04} | options
     result = certify_roa(system or plant(), REST, folder, **given)  # type: ignore[arg-type]
     assert result.verdict is Verdict.PROVED
     return result
@@ -89,6 +89,7 @@ def test_the_default_goes_beyond_the_ellipsoid(by_default: RoaResult) -> None:
     assert f"about {100 * share:.0f} % of what converges is proved" in said and "no part of the proof" in said
 
 
+@pytest.mark.slow
 def test_the_same_run_gives_the_same_bytes(by_default: RoaResult, tmp_path: Path) -> None:
     again = proved(tmp_path)
     assert again.raw is not None and by_default.raw == again.raw

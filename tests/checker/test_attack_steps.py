@@ -237,17 +237,17 @@ def drives(name: str) -> list[Drive]:
     return [closer(name, sign) for sign in (1, -1) if np.max(sign * slope(x)) > 1e-6]
 
 
-@pytest.mark.parametrize("name", slow_after(5, CURVES))
+@pytest.mark.parametrize("name", slow_after(2, CURVES))
 def test_most_of_what_comes_closer_is_accepted(name: str) -> None:
     assert all(drive.share * drive.truth <= drive.last() for drive in drives(name))
 
 
-@pytest.mark.parametrize("name", slow_after(5, CURVES))
+@pytest.mark.parametrize("name", slow_after(2, CURVES))
 def test_no_two_trajectories_part_that_are_said_to_come_closer(name: str) -> None:
     assert all(drive.last() <= drive.truth for drive in drives(name))
 
 
-@pytest.mark.parametrize("name", ["cos", "exp", "quartic"])
+@pytest.mark.parametrize("name", slow_after(1, ["cos", "exp", "quartic"]))
 def test_without_lipschitz_constants_trajectories_part(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is left of x^4 is left by products, of the others by functions."""
     product = Jet.__mul__

@@ -206,7 +206,7 @@ def closeness(result: Jet, common: list[float], truth: Any, gradient: list[arb],
     return used
 
 
-@pytest.mark.parametrize("size", [1e-6, 0.02, 0.3])
+@pytest.mark.parametrize("size", slow_after(1, [1e-6, 0.02, 0.3]))
 def test_operations_know_the_errors_that_their_operands_share(size: float) -> None:
     generator, used = np.random.default_rng(int(size * 1e6)), 0.0
     with ctx.workprec(2500):
@@ -392,7 +392,7 @@ NETWORKS = [
 ]
 
 
-@pytest.mark.parametrize(("squash", "centre", "widths"), slow_after(8, NETWORKS))
+@pytest.mark.parametrize(("squash", "centre", "widths"), slow_after(4, NETWORKS))
 @pytest.mark.parametrize("moving", [False, True])
 def test_units_carry_all_that_their_inputs_leave_out(
     squash: str, centre: str, widths: list[int], moving: bool, monkeypatch: pytest.MonkeyPatch

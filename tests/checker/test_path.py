@@ -443,7 +443,7 @@ PLANTED: dict[str, tuple[Callable[[], Document], int, Any]] = {  # base, compone
 }
 
 
-@pytest.mark.parametrize("name", slow_after(6, PLANTED))
+@pytest.mark.parametrize("name", slow_after(5, PLANTED))
 def test_planted_violations_are_refused(name: str) -> None:
     """The least term that breaks condition 7' where it is looked, by at most 5 % of the largest rate."""
     base, i, tree = PLANTED[name]

@@ -189,7 +189,7 @@ FAULTS = [_dies, _is_killed, _leaves_quietly, _raises, _exits, _ends_its_answers
 
 @pytest.mark.parametrize("batch", slow_after(1, [1, 0, 3]))
 @pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.parametrize("name", ["accepted", "refused"])
+@pytest.mark.parametrize("name", slow_after(1, ["accepted", "refused"]))
 def test_a_process_that_does_not_answer_is_an_internal_error(
     name: str,
     fault: Callable[[], None],
@@ -257,7 +257,7 @@ LIES: dict[str, Lie] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", slow_after(7, LIES))
+@pytest.mark.parametrize("what", slow_after(4, LIES))
 def test_answers_that_cannot_be_are_an_internal_error(
     what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -189,7 +189,7 @@ def test_the_largest_fourth_derivative(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-@pytest.mark.parametrize("size", [0.05, 0.2])
+@pytest.mark.parametrize("size", slow_after(1, [0.05, 0.2]))
 def test_the_constant_of_what_is_beyond_the_third_order(name: str, size: float) -> None:
     """Differences at pairs of points, near each other and apart, in the middle and at the edge of the ball."""
     data = document(name, None, 1, True, [("q", "1", f"{1 + NARROW}"), ("p", "1/4", f"{NARROW + Fraction(1, 4)}")])
