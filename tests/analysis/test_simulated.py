@@ -30,6 +30,7 @@ from certify.lyapunov import Polynomial
 from certify.lyapunov.function import Quadratic
 from certify.report.rows import rows_of
 from certify.report.sections.simulated import drawn_of
+from tests.support.marks import slow_after
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
 x, u = Symbol("x"), Symbol("u")
@@ -97,15 +98,18 @@ def test_the_same_run_gives_the_same_bytes(by_default: RoaResult, tmp_path: Path
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {"candidate": "ellipsoid"},
-        {"candidate": "lyapunov"},
-        {"Q": (2.0,)},
-        {"P": [[1.0]]},
-        {"level": 0.1},
-        {"rate": 0.01},
-        {"enlarge": True},
-    ],
+    slow_after(
+        5,
+        [
+            {"candidate": "ellipsoid"},
+            {"candidate": "lyapunov"},
+            {"Q": (2.0,)},
+            {"P": [[1.0]]},
+            {"level": 0.1},
+            {"rate": 0.01},
+            {"enlarge": True},
+        ],
+    ),
 )
 def test_what_asks_for_an_ellipsoid_gets_one(options: dict[str, object], tmp_path: Path) -> None:
     result = proved(tmp_path, plant(), **options)

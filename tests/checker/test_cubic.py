@@ -579,7 +579,7 @@ def random_models(generator: Generator, n: int, k: int, units: int) -> Models:
     return models_of(generator.standard_normal((n, n)), F, known, True)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("n", slow_after(2, [1, 2, 3]))
 @pytest.mark.parametrize("kind", WEIGHTS)
 def test_the_two_new_sums_bound_what_they_stand_for(n: int, kind: str) -> None:
     """Exactly, at rational points: 2 sum_i (b_i.d) K_i[d], and 2 sum_q (p_q.d) e_q with the worst signs."""

@@ -74,7 +74,7 @@ def test_without_the_rule_these_would_be_accepted(kind: str, monkeypatch: pytest
 
 
 @pytest.mark.parametrize("kind", ["tube", "path"])
-@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("axis", slow_after(1, [0, 1]))
 def test_a_wall_may_stand_beside_the_balls_and_no_nearer(kind: str, axis: int) -> None:
     """g is linear, so that its models are exact: it counts on the balls, which are wider than the ellipsoids."""
     far, name = widest(base(kind), axis), "xy"[axis]

@@ -50,7 +50,7 @@ def test_the_second_checker_accepts_the_originals(name: str) -> None:
     assert judge(base(name)) is None
 
 
-@pytest.mark.parametrize("name", slow_after(9, BASES))
+@pytest.mark.parametrize("name", slow_after(5, BASES))
 def test_trajectories_from_the_set_enter_the_ellipsoid(name: str) -> None:
     """What the claim says, and not the conditions that give it: by integration, at constant values."""
     data = base(name)
@@ -130,6 +130,6 @@ def test_there_are_enough_planted_violations() -> None:
     assert sum(share < 0.05 for share in shares(2, np.random.default_rng(0))) == 1
 
 
-@pytest.mark.parametrize("name", slow_after(26, FAMILIES))
+@pytest.mark.parametrize("name", slow_after(12, FAMILIES))
 def test_nothing_but_the_outer_set_is_wrong_with_what_is_planted(name: str) -> None:
     assert verdict(stripped(FAMILIES[name].beyond(0.05))) == "ACCEPTED"

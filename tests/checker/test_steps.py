@@ -100,7 +100,7 @@ def test_what_is_planted_is_refused_and_what_lies_within_is_accepted(name: str) 
         assert verdict(true) == "ACCEPTED", share
 
 
-@pytest.mark.parametrize("peak", [0.5, 0.501, 0.52, 0.6, 0.75, 0.9])
+@pytest.mark.parametrize("peak", slow_after(3, [0.5, 0.501, 0.52, 0.6, 0.75, 0.9]))
 def test_a_step_out_of_what_is_to_be_kept_is_refused(peak: float) -> None:
     """D is negative wherever V >= c0, and from 0 a step leads to the peak, beyond c0."""
     assert largest(peaked(peak)) < 0

@@ -145,7 +145,7 @@ def points_of(generator: np.random.Generator, count: int) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("practical", slow_after(1, [False, True]))
 @pytest.mark.parametrize(("sample", "order"), slow_after(1, SAMPLES))
-@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("name", slow_after(6, FUNCTIONS))
 def test_a_ball_encloses_the_mean_of_every_period(
     name: str, sample: tuple[str, str], order: int, practical: bool
 ) -> None:

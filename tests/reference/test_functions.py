@@ -383,7 +383,7 @@ def test_a_loop_of_each_activation_is_proved(name: str, loop: Callable[[str], tu
             assert program(raw(forged)) in ("local", "ring") and program(raw(proved(forged))) in ("local", "ring")
 
 
-@pytest.mark.parametrize("name", [*ACTIVATIONS, "tanh"])
+@pytest.mark.parametrize("name", slow_after(4, [*ACTIVATIONS, "tanh"]))
 def test_a_level_beyond_another_equilibrium_is_refused(name: str) -> None:
     """Up to close below it there is a proof, beyond it by a millionth there is none."""
     data, rate = one_state(name)
