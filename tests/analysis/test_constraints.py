@@ -25,7 +25,7 @@ from tests.support.loops import pendulum_network
 
 ROOT = Path(__file__).parents[2]
 OSCILLATOR = ROOT / "examples" / "plants" / "van_der_pol.toml"
-QUICK = RoaOptions(candidate="lyapunov", effort=0.01)
+QUICK = RoaOptions(candidate="lyapunov", effort=0.05)
 
 
 def oscillator() -> tuple[System, PolicyNetwork]:

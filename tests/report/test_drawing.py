@@ -22,7 +22,7 @@ Asked = tuple[bytes, Path, dict[str, Any], dict[str, Any]]
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
-    return certify_roa(get_system("pendulum"), pendulum_network((8, 8)), tmp_path_factory.mktemp("run"), effort=0.1)
+    return certify_roa(get_system("pendulum"), pendulum_network((8, 8)), tmp_path_factory.mktemp("run"))
 
 
 @pytest.fixture
