@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import cache
 from graphlib import TopologicalSorter
 from itertools import pairwise
 from pathlib import Path
@@ -56,7 +57,8 @@ def units() -> dict[str, list[Path]]:
     return found
 
 
-def imports(path: Path) -> set[str]:
+@cache
+def imports(path: Path) -> frozenset[str]:
     """Absolute names of the modules that a file imports, at any depth of the code."""
     found = set()
     package = path.relative_to(ROOT).with_suffix("").parts[:-1]
@@ -66,7 +68,7 @@ def imports(path: Path) -> set[str]:
         elif isinstance(node, ast.ImportFrom):
             base = list(package[: len(package) - node.level + 1]) if node.level else []
             found.add(".".join([*base, *(node.module.split(".") if node.module else [])]))
-    return found
+    return frozenset(found)
 
 
 def modules(name: str) -> list[Path]:
@@ -205,6 +207,9 @@ NOT_FOR_A_VERDICT = [
 ]
 
 
+QUICK = ["--effort", "0.1"]
+
+
 @pytest.mark.parametrize("arguments", slow_after(1, [[], ["--candidate", "lyapunov"]]))
 def test_a_proof_loads_no_more_than_it_needs(arguments: list[str], tmp_path: Path) -> None:
     """The whole command as a user has it: what draws its report comes after the proof, what checks it is elsewhere."""
@@ -216,7 +221,19 @@ def test_a_proof_loads_no_more_than_it_needs(arguments: list[str], tmp_path: Pat
         "checkers = {'certify.checker', 'certify.reference'} & set(sys.modules)\n"
         f"sys.exit(' '.join(set({NOT_FOR_A_VERDICT}) & seen[0] | checkers) or status)"
     )
-    command = [sys.executable, "-c", code, "roa", "--policy", str(SHIPPED), "--out", str(tmp_path), *arguments]
+    command = [
+        sys.executable,
+        "-c",
+        code,
+        "roa",
+        "--policy",
+        str(SHIPPED),
+        "--out",
+        str(tmp_path),
+        "--effort",
+        "0.1",
+        *arguments,
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("PROVED") and "Figures" in (tmp_path / "report.html").read_text()

@@ -65,10 +65,10 @@ def images_of(notebook: Any) -> list[str]:
 
 
 def test_pendulum(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CERTIFY_NOTEBOOK_STEPS", "900")
+    monkeypatch.setenv("CERTIFY_NOTEBOOK_STEPS", "500")
     notebook = executed("01_pendulum")
     text = text_of(notebook)
-    assert "after 900 steps" in text
+    assert "after 500 steps" in text
     assert "PROVED  pendulum" in text and "result: ACCEPTED" in text
     assert "simulated, not proved: the proved set covers" in text
     for what in ("level doubled", "another weight", "another leaf"):

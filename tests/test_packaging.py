@@ -76,8 +76,9 @@ def wheel(sdist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The `bin` of a fresh environment: the wheel, and beside it the packages of this one."""
     home = tmp_path_factory.mktemp("fresh")
-    venv.create(home, with_pip=True)
-    pip = [str(home / "bin" / "python"), "-m", "pip", "install", "-q", "--no-deps", "--no-index", str(wheel)]
+    venv.create(home)
+    into = ["--python", str(home / "bin" / "python")]
+    pip = [sys.executable, "-m", "pip", *into, "install", "-q", "--no-deps", "--no-index", str(wheel)]
     subprocess.run(pip, check=True, capture_output=True)
     (packages,) = home.glob("lib/python*/site-packages")
     others = {str(Path(m.__file__ or "").resolve().parent.parent) for m in (np, pytest)}

@@ -114,14 +114,14 @@ CHANGED = {
     "rate": (WALL, dataclasses.replace(QUICK, rate=0.05)),
     "held": (dataclasses.replace(WALL, sample_time=Fraction(1, 50)), QUICK),
     "jitter": (dataclasses.replace(WALL, sample_time=(Fraction(1, 100), Fraction(1, 50))), QUICK),
-    "practical": (WALL, RoaOptions(claim="practical", candidate="lyapunov", effort=0.1)),
+    "practical": (WALL, RoaOptions(claim="practical", candidate="lyapunov", effort=0.02)),
     "uncertain": (
         dataclasses.replace(WALL, parameters={"mu": (Fraction(9, 10), Fraction(11, 10))}),
-        dataclasses.replace(QUICK, effort=0.2),
+        dataclasses.replace(QUICK, effort=0.05),
     ),
     "erring": (
         dataclasses.replace(WALL, input_error=Fraction(1, 100)),
-        RoaOptions(claim="nearby", candidate="lyapunov", effort=0.1),
+        RoaOptions(claim="nearby", candidate="lyapunov", effort=0.02),
     ),
 }
 

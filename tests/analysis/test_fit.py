@@ -100,7 +100,7 @@ def within(truth: Truth, share: float = 1.0) -> tuple[bool, bool]:
     return bool((np.abs(truth(z) - said) <= most + 1e-9).all()), inside
 
 
-@pytest.mark.parametrize("seed", slow_after(20, range(60)))
+@pytest.mark.parametrize("seed", slow_after(8, range(60)))
 def test_the_truth_is_within_what_is_found(seed: int) -> None:
     assert within(Truth(seed)) == (True, True)
 

@@ -30,6 +30,7 @@ from certify.lyapunov import Polynomial
 from certify.lyapunov.function import Quadratic
 from certify.report.rows import rows_of
 from certify.report.sections.simulated import drawn_of
+from tests.support.marks import slow_after
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
 x, u = Symbol("x"), Symbol("u")
@@ -89,6 +90,7 @@ def test_the_default_goes_beyond_the_ellipsoid(by_default: RoaResult) -> None:
     assert f"about {100 * share:.0f} % of what converges is proved" in said and "no part of the proof" in said
 
 
+@pytest.mark.slow
 def test_the_same_run_gives_the_same_bytes(by_default: RoaResult, tmp_path: Path) -> None:
     again = proved(tmp_path)
     assert again.raw is not None and by_default.raw == again.raw
@@ -96,18 +98,21 @@ def test_the_same_run_gives_the_same_bytes(by_default: RoaResult, tmp_path: Path
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {"candidate": "ellipsoid"},
-        {"candidate": "lyapunov"},
-        {"Q": (2.0,)},
-        {"P": [[1.0]]},
-        {"level": 0.1},
-        {"rate": 0.01},
-        {"enlarge": True},
-    ],
+    slow_after(
+        5,
+        [
+            {"candidate": "ellipsoid"},
+            {"candidate": "lyapunov"},
+            {"Q": (2.0,)},
+            {"P": [[1.0]]},
+            {"level": 0.1},
+            {"rate": 0.01},
+            {"enlarge": True},
+        ],
+    ),
 )
 def test_what_asks_for_an_ellipsoid_gets_one(options: dict[str, object], tmp_path: Path) -> None:
-    result = proved(tmp_path, plant(), **options)
+    result = proved(tmp_path, plant(), **{"effort": 0.04} | options)
     assert result.outer is None and result.simulated is not None
     assert result.simulated.share is not None and result.simulated.share < 0.6
     assert not result.contains([-2.0])
@@ -176,7 +181,7 @@ def test_the_ellipsoid_stays_where_the_checker_refuses_more(
         return ask(clerk, certificate)
 
     monkeypatch.setattr(Clerk, "ask", wrong)
-    result = proved(tmp_path, system)
+    result = proved(tmp_path, system, effort=0.04)
     assert result.outer is None and result.ranks is None
     assert result.notice is not None and "left out" in result.notice
     assert result.simulated is not None and (result.simulated.share or 0.0) < 0.7
@@ -194,12 +199,12 @@ def test_a_ring_that_is_cut_for_more_is_resumed_without_it(tmp_path: Path, monke
 
 
 def test_boxes_get_ranks_until_nearly_all_is_proved(tmp_path: Path) -> None:
-    result = proved(tmp_path / "default", STEPS)
-    every = proved(tmp_path / "all", STEPS, candidate="ellipsoid", ranks=True)
+    result = proved(tmp_path / "default", STEPS, effort=0.04)
+    every = proved(tmp_path / "all", STEPS, candidate="ellipsoid", ranks=True, effort=0.04)
     assert result.ranks is not None and result.simulated is not None and every.ranks is not None
     assert (result.simulated.share or 0.0) > 0.9 and result.contains([-2.5])
     assert result.ranks.leaves <= every.ranks.leaves and result.ranks.covered <= every.ranks.covered
-    alone = proved(tmp_path / "alone", STEPS, candidate="ellipsoid")
+    alone = proved(tmp_path / "alone", STEPS, candidate="ellipsoid", effort=0.04)
     assert alone.ranks is None and alone.diagnosis is not None
     assert dict(alone.diagnosis.next.options) == {"--ranks": ""}
 

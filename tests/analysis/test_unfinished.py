@@ -35,6 +35,7 @@ from certify.provers.execution import ThreadRunner
 from certify.provers.falsify import Witness, falsify
 from tests.support.cases import case_of
 from tests.support.loops import box, pendulum_network, scalar_tanh
+from tests.support.marks import slow_after
 
 WIDE = dataclasses.replace(get_system("pendulum"), domain=box(7, 30))
 LOOP = ClosedLoop(WIDE, pendulum_network())
@@ -296,7 +297,7 @@ def test_a_search_in_pieces_is_the_search_in_one(tmp_path: Path) -> None:
         attempt = begun(found)
         attempt.restore(found.state)
         levels.append(attempt.level)
-        attempt.advance(Budget(boxes=200, batch=8))
+        attempt.advance(Budget(boxes=600, batch=8))
         state = attempt.state()
         if state is None:
             break
@@ -390,7 +391,7 @@ PLACES = {  # where Ctrl-C comes, and on which call: from the first candidate to
 }
 
 
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("place", slow_after(4, PLACES))
 def test_a_run_that_is_interrupted_anywhere_is_resumed_to_its_end(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

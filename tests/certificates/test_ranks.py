@@ -32,6 +32,13 @@ def tree_of(certificate: Certificate) -> RankTree:
     return certificate.evidence.ranks
 
 
+@pytest.fixture
+def certificate(request: pytest.FixtureRequest) -> Certificate:
+    found = getattr(made, request.param)()
+    assert isinstance(found, Certificate)
+    return found
+
+
 def ranked_of(certificate: Certificate) -> Ranked:
     found = region_of(certificate).ranked
     assert found is not None
@@ -41,7 +48,7 @@ def ranked_of(certificate: Certificate) -> Ranked:
 # ------------------------------------------------------------------------------------------------------------ the file
 
 
-@pytest.mark.parametrize("certificate", [made.linear(), made.pendulum()], ids=["linear", "pendulum"])
+@pytest.mark.parametrize("certificate", ["linear", "pendulum"], indirect=True)
 def test_a_file_reads_back_as_it_was_written(certificate: Certificate) -> None:
     text = certificate.to_json()
     data, read = json.loads(text), parse_certificate(text.encode(), "ranked")
@@ -54,7 +61,7 @@ def test_a_file_reads_back_as_it_was_written(certificate: Certificate) -> None:
         assert np.array_equal(getattr(tree_of(read), name), getattr(tree_of(certificate), name))
 
 
-@pytest.mark.parametrize("certificate", [made.linear(), made.pendulum()], ids=["linear", "pendulum"])
+@pytest.mark.parametrize("certificate", ["linear", "pendulum"], indirect=True)
 def test_both_checkers_accept_them_and_a_state_is_asked_about(certificate: Certificate, tmp_path: Path) -> None:
     path = tmp_path / "certificate.json"
     path.write_text(certificate.to_json())

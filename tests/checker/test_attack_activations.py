@@ -40,6 +40,7 @@ from tests.checker.test_attack_networks import Truth, Truths, affine, call, enco
 from tests.checker.test_networks import CORNERED, Numbers, a_jet, checked, hash_of, needed
 from tests.support.certificates import Document, encode, make
 from tests.support.earlier import newer
+from tests.support.marks import slow_after
 from tests.support.reference import judge_bytes
 
 add_activations()
@@ -343,7 +344,7 @@ def of_the_reference(data: Document, J: Array, ends: tuple[Fraction, Fraction]) 
 
 
 @pytest.mark.usefixtures("many_digits")
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", slow_after(20, range(60)))
 def test_equations_with_kinks_lie_in_the_models_of_both_programs(seed: int) -> None:
     """Values at d = 0, on the ball, and how fast what is beyond the models changes, for one q at a time."""
     rng, (data, J) = np.random.default_rng(seed), equations_with_kinks(400 + seed)

@@ -206,7 +206,7 @@ def closeness(result: Jet, common: list[float], truth: Any, gradient: list[arb],
     return used
 
 
-@pytest.mark.parametrize("size", [1e-6, 0.02, 0.3])
+@pytest.mark.parametrize("size", slow_after(1, [1e-6, 0.02, 0.3]))
 def test_operations_know_the_errors_that_their_operands_share(size: float) -> None:
     generator, used = np.random.default_rng(int(size * 1e6)), 0.0
     with ctx.workprec(2500):
@@ -392,7 +392,7 @@ NETWORKS = [
 ]
 
 
-@pytest.mark.parametrize(("squash", "centre", "widths"), slow_after(8, NETWORKS))
+@pytest.mark.parametrize(("squash", "centre", "widths"), slow_after(4, NETWORKS))
 @pytest.mark.parametrize("moving", [False, True])
 def test_units_carry_all_that_their_inputs_leave_out(
     squash: str, centre: str, widths: list[int], moving: bool, monkeypatch: pytest.MonkeyPatch
@@ -579,7 +579,7 @@ def random_models(generator: Generator, n: int, k: int, units: int) -> Models:
     return models_of(generator.standard_normal((n, n)), F, known, True)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("n", slow_after(2, [1, 2, 3]))
 @pytest.mark.parametrize("kind", WEIGHTS)
 def test_the_two_new_sums_bound_what_they_stand_for(n: int, kind: str) -> None:
     """Exactly, at rational points: 2 sum_i (b_i.d) K_i[d], and 2 sum_q (p_q.d) e_q with the worst signs."""

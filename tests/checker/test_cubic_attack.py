@@ -213,7 +213,7 @@ def wild(generator: Generator, span: int) -> str:
     return str(number * Fraction(10) ** int(generator.integers(-span, span + 1)))
 
 
-@pytest.mark.parametrize("span", [0, 3, 40])
+@pytest.mark.parametrize("span", slow_after(1, [0, 3, 40]))
 def test_polynomials_up_to_the_third_degree_leave_roundings_alone(span: int) -> None:
     """Products that cancel, of numbers that are far apart; a model has all three orders, so that E is rounding."""
     closest = 0.0
@@ -368,7 +368,7 @@ def varied(generator: Generator, data: Document) -> Document:
 FALSE = (1.0, 1 + 2.0**-40, 1.0001, 1.01, 1.05, 1.3, 4.0)
 
 
-@pytest.mark.parametrize("name", LIMITS)
+@pytest.mark.parametrize("name", slow_after(5, LIMITS))
 def test_no_hint_reaches_the_true_limit(name: str) -> None:
     data, edge, side, part = LIMITS[name]
     assert field_in_arb(parse(data), [[arb(side * edge)]])[0][0] * side >= 0  # Vdot is not negative there
@@ -381,7 +381,7 @@ def test_no_hint_reaches_the_true_limit(name: str) -> None:
 
 
 @pytest.mark.parametrize("shear", [0, -3])
-@pytest.mark.parametrize("power", [0, -9, 9])
+@pytest.mark.parametrize("power", slow_after(1, [0, -9, 9]))
 def test_a_cubic_in_skewed_coordinates_is_not_proved_to_its_limit(shear: int, power: int) -> None:
     """z' = (|z|^2 - 1) z + 2 (z turned), z = T x, V = |z|^2: Vdot < 0 in {V < 1}, and 0 where V = 1. All is exact."""
     T = np.array([[1.0, shear], [0.0, 2.0**power]])
@@ -449,7 +449,7 @@ def attempts(case: Case, piece: tube.Piece) -> Iterator[tube.Piece]:
             yield replace(piece, slab=replace(slab, path=moving))
 
 
-@pytest.mark.parametrize("name", slow_after(5, LIMITS))
+@pytest.mark.parametrize("name", slow_after(2, LIMITS))
 @pytest.mark.parametrize("moving", [False, True])
 @sizes(1, 20)
 def test_slabs_that_are_accepted_next_to_the_flow_are_true(name: str, moving: bool, count: int) -> None:

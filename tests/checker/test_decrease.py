@@ -22,6 +22,7 @@ from certify.reference import decrease as reference
 from certify.reference.evidence import Ball
 from certify.reference.model import Model
 from tests.support.jets import Jet, models_of, no_units, plain
+from tests.support.marks import slow_after
 
 Generator = np.random.Generator
 Rows = tuple[list[float], list[float], list[float]]
@@ -96,7 +97,7 @@ def symmetric(generator: Generator, n: int) -> np.ndarray:
     return A + A.T
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("n", slow_after(2, [1, 2, 3]))
 @pytest.mark.parametrize("kind", ["apart", "jointly", "both"])
 def test_the_sides_bound_what_they_stand_for(n: int, kind: str) -> None:
     """P and R are symmetric and otherwise arbitrary; J need not have an inverse."""

@@ -66,7 +66,7 @@ class At(Member):
             self.a = [p + arb(sign) * arb(q) for p, q in zip(self.a, a, strict=True)]
 
 
-@pytest.mark.parametrize("size", [1e-6, 0.02, 0.2])
+@pytest.mark.parametrize("size", slow_after(1, [1e-6, 0.02, 0.2]))
 def test_jets_that_are_affine_in_y_contain_what_they_stand_for(size: float) -> None:
     """Sums, products and functions at the corners of y, in the middle and anywhere, with the errors that are shared."""
     generator, used, k, m, count = np.random.default_rng(int(size * 1e6)), 0.0, 2, 2, 2
@@ -197,11 +197,11 @@ def within_jet(jet: Jet, y: list[float], d: np.ndarray, true: float, sure: float
     return bool(abs(true - middle) <= room + sure)
 
 
-CASES = [(False, "1/10", "1/10", 1), (False, "1/10", "1/10", 2), (False, "1/20", "1/10", 3), (False, "0", "1/10", 4),
-         (True, "1/10", "1/10", 3), (True, "1/20", "1/10", 2), (True, "1/20", "1/10", 4)]  # fmt: skip
+CASES = [(False, "1/10", "1/10", 1), (True, "1/20", "1/10", 2), (False, "0", "1/10", 4), (False, "1/10", "1/10", 2),
+         (False, "1/20", "1/10", 3), (True, "1/10", "1/10", 3), (True, "1/20", "1/10", 4)]  # fmt: skip
 
 
-@pytest.mark.parametrize(("disturbed", "lo", "hi", "order"), slow_after(4, CASES))
+@pytest.mark.parametrize(("disturbed", "lo", "hi", "order"), slow_after(2, CASES))
 def test_the_ball_holds_the_mean_over_a_period_in_which_what_is_uncertain_switches(
     disturbed: bool, lo: str, hi: str, order: int
 ) -> None:
@@ -226,7 +226,7 @@ def test_the_ball_holds_the_mean_over_a_period_in_which_what_is_uncertain_switch
         assert max(np.linalg.norm(g.whole) + g.error + g.slack for g in G) < 40 * widest  # not everything is held
 
 
-@pytest.mark.parametrize(("disturbed", "lo", "hi", "order"), CASES)
+@pytest.mark.parametrize(("disturbed", "lo", "hi", "order"), slow_after(3, CASES))
 def test_leaves_hold_the_mean_over_a_period_in_which_what_is_uncertain_switches(
     disturbed: bool, lo: str, hi: str, order: int
 ) -> None:
@@ -385,7 +385,7 @@ def test_gamma_bounds_what_models_have_beyond_their_first_order(n: int) -> None:
 
 @pytest.mark.parametrize("n", [1, 2])
 @pytest.mark.parametrize("level", [False, True])
-@pytest.mark.parametrize("h", slow_after(2, [0.0, 0.25, 1.0]))
+@pytest.mark.parametrize("h", slow_after(1, [0.0, 0.25, 1.0]))
 def test_the_sides_of_a_step_bound_what_they_stand_for(n: int, level: bool, h: float) -> None:
     """D + 2 lambda V + k (V - c0) at points is at most what the matrices say, at every corner and between them."""
     generator, closest = np.random.default_rng(n), np.inf

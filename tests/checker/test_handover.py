@@ -30,6 +30,7 @@ from tests.checker.test_uncertain import disturbed_claim
 from tests.support.balls import with_ball
 from tests.support.certificates import Document, decode, edited, encode, grow, make, rehash
 from tests.support.earlier import newer
+from tests.support.marks import slow_after
 from tests.support.steps import stepping
 
 Edit = Callable[[Document], Document]
@@ -302,7 +303,7 @@ def of_forms(P: np.ndarray, other: np.ndarray, floor: float, c2: float) -> Docum
     return {**data, "then": inner}
 
 
-@pytest.mark.parametrize("seed", range(200))
+@pytest.mark.parametrize("seed", slow_after(60, range(200)))
 def test_a_floor_that_just_fits_and_one_that_just_does_not(seed: int) -> None:
     """Levels a hair below and above the largest value of the second form on the floor."""
     for c2, fits in ((1 - 1e-9, False), (1 + 1e-9, True)):

@@ -19,6 +19,7 @@ from certify.checker.near import Vector
 from certify.checker.networks import Affine, Clip, Map, Network
 from tests.support.certificates import LEAF, Document, edited, encode, parse, verdict
 from tests.support.kinked import even, kinked, mirrored, pi
+from tests.support.marks import slow_after
 from tests.support.network_loops import affine, hashed, joined, mapped, with_policy
 from tests.support.reference import judge
 
@@ -175,7 +176,7 @@ def cones_of(rng: np.random.Generator, n: int, close: bool) -> list[kinks.Cone]:
     return [every[i] for i in rng.choice(len(every), min(len(every), 4), replace=False)]
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", slow_after(12, range(40)))
 @pytest.mark.parametrize("close", [False, True])
 def test_models_hold_what_a_network_does_on_a_cone(seed: int, close: bool) -> None:
     """Of the value less what is known, at each d; with `close` of its difference at any two d as well."""
@@ -202,7 +203,7 @@ def test_models_hold_what_a_network_does_on_a_cone(seed: int, close: bool) -> No
                 assert np.all(gap <= np.linalg.norm(d - e, axis=1)[:, None] * lip + 1e-12)
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", slow_after(12, range(40)))
 @pytest.mark.parametrize("close", [False, True])
 def test_a_kink_is_within_its_sector(seed: int, close: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """|e| <= |alpha.d| + beta ||d|| and <= rho ||d||, and with `close` so for differences."""
@@ -238,7 +239,7 @@ def beyond(f: Callable[..., np.ndarray], y: Any, J: np.ndarray, d: np.ndarray, s
     return found if signed else np.abs(found)
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", slow_after(16, range(60)))
 def test_nothing_is_shown_that_samples_refute(seed: int) -> None:
     """Random loops near the edge of what holds: where all inequalities hold on all cones, V falls at all samples."""
     rng = np.random.default_rng(seed)
@@ -263,6 +264,7 @@ def test_nothing_is_shown_that_samples_refute(seed: int) -> None:
         assert np.max(rise) < 0
 
 
+@pytest.mark.slow
 def test_enough_of_the_random_loops_are_shown() -> None:
     """The test above would hold of a rule that shows nothing."""
     rng, shown = np.random.default_rng(5), 0

@@ -63,7 +63,7 @@ def corner_of(models: Models, P: Array, jets: list[Any], y: Array) -> Models:
     return found[int(np.argmin(near))]
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("n", slow_after(2, [1, 2, 3]))
 @pytest.mark.parametrize("level", [False, True])
 @pytest.mark.parametrize("h", slow_after(1, [0.25, 0.0, 1.0]))
 def test_the_sides_hold_for_the_others_at_every_value(n: int, level: bool, h: float) -> None:
@@ -186,7 +186,7 @@ def settled(data: Document) -> Document:
 
 
 @pytest.mark.parametrize("program", [verdict, judge])
-@pytest.mark.parametrize("seed", slow_after(2, range(30)))
+@pytest.mark.parametrize("seed", slow_after(1, range(30)))
 def test_claims_that_fail_at_one_corner_are_refused(program: Callable[[Document], str | None], seed: int) -> None:
     rows, half, P = drawn(seed)
     A = np.array([[float(v) for v in row] for row in rows]) - np.diag([1.0, *[0.0] * (len(rows) - 1)])
@@ -212,7 +212,7 @@ def one_state(hi: str, lo: str = "0", **more: Any) -> Document:
 
 
 @pytest.mark.parametrize("program", [verdict, judge])
-@pytest.mark.parametrize("over", ["1/1000000", "1/1000", "1/10"])
+@pytest.mark.parametrize("over", slow_after(1, ["1/1000000", "1/1000", "1/10"]))
 def test_in_one_state_nothing_is_lost(program: Callable[[Document], str | None], over: str) -> None:
     above, below = Fraction(1, 8) * (1 + Fraction(over)), Fraction(1, 8) * (1 - Fraction(over))
     assert program(settled(one_state(str(above)))) == "local"
@@ -220,7 +220,7 @@ def test_in_one_state_nothing_is_lost(program: Callable[[Document], str | None],
 
 
 @pytest.mark.parametrize("program", [verdict, judge])
-@pytest.mark.parametrize("over", ["1/1000000", "1/1000", "1/10"])
+@pytest.mark.parametrize("over", slow_after(1, ["1/1000000", "1/1000", "1/10"]))
 def test_nor_with_a_step(program: Callable[[Document], str | None], over: str) -> None:
     for sign in (1, -1):
         hi = Fraction(1, 4) * (1 + sign * Fraction(over))

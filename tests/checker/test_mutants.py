@@ -126,7 +126,7 @@ def test_the_originals_are_accepted(name: str, tmp_path: Path) -> None:
     assert judge(base(name)) is None
 
 
-@pytest.mark.parametrize("share", slow_after(1, [6, 1]), ids=["a sixth", "all"])
+@pytest.mark.parametrize("share", slow_after(1, [12, 1]), ids=["a twelfth", "all"])
 @pytest.mark.parametrize("name", FAMILIES)
 def test_mutants_that_count_are_refused_by_the_expected_rule(name: str, share: int, tmp_path: Path) -> None:
     least, met = CAMPAIGN[name]
@@ -152,7 +152,7 @@ def test_names_are_used_once() -> None:
     assert len(set(names)) == len(names)
 
 
-@pytest.mark.parametrize("name", BASES)
+@pytest.mark.parametrize("name", slow_after(4, sorted(BASES, key=lambda name: "rotor" in name)))
 def test_true_edits_are_accepted(name: str, tmp_path: Path) -> None:
     """What is true and fully evidenced, by the oracle and the reference, stays accepted."""
     edits = [one for one in true_edits() if one.name.startswith(f"{name}: ")]
@@ -172,6 +172,7 @@ def test_a_solvers_word_is_never_accepted(tmp_path: Path) -> None:
         assert verdict_on(Mutant(name, data, frozenset()).write(path)) == "TRUSTED"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the peak of the resident set")
 def test_no_size_takes_a_gigabyte(tmp_path: Path) -> None:
     paths = [str(one.write(tmp_path / f"{k}.json")) for k, one in enumerate(family("sizes"))]

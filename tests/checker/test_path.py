@@ -443,7 +443,7 @@ PLANTED: dict[str, tuple[Callable[[], Document], int, Any]] = {  # base, compone
 }
 
 
-@pytest.mark.parametrize("name", slow_after(6, PLANTED))
+@pytest.mark.parametrize("name", slow_after(5, PLANTED))
 def test_planted_violations_are_refused(name: str) -> None:
     """The least term that breaks condition 7' where it is looked, by at most 5 % of the largest rate."""
     base, i, tree = PLANTED[name]
@@ -671,7 +671,7 @@ def just_accepted(name: str, edit: Size, seed: int) -> Document:
     return of(low)
 
 
-@pytest.mark.parametrize("what", slow_after(5, SIZED))
+@pytest.mark.parametrize("what", slow_after(3, SIZED))
 def test_what_is_just_accepted_of_a_well_is_true(what: str) -> None:
     assert_true(just_accepted("well", SIZED[what], 1), 2)
 
@@ -739,7 +739,7 @@ def left_over(jet: Jet, change: arb, d: list[float]) -> tuple[arb, arb]:
     return change - curved(jet, d) - linear, arb(float(jet.slack)) * size + quadratic(jet.whole.tolist(), d)
 
 
-@pytest.mark.parametrize("where", slow_after(2, WHERE))
+@pytest.mark.parametrize("where", slow_after(1, WHERE))
 @pytest.mark.parametrize("name", ENCLOSED)
 def test_the_models_along_a_path_enclose_the_field(name: str, where: str) -> None:
     """F and the inputs at points of balls whose middles and steps binary64 does not hold, without any tolerance."""
@@ -852,7 +852,7 @@ def multipliers_of(generator: np.random.Generator, n: int, kind: str) -> tuple[M
     )
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("n", slow_after(2, [1, 2, 3]))
 @pytest.mark.parametrize("kind", ["apart", "jointly", "both"])
 def test_the_sides_along_a_path_bound_what_they_stand_for(n: int, kind: str) -> None:
     """Exactly, at rational points of the ball, with errors of the worst sign; P and R are symmetric and otherwise

@@ -22,6 +22,7 @@ from certify.reference.tangents import OnBall as Tangents
 from tests.checker.test_attack_networks import Truths
 from tests.checker.test_networks import a_jet
 from tests.reference.test_networks import read
+from tests.support.marks import slow_after
 
 Array = Any
 SCALES = [0.0, 5e-324, 1e-300, 1e-160, 1e-30, 1.0, 1e30, 1e160, 1e300]
@@ -122,7 +123,7 @@ def program(rng: Any, gain: float) -> Network:
     return Network("net", 2, tuple(steps))
 
 
-@pytest.mark.parametrize("seed", range(120))
+@pytest.mark.parametrize("seed", slow_after(40, range(120)))
 def test_programs_of_products_lie_within_both_enclosures(seed: int) -> None:
     """Without a tolerance, at corners and within, from numbers that underflow to numbers that overflow."""
     rng = np.random.default_rng(seed)

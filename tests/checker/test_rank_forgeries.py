@@ -111,7 +111,7 @@ def refuses(forgery: Forgery) -> bool:
     return None not in found
 
 
-@pytest.mark.parametrize("seed", slow_after(FAST, SEEDS))
+@pytest.mark.parametrize("seed", slow_after(1, SEEDS))
 def test_random_loops_do_what_is_accepted_and_no_forgery_is(seed: int) -> None:
     drawn = Draw(seed, (1, 1, 2)).ranked(depths=(5, 6, 6))
     assert len(drawn.moving) > 5 and verdicts(drawn.document) == (None, None)
@@ -154,7 +154,7 @@ def test_an_obstacle_that_an_ellipsoid_grazes(name: str) -> None:
             assert verdicts(data | {"claim": keep}) == (rule, rule)
 
 
-@pytest.mark.parametrize("sign", ["", "-"])
+@pytest.mark.parametrize("sign", slow_after(1, ["", "-"]))
 def test_ranks_that_run_in_a_circle(sign: str) -> None:
     """x+ = x or -x stays at the same distance for ever."""
     loop = Loop([["*", f"{sign}1", "x"]], [affine([[0.0]])], [["-", ["*", "x", "x"], "1/16"]])

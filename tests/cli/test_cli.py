@@ -29,6 +29,7 @@ from certify.loop.plants import get_system
 from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_policy
 from certify.provers.base import Progress
 from tests.support.loops import chain, pendulum_network
+from tests.support.marks import slow_after
 
 SHIPPED = Path(__file__).parent.parent.parent / "examples" / "policies" / "pendulum.pt"
 VAN_DER_POL = Path(__file__).parent.parent.parent / "examples" / "van_der_pol.toml"
@@ -406,7 +407,7 @@ def test_the_installed_command(tmp_path: Path) -> None:
     assert data["reason"] in ("domain", "witness", "inputs")
 
 
-@pytest.mark.parametrize("where", ["ring", "check"])
+@pytest.mark.parametrize("where", slow_after(1, ["ring", "check"]))
 def test_an_interrupt_leaves_a_search_and_nothing_half_written(
     where: str, tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -419,11 +420,11 @@ def test_an_interrupt_leaves_a_search_and_nothing_half_written(
         monkeypatch.setattr(VdotBound, "__call__", interrupt)
     else:
         monkeypatch.setattr("certify.analysis.acceptance.run_checker", interrupt)
-    status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o")
+    status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", "--effort", "0.1")
     assert status == 130 and out == "" and "interrupted" in err and "--resume" in err
     assert [path.name for path in (tmp_path / "o").iterdir()] == ["search.json"]
     monkeypatch.undo()
-    assert run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", "--resume")[0] == 0
+    assert run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", "--resume", "--effort", "0.1")[0] == 0
     assert sorted(path.name for path in (tmp_path / "o").iterdir()) == ["certificate.json", "report.html"]
     assert run(capsys, "check", tmp_path / "o" / "certificate.json")[0] == 0
 
@@ -493,7 +494,7 @@ def test_a_file_whose_name_is_an_option_is_a_file(tmp_path: Path, monkeypatch: p
     assert done.returncode == 1 and "REJECTED rule=format" in done.stdout
 
 
-@pytest.mark.parametrize("arguments", [["systems", "--json"], ["roa", "--policy", str(SHIPPED)]])
+@pytest.mark.parametrize("arguments", [["systems", "--json"], ["roa", "--policy", str(SHIPPED), "--effort", "0.1"]])
 def test_a_reader_that_has_gone_is_not_a_refutation(tmp_path: Path, arguments: list[str]) -> None:
     out = ["--out", str(tmp_path)] if arguments[0] == "roa" else []
     reading, writing = os.pipe()
@@ -519,7 +520,19 @@ def test_practical_stability_from_the_command_line(tmp_path: Path, capsys: pytes
     plain = SHIPPED.parent / "without_gain" / "pendulum.pt"
     status, out, err = run(capsys, "roa", "--policy", plain, "--out", tmp_path, "--claim", "asymptotic")
     assert (status, out) == (2, "") and "--claim practical" in err
-    arguments = ("roa", "--policy", plain, "--claim", "practical", "--candidate", "lqr", "--out", tmp_path)
+    arguments = (
+        "roa",
+        "--policy",
+        plain,
+        "--claim",
+        "practical",
+        "--candidate",
+        "lqr",
+        "--effort",
+        "0.1",
+        "--out",
+        tmp_path,
+    )
     status, out, _ = run(capsys, *arguments)
     claimed = out.partition("simulated")[0]  # what runs did in simulation comes after that
     assert status == 0 and "enters" in claimed and "converge" not in claimed and "floor c0" in claimed
@@ -609,7 +622,7 @@ def spring(tmp_path: Path) -> tuple[str | Path, ...]:
 def test_reach_proves_that_a_state_converges(
     tmp_path: Path, spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = ("reach", *spring, "--from", "p=1.5,v=1.4", "--box", "p=0.1,v=0.2", "--effort", "0.4", "--json")
+    given = ("reach", *spring, "--from", "p=1.5,v=1.4", "--box", "p=0.1,v=0.2", "--effort", "0.1", "--json")
     status, out, _ = run(capsys, *given)
     assert status == 0 and out.count("\n") == 1
     data = json.loads(out)
@@ -627,7 +640,7 @@ def test_reach_proves_that_a_state_converges(
 def test_a_state_that_is_not_shown_to_converge_exits_3(
     tmp_path: Path, spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = ("reach", *spring, "--from", "p=1.95,v=1.95", "--effort", "0.12")
+    given = ("reach", *spring, "--from", "p=1.95,v=1.95", "--effort", "0.02")
     status, out, _ = run(capsys, *given)
     assert status == 3
     said = " ".join(out.split())

@@ -42,6 +42,7 @@ from controllers.simulation.stepping import Stepper
 from controllers.simulation.trajectories import simulate
 from controllers.training.environment import PlantEnvironment
 from controllers.training.trainer import Trainer, train
+from tests.support.marks import slow_after
 
 HENON = Path(__file__).parents[2] / "examples" / "plants" / "henon.toml"
 A = np.array([[-2 * 1.4 * 0.63, 1.0], [0.3, 0.0]])
@@ -255,7 +256,7 @@ def _bent(K, seed=0):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("gain", ["kept", "lqr"])
+@pytest.mark.parametrize("gain", slow_after(1, ["kept", "lqr"]))
 def test_flattening_judges_by_the_map(henon, gain):
     system, plant = henon[0], replace(henon[1], initial_states=(0.2, 0.2))
     Q, R = (np.diag(v) for v in (plant.preset.state_weights, plant.preset.input_weights))

@@ -301,7 +301,7 @@ KNOWN: dict[str, tuple[Callable[[], tuple[System, PolicyNetwork]], float]] = {
 def test_a_plant_of_each_function_is_proved_up_to_its_edge(name: str, tmp_path: Path) -> None:
     build, edge = KNOWN[name]
     system, network = build()
-    result = certify_roa(system, network, tmp_path, RoaOptions(candidate="lyapunov"))
+    result = certify_roa(system, network, tmp_path, RoaOptions(candidate="lyapunov", effort=0.1))
     assert result.verdict is Verdict.PROVED and result.P is not None and result.levels.roa is not None
     limit = edge**2 * float(result.P[0, 0])
     assert 0.998 * limit < result.levels.roa < limit

@@ -21,6 +21,7 @@ from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_polic
 from certify.loop.policies.importers import Clip, Imported, ImportOptions, content_of, import_policy
 from tests.support.compiled import Constant, SetsItsState
 from tests.support.foreign import TWO_STAGE, Odd, external, mlp, plant, saved, sb3, two_stage, values
+from tests.support.marks import slow_after
 
 U_EQ = (Fraction(0),)
 X = np.random.default_rng(3).uniform(-1.5, 1.5, (500, 2)).astype(np.float32).astype(np.float64)
@@ -447,7 +448,7 @@ ACTIVATIONS = [
 ]
 
 
-@pytest.mark.parametrize("how", ["trace", "script", "freeze"])
+@pytest.mark.parametrize("how", slow_after(2, ["trace", "script", "freeze"]))
 @pytest.mark.parametrize("name", [*ACTIVATIONS, *(f"{name} in place" for name in ACTIVATIONS[:3])])
 def test_torchscript_of_every_activation(name: str, how: str, tmp_path: Path) -> None:
     torch.manual_seed(4)

@@ -120,7 +120,7 @@ def test_practical_stability_is_claimed_where_the_policy_is_not_centred(tmp_path
 def test_the_command_centres_on_request_and_says_what_that_changes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["roa", "--policy", str(PLAIN), "--candidate", "lqr", "--out", str(tmp_path), "--json"]
+    command = ["roa", "--policy", str(PLAIN), "--candidate", "lqr", "--effort", "0.1", "--out", str(tmp_path), "--json"]
     assert _run([*command, "--claim", "practical"], True) == 0
     further = json.loads(capsys.readouterr().out)["diagnosis"]["next"]
     assert further["options"] == {"--centre": "preactivation", "--claim": "auto"}
@@ -194,7 +194,7 @@ def test_a_point_of_rest_that_newton_misses_is_found_along_a_trajectory() -> Non
 def test_the_set_lies_around_where_the_loop_rests(tmp_path: Path, around: Literal["auto", "rest"]) -> None:
     policy = load_policy(PLAIN)
     system = get_system("pendulum").with_parameters(policy.parameters)
-    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="lqr", around=around))
+    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="lqr", around=around, effort=0.1))
     assert result.verdict is Verdict.PROVED and result.claim == "nearby" and result.certificate is not None
     assert run_checker(result.certificate, "reference")["result"] == "ACCEPTED"
     assert result.rest is not None and result.levels.floor is not None and result.P is not None
@@ -263,7 +263,7 @@ def test_a_set_around_the_rest_is_told_from_one_around_another_point(tmp_path: P
     """A policy's hash is the same from wherever it is looked at: what is compared is the loop in its own deviations."""
     policy = load_policy(PLAIN)
     system = get_system("pendulum").with_parameters(policy.parameters)
-    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="lqr"))
+    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="lqr", effort=0.1))
     assert result.certificate is not None and result.rest is not None
     proved = proved_set(result.certificate)
     require_same_question(proved, policy.network, system)
@@ -293,7 +293,19 @@ def test_a_set_around_the_rest_is_told_from_one_around_another_point(tmp_path: P
 
 def test_what_is_asked_of_a_set_is_about_its_own_point(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """`--contains` names values: 2.8 lies outside, and would lie inside if it were a deviation; -2.9 the other way."""
-    command = ["roa", "--policy", str(PLAIN), "--candidate", "lqr", "--out", str(tmp_path), "--json", "--contains"]
+    command = [
+        "roa",
+        "--policy",
+        str(PLAIN),
+        "--candidate",
+        "lqr",
+        "--effort",
+        "0.1",
+        "--out",
+        str(tmp_path),
+        "--json",
+        "--contains",
+    ]
     for states, inside in (("theta=2.8", False), ("theta=-2.9", True)):
         assert _run([*command, states], True) == 0
         said = json.loads(capsys.readouterr().out)["contains"]
@@ -308,7 +320,7 @@ def test_what_is_asked_of_a_set_is_about_its_own_point(tmp_path: Path, capsys: p
 def test_the_largest_rate_is_of_the_set_around_the_rest(tmp_path: Path) -> None:
     policy = load_policy(PLAIN)
     system = get_system("pendulum").with_parameters(policy.parameters)
-    result = certify_largest("rate", system, policy.network, tmp_path, RoaOptions(candidate="lqr"))
+    result = certify_largest("rate", system, policy.network, tmp_path, RoaOptions(candidate="lqr", effort=0.1))
     assert result.verdict is Verdict.PROVED and result.certificate is not None and result.rest is not None
     assert result.problem is not None and result.problem.rate > 0.5
     read = read_certificate(result.certificate)

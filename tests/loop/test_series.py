@@ -33,7 +33,7 @@ class Numbers(Algebra[float]):
 @pytest.mark.parametrize(
     "text",
     slow_after(
-        6,
+        4,
         [
             "sin(x)",
             "cos(x)*sin(x)",

@@ -283,6 +283,7 @@ def test_another_seed_learns_another_function(network: Learned) -> None:
     assert not np.array_equal(network.function.weights[0], other.function.weights[0])
 
 
+@pytest.mark.slow
 def test_the_same_seed_learns_the_same_function(network: Learned) -> None:
     again = learn(disc(), UNIT, 0.09, (8,), seed=3)
     for name in ("weights", "biases"):

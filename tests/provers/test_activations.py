@@ -40,6 +40,7 @@ from tests.provers.test_models import beyond
 from tests.support.cases import case_of
 from tests.support.certificates import parse
 from tests.support.loops import saturated_lqr, scalar_tanh
+from tests.support.marks import slow_after
 from tests.support.ways import WAYS, Way, bounded
 
 add_activations()
@@ -116,7 +117,7 @@ def boxes(count: int, size: float) -> tuple[np.ndarray, np.ndarray]:
     return x, np.zeros((2, count))
 
 
-@pytest.mark.parametrize("size", [1e-6, 0.05, 1.0, 10.0])
+@pytest.mark.parametrize("size", slow_after(2, [1e-6, 0.05, 1.0, 10.0]))
 @pytest.mark.parametrize("name", NEW)
 def test_policies_on_boxes(name: str, size: float) -> None:
     """They hold samples and corners, both ways of computing agree to the bit, and the checker is as tight."""
@@ -217,13 +218,13 @@ def free_of_biases(law: PolicyNetwork, units: int) -> PolicyNetwork:
 def test_a_corner_at_the_operating_point_proves_nothing_but_of_relu() -> None:
     case = case_of(PLANT, free_of_biases(policy("elu"), 1))
     assert prove_local(case.problem, case.T, domain_limit(case.P, PLANT.domain)) is None
-    result = certify_roa(PLANT, case.loop.network)
+    result = certify_roa(PLANT, case.loop.network, effort=0.1)
     assert result.verdict is Verdict.UNKNOWN and "a unit of elu has its corner at the operating point" in result.reason
 
 
 def test_a_relu_with_its_corner_at_the_operating_point_has_directions(tmp_path: Any) -> None:
     """A kink at the origin, and an unstable loop on one side of it."""
-    result = certify_roa(PLANT, free_of_biases(policy("relu"), 1), out=tmp_path)
+    result = certify_roa(PLANT, free_of_biases(policy("relu"), 1), out=tmp_path, effort=0.1)
     assert result.verdict is Verdict.PROVED and result.volume is not None and result.volume > 10
     local = json.loads((tmp_path / "certificate.json").read_text("utf-8"))["evidence"]["local"]
     assert len(local["directions"]) == 4
@@ -240,7 +241,7 @@ def test_a_relu_network_without_biases_is_proved_where_it_stabilises(share: floa
         (np.vstack([-K, K]), np.array([[1.0, -share]])), (np.zeros(2), np.zeros(1)), np.ones(1), np.zeros(1),
         "identity", "none", activation="relu", clip=(np.array([-6.0]), np.array([6.0])),
     )  # fmt: skip
-    result = certify_roa(PLANT, law, out=tmp_path)
+    result = certify_roa(PLANT, law, out=tmp_path, effort=0.1)
     assert (result.verdict is Verdict.PROVED) is (share == 1.0)
     if share == 1.0:
         assert result.volume is not None and result.volume > 100 and decreases(result, result.levels.roa or 0.0)
@@ -252,7 +253,7 @@ def test_a_relu_network_without_biases_is_proved_where_it_stabilises(share: floa
 @pytest.mark.parametrize("name", NEW)
 @pytest.mark.usefixtures("alone")
 def test_a_loop_is_proved_and_accepted(name: str, tmp_path: Any) -> None:
-    result = certify_roa(PLANT, policy(name), out=tmp_path)
+    result = certify_roa(PLANT, policy(name), out=tmp_path, effort=0.1)
     assert result.verdict is Verdict.PROVED and result.levels.roa is not None and result.volume is not None
     assert result.volume > 10 and result.raw is not None
     assert decreases(result, result.levels.roa)
@@ -279,9 +280,9 @@ def test_planted_violations_are_never_proved(name: str) -> None:
     """A law that pushes away is refuted; one with a spike in the middle of its set is proved below that alone."""
     law = policy(name)
     away = law.with_layers(weights=(*law.weights[:-1], -law.weights[-1]))
-    assert certify_roa(PLANT, away).verdict is not Verdict.PROVED
+    assert certify_roa(PLANT, away, effort=0.1).verdict is not Verdict.PROVED
     weak = replace(law, scale=law.scale * 0.02)
-    result = certify_roa(PLANT, weak)
+    result = certify_roa(PLANT, weak, effort=0.1)
     if result.verdict is Verdict.PROVED:
         assert result.levels.roa is not None and decreases(result, result.levels.roa)
 

@@ -85,7 +85,7 @@ def judged(way: Way, rule: VdotBound, lo: np.ndarray, hi: np.ndarray) -> BoxBoun
 
 
 @pytest.mark.parametrize("name", LOOPS)
-@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-3, 0.1, 1.0])
+@pytest.mark.parametrize("size", slow_after(3, [0.0, 1e-9, 1e-3, 0.1, 1.0]))
 def test_both_ways_give_the_same_bits(name: str, size: float) -> None:
     problem, T = LOOPS[name]()
     rule = VdotBound(problem, T)

@@ -69,7 +69,7 @@ def misses(model: Taylor, e: Expression, x: Array, rng: np.random.Generator) -> 
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-6, 0.03, 0.5])
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", slow_after(5, range(12)))
 def test_models_on_boxes_hold_the_values_both_ways(seed: int, size: float) -> None:
     rng, e = np.random.default_rng(seed), tree(random.Random(seed), 4)
     x, error = boxes(rng, size)
@@ -244,7 +244,7 @@ LOOPS: dict[str, tuple[Any, float]] = {
 def test_saturated_plants_are_proved(name: str, tmp_path: Path) -> None:
     """To the end: the checker accepts it, and simulated runs from the set converge."""
     build, least = LOOPS[name]
-    result = certify_roa(build(), regulator(1.0, 1.73), tmp_path, RoaOptions())
+    result = certify_roa(build(), regulator(1.0, 1.73), tmp_path, RoaOptions(effort=0.1))
     assert result.verdict is Verdict.PROVED and result.levels.roa is not None and result.problem is not None
     assert result.levels.roa > least
     system, loop = result.problem.loop.system, result.problem.loop

@@ -28,6 +28,7 @@ from certify.provers.falsify import confirm, falsify, refutes, touch
 from tests.provers.test_steps import Stepped, alone, held, stepped, uncertain_pendulum
 from tests.provers.test_vdot import boxes
 from tests.support.loops import pendulum_network, scalar_tanh
+from tests.support.marks import slow_after
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
 KEEP = ("theta_dot + 3*theta <= 2", "max(abs(u) - 4, theta*theta_dot/3 + sin(theta) - 0.8) <= 0")
@@ -146,7 +147,7 @@ def grazed(seed: int, by: float) -> tuple[System, np.ndarray, float]:
     return with_constraints(system, keep, avoid), P, level
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", slow_after(2, range(6)))
 @pytest.mark.parametrize("by", [1e-3, 1e-6, -1e-6, -1e-3])
 def test_a_level_that_grazes_a_constraint_is_proved_on_one_side_only(seed: int, by: float, tmp_path: Path) -> None:
     system, P, level = grazed(seed, by)

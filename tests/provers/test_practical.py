@@ -35,9 +35,10 @@ from certify.provers.falsify import survey
 from tests.provers.test_bounds import planted, vdot
 from tests.support.cases import Case, case_of
 from tests.support.loops import box, pendulum_network, scalar_tanh
+from tests.support.marks import slow_after
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
-PRACTICAL = RoaOptions(claim="practical")
+PRACTICAL = RoaOptions(claim="practical", effort=0.1)
 
 
 def prove(case: Case, budget: Budget | None = None, exactly: float | None = None) -> Proof:
@@ -113,7 +114,7 @@ def test_the_shipped_pendulum_without_its_centring(claim: str, tmp_path: Path) -
 
 def test_a_policy_trained_without_the_gain(tmp_path: Path) -> None:
     policy = load_policy(POLICIES / "without_gain" / "pendulum.pt")
-    options = RoaOptions(claim="practical", candidate="lqr", around="origin")
+    options = RoaOptions(claim="practical", candidate="lqr", around="origin", effort=0.1)
     result = certify_roa(get_system("pendulum").with_parameters(policy.parameters), policy.network, tmp_path, options)
     assert result.verdict is Verdict.PROVED and result.problem is not None and result.certificate is not None
     rest = np.array([-0.084302068, 0.0])  # where it comes to rest in simulation
@@ -247,7 +248,7 @@ def test_the_optimised_candidate_is_that_of_the_centred_loop() -> None:
     assert 0 < found.volume <= 1.01 * known.volume
 
 
-@pytest.mark.parametrize("candidate", [peak_candidate, robust_candidate])
+@pytest.mark.parametrize("candidate", slow_after(1, [peak_candidate, robust_candidate]))
 def test_a_solution_that_may_be_inaccurate_is_no_warning(
     candidate: Callable[[ClosedLoop], np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -147,7 +147,7 @@ def test_rationals_know_what_steps_make_of_0() -> None:
 
 @pytest.mark.parametrize("name", slow_after(3, PROGRAMS))
 def test_they_prove_loops_that_both_checkers_accept(name: str) -> None:
-    result = certify_roa(PLANT, policy(name))
+    result = certify_roa(PLANT, policy(name), effort=0.1)
     assert result.verdict is Verdict.PROVED and result.volume is not None and result.volume > 30
     assert result.certificate is not None
     kept = read_certificate(result.certificate)
@@ -185,7 +185,7 @@ def test_no_program_is_proved_that_lets_go() -> None:
     steps = list(away.network.steps)
     steps[3] = replace(steps[3], weight=-steps[3].weight)
     broken = PolicyNetwork(replace(away.network, steps=tuple(steps)), away.scale, away.offset, "tanh", "preactivation")
-    assert certify_roa(PLANT, broken).verdict is not Verdict.PROVED
+    assert certify_roa(PLANT, broken, effort=0.1).verdict is not Verdict.PROVED
 
 
 @pytest.mark.parametrize("name", PROGRAMS)

@@ -448,7 +448,7 @@ def test_a_refuted_rate_is_told_as_such(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("dynamics", "time", "falls"), [("-x + u", "continuous", 1.0), ("x/2 + u", "discrete", 0.375)])
 @pytest.mark.parametrize("level", [0.25, None])
-@pytest.mark.parametrize("factor", [1.0, 1.2])
+@pytest.mark.parametrize("factor", slow_after(1, [1.0, 1.2]))
 def test_of_a_rate_that_is_met_exactly_a_smaller_one_is_suggested(
     dynamics: str, time: str, falls: float, level: float | None, factor: float, tmp_path: Path
 ) -> None:

@@ -279,7 +279,7 @@ def test_a_period_too_long_for_any_enclosure_has_no_models() -> None:
 @pytest.mark.parametrize(
     "loop",
     slow_after(
-        3,
+        2,
         [
             shipped("pendulum", TENTH),
             shipped("pendulum", TENTH, (HUNDREDTH, HUNDREDTH)),

@@ -11,6 +11,7 @@ from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from certify.reference.balls import ON_LEAVES
 from certify.reference.taylor import Taylor, positive_part
+from tests.support.marks import slow_after
 from tests.support.oracle import ball
 
 Rows = list[list[Fraction]]
@@ -81,7 +82,7 @@ def test_no_bound_is_below_the_largest_value(n: int, kind: str) -> None:
     assert kind != "steep" or (exact > 10 and (less > 5 or n == 1))
 
 
-@pytest.mark.parametrize("shift", [0, 1, -1])
+@pytest.mark.parametrize("shift", slow_after(2, [0, 1, -1]))
 def test_numbers_that_are_not_known_exactly(shift: int) -> None:
     """Balls around 0 decide no sign, and every number in them must be covered; so must what is not finite."""
     generator = np.random.default_rng(3)

@@ -18,6 +18,7 @@ from tests.checker.test_rules import honest as of_version_3
 from tests.reference.test_practical import scalar
 from tests.support.balls import with_ball
 from tests.support.certificates import Document, dump, edited, write
+from tests.support.marks import slow_after
 
 TRUSTED = {"kind": "trusted-solver", "solver": "dReal", "version": "4", "precision": (0.5).hex(), "queries": []}
 KEYS = [
@@ -98,7 +99,7 @@ def test_json(tmp_path: Path, path: str, value: Any, status: int, result: str, r
         assert (said["rate"], said["sample"], said["discrete"]) == (0.0, None, False)
 
 
-@pytest.mark.parametrize("json_too", [False, True])
+@pytest.mark.parametrize("json_too", slow_after(1, [False, True]))
 def test_files_that_cannot_be_read(tmp_path: Path, json_too: bool) -> None:
     fifo = tmp_path / "fifo"
     os.mkfifo(fifo)

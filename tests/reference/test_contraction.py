@@ -152,7 +152,7 @@ POLES = {
 }
 
 
-@pytest.mark.parametrize("weight", slow_after(2, [0.1, 0.5, 0.01, 0.3, 1.0, 3.0]))
+@pytest.mark.parametrize("weight", slow_after(1, [0.1, 0.5, 0.01, 0.3, 1.0, 3.0]))
 @pytest.mark.parametrize("name", POLES)
 def test_trajectories_that_part_at_the_edge(name: str, weight: float) -> None:
     """The slope of F is positive at the left end of {V <= c0}. Near a pole the remainder's own factor is too small."""
@@ -189,7 +189,7 @@ def test_the_largest_fourth_derivative(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-@pytest.mark.parametrize("size", [0.05, 0.2])
+@pytest.mark.parametrize("size", slow_after(1, [0.05, 0.2]))
 def test_the_constant_of_what_is_beyond_the_third_order(name: str, size: float) -> None:
     """Differences at pairs of points, near each other and apart, in the middle and at the edge of the ball."""
     data = document(name, None, 1, True, [("q", "1", f"{1 + NARROW}"), ("p", "1/4", f"{NARROW + Fraction(1, 4)}")])

@@ -32,6 +32,7 @@ from tests.checker.test_networks import FUNCTIONS as FLOATS
 from tests.support.balls import with_ball
 from tests.support.certificates import Document, decode, edited, encode, grow, make
 from tests.support.earlier import newer
+from tests.support.marks import slow_after
 from tests.support.reference import judge_bytes
 
 add_activations()
@@ -103,7 +104,7 @@ def test_every_function_that_a_map_may_have_is_a_row() -> None:
     assert {name for name, row in FUNCTIONS.items() if row.cornered} == {*CORNERED, "abs"}
 
 
-@pytest.mark.parametrize("precision", [ON_LEAVES, PRECISION])
+@pytest.mark.parametrize("precision", slow_after(1, [ON_LEAVES, PRECISION]))
 @EVERYWHERE
 def test_derivatives_hold_those_of_all_numbers_of_a_ball(name: str, precision: int) -> None:
     for c, r in ranges():
@@ -359,7 +360,7 @@ def raw(data: Document) -> bytes:
     return json.dumps(data).encode()
 
 
-@pytest.mark.parametrize("loop", [one_state, two_states])
+@pytest.mark.parametrize("loop", slow_after(1, [one_state, two_states]))
 @pytest.mark.parametrize("name", [*ACTIVATIONS, "tanh"])
 def test_a_loop_of_each_activation_is_proved(name: str, loop: Callable[[str], tuple[Document, Any]]) -> None:
     """And is not with the opposite weights, nor with cos or exp, if with that the loop is not stable."""
@@ -382,7 +383,7 @@ def test_a_loop_of_each_activation_is_proved(name: str, loop: Callable[[str], tu
             assert program(raw(forged)) in ("local", "ring") and program(raw(proved(forged))) in ("local", "ring")
 
 
-@pytest.mark.parametrize("name", [*ACTIVATIONS, "tanh"])
+@pytest.mark.parametrize("name", slow_after(4, [*ACTIVATIONS, "tanh"]))
 def test_a_level_beyond_another_equilibrium_is_refused(name: str) -> None:
     """Up to close below it there is a proof, beyond it by a millionth there is none."""
     data, rate = one_state(name)

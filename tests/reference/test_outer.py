@@ -701,7 +701,7 @@ def test_the_slope_of_a_function_as_a_function(name: str) -> None:
                 assert not abs(true - exactly_at(slope, [share])) > slope.r
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", slow_after(2, range(4)))
 def test_what_is_accepted_of_a_random_network_is_true(seed: int) -> None:
     """The largest level of three that is accepted; for each the claim is looked at, at many points."""
     generator = np.random.default_rng(seed)

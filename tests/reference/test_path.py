@@ -151,7 +151,7 @@ def honest(name: str) -> Document:
         return next(maker for maker in MAKERS if maker.__name__ == name)()
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_after(3, NAMES))
 def test_honest_tubes_are_accepted(name: str) -> None:
     verdict = rules.judge(dump(honest(name)))
     assert verdict.result == "ACCEPTED", f"{verdict.rule} {verdict.at} {verdict.detail}"
@@ -298,7 +298,7 @@ def test_forgeries(place: str, name: str, edit: Edit) -> None:
     assert str(verdict.at).startswith(place)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_after(2, NAMES))
 def test_the_checker_says_the_same(name: str) -> None:
     """Of the honest tube and of each forgery, by the rule that refuses it."""
     edits = [edit for _, base, _, edit in FORGERIES if base == name]
@@ -577,7 +577,7 @@ def test_what_is_not_finite_does_not_decrease(bad: str, part: str, multipliers: 
         assert not decreases_along(hints([[1.0]], *multipliers), path, one, zero, field([changed], units_of))
 
 
-@pytest.mark.parametrize("n", slow_after(2, [1, 2, 3]))
+@pytest.mark.parametrize("n", slow_after(1, [1, 2, 3]))
 @pytest.mark.parametrize("kind", ["apart", "jointly"])
 def test_what_decreases_does_so_at_every_point(n: int, kind: str) -> None:
     """Systems at random, near the edge; remainders and errors take the worst sign and size that their bounds allow.
@@ -740,7 +740,7 @@ EDGES: list[tuple[str, Callable[[Document, float], Document]]] = [  # how an edi
 
 
 @pytest.mark.parametrize("name", slow_after(1, ["bent", "swing"]))
-@pytest.mark.parametrize(("what", "edit"), slow_after(2, EDGES))
+@pytest.mark.parametrize(("what", "edit"), slow_after(1, EDGES))
 def test_the_checker_draws_the_same_line(what: str, edit: Callable[[Document, float], Document], name: str) -> None:
     """How far a number can be moved before a file is refused: the same for two programs."""
     ends = []

@@ -70,7 +70,7 @@ def test_a_rate_that_only_leaves_break(monkeypatch: pytest.MonkeyPatch) -> None:
         assert judge(data) == rule
 
 
-@pytest.mark.parametrize("order", [1, 2, 3, 8])
+@pytest.mark.parametrize("order", slow_after(2, [1, 2, 3, 8]))
 @pytest.mark.parametrize("sample", [("0", "1"), ("1", "1"), ("1/2", "1")])
 @pytest.mark.parametrize(("k", "true"), [(1.9, True), (2.0, False), (2.1, False)])
 def test_an_integrator_whose_input_is_held(k: float, true: bool, sample: tuple[str, str], order: int) -> None:

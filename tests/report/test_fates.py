@@ -167,6 +167,7 @@ def test_counted_work_ends_runs_early_and_keeps_what_there_is() -> None:
     assert len(simulate(flow, begin, 0.01, 100)) == 101
 
 
+@pytest.mark.slow
 def test_a_picture_is_the_same_on_a_machine_that_is_busy(monkeypatch: pytest.MonkeyPatch) -> None:
     """Seconds pass between two readings of the clock, as on a machine where other programs run."""
     claimed = certificate(plane("-x/10", "-y*50"), 0.9)

@@ -66,7 +66,7 @@ def moving(middle: np.ndarray, end: np.ndarray, to: Sequence[float], duration: f
 
 @pytest.fixture(scope="module")
 def proved(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
-    options = RoaOptions(candidate="lyapunov", reach_from=FROM, effort=0.4)
+    options = RoaOptions(candidate="lyapunov", reach_from=FROM, effort=0.1)
     result = certify_roa(*soft_spring(), tmp_path_factory.mktemp("soft"), options)
     assert result.verdict is Verdict.PROVED and result.claim == "reached" and result.tube is not None
     return result
@@ -193,7 +193,7 @@ def test_a_state_that_is_missed_is_said_to_be_first(missed: RoaResult) -> None:
 
 
 def test_values_and_deviations_are_told_apart(tmp_path: Path) -> None:
-    options = RoaOptions(candidate="lyapunov", reach_from={"p": Fraction(17, 10), "v": Fraction(1, 2)}, effort=0.4)
+    options = RoaOptions(candidate="lyapunov", reach_from={"p": Fraction(17, 10), "v": Fraction(1, 2)}, effort=0.1)
     result = certify_roa(*shifted_spring(), tmp_path, options)
     assert result.verdict is Verdict.PROVED and claim_of(certificate_of(result)).centre == (1.2, 0.5)
     text = page_of(result).text
@@ -208,7 +208,7 @@ def test_values_and_deviations_are_told_apart(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    slow_after(6, [
+    slow_after(3, [
         {"centre": [math.nan, 0.0]},
         {"centre": [math.inf, 0.0]},
         {"centre": [50.0, 0.0]},

@@ -789,7 +789,7 @@ def test_the_summary_looks_no_plant_up(pendulum_case: Case) -> None:
 @pytest.mark.parametrize(
     "provenance",
     slow_after(
-        5,
+        2,
         [
             [],
             "text",

@@ -40,6 +40,7 @@ from certify.report.sampling import growth, quadratic, runs_of, simulated_roa_fr
 from certify.report.timing import TimingInWords
 from tests.report.test_report import Page, exactly
 from tests.support.loops import box
+from tests.support.marks import slow_after
 
 F = Fraction
 EXACT, RANGE, FROM_0 = (F(1, 50), F(1, 50)), (F(1, 100), F(1, 50)), (F(0), F(1, 50))
@@ -190,7 +191,9 @@ def test_each_kind_has_words() -> None:
         assert all("$" not in text for text in every_text(words_for(kind)))
 
 
-@pytest.mark.parametrize("claim", [asymptotic(), practical(), asymptotic(0.25), practical(0.25)], ids=repr)
+@pytest.mark.parametrize(
+    "claim", slow_after(2, [asymptotic(), practical(), asymptotic(0.25), practical(0.25)]), ids=repr
+)
 def test_a_sampled_page_cannot_be_misread(claim: Claim) -> None:
     found = page(claimed(TIMINGS["range"], claim))
     for text in (found.text, *found.drawings(), *(a.get("alt") or "" for _, a in found.tags)):

@@ -54,7 +54,7 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
     """The levitated ball under a policy that is not centred: its loop rests half a millimetre below where it should."""
     stored = load_policy(EXAMPLES / "policies" / "maglev.pt").network
     off = stored.with_layers(centre="none", biases=(*stored.biases[:-1], stored.biases[-1] + 0.01))
-    return certify_roa(load_system(MAGLEV), off, tmp_path_factory.mktemp("beside"), RoaOptions(effort=0.4))
+    return certify_roa(load_system(MAGLEV), off, tmp_path_factory.mktemp("beside"), RoaOptions(effort=0.05))
 
 
 def test_where_a_loop_rests_is_said_by_the_states_values(beside: RoaResult) -> None:
@@ -70,7 +70,7 @@ def test_where_a_loop_rests_is_said_by_the_states_values(beside: RoaResult) -> N
     assert re.search(rf"equilibrium h = {h:.9g} m, v = 0 m/s; eigenvalues there", text)
     around = certify_roa(
         load_system(MAGLEV), replace(beside.network, origin=np.zeros(2)), beside.certificate.parent / "o",  # type: ignore[union-attr]
-        RoaOptions(effort=0.4, around="origin"),
+        RoaOptions(effort=0.05, around="origin"),
     )  # fmt: skip
     said = printed(around)
     assert not around.network.is_moved and f"equilibrium h = {h:.9g} m" in said
@@ -143,7 +143,7 @@ def test_flattening_is_suggested_where_bounds_see_bends_and_little_is_proved(
 def test_flattening_is_not_suggested_to_whom_it_cannot_help(tmp_path: Path) -> None:
     """A policy without bends, one without hidden units, much proved, a known pace."""
     result = certify_roa(
-        load_system(EXAMPLES / "van_der_pol.toml"), bent().network, tmp_path, RoaOptions(max_boxes=3, effort=0.08)
+        load_system(EXAMPLES / "van_der_pol.toml"), bent().network, tmp_path, RoaOptions(max_boxes=3, effort=0.02)
     )
     little = tuple(replace(one, volume=1e6 * one.volume) for one in result.tried)
     short = replace(result, stop=Stop.BOXES, tried=little)

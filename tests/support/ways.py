@@ -18,13 +18,13 @@ Array = NDArray[np.float64]
 
 Way = Literal["numpy", "compiled"]
 WAYS: tuple[Way, ...] = ("numpy", "compiled")
+CHOSEN = {"numpy": compiled.Compiled(worth=math.inf), "compiled": compiled.Compiled(worth=0.0)}  # compiled once
 
 
 @contextmanager
 def bounded(way: Way) -> Iterator[None]:
     """All boxes in that way, however few; fails where numba is missing, so that nothing passes for lack of it."""
-    before = compiled._of_process
-    chosen = compiled.Compiled(worth=math.inf if way == "numpy" else 0.0)
+    before, chosen = compiled._of_process, CHOSEN[way]
     if way == "compiled" and chosen(1.0) is vectors:
         raise RuntimeError("the tests need numba; found none.")
     compiled._of_process = chosen

@@ -379,7 +379,7 @@ def test_a_cluster_goes_on_from_the_checkpoint_that_is_here(finished, pendulum_s
     assert (tmp_path / "runs" / ours).read_bytes() == (finished[0] / ours).read_bytes()
 
 
-@pytest.mark.parametrize("sent", ["another seed", "unfinished", b"no files", b"\x80\x04N."])
+@pytest.mark.parametrize("sent", slow_after(2, ["another seed", "unfinished", b"no files", b"\x80\x04N."]))
 def test_what_comes_back_and_is_no_such_run_is_not_written(finished, pendulum_system, tmp_path, sent):
     content, source = sent, finished[0] / "ours" / "seed-0"
     if isinstance(sent, str):

@@ -20,6 +20,7 @@ from controllers.comparison.learning_curve import CurvePoint, Measurement, best,
 from controllers.comparison.methods import Run
 from controllers.comparison.stopping import Fixed, Plan, Stopping
 from controllers.options import preset
+from tests.support.marks import slow_after
 
 TINY = replace(preset("pendulum"), steps=60, warm_up=20, n_A=8, n_B=8, batch=4, actor=(4, 3), critic=(5,), seed=3)
 PENDULUM = get_system("pendulum")
@@ -105,12 +106,15 @@ def followed(run: Run, plan: Plan, folder: Path, cut_at: int = 10**9) -> Finishe
 
 @pytest.mark.parametrize(
     ("run", "plan"),
-    [
-        ("ours", Fixed(steps=60, every=20)),
-        ("sac", Stopping(budget=40, every=20, patience=9)),
-        ("sb3-sac", Stopping(budget=40, every=20, patience=9)),
-        ("sb3-ppo", Stopping(budget=160, every=80, patience=9, closing=0.9)),
-    ],
+    slow_after(
+        2,
+        [
+            ("ours", Fixed(steps=60, every=20)),
+            ("sac", Stopping(budget=40, every=20, patience=9)),
+            ("sb3-sac", Stopping(budget=40, every=20, patience=9)),
+            ("sb3-ppo", Stopping(budget=160, every=80, patience=9, closing=0.9)),
+        ],
+    ),
 )
 def test_a_run_that_is_cut_off_again_and_again_equals_one_that_is_not(
     tmp_path: Path, run: Run, plan: Plan, monkeypatch: pytest.MonkeyPatch

@@ -21,6 +21,7 @@ from controllers.distillation.last_layer import fitted
 from controllers.distillation.options import DistilOptions
 from controllers.evaluation.corners import nearest_corner
 from controllers.simulation.trajectories import initial_states
+from tests.support.marks import slow_after
 
 SHIPPED = Path(__file__).parents[3] / "examples" / "policies" / "pendulum.pt"
 PENDULUM = get_system("pendulum")
@@ -50,7 +51,7 @@ def _by_differences(network: PolicyNetwork) -> np.ndarray:
     return np.array([(network(h * e, ORIGIN) - network(-h * e, ORIGIN)) / (2 * h) for e in np.eye(2)]).T
 
 
-@pytest.mark.parametrize("name", ["tanh", "relu", "elu", "silu", "softsign"])
+@pytest.mark.parametrize("name", slow_after(2, ["tanh", "relu", "elu", "silu", "softsign"]))
 def test_a_small_network_imitates_the_source_and_has_its_gain(name):
     source = load_policy(SHIPPED)
     result = distil(source, replace(QUICK, activation=name))
@@ -82,13 +83,16 @@ def test_its_figures_are_those_of_the_two_policies():
 
 @pytest.mark.parametrize(
     ("squash", "centre", "scale", "clip", "asked", "wanted"),
-    [
-        ("tanh", "preactivation", 6.0, None, None, "preactivation"),
-        ("tanh", "output", 6.0, None, "preactivation", "preactivation"),
-        ("tanh", "preactivation", 6.0, None, "output", "output"),
-        ("identity", "output", 2.0, ([-6.0], [6.0]), None, "output"),
-        ("identity", "none", 2.0, ([-6.0], [6.0]), "none", "none"),
-    ],
+    slow_after(
+        2,
+        [
+            ("tanh", "preactivation", 6.0, None, None, "preactivation"),
+            ("tanh", "output", 6.0, None, "preactivation", "preactivation"),
+            ("tanh", "preactivation", 6.0, None, "output", "output"),
+            ("identity", "output", 2.0, ([-6.0], [6.0]), None, "output"),
+            ("identity", "none", 2.0, ([-6.0], [6.0]), "none", "none"),
+        ],
+    ),
 )
 def test_any_steps_are_imitated_with_the_centring_that_is_asked_for(squash, centre, scale, clip, asked, wanted):
     source = _observed(squash, centre, scale, clip)
@@ -130,7 +134,7 @@ def test_the_last_layer_has_the_jacobian_exactly_and_the_least_squares_beyond_it
 def test_the_command_writes_the_same_bytes_twice_and_says_how_far_it_is(tmp_path):
     source = tmp_path / "source.pt"
     save_policy(source, Policy(_observed(), "pendulum"))
-    short = ["--steps", "40", "--samples", "1000", "--states", "5", "--hidden", "12", "--activation", "relu"]
+    short = ["--steps", "10", "--samples", "300", "--states", "5", "--hidden", "12", "--activation", "relu"]
     outs = [tmp_path / "a.pt", tmp_path / "b.pt"]
     for out in outs:
         done = runner.invoke(app, ["distil", str(source), *short, "--out", str(out), "--json"])

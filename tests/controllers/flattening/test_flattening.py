@@ -125,6 +125,7 @@ def test_what_the_record_says_of_the_numbers_is_said_of_the_new_ones():
     assert evaluate(found, EvaluationOptions(states=2, duration=1.0)).curvature == record["curvature"]
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_policy(result):
     again = flatten(Policy(curved(), "pendulum", training=_record()), QUICK)
     assert again.policy.network.sha256() == result.policy.network.sha256()

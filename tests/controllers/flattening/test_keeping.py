@@ -100,6 +100,7 @@ def test_the_distance_in_training_is_that_which_is_reported():
     assert found == pytest.approx(nonlinearity(curved(), ORIGIN, x).rms, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_equal_options_give_equal_policies(result):
     assert flatten(Policy(curved(), "pendulum"), QUICK).policy.network.sha256() == result.policy.network.sha256()
 

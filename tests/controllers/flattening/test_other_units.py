@@ -19,6 +19,7 @@ from controllers.flattening.contraction import contracted, with_value_at_origin
 from controllers.flattening.flattening import flatten
 from controllers.flattening.options import FlattenOptions
 from controllers.training.departure import departure_of
+from tests.support.marks import slow_after
 
 PENDULUM = get_system("pendulum")
 ORIGIN = PENDULUM.exact_u_eq()
@@ -70,7 +71,7 @@ def test_the_value_at_the_origin_is_set_for_other_units_too():
     np.testing.assert_allclose(with_value_at_origin(_curved("silu"), wanted).net(np.zeros(2)), wanted, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["relu", "elu", "silu"])
+@pytest.mark.parametrize("name", slow_after(1, ["relu", "elu", "silu"]))
 def test_it_is_easier_to_prove_and_within_its_bounds(name):
     network = _curved(name)
     result = flatten(Policy(network, "pendulum"), replace(QUICK, max_cost_change=0.2))

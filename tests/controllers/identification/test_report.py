@@ -14,6 +14,7 @@ from controllers.identification.enclosed_gain import Box, enclosed_gain
 from controllers.identification.gain_learner import Identified
 from controllers.identification.report import Declared, identify_report
 from controllers.identification.riccati import riccati_gain
+from tests.support.marks import slow_after
 
 Q, R = np.diag([1.0, 0.5]), np.eye(1)
 A, B = np.array([[1.004, 0.0195], [0.3825, 0.9519]]), np.array([[0.0052], [0.52]])
@@ -102,7 +103,7 @@ def report_of(rows, noise="1e-5", second=SECOND):
     return identify_report(learned, rows, get_system("pendulum"), (Q, R), Declared(second, Fraction(noise)))
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", slow_after(8, range(20)))
 def test_the_true_plant_lies_in_the_ranges(seed):
     found = report_of(rows_of(seed, 1e-5))
     for box, true in ((found.A, A), (found.B, B)):

@@ -24,6 +24,7 @@ from controllers.training.departure import departure_of
 from controllers.training.interface import Interface
 from controllers.training.trainer import Trainer
 from controllers.training.units import Units
+from tests.support.marks import slow_after
 
 PENDULUM = get_system("pendulum")
 ORIGIN = PENDULUM.exact_u_eq()
@@ -153,7 +154,7 @@ def test_the_term_of_units_at_rest_is_of_tanh_only():
     assert _actor("silu").rest_loss().item() == 0.0 < _actor("tanh").rest_loss().item()
 
 
-@pytest.mark.parametrize("name", ["relu", "elu", "silu"])
+@pytest.mark.parametrize("name", slow_after(1, ["relu", "elu", "silu"]))
 def test_a_policy_is_trained_and_evaluated(tmp_path, name):
     out, folder = tmp_path / "p.pt", tmp_path / "runs"
     arguments = ["pendulum", *SHORT, "--activation", name, "--checkpoint-dir", folder, "--checkpoint-every", 130]

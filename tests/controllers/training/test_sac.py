@@ -18,6 +18,7 @@ from controllers.training.critic import Critic
 from controllers.training.interface import Interface
 from controllers.training.replay import Replay
 from controllers.training.sac import SAC
+from tests.support.marks import slow_after
 
 K = torch.tensor([[1.76, 0.59]])
 
@@ -138,7 +139,7 @@ def _batch(size=32, terminated=0.0):
     return x, action, torch.ones(size, 1), x + 0.01, torch.full((size, 1), terminated)
 
 
-@pytest.mark.parametrize("terminated, goal", [(1.0, 6.0), (0.0, 6.0 + 0.5 * 10.0)])
+@pytest.mark.parametrize("terminated, goal", slow_after(2, [(1.0, 6.0), (0.0, 6.0 + 0.5 * 10.0)]))
 def test_q_learns_the_scaled_reward_and_bootstraps_only_before_a_termination(options, terminated, goal):
     options = replace(options, reward_scale=6.0, gamma=0.5, learning_rate=1e-2, tau=1e-12)
     sac = _sac(options)
@@ -153,7 +154,7 @@ def test_q_learns_the_scaled_reward_and_bootstraps_only_before_a_termination(opt
     assert (q - goal).abs().max().item() < 0.1
 
 
-@pytest.mark.parametrize(("scale", "learned"), [(100.0, True), (1.0, False)])
+@pytest.mark.parametrize(("scale", "learned"), slow_after(1, [(100.0, True), (1.0, False)]))
 def test_returns_of_some_hundreds_are_learned_in_their_own_unit(options, scale, learned):
     """Goals around -500, Adam's steps of 3e-4: in units of one the critic is still far off."""
     options = replace(options, critic=(64, 64), critic_scale=scale, reward_scale=1.0, gamma=0.0)

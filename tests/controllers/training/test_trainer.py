@@ -248,7 +248,7 @@ MEMBERS = [
 ]
 
 
-@pytest.mark.parametrize(("name", "layers", "states", "slowest"), slow_after(2, MEMBERS))
+@pytest.mark.parametrize(("name", "layers", "states", "slowest"), slow_after(1, MEMBERS))
 def test_the_shipped_policy_matches_its_gain_and_settles(name, layers, states, slowest):
     policy = load_policy(POLICIES / f"{name}.pt")
     assert policy.system == name
