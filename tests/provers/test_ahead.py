@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -459,6 +460,22 @@ def honest(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
 
 def accepted(result: RoaResult) -> bool:
     return result.certificate is not None and run_checker(result.certificate)["result"] == "ACCEPTED"
+
+
+@pytest.mark.parametrize("effort", [0.004, 0.24])
+def test_a_run_has_the_same_certificate(effort: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From its candidates to its file, also where the effort ends in the middle of the ring."""
+    for place in ("certify.analysis.stages.candidate", "certify.analysis.stages.ring", "certify.analysis.selection"):
+        monkeypatch.setattr(f"{place}.Budget", partial(Budget, batch=16))
+    expected = certify_roa(WIDE, pendulum_network(), tmp_path / "alone", RoaOptions(Q=(1.0, 1.0), effort=effort))
+    troupe = Troupe(places=lambda _: 3, seed=7)
+    found = certified(tmp_path / "shared", troupe, monkeypatch, effort=effort)
+    assert expected.stop is found.stop is (Stop.WITNESS if effort > 0.2 else Stop.EFFORT) and troupe.answered > 3
+    assert found.verdict is expected.verdict and found.levels == expected.levels and found.boxes == expected.boxes
+    files = [json.loads(each.certificate.read_text()) for each in (expected, found) if each.certificate is not None]
+    for file in files:
+        file.pop("provenance", None)
+    assert len(files) == 2 and files[0] == files[1]
 
 
 @pytest.mark.parametrize("name", [name if name == "all is proved" else pytest.param(name, marks=SLOW) for name in LIES])
