@@ -1,14 +1,16 @@
 """How a proof would spread over many workers: a simulation of the search on the tree of a certificate.
 
 Run with `python benchmarks/scaling.py CERTIFICATE [--workers 1 2 8 64 256 1024] [--copies 1] [--overhead SECONDS]`.
-The tree is known; what is simulated is who grows which part of it when, by the rules of `engines/bounds/subtrees.py`:
-jobs of open boxes in the order of the lowest V, two a worker, of some seconds at most, whose open boxes come back and
-are shared out anew. Costs are measured first, here: of a batch of boxes as a line in its size, of grafting a node, and
-of a job of Dask from giving it to having its answer in hand (`local:1`), all of which is taken as time of the one
-process that holds the search. A larger tree is that of several copies of the certificate's.
+The tree is known; what is simulated is who bounds which part of it when, by the rules of `provers/boxes/ahead.py`: jobs
+of open boxes in the order of the lowest V, two a worker, of some seconds at most, whose open boxes go out anew. The
+search itself takes every box, in its own order, with the bounds that came. Costs are measured first, here: of a batch
+of boxes as a line in its size, of a box whose bounds came, and of a job of Dask from giving it to having its answer in
+hand (`local:1`), all of which is taken as time of the one process that holds the search. A larger tree is that of
+several copies of the certificate's.
 
-What it leaves out: networks slower than this machine's own, workers that differ, and the boxes that are bounded twice
-because a level moved. Absolute times are this machine's; the ratios are what to look at.
+What it leaves out: networks slower than this machine's own, workers that differ, that the search waits for the lowest
+box first, and the boxes that are bounded twice because a level moved. Absolute times are this machine's; the ratios are
+what to look at.
 """
 
 from __future__ import annotations
@@ -19,8 +21,11 @@ import math
 import os
 import statistics
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -32,25 +37,28 @@ from certify.certificates import Certificate, PartitionTree, leaves, read_certif
 from certify.certificates.claims import Problem
 from certify.effort import UNIT
 from certify.loop.closed_loop import ClosedLoop
-from certify.provers.boxes import subtrees
-from certify.provers.boxes.partition import Partition
+from certify.provers.base import Budget
+from certify.provers.boxes import ahead
 from certify.provers.boxes.rule import VdotBound
+from certify.provers.boxes.search import outwards
+from certify.provers.execution import Bound, ThreadRunner, rows
 from certify.provers.execution.cluster import ClusterJobs, connect
 
 _BATCH = 2048
-_SHELL = 16.0  # of the ring's search
+_REPLAYED = 50_000  # boxes
 _AT_HAND = 65_536
 _WARM = 15.0  # seconds
 Nodes = NDArray[np.int64]
+Corners = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Costs:
-    """Seconds: of a batch whatever its size, of a box, of grafting a node, and of a job to the process that gave it."""
+    """Seconds: of a batch whatever its size, of a box, of one whose bounds came, and of a job to whoever gave it."""
 
     batch: float
     box: float
-    node: float
+    known: float
     job: float
 
 
@@ -91,10 +99,63 @@ def measured(certificate: Certificate, evidence: PartitionTree, rule: VdotBound)
             each.append(time.perf_counter() - start)
         times.append(min(each))
     box, batch = np.polyfit(sizes, times, 1)
-    root, start = evidence.root, time.perf_counter()
-    Partition(root).graft(np.zeros(1, np.int64), -root[:, None], root[:, None], evidence.tree)
-    node = (time.perf_counter() - start) / len(evidence.tree)
-    return Costs(max(0.0, float(batch)), float(box), node, _overhead(2 * 8 * len(root) * _BATCH))
+    known = _replayed(certificate, evidence)
+    return Costs(max(0.0, float(batch)), float(box), known, _overhead(2 * 8 * len(evidence.root) * _BATCH))
+
+
+class _Replay(ThreadRunner):
+    """Bounds are worked out once, and known ahead the second time."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+        self.boxes: list[bytes] = []
+        self.rows: list[bytes] = []
+        self.layout: rows.Layout | None = None
+        self.known: dict[bytes, bytes] = {}
+        self.seconds = 0.0  # of taking them in
+
+    @contextmanager
+    def start(self, bound: Bound) -> Iterator[Bound]:
+        def recorded(lo: Corners, hi: Corners, inner: float, outer: float) -> Any:
+            found = bound(lo, hi, inner, outer)
+            self.layout = rows.Layout.of(found)
+            self.boxes += rows.boxes_of(lo, hi)
+            self.rows.append(self.layout.write(found))
+            return found
+
+        def replayed(lo: Corners, hi: Corners, inner: float, outer: float) -> Any:
+            if layout is None:
+                raise RuntimeError("nothing is known.")
+            return layout.read(b"".join([self.known.pop(box) for box in rows.boxes_of(lo, hi)]))
+
+        layout = self.layout
+        yield recorded if layout is None else replayed
+
+    def arrive(self) -> None:
+        """Take in all that was recorded, as an answer."""
+        job, n = b"", len(self.boxes[0])
+        answer = rows.sealed(job, b"".join(self.boxes + self.rows))
+        start = time.process_time()
+        body = rows.unsealed(job, answer)
+        one = self.layout.row.itemsize if self.layout else 1
+        end = n * len(self.boxes)
+        self.known.update(zip(rows.pieces(body[:end], n), rows.pieces(body[end:], one), strict=True))
+        self.seconds = time.process_time() - start
+
+
+def _replayed(certificate: Certificate, evidence: PartitionTree) -> float:
+    """Seconds for a box whose bounds came, from the arrival of these to its halves."""
+    runner, problem = _Replay(), Problem(ClosedLoop(certificate.system, certificate.network), certificate.V)
+    levels, budget = (certificate.inner, certificate.roa), Budget(boxes=_REPLAYED)
+    outwards(problem, evidence.T, *levels, runner).advance(budget)
+    each = []
+    for _ in range(8):
+        runner.arrive()
+        ring = outwards(problem, evidence.T, *levels, runner)
+        start = time.process_time()
+        ring.advance(budget)
+        each.append((runner.seconds + time.process_time() - start) / ring.boxes)
+    return min(each)
 
 
 def _overhead(size: int, count: int = 200) -> float:
@@ -175,24 +236,18 @@ class _Queue:
             self.far, self.least_far = [far], float(self.key[far].min())
         self.near, self.at = near[np.argsort(self.key[near])], 0
 
-    def least(self) -> float:
-        self._settle(1)
-        return float(self.key[self.near[self.at]])
-
-    def take(self, count: int, limit: float) -> Nodes:
+    def take(self, count: int) -> Nodes:
         self._settle(min(count, self.size))
-        left = self.near[self.at :]
-        allowed = max(64, int(np.searchsorted(self.key[left], limit, side="right")))
-        taken = left[: min(count, allowed)]
+        taken = self.near[self.at :][:count]
         self.at, self.size = self.at + len(taken), self.size - len(taken)
         return taken
 
 
-def _grow(tree: Tree, costs: Costs, nodes: Nodes, seconds: float) -> tuple[float, int, Nodes]:
+def _grow(tree: Tree, costs: Costs, nodes: Nodes, seconds: float, most: float) -> tuple[float, int, Nodes]:
     """Seconds that a job takes, boxes that it bounds, and what it leaves open."""
     spent, boxes, queue = 0.0, 0, _Queue(tree.key, nodes)
-    while len(queue) and (not boxes or spent < seconds):
-        now = queue.take(_BATCH, math.inf)
+    while len(queue) and (not boxes or (spent < seconds and boxes < most)):
+        now = queue.take(_BATCH)
         spent += costs.batch + costs.box * len(now)
         boxes += len(now)
         split = now[tree.upper[now] >= 0]
@@ -203,39 +258,31 @@ def _grow(tree: Tree, costs: Costs, nodes: Nodes, seconds: float) -> tuple[float
 def simulate(tree: Tree, costs: Costs, workers: int) -> Outcome:
     """The search with so many workers; with one, all is done by the process that holds it."""
     if workers == 1:
-        spent, _, _ = _grow(tree, costs, tree.roots, np.inf)
+        spent, _, _ = _grow(tree, costs, tree.roots, np.inf, np.inf)
         return Outcome(spent, spent, 0)
     clock = busy = 0.0  # of the master
     frontier, out, jobs = _Queue(tree.key, tree.roots), 0, 0
     free: list[tuple[float, int]] = [(0.0, w) for w in range(workers)]  # when a worker is next without work
     ended: list[tuple[float, int, int, Nodes]] = []
-    lowest: list[tuple[float, int]] = []  # of the jobs that are out, and of some that are not any more
-    gone: set[int] = set()
     while len(frontier) or ended:
-        if not ended and len(frontier) < subtrees.enough(workers):
-            seconds, _, opened = _grow(tree, costs, frontier.take(_BATCH, math.inf), 0.0)
+        if not ended and len(frontier) < ahead.enough(workers):
+            seconds, _, opened = _grow(tree, costs, frontier.take(_BATCH), 0.0, 0.0)
             frontier.add(opened)
             clock, busy = clock + seconds, busy + seconds
             continue
-        most = subtrees._QUEUE * workers
-        while out < most and len(frontier):
-            while lowest and lowest[0][1] in gone:
-                gone.discard(heapq.heappop(lowest)[1])
-            least = min(frontier.least(), lowest[0][0] if lowest else math.inf)
-            count = min(_BATCH, max(subtrees._LEAST, len(frontier) // most))
-            now = frontier.take(count, _SHELL * max(least, 0.0))
+        most = ahead._QUEUE * workers
+        while out < most and len(frontier) >= ahead.enough(workers):
+            now = frontier.take(min(_BATCH, max(ahead._LEAST, len(frontier) // most)))
             clock, busy = clock + costs.job, busy + costs.job
             when, worker = heapq.heappop(free)
-            seconds, boxes, opened = _grow(tree, costs, now, subtrees.turn(workers) / UNIT)
+            seconds, boxes, opened = _grow(tree, costs, now, ahead.turn(workers) / UNIT, ahead._MOST)
             end = max(when, clock) + seconds
             heapq.heappush(free, (end, worker))
             jobs, out = jobs + 1, out + 1
-            heapq.heappush(lowest, (float(tree.key[now].min()), jobs))
             heapq.heappush(ended, (end, jobs, boxes, opened))
-        end, number, boxes, opened = heapq.heappop(ended)
-        seconds = costs.node * boxes
+        end, _, boxes, opened = heapq.heappop(ended)
+        seconds = costs.known * boxes
         clock, busy, out = max(clock, end) + seconds, busy + seconds, out - 1
-        gone.add(number)
         frontier.add(opened)
     return Outcome(clock, busy, jobs)
 
@@ -256,10 +303,10 @@ def main() -> None:
     problem = Problem(ClosedLoop(certificate.system, certificate.network), certificate.V)
     rule = VdotBound(problem, evidence.T, order=evidence.order)
     costs = measured(certificate, evidence, rule)
-    costs = Costs(costs.batch, options.box or costs.box, costs.node, options.overhead or costs.job)
+    costs = Costs(costs.batch, options.box or costs.box, costs.known, options.overhead or costs.job)
     print(
-        f"a batch {1e3 * costs.batch:.2f} ms and {1e6 * costs.box:.1f} us a box; grafting {1e9 * costs.node:.0f} ns a "
-        f"node; a job {1e3 * costs.job:.2f} ms"
+        f"a batch {1e3 * costs.batch:.2f} ms and {1e6 * costs.box:.1f} us a box; {1e6 * costs.known:.1f} us one "
+        f"whose bounds came; a job {1e3 * costs.job:.2f} ms"
     )
     for copies in options.copies:
         tree = read_tree(evidence, rule, copies)

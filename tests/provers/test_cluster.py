@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from certify.errors import BackendError, InputError
 from certify.loop.plants import get_system
 from certify.loop.policies import load_policy
 from certify.provers.base import Budget
-from certify.provers.boxes import subtrees
+from certify.provers.boxes import ahead
 from certify.provers.boxes.search import outwards, prove_outwards
 from certify.provers.execution import ThreadRunner
 from certify.provers.execution.cluster import ClusterJobs, ClusterRunner, connect
@@ -111,14 +112,26 @@ def test_jobs_that_are_forgotten_are_not_answered(local: ClusterRunner) -> None:
         assert set(answers(jobs, 2, 10)) == {6, 7} and answers(jobs, 1, 0.5) == {}
 
 
-def test_two_processes_grow_the_same_tree(local: ClusterRunner, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(subtrees, "_FEW", 2)
-    monkeypatch.setattr(subtrees, "_TURN", (0.05, 0.05))
-    case, budget = cartpole_case(), Budget(batch=64, effort=Effort(60 * UNIT))
-    begin = local.remark
-    expected = prove_outwards(case.problem, case.T, 2.5e-4, 1e-3, budget, ThreadRunner())
-    found = prove_outwards(case.problem, case.T, 2.5e-4, 1e-3, budget, local)
-    assert found.tree == expected.tree and found.outer == expected.outer == 1e-3 and local.remark == begin
+@pytest.mark.parametrize(
+    ("places", "effort"), [(2, 60.0), (2, 0.07), *(pytest.param(n, 0.07, marks=pytest.mark.slow) for n in (1, 3))]
+)
+def test_processes_make_the_same_proof(
+    places: int, effort: float, local: ClusterRunner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its levels, tree and count, also where the effort ends in the middle of it, with one process, two and three."""
+    monkeypatch.setattr(ahead, "_FEW", 2)
+    monkeypatch.setattr(ahead, "_TURN", (0.05, 0.05))
+    case, begin = cartpole_case(), local.remark
+    with ExitStack() as stack:
+        runner = local if places == 2 else ClusterRunner(stack.enter_context(connect(f"local:{places}")))
+        expected, found = (
+            prove_outwards(case.problem, case.T, 2.5e-4, 1e-3, Budget(batch=16, effort=Effort(effort * UNIT)), each)
+            for each in (ThreadRunner(), runner)
+        )
+    assert (found.outer, found.tree, found.boxes, found.stop) == (
+        expected.outer, expected.tree, expected.boxes, expected.stop
+    )  # fmt: skip
+    assert (expected.stop is Stop.EFFORT) == (effort < 1) and local.remark == begin
 
 
 @pytest.mark.parametrize("address", ["", "local:0", "local:", "local:99999", "8786", "tcp://", "tcp:// x", "TCP://a:1"])
@@ -177,7 +190,7 @@ def test_a_worker_that_comes_late_is_given_work() -> None:
         places: list[int] = []
 
         def report(_: Any) -> None:
-            places.append(0 if ring.abroad is None else ring.abroad.jobs.places)
+            places.append(len(client.nthreads()))
             if len(places) == 1:
                 dask.worker()
             if len(places) < 6:
@@ -227,7 +240,7 @@ def test_a_worker_without_memory_is_done_without() -> None:
 def test_a_worker_with_another_version_of_the_code_is_of_no_harm(tmp_path: Path) -> None:
     """There the classes of the search do not exist: its jobs fail, are done here, and that is said."""
     shutil.copytree(ROOT / "certify", tmp_path / "certify", ignore=shutil.ignore_patterns("__pycache__"))
-    older = tmp_path / "certify" / "engines" / "bounds" / "subtrees.py"
+    older = tmp_path / "certify" / "provers" / "boxes" / "ahead.py"
     older.write_text(older.read_text().replace("class Subtrees", "class Subforests"))
     case, budget = cartpole_case(), Budget(batch=64, effort=Effort(120 * UNIT))
     expected = prove_outwards(case.problem, case.T, 2.5e-4, 1e-3, budget, ThreadRunner())
@@ -283,7 +296,7 @@ def test_a_scheduler_killed_in_the_middle_of_a_run_leaves_a_certificate_and_a_se
     for place in ("certify.analysis.stages.candidate", "certify.analysis.stages.ring", "certify.analysis.selection"):
         monkeypatch.setattr(f"{place}.Budget", partial(Budget, batch=64))
     monkeypatch.setattr("certify.analysis.stages.candidate._HEAT", 1e-9)
-    monkeypatch.setattr(subtrees, "_TURN", (0.05, 0.05))
+    monkeypatch.setattr(ahead, "_TURN", (0.05, 0.05))
     policy = load_policy(POLICIES / "cartpole.pt")
     system = get_system("cartpole").with_parameters(policy.parameters)
     killed: list[float] = []

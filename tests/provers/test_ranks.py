@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -21,12 +22,14 @@ from certify.loop.expressions import Number, symbols
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
-from certify.provers.execution import ThreadRunner
+from certify.provers.execution import Runner, ThreadRunner, rows
 from certify.provers.ranks import Question, RankProof, Sublevel, prove_ranks, root_box, without_leaf
 from certify.provers.ranks.cover import Cover
 from certify.provers.ranks.images import Form
 from certify.provers.ranks.search import COUNTS
+from tests.support.jobs import PlayedRunner, Troupe
 from tests.support.loops import box
+from tests.support.marks import slow_after
 from tests.support.ranks import hanging
 
 PERIOD = Fraction(1, 10)
@@ -87,6 +90,42 @@ def leaves_of(tree: RankTree) -> list[tuple[list[float], list[float]]]:
         left[axis] = right[axis] = 0.5 * lo[axis] + 0.5 * hi[axis]
         waiting += [(right, hi), (lo, left)]
     return found
+
+
+TROUPES: dict[str, Callable[[], Troupe]] = {
+    "three places in any order": lambda: Troupe(places=lambda _: 3, seed=1),
+    "jobs are lost": lambda: Troupe(play=lambda job, answer: answer if sum(job) % 2 else None, seed=2),
+    "the scheduler is lost": lambda: Troupe(lost_after=5),
+    "one place": lambda: Troupe(places=lambda _: 1),
+    "two places": Troupe,
+    "all places are lost": lambda: Troupe(places=lambda asked: 2 if asked < 9 else 0),
+    "answers are cut": lambda: Troupe(play=lambda job, answer: answer[:-1]),
+    "answers are too short": lambda: Troupe(play=lambda job, answer: rows.sealed(job, b"")),
+}
+
+
+@pytest.mark.parametrize(("name", "effort"), slow_after(3, [(name, e) for e in (0.05, 0.2) for name in TROUPES]))
+@pytest.mark.parametrize("loop", [bistable(), hanging()], ids=["bistable", "hanging"])
+def test_ranks_are_the_same_whoever_follows_the_boxes(
+    loop: tuple[System, PolicyNetwork], name: str, effort: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("certify.provers.execution.shared._WORTH", 0.0)
+    made, left = TROUPES[name](), list[float]()
+
+    def prove(runner: Runner) -> RankProof:
+        given = Effort(effort * UNIT)
+        found = prove_ranks(question(loop, 0.01), given, runner)
+        left.append(given.left)
+        assert found is not None
+        return found
+
+    expected, found = prove(ThreadRunner()), prove(PlayedRunner(made))
+    one, other = found.evidence, expected.evidence
+    assert one.tree == other.tree
+    assert np.array_equal(one.ranks, other.ranks) and np.array_equal(one.steps, other.steps)
+    counts = ("share", "boxes", "rounds", "done")
+    assert [getattr(found, c) for c in counts] == [getattr(expected, c) for c in counts] and left[0] == left[1]
+    assert made.answered > 3 and (made.refused > 0) == name.startswith("answers")
 
 
 @pytest.mark.parametrize("loop", [bistable(), bistable("held"), hanging(), swinging()])

@@ -10,11 +10,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from certify.errors import BackendError
-from certify.provers.boxes import subtrees
-from certify.provers.execution import ThreadRunner, Work
+from certify.provers.boxes import ahead
+from certify.provers.execution import ThreadRunner, Work, rows
 
 Play = Callable[[bytes, bytes], bytes | None]  # a job and its honest answer to what is answered
-OPEN, LOOK, LEAF = b"\xfe", b"\xfd", b"\xff"
 
 
 @dataclass
@@ -22,12 +21,13 @@ class Troupe:
     """What the workers do, and what came of it.
 
     `places` by how often it was asked for; `lost_after` so many answers the scheduler is gone, at once or when its next
-    job is given.
+    job is given. With a `seed` answers come in any order, some late, and now and then none.
     """
 
     play: Play = field(default=lambda job, answer: answer)
     places: Callable[[int], int] = field(default=lambda asked: 2)
     lost_after: int | None = None
+    seed: int | None = None
     asked: int = 0
     given: int = 0
     answered: int = 0
@@ -42,6 +42,7 @@ class PlayedJobs:
         self.troupe = troupe
         self.work: Work = pickle.loads(pickle.dumps(work))
         self.open: dict[int, bytes] = {}
+        self.generator = None if troupe.seed is None else np.random.default_rng(troupe.seed)
 
     @property
     def places(self) -> int:
@@ -58,7 +59,11 @@ class PlayedJobs:
     def ended(self, seconds: float) -> list[tuple[int, bytes | None]]:
         self._there()
         found = []
-        for number in sorted(self.open, reverse=True)[: 1 + len(self.open) // 2]:
+        numbers = sorted(self.open, reverse=True)[: 1 + len(self.open) // 2]
+        if self.generator is not None:
+            some = int(self.generator.integers(0, len(self.open) + 1))
+            numbers = self.generator.permutation(sorted(self.open))[:some].tolist()
+        for number in numbers:
             job = self.open.pop(number)
             found.append((number, self.troupe.play(job, self.work(job))))
             self.troupe.answered += 1
@@ -88,21 +93,28 @@ class PlayedRunner(ThreadRunner):
         yield PlayedJobs(self.troupe, work)
 
 
-def parts(answer: bytes) -> tuple[list[int], bytes, np.ndarray]:
-    """The counts of an answer, its trees and the keys of what is open."""
-    size = subtrees._ANSWER.size
-    _, *counts, _ = subtrees._ANSWER.unpack_from(answer)
-    return counts, answer[size : size + counts[2]], np.frombuffer(answer[size + counts[2] :])
+def parts(job: bytes, answer: bytes) -> tuple[bytes, bytes, bytes, np.ndarray]:
+    """The boxes of an answer, their rows, those that are open, and the keys of these."""
+    body, n = rows.unsealed(job, answer), counts_of(job)[0]
+    bounded, opened = ahead._COUNTS.unpack_from(body)
+    head, one = ahead._COUNTS.size, 16 * n
+    a, b = head + one * bounded, len(body) - (one + 8) * opened
+    return body[head:a], body[a:b], body[b : len(body) - 8 * opened], np.frombuffer(body[len(body) - 8 * opened :])
 
 
-def sealed(job: bytes, boxes: int, proved: int, trees: bytes, keys: np.ndarray | None = None) -> bytes:
-    """An answer of somebody who knows how answers are made, with `trees` or `keys` of their own."""
-    body = trees + (np.zeros(0) if keys is None else keys).tobytes()
-    counts = boxes, proved, len(trees), 0 if keys is None else len(keys)
-    return subtrees._ANSWER.pack(subtrees._MAGIC, *counts, subtrees._seal(job, counts, body)) + body
+def sealed(job: bytes, boxes: bytes, found: bytes, opened: bytes, keys: np.ndarray) -> bytes:
+    """An answer of somebody who knows how answers are made, with contents of their own."""
+    one = 16 * counts_of(job)[0]
+    counts = ahead._COUNTS.pack(len(boxes) // one, len(opened) // one)
+    return rows.sealed(job, counts + boxes + found + opened + keys.tobytes())
 
 
-def boxes_of(job: bytes) -> tuple[int, int]:
+def counts_of(job: bytes) -> tuple[int, int]:
     """States, and boxes of a job."""
-    _, n, count, *_ = subtrees._JOB.unpack_from(job)
+    n, count, *_ = ahead._JOB.unpack_from(job)
     return n, count
+
+
+def row_of(n: int) -> np.dtype:
+    """The row of a box of the ring."""
+    return np.dtype([("proved", "u1"), ("bound", "f8"), ("score", "f8", (n,)), ("violated", "u1"), ("smooth", "u1")])

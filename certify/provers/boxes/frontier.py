@@ -77,6 +77,11 @@ class Frontier:
         self._keep(order[len(now) :])
         return taken
 
+    def near(self, count: int) -> Boxes:
+        """Up to `count` of the boxes at hand, those with the smallest keys in any order; they stay."""
+        index = np.arange(len(self.key)) if len(self.key) <= count else np.argpartition(self.key, count)[:count]
+        return Boxes(self.lo.take(index, -1), self.hi.take(index, -1), self.number[index], self.key[index])
+
     def waiting(self) -> tuple[NDArray[np.int64], Array]:
         """Numbers (B,) and keys (B,) of all boxes."""
         numbers = joined([self.number, *(number for _, number in self._away)])

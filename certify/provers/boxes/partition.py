@@ -1,7 +1,7 @@
 """The partition that a pass grows, bounded in memory.
 
 A split is five bytes (parent and axis), because everything else follows from them: the certificate is written from it,
-and corners are rebuilt by replaying the same midpoints. Trees that were grown elsewhere come as bytes.
+and corners are rebuilt by replaying the same midpoints. A tree that was kept comes as bytes.
 """
 
 from __future__ import annotations
@@ -19,23 +19,15 @@ Numbers = NDArray[np.int64]
 LEAF = 255
 MAX_DEPTH = 4096  # the most of a certificate's tree
 MOST_SPLITS = 40_000_000  # the most that a certificate can hold, and two gibibytes
-_ROUNDING = 1e-12  # relative, of a width
-OPEN, LOOK = 254, 253  # leaves of a tree that grows still: not bounded yet; to be looked at by whoever asked for it
+OPEN = 254  # a leaf of a tree that grows still, not bounded yet
 
 
 class Grafted(NamedTuple):
-    """Boxes of one mark that came with trees: numbers (B,), corners (n, B), and places (B,) among the leaves of both
-    marks, in the order of the trees."""
+    """Open boxes that came with a tree: numbers (B,) and corners (n, B), in its order."""
 
     number: Numbers
     lo: Array
     hi: Array
-    place: Numbers
-
-    @property
-    def boxes(self) -> tuple[Array, Array, Numbers]:
-        """Corners and numbers."""
-        return self.lo, self.hi, self.number
 
 
 class Partition:
@@ -130,53 +122,34 @@ class Partition:
         self.splits, calls = mark
         del self._calls[calls:]
 
-    def graft(
-        self, boxes: Numbers, lo: Array, hi: Array, trees: bytes, least: Array | None = None
-    ) -> tuple[Grafted, Grafted]:
-        """Split boxes (B,), of corners (n, B), as their trees say, which follow each other; the leaves that are `OPEN`,
-        and those to `LOOK` at.
-
-        Parameters
-        ----------
-        least : (n,), the width that a half must have along the axis of its split; None for any.
+    def graft(self, tree: bytes) -> Grafted:
+        """Split the first box as a tree in preorder says; its leaves that are `OPEN`.
 
         Raises
         ------
-        CertificateFormatError : the bytes are not one tree for each of the boxes, or one of them is too deep or too
-            fine; then the partition is as it was.
+        CertificateFormatError : the bytes are not one tree, or it is too deep; then the partition is as it was.
         """
-        nodes = np.frombuffer(trees, dtype=np.uint8)
-        at, upper = _links(nodes, len(self.root), len(boxes))
+        nodes = np.frombuffer(tree, dtype=np.uint8)
+        at, upper = _links(nodes, len(self.root))
+        boxes, lo, hi = np.zeros(1, np.int64), self._lo[:, :1], self._hi[:, :1]
         ends: list[tuple[Numbers, Numbers, Array, Array]] = []
         begin = self.mark()
         while len(at):
-            split = nodes[at] < len(self.root)
-            marked = (nodes[at] == OPEN) | (nodes[at] == LOOK)
+            split, marked = nodes[at] < len(self.root), nodes[at] == OPEN
             ends.append((at[marked], boxes[marked], lo.compress(marked, -1), hi.compress(marked, -1)))
             above = at[split]
-            axis = nodes[above].astype(np.int64)
-            lo, hi = lo.compress(split, -1), hi.compress(split, -1)
-            column = np.arange(len(above))
-            width = hi[axis, column] - lo[axis, column]
             # A chain of upper halves leaves no box open behind it: its depth shows only on the way.
-            deep = len(ends) > MAX_DEPTH and len(above) > 0
-            if deep or (least is not None and np.any(width < 2 * least[axis] * (1 - _ROUNDING))):
+            if len(ends) > MAX_DEPTH and len(above):
                 self.back_to(begin)
-                what = f"deeper than {MAX_DEPTH}" if deep else "finer than the least width"
-                raise CertificateFormatError(f"a tree must not be {what}.")
+                raise CertificateFormatError(f"a tree must not be deeper than {MAX_DEPTH}.")
+            axis = nodes[above].astype(np.int64)
             boxes = self.split(boxes[split], axis) if len(above) else boxes[:0]
             at = np.stack([above + 1, upper[above]], 1).reshape(-1)
-            lo, hi = (np.repeat(side, 2, axis=1) for side in (lo, hi))
+            lo, hi = (np.repeat(side.compress(split, -1), 2, axis=1) for side in (lo, hi))
             _halve(lo, hi, np.arange(len(at)), np.repeat(axis, 2), np.arange(len(at)) % 2 == 1)
         place, number, lo, hi = (np.concatenate(parts, -1) for parts in zip(*ends, strict=True))
         order = np.argsort(place)
-        place, number, lo, hi = place[order], number[order], lo.take(order, -1), hi.take(order, -1)
-        is_open = nodes[place] == OPEN
-        opened, looked = (
-            Grafted(number[one], lo.compress(one, -1), hi.compress(one, -1), np.flatnonzero(one))
-            for one in (is_open, ~is_open)
-        )
-        return opened, looked
+        return Grafted(number[order], lo.take(order, -1), hi.take(order, -1))
 
 
 def _halve(lo: Array, hi: Array, column: Numbers, axis: Numbers, upper: NDArray[np.bool_]) -> None:
@@ -186,23 +159,22 @@ def _halve(lo: Array, hi: Array, column: Numbers, axis: Numbers, upper: NDArray[
     hi[axis[~upper], column[~upper]] = middle[~upper]
 
 
-def _links(nodes: NDArray[np.uint8], n: int, count: int) -> tuple[Numbers, Numbers]:
-    """The node at which each of so many trees begins (count,), and for each split that of its upper half.
+def _links(nodes: NDArray[np.uint8], n: int) -> tuple[Numbers, Numbers]:
+    """The node at which a tree begins (1,), and for each split that of its upper half.
 
     Before a node in preorder, a tree has as many boxes open as splits less leaves so far: the upper half is the next
     node before which there are as many as before the split.
     """
-    ends = nodes >= LOOK
+    ends = nodes >= OPEN
     if np.any((nodes >= n) & ~ends):
         raise CertificateFormatError(f"a tree splits an axis that does not exist; it has {n}.")
     after = np.cumsum(np.where(ends, -1, 1))
-    if not len(nodes) or after[-1] != -count or np.any(after[:-1] <= -count):
-        raise CertificateFormatError(f"{len(nodes)} bytes are not {count} trees.")
+    if not len(nodes) or after[-1] != -1 or np.any(after[:-1] < 0):
+        raise CertificateFormatError(f"{len(nodes)} bytes are not a tree.")
     before = np.concatenate([[0], after[:-1]])
     if before.max() > MAX_DEPTH:
         raise CertificateFormatError(f"a tree must not be deeper than {MAX_DEPTH}; found {before.max()}.")
-    first = np.flatnonzero(np.concatenate([[True], before[1:] < np.minimum.accumulate(before)[:-1]]))
     upper = np.zeros(len(nodes), dtype=np.int64)
     order = np.argsort(before, kind="stable")
     upper[order[:-1]] = order[1:]
-    return first, upper
+    return np.zeros(1, dtype=np.int64), upper

@@ -18,16 +18,16 @@ import numpy as np
 from certify.certificates.claims import Problem
 from certify.certificates.verdict import Stop
 from certify.effort import Effort
-from certify.errors import BackendError, CertificateFormatError, InputError
+from certify.errors import CertificateFormatError, InputError
 from certify.provers.base import Budget, Report, SearchState
-from certify.provers.bounds.arrays import Array, Index
+from certify.provers.bounds.arrays import Array
 from certify.provers.boxes.account import Account
+from certify.provers.boxes.ahead import ahead
 from certify.provers.boxes.frontier import Frontier
 from certify.provers.boxes.halving import split
 from certify.provers.boxes.order import choose_order
 from certify.provers.boxes.partition import LEAF, MOST_SPLITS, OPEN, Partition
 from certify.provers.boxes.rule import BoxBounds, VdotBound
-from certify.provers.boxes.subtrees import Abroad, Subtrees
 from certify.provers.boxes.sweep import Inwards, Outwards, RingGrowth, Sweep
 from certify.provers.execution import Bound, Runner
 from certify.provers.falsify import Witness
@@ -164,7 +164,6 @@ class Pass:
         self.frontier = Frontier(self.partition)
         self.half = root[:, None]
         self.growth = RingGrowth(sweep, rule, self.half)
-        self.abroad: Abroad | None = None
         self.boxes = self.proved = 0
         self.covered = True
         self.halvings = 0.0
@@ -177,106 +176,54 @@ class Pass:
     @property
     def done(self) -> bool:
         """True if no box is open: the pass has nothing left to gain."""
-        return not self._open()
+        return not len(self.frontier)
 
     @property
     def levels(self) -> tuple[float, float]:
         """(inner, outer) between which all is proved; equal if nothing is."""
-        inner, outer = self.sweep.reached(self._least())
+        inner, outer = self.sweep.reached(self.frontier.least())
         return inner, max(inner, outer)
-
-    def _open(self) -> int:
-        return len(self.frontier) + (0 if self.abroad is None else len(self.abroad))
-
-    def _least(self) -> float:
-        return min(self.frontier.least(), math.inf if self.abroad is None else self.abroad.least())
 
     def advance(self, budget: Budget, report: Report | None = None) -> Stop | None:
         """Take boxes, bound them, give way to violations, halve undecided ones; the limit reached, or None if done."""
         most = self.boxes + budget.boxes
-        with self.runner.start(self.rule) as bound, self._elsewhere(budget):
+        with ahead(self.runner, self.growth, budget, alone=bool(self.lost)) as bound:
             while not self.done:
+                if bound.lost:
+                    self.lost = bound.lost
+                    return Stop.CLUSTER
                 if self.boxes >= most or self.partition.splits + 3 * budget.batch > MOST_SPLITS:
                     return Stop.BOXES
                 if budget.effort.left <= self.proved * budget.check:
                     return budget.ended_by
                 before = self.boxes
                 with self._whole():
-                    exchanged = self._exchanged(bound, budget)
-                    if not exchanged:
-                        self._step(bound, min(budget.batch, most - self.boxes), budget.least_width)
+                    bound.offer(self.frontier, budget.effort.left)
+                    self._step(bound, min(budget.batch, most - self.boxes), budget.least_width)
                 work = _BATCH + (self.boxes - before) * self.rule.operations
                 budget.effort.charge(work)
                 self._account.spent += work
-                if exchanged and self.lost:
-                    return Stop.CLUSTER
                 if report is not None:
-                    stand = self.sweep.stand(self._least())
-                    report(replace(self._account.read(*stand, self.boxes, self._open()), down=self.sweep.down))
+                    stand = self.sweep.stand(self.frontier.least())
+                    report(replace(self._account.read(*stand, self.boxes, len(self.frontier)), down=self.sweep.down))
         return None
-
-    @contextmanager
-    def _elsewhere(self, budget: Budget) -> Iterator[None]:
-        """Have boxes grown elsewhere, if that can be; boxes that are out at the end come back."""
-        with self.runner.jobs(Subtrees(self.growth)) as jobs:
-            if jobs is not None and not self.lost:
-                self.abroad = Abroad(jobs, self.growth, self.partition, budget.batch, budget.least_width)
-            try:
-                yield
-            finally:
-                self._recall()
 
     @contextmanager
     def _whole(self) -> Iterator[None]:
         """Do all of a step or nothing: what Ctrl-C cuts short leaves every box where it was, so that the search can be
         kept."""
-        frontier, mark, abroad = self.frontier.copy(), self.partition.mark(), self.abroad
-        held = None if abroad is None else dict(abroad.held)
+        frontier, mark = self.frontier.copy(), self.partition.mark()
         done = False
         try:
             yield
             done = True
         finally:
             if not done:
-                self.frontier, self.abroad = frontier, abroad
+                self.frontier = frontier
                 self.partition.back_to(mark)
-                if abroad is not None and held is not None:
-                    abroad.held = held
-
-    def _recall(self) -> None:
-        if self.abroad is not None:
-            self.abroad.recall(self.frontier)
-        self.abroad = None
-
-    def _exchanged(self, bound: Bound, budget: Budget) -> bool:
-        """Send boxes out, and take in grown trees; False if that is not worth it."""
-        if self.abroad is None:
-            return False
-        sweep = self.sweep
-        try:
-            if not self.abroad.is_worth(self.frontier):
-                return False
-            self.abroad.send((sweep.inner, sweep.outer), self.frontier, sweep.reach(self._least()), budget.effort.left)
-            back = self.abroad.collect()
-        except BackendError as error:
-            self.lost = str(error)
-            self._recall()
-            return True
-        for _, answer, opened, looked in back:
-            self.boxes += answer.boxes
-            self.proved += answer.proved
-            self.frontier.add(opened.lo, opened.hi, answer.keys, opened.number)
-            if len(looked.number):
-                self._examine(bound, *looked.boxes, budget.least_width)
-        self.abroad.forget_above(sweep.last())
-        self.frontier.drop_above(sweep.last())
-        return True
 
     def _step(self, bound: Bound, count: int, least_width: float) -> None:
-        lo, hi, number, _ = self.frontier.take(count, self.sweep.reach(self._least()))
-        self._examine(bound, lo, hi, number, least_width)
-
-    def _examine(self, bound: Bound, lo: Array, hi: Array, number: Index, least_width: float) -> None:
+        lo, hi, number, _ = self.frontier.take(count, self.sweep.reach(self.frontier.least()))
         sweep, rule = self.sweep, self.rule
         self.boxes += lo.shape[1]
         found = bound(lo, hi, sweep.inner, sweep.outer)
@@ -302,14 +249,11 @@ class Pass:
 
     def settle(self) -> None:
         """Take the levels that are proved for good: open boxes lie outside of them, and most need one look."""
-        self.sweep.inner, self.sweep.outer = self.sweep.reached(self._least())
+        self.sweep.inner, self.sweep.outer = self.sweep.reached(self.frontier.least())
 
     def state(self) -> SearchState:
-        """The search as it stands; boxes that are out are open."""
+        """The search as it stands."""
         waiting, keys = self.frontier.waiting()
-        if self.abroad is not None:
-            numbers, their_keys = self.abroad.waiting()
-            waiting, keys = np.concatenate([waiting, numbers]), np.concatenate([keys, their_keys])
         tree = self.partition.preorder([(OPEN, waiting)])
         sweep = self.sweep
         keys = keys[self.partition.order(waiting)]
@@ -324,12 +268,10 @@ class Pass:
         """
         sweep = self.sweep
         try:
-            opened, looked = self.partition.graft(
-                np.zeros(1, np.int64), *self.partition.corners(np.zeros(1, np.int64)), state.tree
-            )
+            opened = self.partition.graft(state.tree)
         except CertificateFormatError as error:
             raise InputError(f"the search cannot be resumed: {error}") from error
-        fits = sweep.inner >= state.inner and state.outer <= sweep.outer and not len(looked.number)
+        fits = sweep.inner >= state.inner and state.outer <= sweep.outer
         if not fits or len(opened.number) != len(state.keys) or np.isnan(state.keys).any():
             raise InputError("the search cannot be resumed: it is of another ring.")
         self.frontier = Frontier(self.partition)

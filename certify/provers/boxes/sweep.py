@@ -10,9 +10,9 @@ import numpy as np
 
 from certify.certificates.claims import Problem
 from certify.provers.bounds.arrays import Array, Mask, chosen
+from certify.provers.boxes.ahead import Growth
 from certify.provers.boxes.halving import Halves
 from certify.provers.boxes.rule import BoxBounds, VdotBound
-from certify.provers.boxes.subtrees import Growth
 from certify.provers.falsify import Witness, descend
 
 _SLACK = 1e-9  # relative distance kept from every level, so that the checker's own rounding agrees

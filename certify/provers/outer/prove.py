@@ -210,7 +210,7 @@ def prove_faces(
 def _ended_by(stop: Stop) -> str:
     """The end of a pass that proved nothing, and what may help."""
     if stop.ran_out:
-        return f"the {stop.value} for that ended: more of it, or a cluster, may do"
+        return f"the {stop.value} for that ended: more of it{', or a cluster,' if stop is Stop.TIME else ''} may do"
     return "a smaller level, or another function, is needed" if stop is Stop.WITNESS else f"it ended by {stop.value}"
 
 

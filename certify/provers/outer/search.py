@@ -10,22 +10,20 @@ none of its own.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from certify.certificates.verdict import Stop
 from certify.effort import UNLIMITED
-from certify.errors import BackendError
 from certify.provers.base import Budget, Report
 from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.boxes.account import Account
+from certify.provers.boxes.ahead import Growth, ahead
 from certify.provers.boxes.frontier import Frontier
 from certify.provers.boxes.halving import Halves, split
 from certify.provers.boxes.partition import LEAF, MOST_SPLITS, Partition
-from certify.provers.boxes.subtrees import Abroad, Growth, Subtrees
 from certify.provers.execution import Bound, Counted, Runner
 from certify.provers.outer.rule import OuterBounds
 
@@ -90,95 +88,45 @@ class Cover:
         self.boxes = self.leaves = 0
         self.done_share = 0.0
         self.stop = Stop.REQUESTED
-        self.lost = ""  # a sentence about a cluster that went away
-        self.abroad: Abroad | None = None
         self._account = Account()
         self.frontier.add(lo, hi, np.full(1, -math.inf), np.zeros(1, dtype=np.int64))
 
     @property
     def proved(self) -> float:
         """The level for which all but the open boxes is proved; -inf at first."""
-        abroad = math.inf if self.abroad is None else self.abroad.least()
-        return min(self.level, min(self.frontier.least(), abroad) - self.slack)
+        return min(self.level, self.frontier.least() - self.slack)
 
     @property
     def growth(self) -> _CoverGrowth:
         """The rule at the level of now."""
         return _CoverGrowth(self.rule, self.width, self.level)
 
-    def _open(self) -> int:
-        return len(self.frontier) + (0 if self.abroad is None else len(self.abroad))
-
     def advance(self, budget: Budget, report: Report | None = None) -> Stop:
         """Prove what there is for the level, or what the budget allows for a lower one; what limits it."""
         most, ended = self.boxes + budget.boxes, None
-        with self.runner.start(self.rule) as bound, self._elsewhere(budget):
-            while self._open() and self.level > self.floor:
+        with ahead(self.runner, self.growth, budget) as bound:
+            while len(self.frontier) and self.level > self.floor:
                 if ended is None:
-                    ended = self._ended(budget, most)
+                    ended = Stop.CLUSTER if bound.lost else self._ended(budget, most)
                     if ended is not None:  # the boxes left have N above this
                         self.stop, self.level = ended, self.proved
                         continue
-                left, before = math.inf if ended is not None else budget.effort.left, self.boxes
-                exchanged = self._exchanged(bound, left, budget)
-                if not exchanged:
-                    self._step(bound, budget)
+                before = self.boxes
+                bound.offer(self.frontier, math.inf if ended is not None else budget.effort.left)
+                self._step(bound, budget)
                 work = _BATCH + (self.boxes - before) * self.rule.operations
                 budget.effort.charge(work)
                 self._account.spent += work
-                if exchanged and self.lost and ended is None:
-                    self.stop = ended = Stop.CLUSTER
-                    self.level = self.proved
-                    continue
                 if report is not None:
                     level = min(max(self.proved, self.floor), self.target)
-                    report(self._account.read(level, self.target, self.done_share, self.boxes, self._open()))
+                    report(self._account.read(level, self.target, self.done_share, self.boxes, len(self.frontier)))
         return self.stop
 
-    @contextmanager
-    def _elsewhere(self, budget: Budget) -> Iterator[None]:
-        """Have boxes grown elsewhere, if that can be; boxes that are out at the end come back."""
-        with self.runner.jobs(Subtrees(self.growth)) as jobs:
-            if jobs is not None:
-                self.abroad = Abroad(jobs, self.growth, self.partition, budget.batch, budget.least_width)
-            try:
-                yield
-            finally:
-                self._recall()
-
-    def _recall(self) -> None:
-        if self.abroad is not None:
-            self.abroad.recall(self.frontier)
-        self.abroad = None
-
     def _ended(self, budget: Budget, most: int) -> Stop | None:
-        if self.boxes >= most or self.partition.splits + 3 * budget.batch + self._open() > MOST_SPLITS:
+        if self.boxes >= most or self.partition.splits + 3 * budget.batch + len(self.frontier) > MOST_SPLITS:
             return Stop.BOXES
-        kept = _LAST_LOOK * self.rule.operations * self._open() + budget.check * self.leaves
+        kept = _LAST_LOOK * self.rule.operations * len(self.frontier) + budget.check * self.leaves
         return budget.ended_by if kept >= budget.effort.left else None
-
-    def _exchanged(self, bound: Bound, left: float, budget: Budget) -> bool:
-        """Send boxes out, and take in grown trees; False if that is not worth it."""
-        if self.abroad is None:
-            return False
-        try:
-            if not self.abroad.is_worth(self.frontier):
-                return False
-            self.abroad.send(self.growth.levels, self.frontier, math.inf, left)
-            back = self.abroad.collect()
-        except BackendError as error:
-            self.lost = str(error)
-            self._recall()
-            return True
-        for sent, answer, opened, looked in back:
-            self.boxes += answer.boxes
-            self.leaves += answer.proved
-            whole, *rest = (self._share(boxes.lo, boxes.hi) for boxes in (sent, opened, looked))
-            self.done_share += whole - sum(rest)
-            self.frontier.add(opened.lo, opened.hi, answer.keys, opened.number)
-            if len(looked.number):
-                self._examine(bound, *looked.boxes, np.full(len(looked.number), -math.inf), budget)
-        return True
 
     def _share(self, lo: Array, hi: Array) -> float:
         """The volume of boxes (n, B), of that of the whole."""

@@ -15,6 +15,7 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression
 from certify.provers.bounds.arrays import Array
 from certify.provers.execution import Runner
+from certify.provers.execution.shared import shared
 from certify.provers.ranks.images import Course
 from certify.provers.ranks.search import COUNTS, Search
 from certify.provers.ranks.targets import TURN, Target
@@ -138,7 +139,7 @@ def prove_ranks(
     course = question.course(COUNTS if wanted is None else COUNTS_FROM)
     search = Search(course, *question.root) if wanted is None else SearchFrom(course, *question.root, wanted)
     new, rounds, done = search.begin(_AT_FIRST * effort.left / (course.counts[-1] * course.operations)), 0, False
-    with runner.start(course) as bound:
+    with shared(runner, course) as bound:
         while True:
             found = bound(search.cover.low[:, new], search.cover.high[:, new], 0.0, 0.0)
             effort.charge(float(found.taken.sum()) * course.operations)

@@ -1,11 +1,12 @@
-"""Boxes that are grown elsewhere: the same tree whoever grows it, and nothing false whatever comes back."""
+"""Boxes that are bounded elsewhere: the same search whoever bounds them, and nothing false whatever comes back."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from functools import cache, partial
 from pathlib import Path
@@ -24,17 +25,18 @@ from certify.effort import UNIT, Effort
 from certify.errors import BackendError, CertificateFormatError
 from certify.loop.plants import get_system
 from certify.provers.base import Budget
-from certify.provers.boxes import search, subtrees
+from certify.provers.boxes import ahead, search
+from certify.provers.boxes.ahead import Ahead
 from certify.provers.boxes.partition import MAX_DEPTH, Partition
 from certify.provers.boxes.search import Pass, RingProof, outwards, prove_inwards, prove_outwards
-from certify.provers.execution import ThreadRunner
-from certify.provers.outer import Nothing, OuterProof, prove_outer
+from certify.provers.execution import ThreadRunner, rows
+from certify.provers.outer import Nothing, prove_outer
 from tests.provers.test_outer import planar, wells
 from tests.provers.test_steps import held, stepped, uncertain_pendulum
 from tests.provers.test_vdot import cartpole_case
 from tests.support.cases import case_of
-from tests.support.jobs import LEAF, LOOK, OPEN, Play, PlayedJobs, PlayedRunner, Troupe, boxes_of, parts, sealed
-from tests.support.loops import box, chain, pendulum_network
+from tests.support.jobs import Play, PlayedJobs, PlayedRunner, Troupe, counts_of, parts, row_of, sealed
+from tests.support.loops import box, pendulum_network
 from tests.support.marks import slow_after
 
 HERE = ThreadRunner()
@@ -45,10 +47,10 @@ DEEP = 10**6
 WIDE = dataclasses.replace(get_system("pendulum"), domain=box(7, 30))  # whose level ends at a violation
 CASES: dict[str, tuple[Callable[[], Any], float, float]] = {
     "two states": (lambda: case_of(get_system("pendulum"), pendulum_network()), 1e-6, 3.0),
-    "three states": (lambda: case_of(*chain(3, [-1, -2, -3])), 1e-3, 1e-2),
     "four states": (cartpole_case, 2.5e-4, 1e-3),
     "uncertain": (lambda: case_of(uncertain_pendulum(), pendulum_network()), 0.02, 0.5),
     "sampled": (lambda: stepped(swung(sample=held("1/50")), pendulum_network()), 0.02, 0.5),
+    "violated": (lambda: case_of(WIDE, pendulum_network()), 1e-6, 30.0),
     "any period": (lambda: stepped(swung(sample=held("1/100", "1/50")), pendulum_network()), 0.02, 0.5),
 }
 
@@ -60,9 +62,9 @@ def swung(**more: Any) -> Any:
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Jobs of one batch, which leave much open, as soon as there are two boxes."""
-    monkeypatch.setattr(subtrees, "_TURN", (0.0, 0.0))
-    monkeypatch.setattr(subtrees, "_FEW", 1)
-    monkeypatch.setattr(subtrees, "_LEAST", 4)
+    monkeypatch.setattr(ahead, "_TURN", (0.0, 0.0))
+    monkeypatch.setattr(ahead, "_FEW", 1)
+    monkeypatch.setattr(ahead, "_LEAST", 4)
 
 
 @cache
@@ -86,72 +88,229 @@ def stands(proof: RingProof, other: RingProof) -> bool:
     return (proof.inner, proof.outer, proof.tree) == (other.inner, other.outer, other.tree)
 
 
-# -------------------------------------------------------------------------------------------------------- the same tree
+# ------------------------------------------------------------------------------------------------------ the same search
+
+EFFORTS = (0.012, 0.05, 60.0)
+MORE_EFFORTS = (0.02, 0.03, 0.04, 0.07, 0.09)
+"""In units: most of these end in the middle of a ring."""
+TROUPES: dict[str, Callable[[], Troupe]] = {
+    "one place": lambda: Troupe(places=lambda _: 1),
+    "two places": lambda: Troupe(places=lambda _: 2),
+    "three places": lambda: Troupe(places=lambda _: 3),
+    "any order": lambda: Troupe(places=lambda _: 3, seed=1),
+    "any other order": lambda: Troupe(places=lambda _: 2, seed=2),
+    "one of two is lost": lambda: Troupe(places=lambda asked: 2 if asked < 9 else 1, seed=3),
+    "both are lost": lambda: Troupe(places=lambda asked: 2 if asked < 9 else 0, seed=4),
+    "jobs are lost": lambda: Troupe(seed=5, play=lambda job, answer: answer if job[-1] % 2 else None),
+}
+
+FEW = ("one place", "any order", "both are lost")
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=SLOW) if name in ("four states", "any period") else name for name in CASES]
-)
-def test_the_tree_is_the_same_whoever_grows_it(name: str) -> None:
+def differences(
+    prove: Callable[[Budget, Any], Any], names: Iterable[str] = FEW, efforts: Sequence[float] = EFFORTS
+) -> tuple[list[str], set[Stop], int]:
+    """Where a proof by a troupe is not the proof without one; how the latter ended; and the answers that came."""
+    found, stops, answered = [], set(), 0
+    for effort in efforts:
+        expected = prove(Budget(batch=16, effort=Effort(effort * UNIT)), HERE)
+        stops.add(expected[-1])
+        for name in names:
+            made = TROUPES[name]()
+            if prove(Budget(batch=16, effort=Effort(effort * UNIT)), PlayedRunner(made)) != expected:
+                found.append(f"{effort:g} {name}")
+            answered += made.answered
+    return found, stops, answered
+
+
+def outwards_of(name: str) -> Callable[[Budget, Any], Any]:
     make, inner, outer = CASES[name]
-    case, troupe = make(), Troupe(places=lambda _: 3)
-    expected = prove_outwards(case.problem, case.T, inner, outer, SMALL, HERE)
-    found = prove_outwards(case.problem, case.T, inner, outer, SMALL, PlayedRunner(troupe))
-    assert stands(found, expected) and found.outer == outer
-    assert found.boxes == expected.boxes and troupe.answered >= 1 and not troupe.refused
+    case = make()
+
+    def prove(budget: Budget, runner: Any) -> Any:
+        ring = outwards(case.problem, case.T, inner, outer, runner)
+        stop = ring.advance(budget)
+        proof = ring.proof(stop)
+        left = budget.effort.left
+        witness = None if proof.witness is None else proof.witness.level
+        return proof.inner, proof.outer, proof.tree, proof.boxes, witness, ring.expected, left, proof.stop
+
+    return prove
 
 
-def test_so_it_is_on_the_way_inwards() -> None:
-    case, troupe = CASES["uncertain"][0](), Troupe()
-    expected = prove_inwards(case.problem, case.T, 0.02, 0.5, SMALL, HERE)
-    found = prove_inwards(case.problem, case.T, 0.02, 0.5, SMALL, PlayedRunner(troupe))
-    assert stands(found, expected) and found.covered and found.inner == 0.02 and troupe.answered > 3
+@pytest.mark.parametrize("name", [pytest.param(name, marks=SLOW) if name == "any period" else name for name in CASES])
+def test_a_proof_is_the_same_whoever_bounds_its_boxes(name: str) -> None:
+    """Its levels, tree, count, effort and end, also where the effort ends in the middle of it, or a level moves."""
+    found, stops, answered = differences(outwards_of(name))
+    assert not found and answered > 30
+    assert Stop.EFFORT in stops and len(stops) > 1 and (Stop.WITNESS in stops) == (name == "violated")
+
+
+@SLOW
+@pytest.mark.parametrize("name", CASES)
+def test_so_it_is_whoever_comes_and_goes(name: str) -> None:
+    found, _, answered = differences(outwards_of(name), TROUPES, MORE_EFFORTS)
+    assert not found and answered > 30
+
+
+@pytest.mark.parametrize("name", ["uncertain", pytest.param("sampled", marks=SLOW)])
+def test_so_it_is_on_the_way_inwards(name: str) -> None:
+    make, inner, outer = CASES[name]
+    case = make()
+
+    def prove(budget: Budget, runner: Any) -> Any:
+        proof = prove_inwards(case.problem, case.T, inner, outer, budget, runner)
+        return proof.inner, proof.outer, proof.tree, proof.boxes, proof.covered, proof.stop
+
+    found, stops, answered = differences(prove)
+    assert not found and answered > 30 and Stop.EFFORT in stops and len(stops) > 1
 
 
 def test_so_it_is_of_a_set_beyond_the_ellipsoid() -> None:
-    problem, N, troupe = planar(), wells([[1.0, 0.0], [-0.5, 0.875], [-0.5, -0.875]], 0.75), Troupe()
-    level = -2.4
-    expected, found = (
-        prove_outer(problem, 0.25, np.eye(2), N, level, Budget(batch=16), runner)
-        for runner in (HERE, PlayedRunner(troupe))
-    )
-    assert isinstance(expected, OuterProof) and isinstance(found, OuterProof) and troupe.answered > 3
-    assert expected.outer.level == found.outer.level == level
-    assert expected.evidence.tree == found.evidence.tree and expected.evidence.faces == found.evidence.faces
+    """The effort ends on a face, and in the middle of the leaves, with a smaller set."""
+    problem, N = planar(), wells([[1.0, 0.0], [-0.5, 0.875], [-0.5, -0.875]], 0.75)
+
+    def prove(budget: Budget, runner: Any) -> Any:
+        proof = prove_outer(problem, 0.25, np.eye(2), N, None, budget, runner)
+        if isinstance(proof, Nothing):
+            return proof.why, Stop.FLOOR
+        return proof.outer.level, proof.evidence.tree, proof.evidence.faces, proof.boxes, proof.stop
+
+    found, stops, answered = differences(prove, efforts=(0.1, 0.15, 0.3, 60.0))
+    assert not found and answered > 30 and stops == {Stop.FLOOR, Stop.EFFORT, Stop.DOMAIN}
 
 
-def test_long_jobs_give_the_same_tree(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(subtrees, "_TURN", (60.0, 60.0))
+@pytest.mark.parametrize("name", ["two states", "violated"])
+def test_a_pass_in_pieces_is_the_same_pass(name: str) -> None:
+    """As candidates are compared: a little effort at a time, after which nothing that is out stays out."""
+    make, inner, outer = CASES[name]
+    case = make()
+    stands_: list[list[Any]] = []
+    for runner in (HERE, PlayedRunner(Troupe(seed=6))):
+        ring = outwards(case.problem, case.T, inner, outer, runner)
+        stands_.append([])
+        while not ring.done and ring.boxes < 2000:
+            ring.advance(Budget(batch=16, effort=Effort(0.01 * UNIT)))
+            stands_[-1].append((ring.levels, ring.boxes, ring.expected, ring.state().tree))
+    assert stands_[0] == stands_[1] and len(stands_[0]) > 5
+
+
+def test_long_jobs_give_the_same_proof(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ahead, "_TURN", (60.0, 60.0))
     troupe = Troupe()
-    assert stands(proved_by(troupe), alone()) and troupe.answered < 10
+    found = proved_by(troupe)
+    assert stands(found, alone()) and found.boxes == alone().boxes and 0 < troupe.answered < 10
+
+
+def test_what_is_known_ahead_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where more than so many boxes are known or out, no more go out until some were asked for."""
+    most: list[int] = []
+
+    def send(self: Ahead, *args: Any) -> None:
+        original(self, *args)
+        most.append(len(self._known) + len(self._out))
+
+    original = Ahead._send
+    monkeypatch.setattr(Ahead, "_send", send)
+    monkeypatch.setattr(ahead, "_KNOWN", 24)
+    found = proved_by(Troupe(places=lambda _: 3))
+    assert stands(found, alone()) and 0 < max(most) < 200
+
+
+def by_arrival(name: str, patched: pytest.MonkeyPatch) -> None:
+    """A search in which something hangs on what has arrived."""
+    offer, step, forget = Ahead.offer, Pass._step, Ahead._forget
+
+    def in_another_order(self: Ahead, frontier: Any, left: float) -> None:
+        offer(self, frontier, left)
+        known = np.array([box in self._known for box in rows.boxes_of(frontier.lo, frontier.hi)], dtype=bool)
+        frontier.key = np.where(known, 0.9 * frontier.key, frontier.key)
+
+    def another_count(self: Pass, bound: Any, *args: Any) -> None:
+        step(self, bound, *args)
+        self.boxes += bool(bound._known)
+
+    def still_known(self: Ahead) -> None:
+        known = getattr(self, "_known", {})
+        forget(self)
+        self._known = known
+
+    if name == "order":
+        patched.setattr(Ahead, "offer", in_another_order)
+    elif name == "count":
+        patched.setattr(Pass, "_step", another_count)
+    else:
+        patched.setattr(Ahead, "_forget", still_known)
+
+
+@pytest.mark.parametrize(("name", "case"), [("order", "two states"), ("count", "sampled"), ("levels", "violated")])
+def test_what_hangs_on_arrival_would_show(name: str, case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The order of boxes, the count of effort, and bounds that were made for levels of before."""
+    by_arrival(name, monkeypatch)
+    found, _, _ = differences(outwards_of(case), ["two places"])
+    assert found
 
 
 # -------------------------------------------------------------------------------------------------------------- garbage
 
 
 def flipped(job: bytes, answer: bytes) -> bytes:
-    """One bit of the trees."""
-    at = subtrees._ANSWER.size + len(answer[subtrees._ANSWER.size :]) // 3
+    """One bit, somewhere in it."""
+    at = len(answer) // 3
     return answer[:at] + bytes([answer[at] ^ 1]) + answer[at + 1 :]
 
 
-def lying(boxes: int, proved: int) -> Play:
+def told(change: Callable[[np.ndarray], None]) -> Play:
+    """Rows by somebody who seals them well."""
+
     def play(job: bytes, answer: bytes) -> bytes:
-        _, trees, keys = parts(answer)
-        return sealed(job, boxes, proved, trees, keys)
+        boxes, found, opened, keys = parts(job, answer)
+        changed = np.frombuffer(found, row_of(counts_of(job)[0])).copy()
+        change(changed)
+        return sealed(job, boxes, changed.tobytes(), opened, keys)
 
     return play
 
 
-def grown(trees: Callable[[int, int], bytes], key: float = 0.0) -> Play:
-    """Trees by somebody who seals them well, with one key for all."""
+def scored(value: float) -> Play:
+    return told(lambda row: row["score"].fill(value))
 
+
+def keyed(change: Callable[[np.ndarray], np.ndarray]) -> Play:
     def play(job: bytes, answer: bytes) -> bytes:
-        made = trees(*boxes_of(job))
-        keys = np.full(made.count(OPEN), key)
-        return sealed(job, min(1, len(made)), 0, made, keys)
+        boxes, found, opened, keys = parts(job, answer)
+        return sealed(job, boxes, found, opened, change(keys))
 
     return play
+
+
+def boxes_in(job: bytes) -> bytes:
+    n, count = counts_of(job)
+    both = np.frombuffer(job, offset=ahead._JOB.size)[: 2 * n * count].reshape(2 * n, count)
+    return both.T.tobytes()
+
+
+def all_open(key: float) -> Play:
+    """The boxes of the job are open as they were; one was bounded that nobody asked for."""
+
+    def play(job: bytes, answer: bytes) -> bytes:
+        n, count = counts_of(job)
+        return sealed(job, bytes(16 * n), bytes(row_of(n).itemsize), boxes_in(job), np.full(count, key))
+
+    return play
+
+
+def counted(bounded: int, opened: int) -> Play:
+    def play(job: bytes, answer: bytes) -> bytes:
+        return rows.sealed(job, ahead._COUNTS.pack(bounded, opened) + rows.unsealed(job, answer)[ahead._COUNTS.size :])
+
+    return play
+
+
+def of_another_version(job: bytes, answer: bytes) -> bytes:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(rows, "_sources", lambda: b"those of before")
+        return rows.sealed(job, answer[rows._SEAL :])
 
 
 last: dict[str, bytes] = {}
@@ -170,48 +329,38 @@ GARBAGE: dict[str, Play] = {
     "cut in the head": lambda job, answer: answer[:20],
     "too long": lambda job, answer: answer + b"\0",
     "a flipped bit": flipped,
-    "another format": lambda job, answer: b"subtree2" + answer[8:],
+    "another version's": of_another_version,
     "another job's": of_another_job,
     "the job itself": lambda job, answer: job,
     "noise": lambda job, answer: np.random.default_rng(len(job)).bytes(len(answer)),
-    "boxes that were not bounded": lying(2**63, 0),
-    "more proved than bounded": lying(1, 2),
-    "more proved than leaves": lying(5, 2**40),
-    "no trees": grown(lambda n, count: b""),
-    "one tree too few": grown(lambda n, count: LEAF * (count - 1)),
-    "one tree too many": grown(lambda n, count: LEAF * (count + 1)),
-    "a tree without its end": grown(lambda n, count: LEAF * (count - 1) + b"\0" + LEAF),
-    "an axis that does not exist": grown(lambda n, count: LEAF * (count - 1) + bytes([n]) + 2 * LEAF),
-    "keys that are no numbers": grown(lambda n, count: OPEN + LEAF * (count - 1), math.nan),
-    "a chain of lower halves": grown(lambda n, count: LEAF * (count - 1) + b"\0" * DEEP + LEAF * (DEEP + 1)),
-    "a chain of upper halves": grown(lambda n, count: LEAF * (count - 1) + (b"\0" + LEAF) * DEEP + LEAF),
-    "finer than it may be": grown(lambda n, count: LEAF * (count - 1) + (b"\0" + LEAF) * 60 + LEAF),
-    "all open": grown(lambda n, count: OPEN * count),
-    "all open, with keys below all": grown(lambda n, count: OPEN * count, -math.inf),
+    "an empty body": lambda job, answer: rows.sealed(job, b""),
+    "no box": lambda job, answer: sealed(job, b"", b"", b"", np.zeros(0)),
+    "more boxes than bytes": counted(2**63, 0),
+    "more open than bytes": counted(1, 2**60),
+    "keys that are no numbers": keyed(lambda keys: np.full_like(keys, math.nan)),
+    "scores that are no numbers": scored(math.nan),
+    "all open": all_open(0.0),
+    "all open, with keys below all": all_open(-math.inf),
 }
 
 
 @pytest.mark.parametrize("name", slow_after(4, GARBAGE))
 def test_garbage_changes_nothing(name: str) -> None:
-    """The second answer, the fourth and so on are garbage: these jobs are done here, and the tree is what it was."""
+    """The second answer, the fourth and so on are garbage: their boxes are bounded here, and the proof is the same."""
     troupe = Troupe()
-
-    def play(job: bytes, answer: bytes) -> bytes | None:
-        turn = troupe.answered == 1 if name.startswith("a chain") else troupe.answered % 2 == 1
-        return GARBAGE[name](job, answer) if turn else answer
-
-    troupe.play = play
+    troupe.play = lambda job, answer: GARBAGE[name](job, answer) if troupe.answered % 2 else answer
     begin = time.monotonic()
     found = proved_by(troupe)
     assert stands(found, alone()) and found.boxes == alone().boxes
-    assert troupe.refused >= (name != "nothing") and troupe.answered > 3
+    accepted_ = name in ("nothing", "all open", "all open, with keys below all")
+    assert (troupe.refused >= 1) is not accepted_ and troupe.answered > 3
     assert time.monotonic() - begin < 20
 
 
 @pytest.mark.parametrize("name", ["nothing", "zero length", "all open"])
 def test_who_never_answers_well_is_of_no_use_and_no_harm(name: str) -> None:
     troupe = Troupe(play=GARBAGE[name])
-    assert stands(proved_by(troupe), alone())
+    assert stands(proved_by(troupe), alone()) and troupe.answered > 3
 
 
 def test_a_job_without_an_answer_is_done_here_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -220,75 +369,73 @@ def test_a_job_without_an_answer_is_done_here_in_the_end(monkeypatch: pytest.Mon
             return []
 
     monkeypatch.setattr("tests.support.jobs.PlayedJobs", Silent)
-    monkeypatch.setattr(subtrees, "_LATE", 0.0)
+    monkeypatch.setattr(ahead, "_LATE", 0.0)
     troupe, case = Troupe(), pendulum()
     found = prove_outwards(case.problem, case.T, 1e-6, 3.0, SMALL, PlayedRunner(troupe))
     assert stands(found, alone()) and troupe.given > 3 and troupe.forgotten == troupe.given
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(1, 3), st.integers(1, 4))
-def test_a_graft_that_is_refused_leaves_the_partition_as_it_was(seed: int, n: int, count: int) -> None:
-    """Random bytes, most of them nearly trees: a partition takes all of them in or nothing."""
+def test_a_row_is_what_was_bounded_bit_for_bit() -> None:
+    case = pendulum()
+    ring = outwards(case.problem, case.T, 1e-6, 3.0, HERE)
+    lo, hi = -ring.half * np.array([[1.0, 0.5, 1.0]]), ring.half * np.array([[1.0, 0.25, 0.0]])
+    found = ring.rule(lo, hi, 1e-6, 3.0)
+    found.bound[1], found.score[0, 1] = math.nan, -0.0
+    layout = rows.Layout.of(found)
+    again = layout.read(layout.write(found))
+    assert type(again) is type(found)
+    for one, other in zip(found, again, strict=True):
+        assert one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
+    boxes = rows.boxes_of(lo, hi)
+    assert [side.tobytes() for side in rows.corners_of(boxes, 2)] == [lo.tobytes(), hi.tobytes()]
+    assert row_of(2) == layout.row
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 3))
+def test_a_graft_that_is_refused_leaves_the_partition_as_it_was(seed: int, n: int) -> None:
+    """Random bytes, most of them nearly a tree: a partition takes all of them in or nothing."""
     generator = np.random.default_rng(seed)
-    root = np.ones((n, count))
-    partition = Partition(root)
-    numbers = np.arange(count, dtype=np.int64)
+    partition = Partition(np.ones(n))
     nodes: list[int] = []
-    open_ = count
+    open_ = 1
     while open_ and len(nodes) < 60:
-        nodes.append(int(generator.choice([generator.integers(0, n + 1), 253, 254, 255], p=[0.3, 0.1, 0.2, 0.4])))
-        open_ += 1 if nodes[-1] < 253 else -1
-    trees = bytes(nodes) + bytes(generator.integers(0, 256, int(generator.integers(0, 2)), dtype=np.uint8))
+        nodes.append(int(generator.choice([int(generator.integers(0, n + 1)), 254, 255], p=[0.4, 0.2, 0.4])))
+        open_ += 1 if nodes[-1] < 254 else -1
+    tree = bytes(nodes) + bytes(generator.integers(0, 256, int(generator.integers(0, 2)), dtype=np.uint8))
     before = partition.preorder()
     try:
-        opened, looked = partition.graft(numbers, -root, root.copy(), trees, np.full(n, 0.2))
+        opened = partition.graft(tree)
     except CertificateFormatError:
         assert partition.preorder() == before and partition.splits == 0
         return
-    marks = [(254, opened.number), (253, looked.number)]
-    assert partition.preorder(marks) == trees
-    for grafted in (opened, looked):
-        lo, hi = partition.corners(grafted.number)
-        assert np.array_equal(lo, grafted.lo) and np.array_equal(hi, grafted.hi)
-        assert not grafted.number.size or (hi - lo).min() >= 0.2
+    assert partition.preorder([(254, opened.number)]) == tree
+    lo, hi = partition.corners(opened.number)
+    assert np.array_equal(lo, opened.lo) and np.array_equal(hi, opened.hi)
 
 
 def test_a_chain_is_as_deep_as_a_certificate_may_be_and_no_deeper() -> None:
-    one = np.zeros(1, dtype=np.int64)
+    leaf = b"\xff"
     for depth, fits in ((MAX_DEPTH, True), (MAX_DEPTH + 1, False)):
-        for chain_ in (b"\0" * depth + LEAF * (depth + 1), (b"\0" + LEAF) * depth + LEAF):
+        for chain_ in (b"\0" * depth + leaf * (depth + 1), (b"\0" + leaf) * depth + leaf):
             partition = Partition(np.ones(1))
             if fits:
-                partition.graft(one, -np.ones((1, 1)), np.ones((1, 1)), chain_)
+                partition.graft(chain_)
             else:
                 with pytest.raises(CertificateFormatError, match="deeper"):
-                    partition.graft(one, -np.ones((1, 1)), np.ones((1, 1)), chain_)
+                    partition.graft(chain_)
             assert partition.splits == (depth if fits else 0)
 
 
 # ----------------------------------------------------------------------------------------------------------------- lies
 
 
-def nothing_done(job: bytes, answer: bytes) -> bytes:
-    """One box of the job is split, the others are open as they were: as little as passes for an answer."""
-    _, count = boxes_of(job)
-    return sealed(job, 1, 0, b"\0" + OPEN * (count + 1), np.full(count + 1, -math.inf))
-
-
-def keyed(change: Callable[[np.ndarray], np.ndarray]) -> Play:
-    def play(job: bytes, answer: bytes) -> bytes:
-        (boxes, proved, _, _), trees, keys = parts(answer)
-        return sealed(job, boxes, proved, trees, change(keys))
-
-    return play
-
-
 LIES: dict[str, Play] = {
-    "all is proved": lambda job, answer: sealed(job, boxes_of(job)[1], boxes_of(job)[1], LEAF * boxes_of(job)[1]),
-    "what is open lies beyond all": keyed(lambda keys: np.full_like(keys, math.inf)),
-    "what is open is a thousand times higher": keyed(lambda keys: keys * 1000),
+    "all is proved": told(lambda row: row["proved"].fill(1)),
+    "all is violated": told(lambda row: row["violated"].fill(1)),
+    "nothing is proved": told(lambda row: row["proved"].fill(0)),
+    "scores without an end": scored(math.inf),
     "what is open lies below all": keyed(lambda keys: np.full_like(keys, -math.inf)),
-    "look at all": lambda job, answer: sealed(job, boxes_of(job)[1], 0, LOOK * boxes_of(job)[1]),
+    "what is open lies beyond all": keyed(lambda keys: np.full_like(keys, math.inf)),
 }
 
 
@@ -315,6 +462,22 @@ def accepted(result: RoaResult) -> bool:
     return result.certificate is not None and run_checker(result.certificate)["result"] == "ACCEPTED"
 
 
+@pytest.mark.parametrize("effort", [0.004, 0.24])
+def test_a_run_has_the_same_certificate(effort: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From its candidates to its file, also where the effort ends in the middle of the ring."""
+    for place in ("certify.analysis.stages.candidate", "certify.analysis.stages.ring", "certify.analysis.selection"):
+        monkeypatch.setattr(f"{place}.Budget", partial(Budget, batch=16))
+    expected = certify_roa(WIDE, pendulum_network(), tmp_path / "alone", RoaOptions(Q=(1.0, 1.0), effort=effort))
+    troupe = Troupe(places=lambda _: 3, seed=7)
+    found = certified(tmp_path / "shared", troupe, monkeypatch, effort=effort)
+    assert expected.stop is found.stop is (Stop.WITNESS if effort > 0.2 else Stop.EFFORT) and troupe.answered > 3
+    assert found.verdict is expected.verdict and found.levels == expected.levels and found.boxes == expected.boxes
+    files = [json.loads(each.certificate.read_text()) for each in (expected, found) if each.certificate is not None]
+    for file in files:
+        file.pop("provenance", None)
+    assert len(files) == 2 and files[0] == files[1]
+
+
 @pytest.mark.parametrize("name", [name if name == "all is proved" else pytest.param(name, marks=SLOW) for name in LIES])
 def test_a_lie_never_makes_a_larger_set(
     name: str, honest: RoaResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -329,8 +492,8 @@ def test_a_lie_never_makes_a_larger_set(
     if name == "all is proved":
         assert found.stop is Stop.REFUSED and found.levels.roa < expected.levels.roa
         assert ADDRESS in (found.notice or "") and "may be at fault" in (found.notice or "")
-    if name in ("what is open lies below all", "look at all"):
-        assert found.levels.roa >= expected.levels.roa * 0.99
+    if name.startswith("what is open"):  # an order that nothing hangs on
+        assert found.levels == expected.levels
 
 
 @SLOW
@@ -356,23 +519,10 @@ def test_what_cannot_be_mended_is_not_called_a_fault_of_this_program(
     assert not (tmp_path / "certificate.json").exists() and list(tmp_path.glob("*.unchecked.json"))
 
 
-def test_a_worker_that_hardly_works_does_not_outlive_the_time() -> None:
-    begin, troupe = time.monotonic(), Troupe(play=nothing_done)
-    found = proved_by(troupe, Budget(batch=16, effort=Effort(1 * UNIT)))
-    assert time.monotonic() - begin < 10 and troupe.answered > 3
-    assert stands(found, alone()) or found.outer <= 3.0
-
-
-def test_looking_at_everything_comes_to_an_end() -> None:
-    """Where a job is only to be looked at, all is bounded here, and the tree is what it was."""
-    found = proved_by(Troupe(play=LIES["look at all"]))
-    assert stands(found, alone())
-
-
 def test_a_set_beyond_the_ellipsoid_ends_with_workers_that_leave_all_open() -> None:
     """When its boxes are spent a cover goes on until nothing is open, without an end in time: it must come to one."""
     problem, N = planar(), wells([[1.0, 0.0], [-0.5, 0.875], [-0.5, -0.875]], 0.75)
-    for play in (GARBAGE["all open"], LIES["look at all"], GARBAGE["nothing"]):
+    for play in (GARBAGE["all open"], GARBAGE["nothing"]):
         troupe = Troupe(play=play)
         budget = Budget(batch=4, boxes=150)
         found = prove_outer(problem, 0.25, np.eye(2), N, -2.4, budget, PlayedRunner(troupe))
@@ -396,19 +546,8 @@ def test_a_set_beyond_the_ellipsoid_ends_with_workers_that_leave_all_open() -> N
 def test_places_come_and_go(places: Callable[[int], int]) -> None:
     troupe = Troupe(places=places)
     found = proved_by(troupe)
-    assert stands(found, alone()) and found.boxes >= alone().boxes
+    assert stands(found, alone()) and found.boxes == alone().boxes
     assert (troupe.answered > 0) is any(places(k) for k in range(1, 10))
-
-
-def test_boxes_that_are_out_come_back_when_a_heat_ends() -> None:
-    """A pass in pieces, some of whose boxes are out at each end, is the pass in one."""
-    case, troupe = pendulum(), Troupe()
-    ring = outwards(case.problem, case.T, 1e-6, 3.0, PlayedRunner(troupe))
-    while not ring.done:
-        before = ring.boxes
-        assert ring.advance(Budget(boxes=40, batch=16)) in (Stop.BOXES, None)
-        assert ring.abroad is None and ring.boxes > before
-    assert stands(ring.proof(), alone()) and troupe.forgotten
 
 
 # ------------------------------------------------------------------------------------------------ the scheduler is gone
@@ -419,7 +558,7 @@ def test_a_scheduler_that_goes_takes_nothing_with_it(answers: int) -> None:
     case, troupe = pendulum(), Troupe(lost_after=answers)
     ring = outwards(case.problem, case.T, 1e-6, 3.0, PlayedRunner(troupe))
     assert ring.advance(SMALL) is Stop.CLUSTER and "tcp://nowhere:1" in ring.lost
-    assert not ring.done and ring.abroad is None
+    assert not ring.done
     state = ring.state()
     other = outwards(case.problem, case.T, 1e-6, 3.0, HERE)
     other.restore(state)
