@@ -146,7 +146,7 @@ class ClosedLoop:
 
 
 def _depends(expression: Expression, at_zero: Mapping[Symbol, Fraction], system: System) -> str:
-    """How an equation at the operating point depends on what is uncertain: by its value, or only as it is written."""
+    """The words for an equation that depends on what is uncertain at rest: by its value, or only as it is written."""
     try:
         values = [
             evaluate_exactly(expression, {**at_zero, **{name: ends[side] for name, ends in system.uncertain}})
