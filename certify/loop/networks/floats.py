@@ -20,7 +20,9 @@ class Values(Algebra[Any]):
     """Arrays or tensors, entries along the last axis."""
 
     def affine(self, step: Affine, v: Any) -> Any:
-        return v @ like(step.weight.T, v) + like(step.bias, v)
+        found = v @ like(step.weight.T, v)
+        found += like(step.bias, v)  # a second array would cost several times the product
+        return found
 
     def map(self, step: Map, v: Any) -> Any:
         return step.phi(v)
