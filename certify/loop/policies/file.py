@@ -62,8 +62,8 @@ class Policy:
     beta : rounded `atanh((u_eq - offset) / scale)` stored by another program, shape (m,), or None;
         the proof uses the real number and reports the shift.
     valid : bounds of each state, shape (n, 2), infinite where there is none, or None. Only between them the network
-    equals its source, because no observation is clipped there. A plant's domain must be cut to them before a proof;
-    `certify roa` does so.
+        equals its source, because no observation is clipped there. A plant's domain must be cut to them before a
+        proof; `certify roa` does so.
 
     Raises
     ------
