@@ -45,14 +45,13 @@ def policy_in(
         cannot be had.
     """
     from certify.loop.policies import load_policy
+    from certify.loop.policies.importers import import_policy
 
     if is_own(path, importing):
         stored = load_policy(path)
         if importing.centre is None:
             return stored
         return centred(stored, importing.centre, plant_of(stored, system, changes, lambda _: None), tell)
-    from certify.loop.policies.importers import import_policy
-
     imported = import_policy(path, plant_for(f"the policy file {path}", system, changes), importing)
     for line in lines(imported):
         tell(line)

@@ -18,6 +18,10 @@ from certify.loop.networks import Affine, Concat, Network, Observe, Step, values
 from certify.loop.plants import System
 from certify.loop.plants.calls import Call, NetworkFile
 from certify.loop.policies import PolicyNetwork, bounded_by_form, load_policy, program_of
+from certify.loop.policies.importers import ImportOptions, content_of, read_bytes
+from certify.loop.policies.importers.comparing import compare_reading
+from certify.loop.policies.importers.folding import fold
+from certify.loop.policies.importers.recognising import kind_of, read_kind
 
 _SAMPLES = 1000  # arguments at which a network is compared with its file's own program
 _FREE = 2.0**100  # the bounds of a result, beyond anything that is proved
@@ -83,12 +87,6 @@ def _entry(call: Call, network: Network, entry: int | None) -> int:
 
 
 def _read(file: NetworkFile, reads: int) -> Network:
-    # Few plants call a network of a file: the readers are loaded for these alone.
-    from certify.loop.policies.importers.comparing import compare_reading
-    from certify.loop.policies.importers.folding import fold
-    from certify.loop.policies.importers.options import ImportOptions
-    from certify.loop.policies.importers.recognising import content_of, kind_of, read_bytes, read_kind
-
     raw = read_bytes(file.path)
     if content_of(raw, file.path.name) == "policy":
         policy = load_policy(file.path).network

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 from certify.lyapunov.candidates import increment_matrix, slowest_decay, solve_lyapunov
 from certify.lyapunov.choice import BEYOND, SOLVED, Beyond, Candidate, Chosen, Named, choose_candidate
 from certify.lyapunov.file import StoredLyapunov, load_lyapunov, save_lyapunov
 from certify.lyapunov.function import LyapunovFunction, Quadratic
+from certify.lyapunov.importing import ImportedLyapunov, import_lyapunov
 from certify.lyapunov.level_sets import (
     are_inside,
     ball_volume,
@@ -25,9 +24,6 @@ from certify.lyapunov.optimised import optimise_candidate, optimise_repeatedly
 from certify.lyapunov.polynomial import Polynomial
 from certify.lyapunov.sampled import sampled_volume
 from certify.lyapunov.symbolic import Symbolic, of_polynomial
-
-if TYPE_CHECKING:
-    from certify.lyapunov.importing import ImportedLyapunov, import_lyapunov
 
 __all__ = [
     "BEYOND",
@@ -65,12 +61,3 @@ __all__ = [
     "solve_lyapunov",
     "volume",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    """Readers of other programs' files are loaded on first use (PEP 562)."""
-    if name in ("ImportedLyapunov", "import_lyapunov"):
-        from certify.lyapunov import importing
-
-        return getattr(importing, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -19,10 +19,11 @@ import numpy as np
 from certify.errors import InputError
 from certify.loop.policies.importers.comparing import Difference, compare_reading
 from certify.loop.policies.importers.folding import fold
+from certify.loop.policies.importers.importing import read_bytes
 from certify.loop.policies.importers.normalisers import rsl_normaliser
 from certify.loop.policies.importers.observing import observed, over_states, require_equilibrium, sample, shift
 from certify.loop.policies.importers.options import ImportOptions
-from certify.loop.policies.importers.recognising import Content, kind_of, read_bytes, tensors_in
+from certify.loop.policies.importers.recognising import Content, kind_of, tensors_in
 from certify.loop.policies.importers.state_dict import read_lyapunov
 from certify.lyapunov.file import StoredLyapunov
 from certify.lyapunov.neural import Neural

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from certify.errors import InputError
+from certify.loop.files.archives import MAX_BYTES
 from certify.loop.networks import Affine, Network
 from certify.loop.policies.exact import require_centred
 from certify.loop.policies.file import Policy
@@ -34,7 +35,7 @@ from certify.loop.policies.importers.observing import (
 )
 from certify.loop.policies.importers.options import ImportOptions
 from certify.loop.policies.importers.reading import Evaluate, Reading
-from certify.loop.policies.importers.recognising import Content, kind_of, read_bytes, read_kind
+from certify.loop.policies.importers.recognising import Content, kind_of, read_kind
 from certify.loop.policies.importers.steps import Clip, Diagonal, Normalise, Step, spread
 from certify.loop.policies.network import Array, Centre, PolicyNetwork
 
@@ -98,6 +99,21 @@ def import_policy(
         return import_bytes(raw, path.name, plant, options, folder=path.parent, beside=beside)
     except InputError as error:
         raise InputError(f"policy file {path}: {error}") from error
+
+
+def read_bytes(path: Path) -> bytes:
+    """The bytes of a policy file.
+
+    Raises
+    ------
+    InputError : it cannot be read, or is larger than any policy.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"policy file {path} must have at most {MAX_BYTES >> 20} MiB; it has more.")
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"policy file {path} cannot be read: {error.strerror}.") from error
 
 
 def import_bytes(

@@ -2,37 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from certify.errors import InputError
-from certify.loop.files.archives import MAX_BYTES, Archive
+from certify.loop.files.archives import Archive
+from certify.loop.files.arrays import Numbers
 from certify.loop.files.legacy import BEGINNING
 from certify.loop.files.torchfile import TorchFile
 from certify.loop.policies.file import is_text
+from certify.loop.policies.importers.onnx_graph import read_onnx
 from certify.loop.policies.importers.options import ImportOptions
-
-if TYPE_CHECKING:
-    from certify.loop.files.arrays import Numbers
-    from certify.loop.policies.importers.reading import Reading
+from certify.loop.policies.importers.reading import Reading
+from certify.loop.policies.importers.sb3 import read_sb3
+from certify.loop.policies.importers.state_dict import is_two_stage, read_state_dict, read_two_stage
+from certify.loop.policies.importers.tensors import load_safetensors, load_tensors
+from certify.loop.policies.importers.torchscript import is_torchscript, read_torchscript
 
 Content = Literal["state-dict", "torchscript", "onnx", "sb3", "safetensors", "two-stage", "policy"]
 _OWN, _LYAPUNOV = "certify-policy/", "certify-lyapunov/"
-
-
-def read_bytes(path: Path) -> bytes:
-    """The bytes of a policy file.
-
-    Raises
-    ------
-    InputError : it cannot be read, or is larger than any policy.
-    """
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"policy file {path} must have at most {MAX_BYTES >> 20} MiB; it has more.")
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"policy file {path} cannot be read: {error.strerror}.") from error
 
 
 def content_of(raw: bytes, name: str) -> Content | None:
@@ -50,20 +39,12 @@ def content_of(raw: bytes, name: str) -> Content | None:
             return "policy"
         if isinstance(said, str) and said.startswith(_LYAPUNOV):
             raise InputError("it must hold a policy; it is a Lyapunov function of this program.")
-        from certify.loop.policies.importers.state_dict import is_two_stage
-        from certify.loop.policies.importers.tensors import load_tensors
-
         return "two-stage" if is_two_stage(load_tensors(raw, name, file)) else "state-dict"
     if name.endswith(".onnx"):
         return "onnx"
     if name.endswith(".safetensors") or raw[8:9] == b"{":
         return "safetensors"
     return None
-
-
-def is_torchscript(file: TorchFile) -> bool:
-    """True if a torch file holds code."""
-    return any(name.startswith(f"{file.root}code/") for name in file.archive.names)
 
 
 def kind_of(raw: bytes, name: str, options: ImportOptions) -> Content:
@@ -98,28 +79,17 @@ def read_kind(
     folder: Path | None,
     beside: str | None,
 ) -> Reading:
-    """The policy of a file of this kind."""
-    if kind == "sb3":
-        from certify.loop.policies.importers.sb3 import read_sb3
-
-        return read_sb3(Archive(raw, name), name, options.ignore)
-    if kind == "torchscript":
-        from certify.loop.policies.importers.torchscript import read_torchscript
-
-        return read_torchscript(TorchFile(raw, name))
-    if kind == "onnx":
-        from certify.loop.policies.importers.onnx_graph import read_onnx
-
-        return read_onnx(raw, name, options.output, folder)
-    from certify.loop.policies.importers.state_dict import read_state_dict, read_two_stage
-
-    if kind == "two-stage":
-        return read_two_stage(tensors_in(kind, raw, name), options)
-    return read_state_dict(tensors_in(kind, raw, name), options, n, m, beside)
+    readers: dict[Content, Callable[[], Reading]] = {
+        "sb3": lambda: read_sb3(Archive(raw, name), name, options.ignore),
+        "torchscript": lambda: read_torchscript(TorchFile(raw, name)),
+        "onnx": lambda: read_onnx(raw, name, options.output, folder),
+        "safetensors": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m, beside),
+        "two-stage": lambda: read_two_stage(tensors_in(kind, raw, name), options),
+        "state-dict": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m, beside),
+    }
+    return readers[kind]()
 
 
 def tensors_in(kind: Content, raw: bytes, name: str) -> dict[str, Numbers]:
     """The tensors of a state_dict or two-stage file, or of safetensors, by their names."""
-    from certify.loop.policies.importers.tensors import load_safetensors, load_tensors
-
     return load_safetensors(raw, name) if kind == "safetensors" else load_tensors(raw, name)

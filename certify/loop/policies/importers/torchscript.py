@@ -92,6 +92,11 @@ class _Program:
             raise InputError(f"{self.file.what} must have at most {_MAX_OPERATIONS} operations; it has more.")
 
 
+def is_torchscript(file: TorchFile) -> bool:
+    """True if a torch file holds code."""
+    return any(name.startswith(f"{file.root}code/") for name in file.archive.names)
+
+
 def read_torchscript(file: TorchFile) -> Reading:
     """The policy of a TorchScript archive, whose `forward` takes the observation and gives the action.
 
