@@ -24,8 +24,10 @@ from certify.analysis.identifying.writing import rounded
 from certify.certificates.checking import ask
 from certify.cli.main import _run
 from certify.errors import InputError
-from certify.loop.plants import System, get_system, load_system
+from certify.loop.plants import Measurements, Run, System, get_system, load_system
 from certify.provers.data import Contradiction
+from certify.provers.data.identify import _Box, _Data
+from certify.provers.data.models import Flows
 from tests.support.marks import slow_after
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -428,6 +430,25 @@ def test_an_end_of_a_prior_that_no_measurement_moves_may_be_any_number(tmp_path:
     low, high = result.system.ranges["b"]
     assert lo < Fraction("2.1") and hi > Fraction("2.9")  # neither end was moved
     assert low <= lo and hi <= high and high - low < Fraction("0.8000001")
+
+
+def test_a_part_of_which_nothing_is_left_is_stated_beyond_its_ends(tmp_path: Path) -> None:
+    """A certificate has binary64 numbers, and the ends of priors need not be such."""
+    file = tmp_path / "plant.toml"
+    file.write_text(STRUCTURE.replace("a = [10, 30]", "a = [24.1, 29.9]").replace("b = [1, 4]", "b = [1.1, 3.9]"))
+    rows = transitions(noise=1e-4)
+    runs = tuple(Run(np.stack([row[:2], row[3:]]), row[None, 2:3]) for row in rows)
+    plant = load_system(file)
+    period = (Fraction(1, 50), Fraction(1, 50))
+    measurements = Measurements(plant.ranges, period, (Fraction(1, 10**4),) * 2, runs, "0" * 64)
+    part = _Box(_Data(plant, measurements), Flows(plant, measurements, 4, 1), dict(plant.ranges))
+    part.separately(np.arange(len(rows)), 3)
+    ((_, _, stated),) = part.rounds
+    assert part.empty
+    for name, (lo, hi) in plant.ranges.items():
+        low, high = stated[name]
+        assert Fraction(float(low)) == low and Fraction(float(high)) == high
+        assert name == "a" or (low <= lo and hi <= high)
 
 
 # The command

@@ -135,7 +135,8 @@ class _Box:
         whole = np.zeros((2, len(self.box), *rows.alpha.shape))
         whole[0, 0] = -sign * weights * (_FAR / excess)
         nothing = self._narrowed(rows, chosen, whole[:, 0], 0)
-        self._keep(self.box | {next(iter(self.box)): nothing}, chosen, whole)
+        stated = {name: _outward(pair) for name, pair in self.box.items()}  # of priors, which may be any rationals
+        self._keep(stated | {next(iter(self.box)): nothing}, chosen, whole)
         self.data.note(chosen, weights)
 
     def _narrowed(self, rows: Rows, chosen: Numbers, weights: Array, k: int) -> Interval:
@@ -146,7 +147,7 @@ class _Box:
         least, most = bound(rows, noise, begins, weights[0], k)[0], bound(rows, noise, begins, weights[1], k)[1]
         low = middle + reach * (Fraction(least) - _SLACK) if -1 < least < np.inf else lo
         high = middle + reach * (Fraction(most) + _SLACK) if -np.inf < most < 1 else hi
-        return _below(max(lo, low)), -_below(-min(hi, high))
+        return _outward((max(lo, low), min(hi, high)))
 
 
 class _Data:
@@ -316,6 +317,11 @@ def _below(q: Fraction) -> Fraction:
     """The largest binary64 number that is not above a rational."""
     nearest = float(q)
     return Fraction(nearest if Fraction(nearest) <= q else np.nextafter(nearest, -np.inf))
+
+
+def _outward(pair: Interval) -> Interval:
+    """The least interval that holds this one and has binary64 ends."""
+    return _below(pair[0]), -_below(-pair[1])
 
 
 def _relative(pair: Interval) -> float:
