@@ -419,7 +419,7 @@ def test_many_tensors_of_one_region_count_each(tmp_path: Path, monkeypatch: pyte
 
 @pytest.mark.parametrize(("beta", "threshold"), [(None, 20.0), (3.0, 20.0), (None, 19.0), (3.0, 19.0)])
 def test_softplus_with_its_threshold(beta: float | None, threshold: float, tmp_path: Path) -> None:
-    """torch's newer exporter writes Where(beta h > 20, h, softplus(beta h) / beta); another threshold is no softplus."""
+    """torch's newer exporter writes Where(beta h > 20, h, softplus(beta h) / beta); with 19 it is no softplus."""
     nodes = [node("Gemm", "x", "W1", "B1", out="h")]
     nodes += [node("Mul", "h", "beta", out="s")] if beta else []
     scaled = "s" if beta else "h"
