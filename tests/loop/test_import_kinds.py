@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from certify.errors import InputError
+from certify.loop.networks import Clip, Map
 from certify.loop.plants import get_system
 from certify.loop.policies.importers import ImportOptions, import_policy
 from certify.loop.policies.importers.constants import computed
@@ -153,6 +154,16 @@ def test_rows_and_conversions(tmp_path: Path) -> None:
     traced = import_policy(saved(module, "trace", tmp_path / "p.pt"), PLANT, SAID)
     assert traced.policy.network == found.policy.network or traced.difference.in_double < 1e-13
     module.kind = ""
+    agree(found.policy, module)
+
+
+def test_a_hidden_clip_from_0_on_has_the_corner_of_relu() -> None:
+    """Where an equilibrium lies on it, the rule of kinks knows which side a relu is on."""
+    module = nn.Sequential(nn.Linear(2, 6, bias=False), nn.ReLU6(), nn.Linear(6, 1, bias=False)).eval()
+    found = import_module(module, PLANT, SAID)
+    _, relu, clip, _ = found.policy.network.network.steps
+    assert isinstance(relu, Map) and relu.function == "relu"
+    assert isinstance(clip, Clip) and np.all(clip.lo == -6) and np.all(clip.hi == 6)
     agree(found.policy, module)
 
 

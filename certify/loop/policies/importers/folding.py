@@ -163,6 +163,8 @@ class _Program:
         width = self.sizes[number]
         lo, hi = spread(step.lo, width), spread(step.hi, width)
         if None not in lo and None not in hi:
+            if not any(lo):  # relu6: the corner at 0, where an equilibrium may lie, is relu's
+                number, lo = self._then(networks.Map((number,), "relu")), tuple(-v for v in hi if v is not None)
             ends = (_numbers([v for v in end if v is not None]) for end in (lo, hi))
             return self._then(networks.Clip((number,), *ends))
         for end, sign in ((lo, 1), (hi, -1)):
