@@ -134,7 +134,7 @@ def _evaluation(module: torch.nn.Module, output: str | None) -> Evaluate:
         with torch.no_grad():
             given = torch.tensor(x, dtype=torch.float64 if double else torch.float32)
             result = versions[double](given)
-            values: Values = (result if output is None else result[int(output)]).numpy()
+            values: Values = (result[int(output or 0)] if isinstance(result, tuple | list) else result).numpy()
         return values
 
     return evaluate

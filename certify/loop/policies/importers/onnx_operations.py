@@ -135,7 +135,7 @@ def _sliced(given: list[Any], wide: int, at: str) -> Chain:
             return graph.selected(value, gives(value, wide), start, stop, at)
         case [[0], [stop], [0], *steps] if isinstance(value, tuple) and stop >= 2**31 - 1 and steps in ([], [[1]]):
             return value
-    raise InputError(f"{at} must take entries of a row, along axis 1.")
+    raise InputError(f"{at} must take entries of a row, along axis 1 of a batch of observations (k, n).")
 
 
 def _split(given: list[Any], flags: dict[str, Any], wide: int, count: int, at: str) -> list[Made]:

@@ -212,7 +212,7 @@ def _parts(name: str, given: list[Any], wide: int, at: str) -> Any:
         case "split" | "split_with_sizes", [list(sizes), 1 | -1] if all(type(s) is int and s > 0 for s in sizes):
             pass
         case _:
-            raise InputError(f"{at} must take entries of a row, along axis 1.")
+            raise InputError(f"{at} must take entries of a row, along axis 1 of a batch of observations (k, n).")
     ends = np.minimum(np.cumsum([0, *sizes]), width).tolist()
     pairs = [(a, b) for a, b in pairwise(ends) if a < b]
     return [Value(graph.selected(value.chain, width, a, b, at), "slice", (value, 1, a, b)) for a, b in pairs]

@@ -185,7 +185,7 @@ def _forward(program: _Program, module: Any, given: list[Any], depth: int, metho
     what = program.file.what
     if not isinstance(module, Call) or not isinstance(module.function, Name) or len(module.states) != 1:
         raise InputError(f"{what} must hold modules; found {brief(module)}.")
-    if "parametriz" in str(module.function).lower():
+    if "torch.nn.utils.parametrize" in str(module.function):
         raise InputError(f"a weight of {what} is computed by {module.function.name}. {WITHOUT_WEIGHT_NORM}")
     definition = program.classes.get(module.function)
     methods = [] if definition is None else [n for n in definition.body if isinstance(n, ast.FunctionDef)]
