@@ -54,7 +54,7 @@ def by_centring(
     centre = centring(system, network)
     proved = result.verdict is Verdict.PROVED
     weaker = result.claim == "practical" or not proved
-    if centre is None or (system.n > FEW and not weaker):
+    if centre is None or (system.n > FEW and not weaker) or _rests(ClosedLoop(system, network)):
         return None
     loop, more = ClosedLoop(system, replace(network, centre=centre)), ""
     L = loop.mean_rate()
@@ -70,6 +70,15 @@ def by_centring(
     why = "shifted so that pi(0) = u_eq the operating point is the equilibrium, and the stronger claim can be tried"
     stronger = (("--claim", "auto"),) if options.claim == "practical" else ()
     return Step((("--centre", centre), *stronger), why + more)
+
+
+def _rests(loop: ClosedLoop) -> bool:
+    """True if the loop rests at the operating point already."""
+    try:
+        loop.require_rest()
+    except InputError:
+        return False
+    return True
 
 
 def by_clipping(result: RoaResult, asked: tuple[System, PolicyNetwork], effort: Effort) -> Step | None:

@@ -273,9 +273,9 @@ def test_what_goes_without_saying_in_stable_baselines_is_refused_where_said(stab
 @pytest.mark.parametrize(
     ("kind", "given", "message"),
     [
-        ("SAC", {"activation_fn": torch.nn.SELU}, "it is SELU"),
-        ("TD3", {"activation_fn": torch.nn.LeakyReLU}, "it is LeakyReLU"),
-        ("PPO", {"activation_fn": torch.nn.Hardtanh}, "it is Hardtanh"),
+        ("SAC", {"activation_fn": torch.nn.Softshrink}, "it is Softshrink"),
+        ("TD3", {"activation_fn": torch.nn.Tanhshrink}, "it is Tanhshrink"),
+        ("PPO", {"activation_fn": torch.nn.Hardshrink}, "it is Hardshrink"),
     ],
 )
 def test_other_activations_of_stable_baselines_are_refused_by_name(
@@ -541,7 +541,7 @@ class Hidden(torch.nn.Module):
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        ("sum", "must join one"),
+        ("sum", r"torch\.sum .* is not read"),
     ],
 )
 def test_graphs_that_are_no_chain_of_layers_are_refused(kind: str, message: str, tmp_path: Path) -> None:

@@ -294,7 +294,7 @@ SHAPED = {
     "integers": (shaped("Cast", to=TensorProto.INT64), "must be a cast to float32 or float64"),
     "half precision": (shaped("Cast", to=TensorProto.FLOAT16), "must be a cast to float32 or float64"),
     "an unknown shape": (shaped("Expand", "s", shape=[1, 6]), "as wide as it is"),
-    "a normalisation": (shaped("BatchNormalization", "B1", "B1", "B1", "B1"), "train the policy again without it"),
+    "a normalisation": (shaped("InstanceNormalization", "B1", "B1"), "train the policy again without it"),
     "a mean": (shaped("ReduceMean"), "a part of LayerNorm"),
     "a prelu": (shaped("ThresholdedRelu"), r"The activations that are proved are .*activation_fn=torch\.nn\.Tanh"),
 }
@@ -415,3 +415,50 @@ def test_many_tensors_of_one_region_count_each(tmp_path: Path, monkeypatch: pyte
             entry.key, entry.value = key, value
     with pytest.raises(InputError, match=r"the tensors of policy\.onnx must have at most"):
         import_policy(written(tmp_path, made), plant(), SAID)
+
+
+@pytest.mark.parametrize(("beta", "threshold"), [(None, 20.0), (3.0, 20.0), (None, 19.0), (3.0, 19.0)])
+def test_softplus_with_its_threshold(beta: float | None, threshold: float, tmp_path: Path) -> None:
+    """torch's newer exporter writes Where(beta h > 20, h, softplus(beta h) / beta); with 19 it is no softplus."""
+    nodes = [node("Gemm", "x", "W1", "B1", out="h")]
+    nodes += [node("Mul", "h", "beta", out="s")] if beta else []
+    scaled = "s" if beta else "h"
+    nodes += [node("Softplus", scaled, out="p")] + ([node("Div", "p", "beta", out="q")] if beta else [])
+    nodes += [node("Greater", scaled, "most", out="above"), node("Where", "above", "h", "q" if beta else "p", out="v")]
+    constants = CONSTANTS | {"most": np.float32(threshold), "beta": np.float32(beta or 1)}
+    path = written(tmp_path, model([*nodes, node("Gemm", "v", "W2", "B2", out="u")], constants))
+    if threshold < 20:
+        with pytest.raises(InputError, match="but for softplus"):
+            import_policy(path, plant(), SAID)
+        return
+    found = import_policy(path, plant(), SAID).policy.network(X, plant().exact_u_eq())
+    hidden = X @ W1.astype(float) + B1
+    soft = np.logaddexp(0, (beta or 1) * hidden) / (beta or 1)
+    assert np.allclose(found, soft @ W2.astype(float) + B2, atol=1e-12)
+
+
+def test_where_between_other_values_is_refused(tmp_path: Path) -> None:
+    nodes = [node("Gemm", "x", "W1", "B1", out="h"), node("Greater", "h", "hi", out="above")]
+    for one, other in (("h", "h"), ("x", "h")):
+        end = [node("Where", "above", one, other, out="v"), node("Gemm", "v", "W2", "B2", out="u")]
+        with pytest.raises(InputError, match="but for softplus"):
+            import_policy(written(tmp_path, model([*nodes, *end])), plant(), SAID)
+
+
+def test_entries_of_a_row_are_taken_along_the_row_alone(tmp_path: Path) -> None:
+    ends = {"one": np.array([1]), "zero": np.array([0]), "three": np.array([3]), "two": np.array([2])}
+    for axis, step, message in (("one", "one", None), ("zero", "one", "axis 1"), ("one", "two", "axis 1")):
+        nodes = [node("Gemm", "x", "W1", "B1", out="h"), node("Slice", "h", "one", "three", axis, step, out="v")]
+        path = written(
+            tmp_path,
+            model(
+                [*nodes, node("ReduceSum" if message else "Gemm", "v", "W3", out="u")],
+                CONSTANTS | ends | {"W3": W2[:2]},
+            ),
+        )
+        if message is None:
+            found = import_policy(path, plant(), SAID).policy.network(X, plant().exact_u_eq())
+            assert np.allclose(found, (X @ W1.astype(float) + B1)[:, 1:3] @ W2[:2].astype(float), atol=1e-13)
+        else:
+            with pytest.raises(InputError, match=message):
+                import_policy(path, plant(), SAID)

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from certify import certify_roa
+from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
+from certify.analysis.suggested import by_centring
 from certify.certificates.claims.conditions import conditions
 from certify.certificates.claims.queries import query
 from certify.certificates.coq.data import read_claim
@@ -24,16 +26,18 @@ from certify.checker.activations import add as add_activations
 from certify.checker.functions import FUNCTIONS
 from certify.checker.near import Above, Form
 from certify.checker.network import enclose_on_boxes, fold
+from certify.effort import UNLIMITED
 from certify.errors import CertificateFormatError, InputError
 from certify.loop.activations import ACTIVATIONS
 from certify.loop.closed_loop import ClosedLoop
+from certify.loop.networks import Affine, Map, Network, Sum
 from certify.loop.plants import get_system
 from certify.loop.policies import PolicyNetwork
 from certify.loop.policies.exact import at_origin
 from certify.loop.rigorous import evaluate_policy
 from certify.lyapunov import domain_limit
 from certify.provers.ball.local import prove_local
-from certify.provers.ball.models import paths
+from certify.provers.ball.models import corner_of, paths
 from certify.provers.bounds.lines import LINES
 from certify.provers.bounds.policy import policy_enclosure
 from tests.provers.test_models import beyond
@@ -218,8 +222,32 @@ def free_of_biases(law: PolicyNetwork, units: int) -> PolicyNetwork:
 def test_a_corner_at_the_operating_point_proves_nothing_but_of_relu() -> None:
     case = case_of(PLANT, free_of_biases(policy("elu"), 1))
     assert prove_local(case.problem, case.T, domain_limit(case.P, PLANT.domain)) is None
-    result = certify_roa(PLANT, case.loop.network, effort=0.1)
+    result = certify_roa(PLANT, case.loop.network, claim="asymptotic", effort=0.1)
     assert result.verdict is Verdict.UNKNOWN and "a unit of elu has its corner at the operating point" in result.reason
+    assert "--claim practical" in result.reason
+
+
+@pytest.mark.parametrize("name", ["elu", "softsign"])
+def test_with_such_a_corner_the_claim_is_the_weaker_one(name: str) -> None:
+    """V is shown to fall from all of the set to next to the corner, where nothing is known."""
+    law = policy(name)
+    law = replace(law.with_layers(biases=tuple(0 * b for b in law.biases)), centre="none")
+    result = certify_roa(PLANT, law, effort=0.3, candidate="ellipsoid")
+    assert result.verdict is Verdict.PROVED and result.claim == "practical" and result.levels.floor is not None
+    assert result.levels.floor < 1e-9 and result.volume is not None and result.volume > 10
+    assert by_centring(result, RoaOptions(), (PLANT, law), UNLIMITED) is None  # pi(0) is u_eq as it is
+
+
+def test_a_corner_of_elu_beside_one_of_relu_has_no_model() -> None:
+    """As in selu, which is a sum of both: directions resolve the relu, and not the elu."""
+    law = free_of_biases(policy("elu"), 1)
+    first, middle, end = (Affine((of,), law.weights[k], law.biases[k]) for k, of in ((0, 0), (1, 4), (2, 6)))
+    units = Map((1,), "elu"), Map((1,), "relu"), Sum((2, 3))
+    net = Network(2, (first, *units, middle, Map((5,), "elu"), end))
+    both = PolicyNetwork(net, law.scale, law.offset, law.squash, law.centre)
+    case = case_of(PLANT, both)
+    assert corner_of(paths(case.loop)) == "elu"
+    assert prove_local(case.problem, case.T, domain_limit(case.P, PLANT.domain)) is None
 
 
 def test_a_relu_with_its_corner_at_the_operating_point_has_directions(tmp_path: Any) -> None:

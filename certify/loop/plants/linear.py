@@ -45,7 +45,8 @@ def linearise(system: System) -> tuple[Matrix, Matrix]:
     for term in _corners(system, at):
         raise InputError(
             f"the equations of {system.name} must be differentiable at the operating point; {term} has a corner there. "
-            "Move the operating point or the corner, or round it off, as sqrt(x**2 + 1e-6) does with abs(x)."
+            "Move the operating point or the corner, or round it off, as sqrt(x**2 + 1e-6) does with abs(x), and "
+            "(x + sqrt(x**2 + 1e-6))/2 with max(x, 0)."
         )
     try:
         A, B = (

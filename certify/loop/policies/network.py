@@ -201,7 +201,7 @@ class PolicyNetwork(Programmed):
             if not Fraction(float(lo)) < value < Fraction(float(hi)):
                 raise InputError(
                     f"the clip must not act at the origin: there input {j} must lie strictly inside [{lo}, {hi}]; it "
-                    f"is {float(value)!r} before the clip. Widen the clip."
+                    f"is {float(value)!r} before the clip. Widen the clip, or take an operating point inside it."
                 )
 
     def centring(

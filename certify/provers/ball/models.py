@@ -489,11 +489,18 @@ def _require_small(network: Network, k: int) -> None:
 
 
 def corner_of(known: Paths) -> str | None:
-    """The activation with a corner at the paths' middle itself, where no ball around that has a model; or None."""
-    for step in (step for step in known.network.steps if isinstance(step, Map)):
-        if not step.phi.is_smooth and np.any(np.abs(known.vectors[step.of[0]].y) <= _AT_CORNER):
-            return step.function
-    return None
+    """The activation with a corner at the paths' middle itself, where no ball around that has a model; or None.
+
+    It is relu, which *kinks* have models of, only if there is no other.
+    """
+    found = {
+        step.function
+        for step in known.network.steps
+        if isinstance(step, Map)
+        and not step.phi.is_smooth
+        and np.any(np.abs(known.vectors[step.of[0]].y) <= _AT_CORNER)
+    }
+    return min(found, key=lambda name: (name == "relu", name), default=None)
 
 
 def _room(loop: ClosedLoop, u: Array) -> Array:

@@ -234,11 +234,14 @@ class _Outwards:
             smaller = ", or a smaller --rate" if self.task.problem.rate else ""
             why = f"the linearisation does not dominate on any ball; try another --Q{smaller}"
             if (name := corner_of(paths(self.task.problem.loop))) is not None:
-                why = f"a unit of {name} has its corner at the operating point; give it another bias there"
+                why = (
+                    f"a unit of {name} has its corner at the operating point, around which it has no model; "
+                    "--claim practical needs none"
+                )
                 if name == "relu":
                     why = (
                         "a unit of relu has its corner at the operating point, and V is not shown to fall in all "
-                        "directions there; try another P, or give it another bias there"
+                        "directions there; try another P, or --claim practical"
                     )
             return Proof(None, None, Stop.LOCAL, why, seconds=self.seconds)
         if self.ring is None:

@@ -34,6 +34,7 @@ from certify.loop.policies.importers.steps import (
     Normalise,
     Step,
     Tanh,
+    nearest,
     spread,
 )
 from certify.loop.policies.network import Array, Squash
@@ -162,6 +163,8 @@ class _Program:
         width = self.sizes[number]
         lo, hi = spread(step.lo, width), spread(step.hi, width)
         if None not in lo and None not in hi:
+            if not any(lo):  # relu6: the corner at 0, where an equilibrium may lie, is relu's
+                number, lo = self._then(networks.Map((number,), "relu")), tuple(-v for v in hi if v is not None)
             ends = (_numbers([v for v in end if v is not None]) for end in (lo, hi))
             return self._then(networks.Clip((number,), *ends))
         for end, sign in ((lo, 1), (hi, -1)):
@@ -335,7 +338,7 @@ def _behind(head: _Head, weight: flint.fmpq_mat, bias: list[Fraction]) -> tuple[
         odd = []
         for j, (entry, root) in enumerate(zip(entries, roots, strict=True)):
             if root is not None:
-                out[i, j] = _nearest(entry / root)
+                out[i, j] = nearest(entry / root)
                 rest -= entry * head.mean[j] / root
             else:
                 out[i, j] = _rounded(Fraction(0), [(entry, head.square[j])])
@@ -348,14 +351,14 @@ def _rounded(rest: Fraction, terms: list[tuple[Fraction, Fraction]]) -> float:
     """`rest + sum of a / sqrt(q)` over the terms (a, q), rounded once to the nearest binary64."""
     terms = [(a, q) for a, q in terms if a != 0]
     if not terms:
-        return _nearest(rest)
+        return nearest(rest)
     lo = hi = 0.0
     for bits in _BITS:
         with flint.ctx.workprec(bits):
             total = flint.arb(_rational(rest))
             for a, q in terms:
                 total += flint.arb(_rational(a)) / flint.arb(_rational(q)).sqrt()
-            lo, hi = _nearest(_end(total.lower())), _nearest(_end(total.upper()))
+            lo, hi = nearest(_end(total.lower())), nearest(_end(total.upper()))
         if lo == hi:
             return lo
     # Terms that cancel exactly, or to the middle of two numbers: nothing separates the ends, which are neighbours.
@@ -428,14 +431,7 @@ def _require_width(weight: Array, width: int) -> None:
 
 
 def _numbers(values: Sequence[Fraction]) -> Array:
-    return np.array([_nearest(v) for v in values])
-
-
-def _nearest(value: Fraction) -> float:
-    try:
-        return float(value)
-    except OverflowError as error:
-        raise InputError("a folded number must lie in the range of binary64; one of them is larger.") from error
+    return np.array([nearest(v) for v in values])
 
 
 def _matrix(array: Array) -> flint.fmpq_mat:

@@ -13,9 +13,11 @@ import numpy as np
 
 from certify.errors import InputError
 from certify.loop.files.arrays import Numbers
+from certify.loop.policies.importers.constants import computed, is_computed
 from certify.loop.policies.importers.steps import (
     ABSOLUTE,
     CUBE,
+    MOST_NORMALISED,
     SQUARE,
     Activate,
     Affine,
@@ -29,6 +31,7 @@ from certify.loop.policies.importers.steps import (
     centred,
     exactly,
     mean_of,
+    nearest,
 )
 from certify.loop.policies.importers.steps import layer_normalised as layer_normalised_steps
 
@@ -37,13 +40,15 @@ _EXACT_INTEGERS = 2**53
 
 
 def real(value: Any, what: str) -> Numbers:
-    """A constant as binary64, which must hold it exactly.
+    """A constant as binary64, which must hold it exactly; one that was computed is rounded once.
 
     Raises
     ------
     InputError : it is no array of real numbers, is not finite, or is an integer that binary64 does not hold.
     """
     array = np.asarray(value)
+    if is_computed(array):
+        return np.array([nearest(v) for v in array.ravel()]).reshape(array.shape)
     if array.dtype.kind not in "fiu" or array.dtype.itemsize > 8:
         raise InputError(f"the constants of {what} must be real numbers; found {array.dtype}.")
     if array.dtype.kind in "iu" and array.size and max(abs(int(array.min())), abs(int(array.max()))) > _EXACT_INTEGERS:
@@ -61,12 +66,13 @@ def row(value: Any, what: str) -> tuple[Fraction, ...]:
     ------
     InputError : it has another shape.
     """
-    array = real(value, what)
+    array = np.asarray(value)
+    array = array if is_computed(array) else real(value, what)
     if any(size != 1 for size in array.shape[:-1]) or array.size == 0:
         raise InputError(
             f"a constant of {what} must be one number or one for each component; its shape is {array.shape}."
         )
-    return exactly(array)
+    return tuple(array.ravel()) if is_computed(array) else exactly(array)
 
 
 def affine(chain: Chain, weight: Any, bias: Any | None, what: str) -> Chain:
@@ -157,6 +163,52 @@ def magnitude(chain: Chain) -> Chain:
     return (*chain, ABSOLUTE)
 
 
+def batch_normalised(
+    chain: Chain, mean: Any, var: Any, epsilon: float, gain: Any | None, bias: Any | None, what: str
+) -> Chain:
+    """`(h - mean) / sqrt(var + epsilon)`, then gain and bias: batch normalisation in evaluation, which is affine."""
+    root = computed("sqrt", (computed("add", (var, epsilon), what),), what)
+    made = scaled(shifted(chain, mean, what, sign=-1), root, what, divide=True)
+    made = made if gain is None else scaled(made, gain, what)
+    return made if bias is None else shifted(made, bias, what)
+
+
+def root_normalised(chain: Chain, width: int, epsilon: Fraction, what: str) -> Chain:
+    """`h / sqrt(mean of h^2 + epsilon)` over all `width` numbers of a row.
+
+    Raises
+    ------
+    InputError : epsilon is not positive, or there are more numbers than are taken.
+    """
+    if not epsilon > 0 or not 0 < width <= MOST_NORMALISED:
+        raise InputError(
+            f"{what} must have a positive epsilon and at most {MOST_NORMALISED} numbers; "
+            f"found {float(epsilon)} and {width}."
+        )
+    mean = *mean_of(width), Diagonal((Fraction(1),), (epsilon,))
+    return (*chain, Branches("product", ((), (SQUARE, *mean, InverseRoot()))))
+
+
+def selected(chain: Chain, width: int, start: int, stop: int, what: str) -> Chain:
+    """The entries from `start` to `stop` of a row of `width` numbers.
+
+    Raises
+    ------
+    InputError : there are none, or the width is not known.
+    """
+    lo, hi = (max(0, min(v + width if v < 0 else v, width)) for v in (start, stop))
+    if not 0 < width <= MOST_NORMALISED or not lo < hi:
+        raise InputError(f"{what} must take some of the numbers of a row; found {start} to {stop} of {width}.")
+    return chain if (lo, hi) == (0, width) else (*chain, Affine(np.eye(width)[lo:hi], np.zeros(hi - lo)))
+
+
+def leaked(chain: Chain, slope: Any, what: str) -> Chain:
+    """`h` where it is positive, and `slope h` where it is negative, with one slope or one for each component."""
+    slopes = row(slope, what)
+    less = Diagonal(tuple(1 - s for s in slopes), (Fraction(0),))
+    return (*chain, Branches("sum", ((Diagonal(slopes, (Fraction(0),)),), (Activate("relu"), less))))
+
+
 def averaged(chain: Chain, width: int) -> Chain:
     """The mean of the `width` numbers of a row."""
     return (*chain, *mean_of(width))
@@ -191,11 +243,15 @@ def divided_by_root(one: Chain, under: Chain, what: str) -> Chain:
     ------
     InputError : it is another quotient, or epsilon is not positive.
     """
-    match _behind(one, under):
+    bare = one
+    while bare and isinstance(bare[-1], Diagonal) and not any(bare[-1].offset) and not _behind(bare, under):
+        bare = bare[:-1]  # a gain, which may stand before the quotient as well as behind it
+    gains = one[len(bare) :]
+    match _behind(bare, under):
         case [Branches() as square, Affine() as total, Diagonal() as share, Diagonal((scale,), (epsilon,)) as last] if (
             square == SQUARE and _averages((total, share)) and scale == 1 and epsilon > 0
         ):
-            return (*one, Branches("product", ((), (square, total, share, last, InverseRoot()))))
+            return (*bare, Branches("product", ((), (square, total, share, last, InverseRoot()))), *gains)
     raise InputError(f"{what} divides by a square root; read is {_NORMALISED}, with a positive epsilon.")
 
 

@@ -34,7 +34,7 @@ from certify.loop.policies.importers.observing import (
     shift,
 )
 from certify.loop.policies.importers.options import ImportOptions
-from certify.loop.policies.importers.reading import Evaluate, Reading
+from certify.loop.policies.importers.reading import Evaluate, Observations, Reading, Values
 from certify.loop.policies.importers.recognising import Content, kind_of, read_kind
 from certify.loop.policies.importers.steps import Clip, Diagonal, Normalise, Step, spread
 from certify.loop.policies.network import Array, Centre, PolicyNetwork
@@ -143,7 +143,7 @@ def import_bytes(
     n = reads.count
     reading = read_kind(kind, raw, name, options, n, plant.m, folder, beside)
     if evaluate is not None:
-        reading = replace(reading, evaluate=evaluate, program="the module itself, run")
+        reading = replace(reading, evaluate=_either(evaluate, reading.evaluate), program="the module itself, run")
     _require_answers(kind, reading, options, plant)
     if (reading.n, reading.m) != (n, plant.m):
         raise InputError(
@@ -186,6 +186,20 @@ def import_bytes(
         u_eq=np.array([float(u) for u in u_eq]),
         centring={} if reading.beta is not None else _centrings(bare, u_eq, x, values),
     )
+
+
+def _either(own: Evaluate, read: Evaluate) -> Evaluate:
+    """A module's own values; in double precision those of its operations, where it rounds its input itself."""
+
+    def evaluate(x: Observations, double: bool) -> Values:
+        try:
+            return own(x, double)
+        except RuntimeError:
+            if not double:
+                raise
+            return read(x, True)
+
+    return evaluate
 
 
 def _record(reading: Reading, options: ImportOptions, plant: System, difference: Difference) -> dict[str, Any]:
@@ -231,7 +245,7 @@ def _require_answers(kind: Content, reading: Reading, options: ImportOptions, pl
         ("--normaliser", options.normaliser, kind != "two-stage"),
         ("--centre", options.centre, kind != "two-stage" or options.centre == "preactivation"),
         ("--ignore", options.ignore, kind not in ("torchscript", "onnx")),
-        ("--output", options.output, kind == "onnx"),
+        ("--output", options.output, kind in ("onnx", "torchscript")),
     ):
         if value is not None and not belongs:
             raise InputError(f"{option} must be left out: a file of {kind} says it itself.")

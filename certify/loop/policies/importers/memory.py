@@ -54,10 +54,12 @@ def import_module(module: torch.nn.Module, plant: System, options: ImportOptions
     n = plant.n if options.states is None else len(options.states)
     try:
         still = copy.deepcopy(module).cpu().eval()
+        for layer in list(still.modules()):
+            _write_out(layer)
         for parameter in still.parameters():
             parameter.requires_grad_(False)
         raw = _traced(still, n)
-        evaluate = _evaluation(still)
+        evaluate = _evaluation(still, options.output)
     except Exception as error:  # code of whoever wrote the module
         raise InputError(f"{name} cannot be copied and traced: {_brief(error)} {_INSTEAD}") from error
     try:
@@ -103,7 +105,26 @@ def _traced(module: torch.nn.Module, n: int) -> bytes:
     return buffer.getvalue()
 
 
-def _evaluation(module: torch.nn.Module) -> Evaluate:
+def _write_out(layer: torch.nn.Module) -> None:
+    """Make a parameter of each weight that a layer computes from others, as weight_norm does, and say RMSNorm's own
+    epsilon, which is another one in double precision."""
+    import torch
+    from torch.nn.utils import parametrize
+
+    if isinstance(layer, torch.nn.RMSNorm) and layer.eps is None:
+        layer.eps = float(torch.finfo(torch.float32).eps)
+
+    if parametrize.is_parametrized(layer):
+        # remove_parametrizations would change the class, which copies of the layer share
+        computed = layer.get_submodule("parametrizations").named_children()
+        weights = {name: getattr(layer, name).detach() for name, _ in computed}
+        layer.__class__ = type(layer).__bases__[0]
+        del layer.parametrizations
+        for name, weight in weights.items():
+            layer.register_parameter(name, torch.nn.Parameter(weight, requires_grad=False))
+
+
+def _evaluation(module: torch.nn.Module, output: str | None) -> Evaluate:
     """The module's own values, in double precision or in single."""
     import torch
 
@@ -112,7 +133,8 @@ def _evaluation(module: torch.nn.Module) -> Evaluate:
     def evaluate(x: Observations, double: bool) -> Values:
         with torch.no_grad():
             given = torch.tensor(x, dtype=torch.float64 if double else torch.float32)
-            values: Values = versions[double](given).numpy()
+            result = versions[double](given)
+            values: Values = (result[int(output or 0)] if isinstance(result, tuple | list) else result).numpy()
         return values
 
     return evaluate

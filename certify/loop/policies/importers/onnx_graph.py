@@ -8,7 +8,6 @@ width that a value has already, which is removed before the graph runs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,33 +15,22 @@ import numpy as np
 
 from certify.errors import InputError
 from certify.loop.files.arrays import Numbers
-from certify.loop.policies.importers import graph
 from certify.loop.policies.importers.graph import Chain
+from certify.loop.policies.importers.onnx_operations import (
+    ACTIVATIONS,
+    ADVICE,
+    KNOWN,
+    NORMALISATIONS,
+    OPERATIONS,
+    TAKES_INTEGERS,
+    Made,
+    applied,
+)
 from certify.loop.policies.importers.onnx_weights import load_weights
 from certify.loop.policies.importers.onnx_written import with_gelu, written_out
 from certify.loop.policies.importers.options import WITH_TANH, WITHOUT_NORMALISATION
-from certify.loop.policies.importers.reading import Observations, Reading, Values, gives
-from certify.loop.policies.importers.steps import MOST_NORMALISED, Affine
+from certify.loop.policies.importers.reading import Observations, Reading, Values
 
-_ACTIVATIONS = ("Tanh", "Elu", "Sigmoid", "Gelu", "Softplus", "Mish", "Softsign", "LeakyRelu", "Selu", "Celu")
-_OPERATIONS = {
-    "Gemm", "MatMul", "Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", *_ACTIVATIONS,
-    "Identity", "Cast", "Flatten", "Reshape", "Constant", "Concat", "LayerNormalization", "Pow",
-    "Abs", "HardSigmoid", "HardSwish", "ReduceMean", "Sqrt",
-}  # fmt: skip
-_KNOWN = (
-    f"Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu, {', '.join(_ACTIVATIONS)}, "
-    "HardSigmoid, HardSwish, Abs, Pow, LayerNormalization, ReduceMean and Sqrt as parts of one, Concat, Identity, "
-    "Flatten and Constant"
-)
-_NORMALISATIONS = {
-    "BatchNormalization",
-    "InstanceNormalization",
-    "GroupNormalization",
-}
-_SELU = {"gamma": float(np.float32(1.05070102214813)), "alpha": float(np.float32(1.67326319217681))}  # of the standard
-_HARD_SIGMOID = {"alpha": float(np.float32(0.2)), "beta": 0.5}
-_TAKES_INTEGERS = ("Reshape", "Pow", "ReduceMean")
 _STANDARD = ("", "ai.onnx")
 _FLAGS = {
     "Gemm": {"alpha", "beta", "transA", "transB"},
@@ -59,6 +47,9 @@ _FLAGS = {
     "Concat": {"axis"},
     "Gelu": {"approximate"},
     "LayerNormalization": {"axis", "epsilon", "stash_type"},
+    "BatchNormalization": {"epsilon", "momentum", "training_mode"},
+    "Split": {"axis", "num_outputs"},
+    "Gather": {"axis"},
 }
 _ELEMENTWISE = {
     "Add",
@@ -68,7 +59,7 @@ _ELEMENTWISE = {
     "Neg",
     "Clip",
     "Relu",
-    *_ACTIVATIONS,
+    *ACTIVATIONS,
     "Exp",
     "Log",
     "Identity",
@@ -76,6 +67,10 @@ _ELEMENTWISE = {
     "Pow",
     "Abs",
     "Sqrt",
+    "PRelu",
+    "Min",
+    "Max",
+    "Reciprocal",
     "HardSigmoid",
     "HardSwish",
 }
@@ -109,6 +104,10 @@ def read_onnx(raw: bytes, what: str, wanted: str | None = None, folder: Path | N
         raise InputError(f"{what} is no ONNX file or is damaged: {error}.") from error
     if model.functions or any(opset.domain not in _STANDARD for opset in model.opset_import):
         raise InputError(f"{what} must hold standard operators only; it defines or imports others.")
+    old = any(opset.version < 14 for opset in model.opset_import)
+    if old and any(node.op_type == "BatchNormalization" for node in model.graph.node):
+        # onnx's own evaluator takes the moments of the batch there
+        raise InputError(f"{what} has a BatchNormalization of an old opset; export it with opset_version=17 or later.")
     name, output = _ends(model.graph, wanted, what)
     unread = _prune(model, output, what)
     beside = load_weights(model.graph, folder, what)
@@ -242,224 +241,52 @@ def _walk(graph_: Any, name: str, output: str, what: str) -> Chain:
         if tensor.name in constants:
             raise InputError(f"{what} must name each tensor once; {tensor.name} stands there twice.")
         constants[tensor.name] = _constant(tensor, what)
-    chains: dict[str, Chain | _Root] = {name: ()}
+    chains: dict[str, Made] = {name: ()}
     wide = _given_width(graph_, name)
     said = [node for node in graph_.node if node.op_type == "Constant" and len(node.output) == 1]
     numbers = {node.output[0]: _attribute({a.name: a for a in node.attribute}, what) for node in said}
     for node in with_gelu(list(graph_.node), constants | numbers, output):
         at = f"{node.op_type} {node.name}".strip()
-        if node.domain not in _STANDARD or len(node.output) != 1:
-            raise InputError(f"{what} must hold {_KNOWN}; found {node.domain}.{at}.")
-        if node.output[0] in chains or node.output[0] in constants:
+        if node.domain not in _STANDARD or (len(node.output) != 1 and node.op_type != "Split"):
+            raise InputError(f"{what} must hold {KNOWN}; found {node.domain}.{at}.")
+        if any(made in chains or made in constants for made in node.output):
             raise InputError(f"{what} must name each value once; {node.output[0]} stands there twice.")
-        if node.op_type in _NORMALISATIONS:
+        if node.op_type in NORMALISATIONS:
             raise InputError(f"{at} in {what} is not read. {WITHOUT_NORMALISATION}")
-        if node.op_type not in _OPERATIONS:
-            raise InputError(f"{at} in {what} is not read: the operations are {_KNOWN}. {WITH_TANH}")
+        if node.op_type not in OPERATIONS:
+            advice = ADVICE.get(node.op_type, f"The operations are {KNOWN}. {WITH_TANH}")
+            raise InputError(f"{at} in {what} is not read. {advice}")
         flags = {a.name: a for a in node.attribute}
         if len(flags) != len(node.attribute):
             raise InputError(f"{at} in {what} must have each attribute once.")
         unknown = sorted(set(flags) - _FLAGS.get(node.op_type, set()))
         if unknown:
-            raise InputError(
-                f"{at} in {what} has {', '.join(unknown)}, which is not read; the operations are {_KNOWN}."
-            )
+            raise InputError(f"{at} in {what} has {', '.join(unknown)}, which is not read; the operations are {KNOWN}.")
         if node.op_type == "Constant":
             constants[node.output[0]] = numbers[node.output[0]]
             continue
         given = [None if not i else chains[i] if i in chains else constants.get(i) for i in node.input]
         if any(i and v is None for i, v in zip(node.input, given, strict=True)):
             raise InputError(f"{at} in {what} reads a value that nothing before it makes.")
-        integers = [v for v in given if isinstance(v, np.ndarray) and v.dtype.kind != "f"]
-        if integers and node.op_type not in _TAKES_INTEGERS:
+        integers = [v for v in given if isinstance(v, np.ndarray) and v.dtype.kind not in "fO"]
+        if len(integers) < len(given) and integers and node.op_type not in TAKES_INTEGERS:
             raise InputError(f"{at} in {what} must be of floating-point numbers (float32 or float64).")
-        if node.op_type in ("Identity", "Cast") and len(given) == 1 and isinstance(given[0], np.ndarray):
-            if node.op_type == "Cast":
-                _require_real(flags, f"{at} in {what}")
-            constants[node.output[0]] = given[0]
-            continue
-        if node.op_type == "ReduceMean":
-            chains[node.output[0]] = _averaged(given, flags, wide, f"{at} in {what}")
-            continue
-        chains[node.output[0]] = _apply(node.op_type, given, flags, f"{at} in {what}")
+        for end, made in zip(
+            node.output, applied(node.op_type, given, flags, wide, len(node.output), f"{at} in {what}"), strict=True
+        ):
+            (constants if isinstance(made, np.ndarray) else chains)[end] = made  # type: ignore[assignment]
     if output not in chains:
         raise InputError(f"the output of {what} does not depend on its input.")
     found = chains[output]
-    if isinstance(found, _Root):
-        raise InputError(f"the output of {what} must be no square root.")
+    if not isinstance(found, tuple):
+        raise InputError(f"the output of {what} must be rows of actions.")
     return found
-
-
-@dataclass(frozen=True, slots=True)
-class _Root:
-    """The square root of a value, by which another may be divided."""
-
-    under: Chain
 
 
 def _given_width(graph_: Any, name: str) -> int:
     """The width of the graph's input; 0 if the graph leaves it open."""
     (dims,) = (value.type.tensor_type.shape.dim for value in graph_.input if value.name == name)
     return max(0, int(dims[-1].dim_value)) if len(dims) else 0
-
-
-def _averaged(given: list[Any], flags: dict[str, Any], wide: int, at: str) -> Chain:
-    """The mean of a row, whose axis is an attribute or, from opset 18 on, a second input."""
-    said = list(flags["axes"].ints) if "axes" in flags else np.ravel(given[1]).tolist() if given[1:] else []
-    kept = flags["keepdims"].i if "keepdims" in flags else 1
-    if not given or not isinstance(given[0], tuple) or said not in ([1], [-1]) or kept != 1:
-        raise InputError(f"{at} (a part of LayerNorm, as exporters write it) must be over axis 1, with keepdims 1.")
-    width = gives(given[0], wide)
-    if not 0 < width <= MOST_NORMALISED:
-        raise InputError(f"{at} must be of 1 to {MOST_NORMALISED} numbers, by a layer or by the shape of the input.")
-    return graph.averaged(given[0], width)
-
-
-def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain | _Root:
-    if kind == "Sqrt" and len(given) == 1 and isinstance(given[0], tuple):
-        return _Root(given[0])
-    found = [k for k, value in enumerate(given) if isinstance(value, tuple | _Root)]
-    if any(isinstance(value, _Root) for value in given) or (len(found) == 2 and kind == "Div"):
-        return _divided(kind, given, at)
-    if len(found) == len(given) == 2 and kind == "Mul":
-        return graph.product(*given)
-    if len(found) == len(given) > 1 and kind in ("Add", "Sub", "Concat"):
-        return _joined(kind, given, flags, at)
-    if len(found) != 1:
-        raise InputError(
-            f"{at} must join one value that depends on the observation with constants; it has {len(found)}. Add, Sub, "
-            "Mul and Concat may join several."
-        )
-    chain: Chain
-    place, chain, others = found[0], given[found[0]], [v for v in given if not isinstance(v, tuple)]
-    match kind, place, len(given):
-        case "Gemm", 0, 2 | 3:
-            return _gemm(chain, given, flags, at)
-        case "MatMul", 0, 2:
-            weight = graph.real(given[1], at)
-            if weight.ndim != 2:
-                raise InputError(f"the weight of {at} must be a matrix; its shape is {weight.shape}.")
-            return graph.affine(chain, weight.T, None, at)
-        case ("Add", _, 2) | ("Sub", 0, 2):
-            return graph.shifted(chain, others[0], at, sign=-1 if kind == "Sub" else 1)
-        case "Sub", 1, 2:
-            return graph.shifted(graph.negated(chain), others[0], at)
-        case "Mul", _, 2:
-            return graph.scaled(chain, others[0], at)
-        case "Div", 0, 2:
-            return graph.scaled(chain, others[0], at, divide=True)
-        case "Pow", 0, 2:
-            return graph.powered(chain, others[0], at)
-        case "Neg", 0, 1:
-            return graph.negated(chain)
-        case _, 0, 1 if kind in _ACTIVATIONS:
-            return _activated(chain, kind, flags, at)
-        case "Abs", 0, 1:
-            return graph.magnitude(chain)
-        case "HardSwish" | "HardSigmoid" | "LayerNormalization", 0, _:
-            return _composed(kind, chain, given, flags, at)
-        case "Cast", 0, 1:
-            _require_real(flags, at)
-            return chain
-        case "Identity", 0, 1:
-            return chain
-        case "Flatten", 0, 1 if flags["axis"].i in (1, -1) if "axis" in flags else True:
-            return chain
-        case "Reshape", 0, 2 if _keeps_width(chain, given[1]) and not ("allowzero" in flags and flags["allowzero"].i):
-            return chain
-        case "Relu", 0, 1:
-            return graph.clipped(chain, 0.0, None, at)
-        case "Clip", 0, 1 | 2 | 3:
-            bounds = [*given[1:], None, None]
-            return graph.clipped(chain, bounds[0], bounds[1], at)
-    raise InputError(f"{at} is not read: the operations are {_KNOWN}, with the observation in the usual place.")
-
-
-def _divided(kind: str, given: list[Any], at: str) -> Chain:
-    """A quotient of two values, or by the square root of one."""
-    match kind, given:
-        case "Div", [tuple() as one, _Root() as root]:
-            return graph.divided_by_root(one, root.under, at)
-        case "Div", [tuple() as one, tuple() as other]:
-            return graph.divided(one, other, at)
-    raise InputError(f"{at} reads a square root, which may only divide a value, as in layer normalisation.")
-
-
-def _gemm(chain: Chain, given: list[Any], flags: dict[str, Any], at: str) -> Chain:
-    """`alpha W h + beta b`."""
-    if "transA" in flags and flags["transA"].i:
-        raise InputError(f"{at} must not transpose the observation (transA).")
-    alpha, beta = (float(flags[k].f) if k in flags else 1.0 for k in ("alpha", "beta"))
-    weight = graph.real(given[1], at)
-    if weight.ndim != 2:
-        raise InputError(f"the weight of {at} must be a matrix; its shape is {weight.shape}.")
-    weight = weight if "transB" in flags and flags["transB"].i else weight.T
-    if alpha == 1 and beta == 1:
-        return graph.affine(chain, weight, given[2] if len(given) == 3 else None, at)
-    chain = graph.affine(chain, weight, None, at)
-    chain = chain if alpha == 1 else graph.scaled(chain, alpha, at)
-    if len(given) == 3 and given[2] is not None:
-        chain = graph.moved(chain, tuple(v * graph.row(beta, at)[0] for v in graph.row(given[2], at)))
-    return chain
-
-
-def _composed(kind: str, chain: Chain, given: list[Any], flags: dict[str, Any], at: str) -> Chain:
-    """Operations that are made of several steps."""
-    if kind == "HardSwish" and len(given) == 1:
-        return graph.mapped(chain, "hardswish")
-    if kind == "HardSigmoid" and len(given) == 1:
-        said = (float(flags[k].f) if k in flags else v for k, v in _HARD_SIGMOID.items())
-        return graph.mapped(chain, "hardsigmoid", *said)
-    axis = flags["axis"].i if "axis" in flags else -1
-    if kind != "LayerNormalization" or len(given) not in (2, 3) or axis not in (1, -1):
-        raise InputError(f"{at} is not read: it must normalise the numbers of a row, along axis 1.")
-    epsilon = float(flags["epsilon"].f) if "epsilon" in flags else float(np.float32(1e-5))
-    gain = graph.real(given[1], at)
-    return graph.layer_normalised(chain, gain.size, epsilon, gain, (*given, None)[2], at)
-
-
-def _joined(kind: str, chains: list[Chain], flags: dict[str, Any], at: str) -> Chain:
-    """Values that depend on the observation, joined: sums, differences, and one behind the other in a row."""
-    if kind == "Concat":
-        if "axis" not in flags or flags["axis"].i not in (1, -1):
-            raise InputError(f"{at} must put the numbers of a row one behind the other, along axis 1.")
-        return graph.joined("concat", *chains)
-    one, other = chains
-    return graph.subtracted(one, other) if kind == "Sub" else graph.joined("sum", one, other)
-
-
-_ALPHAS = {"LeakyRelu": float(np.float32(0.01)), "Elu": 1.0, "Celu": 1.0}  # where nothing is said
-
-
-def _activated(chain: Chain, kind: str, flags: dict[str, Any], at: str) -> Chain:
-    """An activation of the chain."""
-    if kind in _ALPHAS:
-        alpha = float(flags["alpha"].f) if "alpha" in flags else _ALPHAS[kind]
-        name = "leaky_relu" if kind == "LeakyRelu" else kind.lower()
-        return graph.mapped(chain, name, *([] if alpha == 1 and kind == "Elu" else [alpha]))
-    if kind == "Selu":
-        return graph.mapped(chain, "selu", *(float(flags[k].f) if k in flags else v for k, v in _SELU.items()))
-    approximate = flags["approximate"].s if "approximate" in flags else b"none"
-    if approximate not in (b"none", b"tanh"):
-        raise InputError(f"{at} must be the exact one or its tanh form; found approximate {approximate!r}.")
-    return graph.mapped(chain, "gelu-tanh" if approximate == b"tanh" else kind.lower())
-
-
-def _require_real(flags: dict[str, Any], at: str) -> None:
-    """Refuse a Cast to integers or to half precision, which changes numbers by more than rounding."""
-    import onnx
-
-    if "to" not in flags or flags["to"].i not in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE):
-        raise InputError(f"{at} must be a cast to float32 or float64.")
-
-
-def _keeps_width(chain: Chain, shape: Any) -> bool:
-    """True if a Reshape to `shape` leaves rows of a batch as they are, because it names their width."""
-    wide = [step for step in chain if isinstance(step, Affine)]
-    said = np.asarray(shape).ravel().tolist()
-    return len(said) == 2 and (
-        said == [0, -1] or (bool(wide) and said in ([-1, len(wide[-1].bias)], [0, len(wide[-1].bias)]))
-    )
 
 
 def _attribute(flags: dict[str, Any], what: str) -> Numbers:

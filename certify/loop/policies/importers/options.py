@@ -28,8 +28,8 @@ WITH_TANH = (
 """The next step where a policy has another activation."""
 WITHOUT_NORMALISATION = (
     "LayerNorm is read of a module, of TorchScript, of ONNX, and of a policy's state_dict with --norm layer-before or "
-    "layer-after (the activation); for another normalisation between layers train the policy again without it. "
-    "BatchNorm alone is affine in evaluation and can be folded into the layer before it."
+    "layer-after (the activation); RMSNorm, and BatchNorm in evaluation, of all these but a state_dict; for another "
+    "normalisation between layers train the policy again without it."
 )
 """The next step where a policy has a normalisation between its layers."""
 
@@ -57,7 +57,8 @@ class ImportOptions:
     centre : the centring that gives pi(0) = u_eq; None leaves the policy as it is.
     observes : `absolute` if the network reads the states' values, `deviation` if deviations from the operating point.
     ignore : names of tensors that are no part of the policy, with `*` and `?` as in names of files.
-    output : the output of an ONNX graph that is the action, where it has several.
+    output : which output of a program is the action, where it has several: a name for ONNX, for TorchScript and modules
+        the place, counted from 0.
 
     Raises
     ------

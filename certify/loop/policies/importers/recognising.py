@@ -17,7 +17,7 @@ from certify.loop.policies.importers.options import ImportOptions
 from certify.loop.policies.importers.reading import Reading
 from certify.loop.policies.importers.sb3 import read_sb3
 from certify.loop.policies.importers.state_dict import is_two_stage, read_state_dict, read_two_stage
-from certify.loop.policies.importers.tensors import load_safetensors, load_tensors
+from certify.loop.policies.importers.tensors import is_npz, load_npz, load_safetensors, load_tensors
 from certify.loop.policies.importers.torchscript import is_torchscript, read_torchscript
 
 Content = Literal["state-dict", "torchscript", "onnx", "sb3", "safetensors", "two-stage", "policy"]
@@ -30,6 +30,8 @@ def content_of(raw: bytes, name: str) -> Content | None:
         archive = Archive(raw, name) if raw.startswith(b"PK") else None
         if archive is not None and "policy.pth" in archive and "data" in archive:
             return "sb3"
+        if archive is not None and is_npz(archive):
+            return "state-dict"
         file = TorchFile(raw, name, archive)
         if is_torchscript(file):
             return "torchscript"
@@ -56,7 +58,7 @@ def kind_of(raw: bytes, name: str, options: ImportOptions) -> Content:
     """
     kind = options.kind if options.kind in ("onnx", "safetensors") else content_of(raw, name)
     if kind is None:
-        wanted = "it must be a file of torch.save, TorchScript, stable-baselines3, ONNX or safetensors"
+        wanted = "it must be a file of torch.save, TorchScript, stable-baselines3, ONNX, safetensors or npz"
         if raw[:1] in (b"\x80", b"("):
             raise InputError(
                 f"{wanted}; it is a bare pickle. If you trust it, load it and write it again with torch.save."
@@ -81,7 +83,7 @@ def read_kind(
 ) -> Reading:
     readers: dict[Content, Callable[[], Reading]] = {
         "sb3": lambda: read_sb3(Archive(raw, name), name, options.ignore),
-        "torchscript": lambda: read_torchscript(TorchFile(raw, name)),
+        "torchscript": lambda: read_torchscript(TorchFile(raw, name), n, options.output),
         "onnx": lambda: read_onnx(raw, name, options.output, folder),
         "safetensors": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m, beside),
         "two-stage": lambda: read_two_stage(tensors_in(kind, raw, name), options),
@@ -91,5 +93,7 @@ def read_kind(
 
 
 def tensors_in(kind: Content, raw: bytes, name: str) -> dict[str, Numbers]:
-    """The tensors of a state_dict or two-stage file, or of safetensors, by their names."""
+    """The tensors of a state_dict or two-stage file, of safetensors or npz, by their names."""
+    if raw.startswith(b"PK") and is_npz(Archive(raw, name)):
+        return load_npz(raw, name)
     return load_safetensors(raw, name) if kind == "safetensors" else load_tensors(raw, name)

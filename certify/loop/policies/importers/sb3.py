@@ -89,7 +89,14 @@ _CLASSES = {
         "linear ARS", "relu", ("action_net",), "", (), squashed=False
     ),
 }
-_MODULES = {row.name: Name("torch.nn.modules.activation", row.module) for row in ACTIVATIONS.values()}
+_COMPOSED = {
+    **{"leaky_relu": "LeakyReLU", "selu": "SELU", "celu": "CELU", "hardtanh": "Hardtanh", "relu6": "ReLU6"},
+    **{"hardsigmoid": "Hardsigmoid", "hardswish": "Hardswish", "logsigmoid": "LogSigmoid"},
+}
+_MODULES = {
+    name: Name("torch.nn.modules.activation", module)
+    for name, module in ({row.name: row.module for row in ACTIVATIONS.values()} | _COMPOSED).items()
+}
 _LAYERS = "stable_baselines3.common.torch_layers"
 _FLATTEN, _COMBINED = Name(_LAYERS, "FlattenExtractor"), Name(_LAYERS, "CombinedExtractor")
 _HARMLESS = {  # they change how a policy was trained, or are seen in its tensors

@@ -15,6 +15,7 @@ import numpy as np
 from certify.errors import InputError
 from certify.loop.files.arrays import Numbers
 from certify.loop.policies.importers.normalisers import normaliser_root, rsl_normaliser
+from certify.loop.policies.importers.operations import WITHOUT_WEIGHT_NORM
 from certify.loop.policies.importers.options import WITHOUT_NORMALISATION, ImportOptions, Output
 from certify.loop.policies.importers.reading import (
     LayerNorm,
@@ -38,6 +39,8 @@ _ENDS: dict[Output, tuple[Step, ...]] = {
 }
 _EPSILON = Fraction(1e-5)  # torch's number
 _NORMALISATION = f"A normalisation layer has such a one. {WITHOUT_NORMALISATION}"
+_AS_PROGRAM = "Export the policy as TorchScript or ONNX, of which BatchNorm in evaluation is read."
+_LISTED = "layers listed by --prefix"
 Layers = list[Affine]
 
 
@@ -103,7 +106,10 @@ def read_state_dict(
     InputError : there is none, there are several and `--prefix` does not say which, a layer is of a kind that is
         not proved, or another tensor could belong to the policy.
     """
-    prefix = options.prefix if options.prefix is not None else _only(tensors, n, m)
+    if options.prefix is not None and "," in options.prefix:
+        tensors, prefix = _numbered(tensors, options.prefix.split(",")), _LISTED
+    else:
+        prefix = options.prefix if options.prefix is not None else _only(tensors, n, m)
     norms = {} if options.norm is None else _norms(tensors, prefix, options)
     layers = _layers(tensors, prefix, list(norms))
     if (layers[0].weight.shape[1], layers[-1].weight.shape[0]) != (n, m):
@@ -187,6 +193,29 @@ def read_lyapunov(tensors: Mapping[str, Numbers], prefix: str | None, options: I
     )
 
 
+def _numbered(tensors: Mapping[str, Numbers], names: Sequence[str]) -> dict[str, Numbers]:
+    """The tensors with the layers of these names, in their order, numbered under one prefix.
+
+    Raises
+    ------
+    InputError : a name is none of a layer, or stands there twice.
+    """
+    wrong = [name for name in names if f"{name}.weight" not in tensors]
+    if wrong or len(set(names)) != len(names):
+        raise InputError(
+            f"--prefix with commas must name each layer once, in their order; found {','.join(names)}. "
+            f"Layers are {', '.join(_weights(tensors)) or 'none'}."
+        )
+    parts = {f"{name}.{part}": f"{_LISTED}.{k}.{part}" for k, name in enumerate(names) for part in ("weight", "bias")}
+    return {parts.get(name, name): tensor for name, tensor in tensors.items()}
+
+
+def _weights(tensors: Mapping[str, Numbers]) -> list[str]:
+    """The names of layers, each with its sizes."""
+    found = {name.removesuffix(".weight"): tensors[name] for name in tensors if name.endswith(".weight")}
+    return [f"{name} ({w.shape[1]} to {w.shape[0]})" for name, w in sorted(found.items()) if w.ndim == 2]
+
+
 def _groups(tensors: Mapping[str, Numbers]) -> list[str]:
     """Prefixes under which numbered layers lie, in the file's order."""
     found = {}
@@ -210,11 +239,15 @@ def _only(tensors: Mapping[str, Numbers], n: int, m: int) -> str:
             fitting.append(prefix)
     if len(fitting) == 1:
         return fitting[0]
-    listed = "; ".join(described) or "none (layers must be called PREFIX.NUMBER.weight and PREFIX.NUMBER.bias)"
+    listed = "; ".join(described)
+    if not described:
+        named = ", ".join(_weights(tensors))
+        listed = f"layers without a number, {named}: name them in their order, as in --prefix fc1,fc2,fc3"
+        listed = listed if named else "none (layers must be called PREFIX.NUMBER.weight and PREFIX.NUMBER.bias)"
     raise InputError(
         f"a file must hold one policy from {n} states to {m} inputs; it holds {len(fitting)}. "
         f"Name its keys up to their numbers with --prefix, and its states with --states. Found {listed}. "
-        "Of a module that was pickled whole, save the state_dict, or a trace."
+        "If the policy is more than layers one behind the other, export it as TorchScript or ONNX."
     )
 
 
@@ -283,8 +316,11 @@ def _numbers(tensors: Mapping[str, Numbers], prefix: str) -> list[int]:
         if match is None or (match["prefix"] or "") != prefix:
             continue
         if match["rest"] not in ("weight", "bias"):
+            known = (("parametrizations", WITHOUT_WEIGHT_NORM), ("weight_", WITHOUT_WEIGHT_NORM), ("", _AS_PROGRAM))
+            advice = next(words for start, words in known if match["rest"].startswith(start))
             raise InputError(
-                f"the layers of a policy must be affine, with weight and bias; {name} belongs to one of another kind."
+                f"the layers of a policy must be affine, with weight and bias; {name} belongs to one of another kind. "
+                f"{advice}"
             )
         numbers.add(int(match["number"]))
     if not numbers or any(f"{root}{k}.weight" not in tensors for k in numbers):

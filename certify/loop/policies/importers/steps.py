@@ -174,6 +174,8 @@ def activated(function: str, *numbers: Fraction) -> tuple[Step, ...]:
             return (Branches("product", ((), _tanh_gate())),)
         case "logsigmoid", ():
             return (_scaled(-one), Activate("softplus"), _scaled(-one))
+        case "softplus", (beta,):
+            return (_scaled(beta), Activate("softplus"), _scaled(1 / beta))
     raise InputError(f"the activation must be one of {', '.join(IMPORTED)}; found {function}.")
 
 
@@ -241,6 +243,19 @@ def spread(values: tuple[T, ...], width: int) -> tuple[T, ...]:
     if len(values) != width:
         raise InputError(f"there must be one number or {width} of them; found {len(values)}.")
     return values
+
+
+def nearest(value: Fraction) -> float:
+    """The nearest binary64.
+
+    Raises
+    ------
+    InputError : the number is larger than any.
+    """
+    try:
+        return float(value)
+    except OverflowError as error:
+        raise InputError("a folded number must lie in the range of binary64; one of them is larger.") from error
 
 
 def exactly(array: Array) -> tuple[Fraction, ...]:

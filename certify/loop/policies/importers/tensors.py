@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from certify.errors import InputError
+from certify.loop.files.archives import Archive
 from certify.loop.files.arrays import Numbers, array_of, is_array
 from certify.loop.files.pickles import Call
 from certify.loop.files.torchfile import TorchFile, is_tensor
@@ -18,8 +21,13 @@ _SAFE = {
 }  # fmt: skip
 
 
+_INSIDE_MODULES = re.compile(r"(?:^|(?<=\.))_(?:modules|parameters|buffers)\.")
+
+
 def load_tensors(raw: bytes, what: str, file: TorchFile | None = None) -> dict[str, Numbers]:
     """The tensors and arrays of a file of torch.save: the keys on the way to one are joined by dots.
+
+    Those of a module that was pickled whole are called as in its state_dict.
 
     Raises
     ------
@@ -31,6 +39,7 @@ def load_tensors(raw: bytes, what: str, file: TorchFile | None = None) -> dict[s
     while waiting:
         prefix, node = waiting.pop()
         if is_tensor(node) or is_array(node):
+            prefix = _INSIDE_MODULES.sub("", prefix)
             if prefix in found:
                 raise InputError(f"{what} must name each tensor once; {prefix} stands there twice.")
             found[prefix] = file.tensor(node, prefix) if is_tensor(node) else array_of(node, prefix)
@@ -49,6 +58,34 @@ def _inside(node: dict[Any, Any] | list[Any] | tuple[Any, ...] | Call) -> Iterab
     if not isinstance(node, Call):
         return enumerate(node)
     return [pair for state in node.states if isinstance(state, dict) for pair in state.items()]
+
+
+def is_npz(archive: Archive) -> bool:
+    """True if an archive holds arrays of numpy."""
+    return bool(archive.names) and all(name.endswith(".npy") for name in archive.names)
+
+
+def load_npz(raw: bytes, what: str) -> dict[str, Numbers]:
+    """The arrays of a file of numpy.savez by their names, in which a slash becomes a dot; a `kernel` (in, out), as flax
+    has it, becomes a `weight` (out, in).
+
+    Raises
+    ------
+    InputError : the file is damaged, holds objects, or two arrays have one name.
+    """
+    archive, found = Archive(raw, what), dict[str, Numbers]()
+    for member in archive.names:
+        name = member.removesuffix(".npy").replace("/", ".")
+        try:
+            array = np.lib.format.read_array(io.BytesIO(archive.read(member)), allow_pickle=False)
+        except (ValueError, EOFError, TypeError, SyntaxError, MemoryError) as error:
+            raise InputError(f"{member} in {what} is no plain array of numpy: {error}.") from error
+        if name.rpartition(".")[2] == "kernel" and array.ndim == 2:
+            name, array = f"{name.removesuffix('kernel')}weight", array.T
+        if name in found:
+            raise InputError(f"{what} must name each array once; {name} stands there twice.")
+        found[name] = array
+    return found
 
 
 def load_safetensors(raw: bytes, what: str) -> dict[str, Numbers]:

@@ -9,6 +9,7 @@ torch itself, given the same operations one by one.
 from __future__ import annotations
 
 import ast
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,58 +20,40 @@ from certify.errors import InputError
 from certify.loop.files.arrays import Numbers
 from certify.loop.files.pickles import Call, Name, brief
 from certify.loop.files.torchfile import TorchFile, is_tensor
-from certify.loop.policies.importers import graph
-from certify.loop.policies.importers.graph import Chain
-from certify.loop.policies.importers.options import WITH_TANH, WITHOUT_NORMALISATION
-from certify.loop.policies.importers.reading import Observations, Reading, Values
+from certify.loop.policies.importers.operations import (
+    ADVICE,
+    CENTRED,
+    KNOWN,
+    WITHOUT_WEIGHT_NORM,
+    Batch,
+    Value,
+    depends,
+    is_array,
+    operation,
+    run,
+)
+from certify.loop.policies.importers.reading import Observations, Reading, Values, gives
 
 _MAX_OPERATIONS = 1000
 _MAX_DEPTH = 40
 _MAX_TEXT = 2**20
-_KNOWN = (
-    "linear, addmm, matmul, add, sub, rsub, mul, div, neg, cat, clamp, hardtanh, relu, tanh, elu, sigmoid, silu, gelu, "
-    "softplus, mish, leaky_relu, selu, celu, relu6, hardsigmoid, hardswish, log_sigmoid, pow, abs, "
-    "h / (1 + abs(h)) and layer_norm"
-)
-_ACTIVATIONS: dict[str, tuple[float, ...]] = {  # with what a program may write behind the value
-    **{"tanh": (), "sigmoid": (), "silu": (), "gelu": (), "mish": (), "elu": (1.0, 1.0, 1.0), "softplus": (1.0, 20.0)},
-    "gelu-tanh": (),
-    **dict.fromkeys(("selu", "relu6", "hardsigmoid", "hardswish", "log_sigmoid"), ()),
-}
 _IN_PLACE = (
     *("relu", "elu", "leaky_relu", "selu", "celu", "silu", "mish", "tanh", "sigmoid"),
     *("hardtanh", "hardswish", "hardsigmoid", "relu6", "clamp"),
 )
-_NORMALISATIONS = ("batch_norm", "group_norm", "instance_norm", "rms_norm")
 _RESERVED = ("torch", "__torch__", "ops", "CONSTANTS", "getattr")
-_DEFAULTS: dict[str, tuple[Any, ...]] = {"hardtanh": (-1.0, 1.0), "clamp": (None, None)}
-
-
-@dataclass(frozen=True, slots=True)
-class _Value:
-    """A value that depends on the observation: the exact steps to it, and torch's operation that made it, with its
-    arguments, values and constants."""
-
-    chain: Chain = ()
-    name: str = ""
-    given: tuple[Any, ...] = ()
-
-    @property
-    def before(self) -> list[_Value]:
-        """The values that it is made of."""
-        return [v for v in self.given if isinstance(v, _Value)]
-
-    @property
-    def made(self) -> list[_Value]:
-        """All values from the observation to it, in an order in which they can be computed."""
-        found, waiting = dict[int, _Value](), [self]
-        while waiting:
-            missing = [v for v in waiting[-1].before if id(v) not in found]
-            waiting += missing
-            if not missing:
-                value = waiting.pop()
-                found[id(value)] = value
-        return [v for v in found.values() if v.name]
+_COMPARED: dict[str, Callable[[Any, Any], bool]] = {
+    **{
+        "gt": operator.gt,
+        "lt": operator.lt,
+        "ge": operator.ge,
+        "le": operator.le,
+        "eq": operator.eq,
+        "ne": operator.ne,
+    },
+    "__is__": lambda a, b: a is b,
+    "__isnot__": lambda a, b: a is not b,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +65,9 @@ class _Program:
     classes: dict[Name, ast.ClassDef]
     functions: dict[str, ast.FunctionDef]
     constants: tuple[Any, ...]
+    observations: int
     count: list[int] = field(default_factory=lambda: [0])
-    overwritten: list[_Value] = field(default_factory=list)
+    overwritten: list[Value] = field(default_factory=list)
 
     def counted(self) -> None:
         """Count an operation or a call."""
@@ -97,22 +81,28 @@ def is_torchscript(file: TorchFile) -> bool:
     return any(name.startswith(f"{file.root}code/") for name in file.archive.names)
 
 
-def read_torchscript(file: TorchFile) -> Reading:
+def read_torchscript(file: TorchFile, observations: int, wanted: str | None = None) -> Reading:
     """The policy of a TorchScript archive, whose `forward` takes the observation and gives the action.
+
+    Parameters
+    ----------
+    observations : how many numbers an observation has.
+    wanted : the place of the action among what `forward` gives, counted from 0; None if it gives the action alone.
 
     Raises
     ------
     InputError : the archive is damaged, or its code is no chain of known operations.
     """
     constants = file.pickle("constants.pkl") if file.holds("constants.pkl") else ()
-    program = _Program(file, *_definitions(file), constants if isinstance(constants, tuple) else ())
+    program = _Program(file, *_definitions(file), constants if isinstance(constants, tuple) else (), observations)
     try:
-        value = _forward(program, file.pickle("data.pkl"), _Value(), 0)
+        result = _forward(program, file.pickle("data.pkl"), [Value()], 0)
     except RecursionError as error:
         raise InputError(f"the code of {file.what} nests too deep to be read.") from error
+    value = _action(result, wanted, file.what)
     _require_kept(program, value)
     made = value.made
-    own = any(a.dtype == np.float64 and a.ndim for v in made for a in v.given if _is_array(a))
+    own = any(a.dtype == np.float64 and a.ndim for v in made for a in v.given if is_array(a))
 
     torch = _torch(file.what)
 
@@ -121,9 +111,8 @@ def read_torchscript(file: TorchFile) -> Reading:
             known = dict[int, Any]()
             start = torch.tensor(x, dtype=torch.float64 if double else torch.float32)
             for v in made:
-                known[id(v)] = _run(
-                    v.name, [known.get(id(g), start) if isinstance(g, _Value) else g for g in v.given], double
-                )
+                given = [known.get(id(g), start) if isinstance(g, Value) else g for g in v.given]
+                known[id(v)] = run(v.name, given, double)
             values: Values = known[id(value)].numpy() if made else start.numpy()
         return values
 
@@ -172,20 +161,38 @@ def _definitions(file: TorchFile) -> tuple[dict[Name, ast.ClassDef], dict[str, a
     return classes, functions
 
 
-def _forward(program: _Program, module: Any, given: _Value, depth: int, method: str = "forward") -> _Value:
+def _action(result: Any, wanted: str | None, what: str) -> Value:
+    """The action among what `forward` returns."""
+    several = result if isinstance(result, tuple | list) else (result,)
+    if wanted is None and len(several) > 1:
+        raise InputError(
+            f"forward in {what} must return the action; it returns {len(several)} values. Say which is the action with "
+            "--output, counted from 0, as in --output 0."
+        )
+    if wanted is not None and not (wanted.isdecimal() and int(wanted) < len(several)):
+        raise InputError(
+            f"--output must be a number below {len(several)}, one of the values of {what}; found {wanted}."
+        )
+    value = several[int(wanted or 0)]
+    if not depends(value) or value.under is not None:
+        raise InputError(f"forward in {what} must return what it makes of the observation, rows of actions.")
+    found: Value = value
+    return found
+
+
+def _forward(program: _Program, module: Any, given: list[Any], depth: int, method: str = "forward") -> Any:
     """A call of a module; a trace has a method for each of its calls, forward, forward1, forward2."""
     what = program.file.what
     if not isinstance(module, Call) or not isinstance(module.function, Name) or len(module.states) != 1:
         raise InputError(f"{what} must hold modules; found {brief(module)}.")
+    if "torch.nn.utils.parametrize" in str(module.function):
+        raise InputError(f"a weight of {what} is computed by {module.function.name}. {WITHOUT_WEIGHT_NORM}")
     definition = program.classes.get(module.function)
     methods = [] if definition is None else [n for n in definition.body if isinstance(n, ast.FunctionDef)]
     forward = [node for node in methods if node.name == method]
-    if len(forward) != 1 or len(forward[0].args.args) != 2:
-        raise InputError(f"{module.function} in {what} must have one {method} of one observation.")
-    result = _called(program, forward[0], [module, given], depth, f"{method} of {module.function} in {what}")
-    if isinstance(result, _Value):
-        return result
-    raise InputError(f"{method} of {module.function} in {what} must return what it makes of the observation.")
+    if len(forward) != 1:
+        raise InputError(f"{module.function} in {what} must have one {method}.")
+    return _called(program, forward[0], [module, *given], depth, f"{method} of {module.function} in {what}")
 
 
 def _called(program: _Program, function: ast.FunctionDef, given: list[Any], depth: int, at: str) -> Any:
@@ -216,6 +223,13 @@ def _through(program: _Program, body: list[ast.stmt], values: dict[str, Any], de
         match statement:
             case ast.Assign(targets=[ast.Name(id=name)]) if name not in _RESERVED:
                 values[name] = _evaluate(program, statement.value, values, depth)
+            case ast.Assign(targets=[ast.Tuple(elts=names)]) if all(
+                isinstance(name, ast.Name) and name.id not in _RESERVED for name in names
+            ):
+                parts = _evaluate(program, statement.value, values, depth)
+                if not isinstance(parts, list | tuple) or len(parts) != len(names):
+                    raise InputError(f"{at} must take apart as many values as there are: {_text(statement)}.")
+                values |= {name.id: part for name, part in zip(names, parts, strict=True) if isinstance(name, ast.Name)}
             case ast.Return(value=ast.expr() as expression):
                 return (_evaluate(program, expression, values, depth),)
             case ast.If(test=test):
@@ -233,7 +247,7 @@ def _through(program: _Program, body: list[ast.stmt], values: dict[str, Any], de
 
 
 def _evaluate(program: _Program, node: ast.expr, values: dict[str, Any], depth: int) -> Any:
-    """The value of an expression: a module, a constant, or a `_Value`."""
+    """The value of an expression: a module, a constant, or a `Value`."""
     match node:
         case ast.Name(id=name) if name in values:
             return values[name]
@@ -243,6 +257,18 @@ def _evaluate(program: _Program, node: ast.expr, values: dict[str, Any], depth: 
             return -value
         case ast.List(elts=parts):
             return [_evaluate(program, part, values, depth) for part in parts]
+        case ast.Tuple(elts=parts):
+            return tuple(_evaluate(program, part, values, depth) for part in parts)
+        case ast.Call(func=ast.Name(id="int") | ast.Attribute(attr="NumToTensor"), args=[inner], keywords=[]):
+            size = _evaluate(program, inner, values, depth)
+            if isinstance(size, Batch) or type(size) is int:
+                return size
+        case ast.Call(func=ast.Name(id="unchecked_cast" | "annotate"), args=[_, inner], keywords=[]):
+            return _evaluate(program, inner, values, depth)
+        case ast.Subscript(value=inner, slice=at):
+            parts, place = (_evaluate(program, one, values, depth) for one in (inner, at))
+            if isinstance(parts, list | tuple) and type(place) is int and -len(parts) <= place < len(parts):
+                return parts[place]
         case ast.Attribute(value=ast.Name(id="CONSTANTS"), attr=attr) if attr[:1] == "c" and attr[1:].isdecimal():
             index = int(attr[1:])
             if index >= len(program.constants):
@@ -255,20 +281,21 @@ def _evaluate(program: _Program, node: ast.expr, values: dict[str, Any], depth: 
         case ast.Call(func=ast.Name(id="getattr"), args=[inner, ast.Constant(value=str() as attr)], keywords=[]):
             return _attribute(program, _evaluate(program, inner, values, depth), attr)
         case ast.Call(func=ast.Attribute(value=ast.Name(id="torch"), attr=name)):
-            if name in _NORMALISATIONS:
-                raise InputError(f"torch.{name} in {program.file.what} is not read. {WITHOUT_NORMALISATION}")
             arguments = [_evaluate(program, argument, values, depth) for argument in node.args]
             return _operation(program, name, arguments, node)
         case ast.Call(func=inner, args=arguments, keywords=[]) if function := _function(program, inner, values):
             given = [_evaluate(program, argument, values, depth) for argument in arguments]
             return _called(program, function, given, depth + 1, f"{function.name} in {program.file.what}")
-        case ast.Call(func=ast.Attribute(value=inner, attr=method), args=[argument], keywords=[]) if _is_call(method):
+        case ast.Call(func=ast.Attribute(value=inner, attr=method), args=arguments, keywords=[]):
             module = _evaluate(program, inner, values, depth)
-            given = _evaluate(program, argument, values, depth)
-            if not isinstance(given, _Value):
-                raise InputError(f"a module of {program.file.what} must be given what depends on the observation.")
+            given = [_evaluate(program, argument, values, depth) for argument in arguments]
+            if _is_call(method) and given and not any(isinstance(v, Value) and depends(v) for v in given):
+                raise InputError(
+                    f"a module of {program.file.what} must be given what depends on the observation, not constants. "
+                    f"{CENTRED}"
+                )
             return _forward(program, module, given, depth + 1, method)
-    raise InputError(f"{program.file.what} has an expression that is not read: {_text(node)}. Known are {_KNOWN}.")
+    raise InputError(f"{program.file.what} has an expression that is not read: {_text(node)}. Known are {KNOWN}.")
 
 
 def _function(program: _Program, node: ast.expr, values: dict[str, Any]) -> ast.FunctionDef | None:
@@ -298,9 +325,9 @@ def _attribute(program: _Program, module: Any, name: str) -> Any:
     value = state[name]
     if is_tensor(value):
         return _tensor(program, value, name, "data")
-    if isinstance(value, Call | float | int) or value is None:
+    if isinstance(value, Call | float | int | str) or value is None:
         return value
-    raise InputError(f"{name} in {program.file.what} must be a module or a number; found {brief(value)}.")
+    raise InputError(f"{name} in {program.file.what} must be a module, a number or a word; found {brief(value)}.")
 
 
 def _fixed(program: _Program, module: Any, name: str) -> int | float | None:
@@ -323,145 +350,51 @@ def _tensor(program: _Program, node: Any, name: str, folder: str) -> Numbers:
 def _operation(program: _Program, name: str, given: list[Any], node: ast.Call) -> Any:
     at = f"torch.{name} in {program.file.what}"
     program.counted()
-    if name == "gt" and len(given) == 2 and all(isinstance(v, int | float) for v in given) and not node.keywords:
-        return given[0] > given[1]
+    plain = all(v is None or isinstance(v, int | float | str) for v in given)
+    if plain and not node.keywords and name == "__not__" and len(given) == 1:
+        return not given[0]
+    if not node.keywords and name in ("__is__", "__isnot__") and len(given) == 2 and given[1] is None:
+        return (given[0] is None) == (name == "__is__")
+    if plain and not node.keywords and name in _COMPARED and len(given) == 2:
+        return _COMPARED[name](*given)
+    if name == "format":
+        return ""  # words of an error
+    if name in ("dim", "size") and given and depends(given[0]):
+        return _shape(program, name, given, at)
     for value in [v for part in given for v in (part if isinstance(part, list) else [part])]:
         _require_kept(program, value)
     if name.removesuffix("_") in _IN_PLACE and name.endswith("_"):
-        program.overwritten.extend(v for v in given if isinstance(v, _Value))
+        program.overwritten.extend(v for v in given if isinstance(v, Value))
         name = name.removesuffix("_")
+    if name in ADVICE:
+        raise InputError(f"{at} is not read. {ADVICE[name]}")
+    approximate = None
     for word in node.keywords:
-        said = word.value.value if isinstance(word.value, ast.Constant) else None
+        said = word.value.value if isinstance(word.value, ast.Constant) else word
         if name == "gelu" and word.arg == "approximate" and said in ("none", "tanh"):
-            name = "gelu" if said == "none" else "gelu-tanh"
+            approximate = str(said)
         # alpha is written out even where it is 1, and then changes nothing
-        elif word.arg != "alpha" or said != 1:
+        elif said is not None and (word.arg != "alpha" or said != 1):
             raise InputError(f"{at} has {word.arg}, which is not read.")
-    if name in ("t", "numpy_T") and len(given) == 1 and _is_array(given[0]) and given[0].ndim == 2:
-        return given[0].T
-    if name == "cat" and len(given) == 2 and given[1] in (1, -1) and _are_values(given[0]):
-        return _Value(graph.joined("concat", *(v.chain for v in given[0])), name, tuple(given[0]))
-    if name in ("add", "sub") and len(given) == 2 and _are_values(given):
-        one, other = (v.chain for v in given)
-        chain = graph.subtracted(one, other) if name == "sub" else graph.joined("sum", one, other)
-        return _Value(chain, name, tuple(given))
-    if name == "div" and len(given) == 2 and _are_values(given):
-        one, other = (v.chain for v in given)
-        return _Value(graph.divided(one, other, at), name, tuple(given))
-    if name == "mul" and len(given) == 2 and _are_values(given):
-        return _Value(graph.product(*(v.chain for v in given)), name, tuple(given))
-    if name == "layer_norm":
-        return _Value(_normalised(given, at), name, tuple(given[:5]))
-    places = [k for k, value in enumerate(given) if isinstance(value, _Value)]
-    if len(places) != 1 or any(isinstance(value, Call | bool | list) for value in given):
-        raise InputError(
-            f"{at} must join one value that depends on the observation with constants; add, sub, mul and cat may "
-            "join several."
-        )
-    others = tuple(v for v in given if not isinstance(v, _Value))
-    chain = _step(name, places[0], len(given), given[places[0]].chain, others, at)
-    return _Value(chain, name, tuple(given))
+    return operation(name, given, approximate, program.observations, at)
+
+
+def _shape(program: _Program, name: str, given: list[Any], at: str) -> Any:
+    """The number of axes of a value, its shape, or the size of an axis."""
+    shape = [Batch(), gives(given[0].chain, program.observations)]
+    if name == "dim" and len(given) == 1:
+        return 2
+    if name == "size" and len(given) == 1:
+        return shape
+    if name == "size" and len(given) == 2 and given[1] in (0, 1, -1):
+        return shape[given[1]]
+    raise InputError(f"{at} is not read.")
 
 
 def _require_kept(program: _Program, value: Any) -> None:
     """Refuse a value that an operation in place has overwritten."""
     if any(value is gone for gone in program.overwritten):
         raise InputError(f"{program.file.what} must not read a value again that an operation in place has overwritten.")
-
-
-def _normalised(given: list[Any], at: str) -> Chain:
-    """layer_norm(value, [width], gain, bias, epsilon), over the entries of a row; the last ones may be left out."""
-    match [*given, *(None, None, 1e-5)[max(len(given) - 2, 0) :]]:
-        case [_Value() as value, [int(width)], gain, bias, float(epsilon), *rest] if (
-            width > 0 and len(rest) <= 1 and all(v is None or _is_array(v) for v in (gain, bias))
-        ):
-            return graph.layer_normalised(value.chain, width, epsilon, gain, bias, at)
-    raise InputError(f"{at} is read of a value that depends on the observation, over one axis, with constants.")
-
-
-def _are_values(given: Any) -> bool:
-    """True if all of these depend on the observation."""
-    return isinstance(given, list) and len(given) > 1 and all(isinstance(v, _Value) for v in given)
-
-
-def _step(name: str, place: int, count: int, chain: Chain, given: tuple[Any, ...], at: str) -> Chain:
-    match name, place, count:
-        case "linear", 0, 2 | 3:
-            return graph.affine(chain, given[0], given[1] if count == 3 else None, at)
-        case "addmm", 1, 3:
-            return graph.affine(chain, graph.real(given[1], at).T, given[0], at)
-        case "matmul" | "mm", 0, 2:
-            return graph.affine(chain, graph.real(given[0], at).T, None, at)
-        case "add", _, 2:
-            return graph.shifted(chain, given[0], at)
-        case "sub", 0, 2:
-            return graph.shifted(chain, given[0], at, sign=-1)
-        case ("sub", 1, 2) | ("rsub", 0, 2):
-            return graph.shifted(graph.negated(chain), given[0], at)
-        case "mul", _, 2:
-            return graph.scaled(chain, given[0], at)
-        case "div", 0, 2:
-            return graph.scaled(chain, given[0], at, divide=True)
-        case "neg", 0, 1:
-            return graph.negated(chain)
-        case "abs", 0, 1:
-            return graph.magnitude(chain)
-        case "pow", 0, 2:
-            return graph.powered(chain, given[0], at)
-        case "leaky_relu" | "celu", 0, 1 | 2:
-            return graph.mapped(chain, name, *given)
-        case "elu", 0, 2 | 3 | 4 if given[1:] == (1.0, 1.0)[: len(given) - 1] and given[0] != 1:
-            return graph.mapped(chain, name, given[0])
-        case _, 0, _ if name in _ACTIVATIONS and given == _ACTIVATIONS[name][: len(given)]:
-            return graph.mapped(chain, name.replace("log_s", "logs"))
-        case "relu", 0, 1:
-            return graph.clipped(chain, 0.0, None, at)
-        case ("clamp", 0, 1 | 2 | 3) | ("hardtanh", 0, 1 | 2 | 3):
-            lo, hi = (*given, *_DEFAULTS[name][len(given) :])
-            return graph.clipped(chain, lo, hi, at)
-    said = f" with {', '.join(map(str, given))}" if name in _ACTIVATIONS else ""
-    raise InputError(f"{at}{said} is not read: the operations are {_KNOWN}. {WITH_TANH}")
-
-
-def _run(name: str, given: list[Any], double: bool) -> Any:
-    """torch's own operation, with its constants as they are or in double precision."""
-    import torch
-
-    kind = np.float64 if double else None
-    arguments = [torch.from_numpy(np.array(v, dtype=kind)) if _is_array(v) else v for v in given]
-    functions: dict[str, Callable[..., Any]] = {
-        "linear": torch.nn.functional.linear,
-        "addmm": torch.addmm,
-        "matmul": torch.matmul,
-        "mm": torch.mm,
-        "add": torch.add,
-        "sub": torch.sub,
-        "rsub": torch.rsub,
-        "cat": lambda *values: torch.cat(values, 1),
-        "mul": torch.mul,
-        "div": torch.div,
-        "neg": torch.neg,
-        "abs": torch.abs,
-        "pow": torch.pow,
-        "gelu-tanh": lambda h: torch.nn.functional.gelu(h, approximate="tanh"),
-        "tanh": torch.tanh,
-        "sigmoid": torch.sigmoid,
-        **{name: getattr(torch.nn.functional, name) for name in ("silu", "gelu", "mish")},
-        "elu": lambda h, alpha=1.0, *_: torch.nn.functional.elu(h, alpha),
-        **{n: getattr(torch.nn.functional, n) for n in ("leaky_relu", "selu", "celu", "hardsigmoid", "hardswish")},
-        "layer_norm": torch.nn.functional.layer_norm,
-        "relu6": torch.nn.functional.relu6,
-        "log_sigmoid": torch.nn.functional.logsigmoid,
-        "softplus": lambda h, *_: torch.nn.functional.softplus(h),
-        "relu": torch.relu,
-        "clamp": torch.clamp,
-        "hardtanh": torch.nn.functional.hardtanh,
-    }
-    return functions[name](*arguments)
-
-
-def _is_array(value: Any) -> bool:
-    return isinstance(value, np.ndarray)
 
 
 def _text(node: ast.AST) -> str:

@@ -1,0 +1,268 @@
+"""Policies as people write them: normalisers and dropout in evaluation, two heads, normalisations, files of numbers."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from certify.errors import InputError
+from certify.loop.networks import Clip, Map
+from certify.loop.plants import get_system
+from certify.loop.policies.importers import ImportOptions, import_policy
+from certify.loop.policies.importers.constants import computed
+from certify.loop.policies.importers.memory import import_module
+
+torch = pytest.importorskip("torch")
+nn: Any = torch.nn
+PLANT = get_system("pendulum")
+SAID = ImportOptions(states=("theta", "theta_dot"), normaliser="none", action_scale=(Fraction(1),))
+LAYERS = replace(SAID, squash="identity", activation="relu")
+STATES = np.random.default_rng(0).uniform([-3, -20], [3, 20], (200, 2))
+
+
+class Policy(nn.Module):  # type: ignore[misc]
+    """A network in a form that its name says."""
+
+    def __init__(self, kind: str, *between: Any, outputs: int = 1) -> None:
+        super().__init__()
+        torch.manual_seed(4)
+        self.kind = kind
+        self.first, self.between, self.last = nn.Linear(2, 6), nn.Sequential(*between), nn.Linear(6, outputs)
+        self.register_buffer("mean", torch.tensor([0.3, -0.2]))
+        self.register_buffer("var", torch.tensor([2.0, 30.0]))
+        self.register_buffer("most", torch.tensor([0.3]))
+
+    def forward(self, x: Any) -> Any:
+        y = self.last(self.between(self.first(self.observed(x))))
+        if self.kind in ("chunk", "split"):
+            return torch.tanh(y.chunk(2, -1)[1] if self.kind == "chunk" else y.split([3, 1], 1)[1])
+        if self.kind == "slice":
+            return y[:, 2:-1]
+        if self.kind == "two heads":
+            return y.clamp(-5, 2), torch.tanh(y) * 6
+        return torch.maximum(torch.minimum(y, self.most), -self.most) if self.kind == "bounds" else y
+
+    def observed(self, x: Any) -> Any:
+        match self.kind:
+            case "normalised":
+                return ((x - self.mean) / torch.sqrt(self.var + 1e-8)).clip(-10.0, 10.0)
+            case "rsqrt":
+                return (x - self.mean) * (self.var + 1e-8).rsqrt()
+            case "deviation":
+                return (x - self.mean) / (self.var**0.5 + 1e-2)
+            case "rows":
+                return torch.flatten(x.float().view(x.shape[0], -1), 1)
+        return x
+
+
+class RootMean(nn.Module):  # type: ignore[misc]
+    def __init__(self, epsilon: float = 1e-6) -> None:
+        super().__init__()
+        self.gain, self.epsilon = nn.Parameter(torch.linspace(0.5, 2.0, 6)), epsilon
+
+    def forward(self, x: Any) -> Any:
+        return self.gain * x * torch.rsqrt(x.pow(2).mean(-1, keepdim=True) + self.epsilon)
+
+
+def batch_norm() -> Any:
+    norm = nn.BatchNorm1d(6)
+    norm(torch.randn(64, 6, generator=torch.Generator().manual_seed(1)) * 3 + 1)  # moves its statistics
+    return norm
+
+
+KINDS: dict[str, Any] = {
+    **{kind: lambda kind=kind: Policy(kind, nn.ReLU()) for kind in ("normalised", "rsqrt", "deviation", "bounds")},
+    **{k: lambda k=k: Policy(k, nn.SiLU(), outputs=4) for k in ("split", "slice")},
+    "chunk": lambda: Policy("chunk", nn.SiLU(), outputs=2),
+    "dropout": lambda: Policy("", nn.Dropout(0.3), nn.ReLU(), nn.Identity()),
+    "batch norm": lambda: Policy("", batch_norm(), nn.Tanh()),
+    "rms norm": lambda: Policy("", nn.RMSNorm(6), nn.GELU()),
+    "rms norm of its own": lambda: Policy("", RootMean(), nn.ELU()),
+    "prelu": lambda: Policy("", nn.PReLU(6, 0.1)),
+    "softplus": lambda: Policy("", nn.Softplus(3.0)),
+}
+ROWS = {"rows": lambda: Policy("rows", nn.Softsign())}
+
+
+def saved(module: Any, form: str, path: Path) -> Path:
+    x = torch.zeros(1, 2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if form == "onnx":
+            torch.onnx.export(
+                module, (x,), path, dynamo=False, opset_version=18, dynamic_axes={"x": {0: "b"}}, input_names=["x"]
+            )
+            return path
+        torch.jit.save(
+            torch.jit.trace(module, x, check_trace=False) if form == "trace" else torch.jit.script(module), path
+        )
+    return path
+
+
+def agree(policy: Any, module: Any, pick: Any = lambda y: y) -> None:
+    """In double precision the policy is the module, up to 1e-12."""
+    with torch.no_grad():
+        wanted = pick(module.double()(torch.tensor(STATES))).numpy()
+    inside = np.ones(len(STATES), dtype=bool)
+    if policy.valid is not None:
+        inside = np.all((policy.valid[:, 0] <= STATES) & (policy.valid[:, 1] >= STATES), axis=1)
+    assert inside.sum() > 20
+    assert np.allclose(np.asarray(policy.network(STATES, PLANT.exact_u_eq()))[inside], wanted[inside], atol=1e-12)
+
+
+@pytest.mark.parametrize("form", ["memory", "trace", "onnx"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_kinds(kind: str, form: str, tmp_path: Path) -> None:
+    module = KINDS[kind]().eval()
+    if form == "onnx" and kind in ("rms norm", "dropout"):
+        pytest.skip("torch does not write it, or removes it")
+    path = tmp_path / ("p.onnx" if form == "onnx" else "p.pt")
+    found = (
+        import_module(module, PLANT, SAID)
+        if form == "memory"
+        else import_policy(saved(module, form, path), PLANT, SAID)
+    )
+    if kind == "rms norm":
+        module.between[0].eps = float(torch.finfo(torch.float32).eps)
+    loose = form == "onnx" and kind in ("normalised", "rsqrt", "deviation", "rms norm of its own", "batch norm")
+    if loose:  # an exporter has added epsilon in single precision
+        assert found.difference.in_double < 1e-10
+    else:
+        agree(found.policy, module)
+
+
+@pytest.mark.parametrize("kind", ["dropout", "batch norm", "rms norm", "prelu"])
+def test_scripted_kinds(kind: str, tmp_path: Path) -> None:
+    """A Sequential can be scripted; its modules have branches on constants, words, and methods of their own."""
+    layers = KINDS[kind]()
+    module = nn.Sequential(layers.first, *layers.between, layers.last).eval()
+    found = import_policy(saved(module, "script", tmp_path / "p.pt"), PLANT, SAID)
+    if kind == "rms norm":
+        module[1].eps = float(torch.finfo(torch.float32).eps)
+    agree(found.policy, module)
+
+
+def test_rows_and_conversions(tmp_path: Path) -> None:
+    module = ROWS["rows"]().eval()
+    found = import_module(module, PLANT, SAID)
+    traced = import_policy(saved(module, "trace", tmp_path / "p.pt"), PLANT, SAID)
+    assert traced.policy.network == found.policy.network or traced.difference.in_double < 1e-13
+    module.kind = ""
+    agree(found.policy, module)
+
+
+def test_a_hidden_clip_from_0_on_has_the_corner_of_relu() -> None:
+    """Where an equilibrium lies on it, the rule of kinks knows which side a relu is on."""
+    module = nn.Sequential(nn.Linear(2, 6, bias=False), nn.ReLU6(), nn.Linear(6, 1, bias=False)).eval()
+    found = import_module(module, PLANT, SAID)
+    _, relu, clip, _ = found.policy.network.network.steps
+    assert isinstance(relu, Map) and relu.function == "relu"
+    assert isinstance(clip, Clip) and np.all(clip.lo == -6) and np.all(clip.hi == 6)
+    agree(found.policy, module)
+
+
+def test_two_heads_and_weights_that_are_computed(tmp_path: Path) -> None:
+    module = Policy("two heads", nn.ReLU()).eval()
+    path = saved(module, "trace", tmp_path / "p.pt")
+    with pytest.raises(InputError, match=r"returns 2 values.* --output 0"):
+        import_policy(path, PLANT, SAID)
+    with pytest.raises(InputError, match="must be a number below 2"):
+        import_policy(path, PLANT, replace(SAID, output="2"))
+    for found in (
+        import_policy(path, PLANT, replace(SAID, output="1")),
+        import_module(module, PLANT, replace(SAID, output="1")),
+    ):
+        agree(found.policy, module, lambda y: y[1])
+        module.float()
+    normed = Policy("", nn.utils.parametrizations.spectral_norm(nn.Linear(6, 6)), nn.ReLU()).eval()
+    found = import_module(normed, PLANT, SAID)
+    assert hasattr(normed.between[0], "parametrizations")  # the module stays as it is
+    nn.utils.parametrize.remove_parametrizations(normed.between[0], "weight")
+    agree(found.policy, normed)
+
+
+class Written(nn.Module):  # type: ignore[misc]
+    """A module by the function that it is."""
+
+    def __init__(self, function: Any) -> None:
+        super().__init__()
+        self.net, self.function = nn.Linear(2, 4), function
+        self.register_buffer("zero", torch.zeros(1, 2))
+
+    def forward(self, x: Any) -> Any:
+        return self.function(self, x)
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda s, x: s.net(x).max(1, keepdim=True)[0], r"torch\.max .* must join one"),
+        (lambda s, x: torch.tanh(torch.sqrt(s.net(x) ** 2 + 1.0)), "may only divide a value"),
+        (lambda s, x: torch.sqrt(s.net(x) ** 2 + 1.0), "rows of actions"),
+        (lambda s, x: torch.rsqrt(s.net(x) ** 2 + 1.0) / s.net(x), "may only divide a value"),
+        (lambda s, x: s.net(x) - s.net(s.zero), "--centre output"),
+        (lambda s, x: s.net(x) - s.net(torch.zeros_like(x)), "--centre output"),
+        (lambda s, x: s.net(torch.stack([torch.cos(x[:, 0]), x[:, 1]], 1)), r"x\[:, :1\]"),
+        (lambda s, x: torch.cos(s.net(x)), "--states 'cos"),
+        (lambda s, x: s.net(x)[1:], "entries of a row"),
+        (lambda s, x: s.net(x)[:, ::2], "entries of a row"),
+        (lambda s, x: s.net(x).view(-1, 2), "leave the rows"),
+        (lambda s, x: s.net(x).mean(0, keepdim=True), r"torch\.mean"),
+        (lambda s, x: s.net(x).half().float(), "float32 or float64"),
+        (lambda s, x: nn.functional.dropout(s.net(x), 0.5, True), r"model\.eval\(\)"),
+    ],
+)
+def test_what_is_read_wrongly_otherwise_is_refused(function: Any, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        import_policy(saved(Written(function).eval(), "trace", tmp_path / "p.pt"), PLANT, SAID)
+
+
+def test_constants_are_exact() -> None:
+    var, eps = np.array([2.0, 0.1], dtype=np.float32), 1e-8
+    total = computed("add", (var, eps), "it")
+    assert total is not None and total[1] == Fraction(float(np.float32(0.1))) + Fraction(1e-8)
+    root = computed("sqrt", (total,), "it")
+    assert root is not None and all(0 <= 1 - r * r / t < Fraction(1, 2**298) for r, t in zip(root, total, strict=True))
+    assert computed("sqrt", (Fraction(9, 4),), "it") == Fraction(3, 2)
+    assert computed("exp", (1.0,), "it") is None
+    for name, given in (("sqrt", (-1.0,)), ("div", (1, 0)), ("add", (np.ones(2), np.ones(3))), ("pow", (2.0, 0.3))):
+        with pytest.raises(InputError, match="cannot be computed"):
+            computed(name, given, "it")
+    with pytest.raises(InputError, match="finite"):
+        computed("add", (np.inf, 1.0), "it")
+
+
+def test_files_of_numbers(tmp_path: Path) -> None:
+    """Arrays of numpy, a module that was pickled whole, and layers without numbers are read as a state_dict is."""
+    policy = Policy("", nn.ReLU()).eval()
+    net = nn.Sequential(policy.first, nn.ReLU(), policy.last)
+    names = {"fc1": policy.first, "mean": policy.last}
+    plain = {f"{k}.{part}": getattr(layer, part).detach() for k, layer in names.items() for part in ("weight", "bias")}
+    torch.save(net, tmp_path / "whole.pt")
+    torch.save(plain, tmp_path / "plain.pt")
+    np.savez(tmp_path / "arrays.npz", **{k: v.numpy() for k, v in net.state_dict().items()})
+    flax = {
+        f"params/{k}/{'kernel' if v.ndim == 2 else 'bias'}": v.numpy().T
+        for k, v in ((n.split(".")[0], v) for n, v in plain.items())
+    }
+    np.savez(tmp_path / "flax.npz", **flax)
+    for name, prefix in (
+        ("whole.pt", None),
+        ("arrays.npz", None),
+        ("plain.pt", "fc1,mean"),
+        ("flax.npz", "params.fc1,params.mean"),
+    ):
+        agree(import_policy(tmp_path / name, PLANT, replace(LAYERS, prefix=prefix)).policy, net)
+    with pytest.raises(InputError, match=r"fc1 \(2 to 6\), mean \(6 to 1\).*--prefix fc1,fc2,fc3"):
+        import_policy(tmp_path / "plain.pt", PLANT, LAYERS)
+    with pytest.raises(InputError, match=r"name each layer once.*fc1 \(2 to 6\)"):
+        import_policy(tmp_path / "plain.pt", PLANT, replace(LAYERS, prefix="fc1,fc2"))
+    np.savez(tmp_path / "objects.npz", a=np.array([{}], dtype=object))
+    with pytest.raises(InputError, match="no plain array"):
+        import_policy(tmp_path / "objects.npz", PLANT, LAYERS)
