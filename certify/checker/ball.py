@@ -16,13 +16,12 @@ import numpy as np
 
 from .case import Case, Failures
 from .document import Intervals
-from .exact import Exact
 from .expression import Call, evaluate
-from .functions import FUNCTIONS, Undecided
+from .functions import FUNCTIONS
 from .jets import First, Jet, Units, between, constant, no_kinks, uncertain
 from .near import ZERO, Above, Array, Cubic, Near, Square, Vector, all_near, mixed, near, size, stacked, triples, within
 from .network import norm2
-from .networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Product, Sum
+from .networks import Affine, Algebra, Map, Network, Step
 
 if TYPE_CHECKING:
     from .kinks import Cone
@@ -349,7 +348,7 @@ class OnBall(Algebra[Rows]):
         at_0 = None if v.at_0 is None else v.at_0 & (FUNCTIONS[step.function].at_0 == 0)
         return Rows(phi.f[0], X, self.with_units(bent.value, twisted.value, rest.majorant, lips), at_0)
 
-    def bent(self, step: Map | Clip, v: Rows, value: Jet) -> Rows:
+    def bent(self, step: Step, v: Rows, value: Jet) -> Rows:
         """Entries that are known to first order."""
         if self.cone is None:
             raise TypeError("kinks are asked for on a cone")
@@ -358,70 +357,6 @@ class OnBall(Algebra[Rows]):
         nothing = np.zeros((k, k, N)), np.zeros((len(triples(k)[0]), N)), np.zeros((k, k, N)), Above(np.zeros(N))
         at_0 = v.at_0 & (found.y.value == 0)  # relu(0) = 0, and a clip of 0 is exact
         return Rows(found.y, X, self.with_units(*nothing, found.first), at_0)
-
-    def clip(self, step: Clip, v: Rows) -> Rows:
-        """Entries that are certainly not clipped stay, those that certainly are become constant, others NaN."""
-        value = self.jets(v)
-        if self.cone is not None:
-            return self.bent(step, v, value)
-        lo, hi = value.range.ends
-        free, low, high = (lo > step.lo) & (hi < step.hi), hi < step.lo, lo > step.hi
-        slope = np.where(free, 1.0, np.where(low | high, 0.0, np.nan))
-        y = Near(np.where(free, v.y.value, np.where(low, step.lo, step.hi)), v.y.error * slope)
-        return Rows(y, self.columns(v, value.units.count).times(Near(slope)))
-
-    def sum(self, step: Sum, vectors: Sequence[Rows]) -> Rows:
-        units = self.R.shape[2]
-        y, X, at_0 = vectors[0].y, self.columns(vectors[0], units), vectors[0].at_0
-        for v in vectors[1:]:
-            y, X = y + v.y, X + self.columns(v, units)
-            at_0 = None if at_0 is None else at_0 & v.at_0
-        return Rows(y, X, at_0=at_0)
-
-    def concat(self, step: Concat, vectors: Sequence[Rows]) -> Rows:
-        parts, error = [self.columns(v, self.R.shape[2]) for v in vectors], ZERO
-        for X in parts:
-            error = error + X.error * X.error
-        y = np.concatenate([v.y.value for v in vectors])
-        of_y = np.concatenate([v.y.error.top + 0 * v.y.value for v in vectors])
-        at_0 = None if self.cone is None else np.concatenate([v.at_0 for v in vectors])
-        return Rows(Near(y, Above(of_y)), Vector(np.concatenate([X.value for X in parts]), error.root), at_0=at_0)
-
-    def product(self, step: Product, v: Rows, w: Rows) -> Rows:
-        """The units are products of both without their values at d = 0, as of jets without constants."""
-        units = self.R.shape[2]
-        x, y = (self.repeated(part, step.size, units) for part in (v, w))
-        first, second = self.jets(x), self.jets(y)
-        none = Near(np.zeros(step.size))
-        made = replace(first, c=none) * replace(second, c=none, units=first.units)
-        X = y.X.times(x.y) + x.X.times(y.y)
-        of_units = self.with_units(made.Q.value, made.K.value, made.remainder, made.lipschitz)
-        return Rows(x.y * y.y, X, of_units, None if v.at_0 is None or w.at_0 is None else v.at_0 | w.at_0)
-
-    def repeated(self, v: Rows, width: int, units: int) -> Rows:
-        """A vector of so many entries, all of them the same if it has a single one, with columns for all units."""
-        X = self.columns(v, units)
-        if len(X.value) == width:
-            return Rows(v.y, X)
-        ones = np.ones((width, 1))
-        return Rows(v.y.through(ones), X.mapped(ones, size(ones).norm((0, 1))))
-
-    def observe(self, step: Observe, v: Rows) -> Rows:
-        u = self.jets(v)
-        nothing = Near(np.zeros(0)), Vector(np.zeros((self.k, 0)))
-        entries = [
-            Jet(u.c[j], u.a[j], u.Q[j], u.K[j], u.E[j], Near(u.B.value[:, j]), u.units, *nothing, u.lip[j])
-            for j in range(len(v.y.value))
-        ]
-        made = evaluate(step.tape, lambda q: constant(q, u.units, 0), entries)
-        found = self.entered(made)
-        if v.at_0 is None:
-            return found
-        try:
-            known = evaluate(step.tape, Exact, [Exact(Fraction(0) if still else None) for still in v.at_0.tolist()])
-        except Undecided:  # nothing is known to be 0
-            return replace(found, at_0=np.zeros(step.size, dtype=bool))
-        return replace(found, at_0=np.array([x.value == 0 for x in known]))
 
 
 def wider(X: Vector, columns: int) -> Vector:

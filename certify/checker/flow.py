@@ -12,14 +12,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import reduce
+from functools import partial, reduce
 from operator import add
 from typing import Any
 
 import numpy as np
 
 from .expression import Tape, evaluate
-from .functions import FUNCTIONS
 from .near import Above, Array, Near, size
 from .ring import Motion, Moving
 from .taylor import Taylor, affine, pairs
@@ -56,9 +55,9 @@ class Series:
         return self._of(found)
 
     def function(self, name: str) -> Series:
-        """phi(v) for a function phi of the table."""
+        """phi(v) for a function phi that equations may have."""
         count = self.count if len(self.parts) > 1 else 1
-        return self._of(FUNCTIONS[name].series(self.parts, count, self.constant))
+        return self._of(SERIES[name](self.parts, count, self.constant))
 
 
 def coefficients(
@@ -159,3 +158,82 @@ def of_mean(boxes: Moving, f: Taylor) -> Taylor:
     p = f.p.copy()
     p[own] = 0.0
     return Taylor(f.c, p, f.r + size(f.p[own]).sum())
+
+
+# ---------------------------------------------------------------------------------------- power series of functions
+
+
+def _tanh(v: list[Any], count: int, constant: Constant) -> list[Any]:
+    y, slope = [v[0].function("tanh")], list[Any]()
+    for k in range(1, count):
+        square = reduce(add, [y[i] * y[k - 1 - i] for i in range(k)])
+        slope.append(constant(Fraction(1)) + -square if k == 1 else -square)
+        y.append(_step(v, slope, k, constant))
+    return y
+
+
+def _sine(name: str, v: list[Any], count: int, constant: Constant) -> list[Any]:
+    """sin, and cos, which is the sine of v + pi/2."""
+    y, other = [v[0].function(name)], [v[0].function("cos" if name == "sin" else "sin")]
+    for k in range(1, count):
+        rise, fall = _step(v, other, k, constant), _step(v, y, k, constant)
+        y.append(rise if name == "sin" else -rise)
+        other.append(-fall if name == "sin" else fall)
+    return y
+
+
+def _inv(v: list[Any], count: int, constant: Constant) -> list[Any]:
+    y = [v[0].function("inv")]
+    for k in range(1, count):
+        y.append(-(reduce(add, [v[j] * y[k - j] for j in range(1, min(k, len(v) - 1) + 1)]) * y[0]))
+    return y
+
+
+def _exp(v: list[Any], count: int, constant: Constant) -> list[Any]:
+    y = [v[0].function("exp")]
+    for k in range(1, count):
+        y.append(_step(v, y, k, constant))
+    return y
+
+
+def _atan(v: list[Any], count: int, constant: Constant) -> list[Any]:
+    square = [
+        reduce(add, [v[i] * v[k - i] for i in range(max(0, k - len(v) + 1), min(k, len(v) - 1) + 1)])
+        for k in range(min(count, 2 * len(v) - 1))
+    ]
+    slopes = _inv([constant(Fraction(1)) + square[0], *square[1:]], count, constant)
+    y = [v[0].function("atan")]
+    for k in range(1, count):
+        y.append(_step(v, slopes, k, constant))
+    return y
+
+
+def _sqrt(v: list[Any], count: int, constant: Constant) -> list[Any]:
+    y = [v[0].function("sqrt")]
+    half = constant(Fraction(1, 2)) * y[0].function("inv")
+    for k in range(1, count):
+        known = [v[k]] if k < len(v) else []
+        known += [-(y[i] * y[k - i]) for i in range(1, k)]
+        y.append(half * reduce(add, known) if known else constant(Fraction(0)))
+    return y
+
+
+def _abs(v: list[Any], count: int, constant: Constant) -> list[Any]:
+    sign = v[0].function("sign") if count > 1 else None
+    return [v[0].function("abs"), *(sign * v[k] if k < len(v) else constant(Fraction(0)) for k in range(1, count))]
+
+
+def _sign(v: list[Any], count: int, constant: Constant) -> list[Any]:
+    return [v[0].function("sign"), *[constant(Fraction(0))] * (count - 1)]
+
+
+def _step(v: list[Any], w: list[Any], k: int, constant: Constant) -> Any:
+    """sum_(j=1..k) j v_j w_(k-j) / k."""
+    terms = [constant(Fraction(j, k)) * (v[j] * w[k - j]) for j in range(1, min(k, len(v) - 1) + 1)]
+    return reduce(add, terms) if terms else constant(Fraction(0))
+
+
+SERIES: dict[str, Callable[[list[Any], int, Constant], list[Any]]] = {  # the first coefficients of phi(v_0 + v_1 t ...)
+    **{"tanh": _tanh, "sin": partial(_sine, "sin"), "cos": partial(_sine, "cos"), "inv": _inv, "exp": _exp},
+    **{"atan": _atan, "sqrt": _sqrt, "abs": _abs, "sign": _sign},
+}

@@ -17,11 +17,13 @@ from flint import fmpq, fmpq_mat
 from .boxes import batches, is_whole
 from .case import Failures
 from .decrease import OF_ONE, Models, rational, vectors
+from .elementary import least_share, sqrt
 from .exact import exactly, fraction
 from .jets import First, Jet
-from .near import Above, Array, Near, Tensor, Vector, at_least_0, least_share, near, sqrt
-from .networks import Clip, Map
+from .near import Above, Array, Near, Tensor, Vector, at_least_0, near
+from .networks import Step
 from .pairs import bound_of_pairs, in_binary64
+from .wiring import Clip
 
 _AT_ONCE = 4096  # leaves
 _COARSE, _FINE = np.arange(-4.0, 24.0), np.arange(-7.0, 8.0) / 8  # powers of 2 to choose a multiplier from
@@ -62,7 +64,7 @@ class Cone:
         """The weight of directions that are of interest here: no bound depends on it."""
         return np.outer(self.c, self.c) + float(self.r @ self.r) * np.eye(len(self.c))
 
-    def bent(self, step: Map | Clip, v: Jet, at_0: Array) -> Bent:
+    def bent(self, step: Step, v: Jet, at_0: Array) -> Bent:
         """The units of a step of a vector, a batch of jets; `at_0` says which v(0) are exactly 0."""
         below, above, falls, rises = self.reach(v)
         if isinstance(step, Clip):

@@ -25,9 +25,10 @@ from .expression import Call, Tape, evaluate
 from .functions import FUNCTIONS
 from .near import Above, Array, Form, Near, near
 from .network import enclose_on_boxes, entries, models, prepare
-from .networks import Affine, Algebra, Clip, Concat, Map, Observe, Product, Sum
+from .networks import Affine, Algebra, Map
 from .processes import Batch, in_order
 from .taylor import Taylor, constant, constants, upper_bound
+from .wiring import Clip, Concat, Observe, Others, Product, Sum
 
 _BATCH_NUMBERS = 1_000_000  # in the largest array of a batch
 _MOST_NUMBERS, _MOST_VALUES = 2**22, 2**26  # of a box: in the models of a network, and of all of an expression's values
@@ -67,7 +68,7 @@ class Dual:
         return Dual(_through(W, self.value, b), None if self.rate is None else _through(W, self.rate))
 
 
-class InRows(Algebra[Dual]):
+class InRows(Algebra[Dual], Others[Dual]):
     """Networks of such models, each vector in rows (width, B)."""
 
     def affine(self, step: Affine, v: Dual) -> Dual:

@@ -14,7 +14,8 @@ from operator import add
 
 from .case import Case, Failures
 from .expression import Tape, evaluate
-from .networks import Affine, Clip, Observe, OnNumbers
+from .networks import Affine, OnNumbers
+from .wiring import Clip, NumberSteps, Observe
 
 MOST_TURNS = 2**32  # so that no product of many integers takes hours
 
@@ -63,7 +64,7 @@ class Winding:
         return Winding((0,) * len(self.turns)) if name in ("sin", "cos") else self.still()
 
 
-class Windings(OnNumbers):
+class Windings(OnNumbers, NumberSteps):
     """Networks of such numbers."""
 
     def affine(self, step: Affine, v: list[Winding]) -> list[Winding]:

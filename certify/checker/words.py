@@ -8,7 +8,7 @@ from typing import Any
 
 from .document import Array, Certificate, Partition, Policy
 from .expression import Tape
-from .networks import Map, Network, Observe, Product, Step, Sum, hashed
+from .networks import Network, hashed
 
 CLAIMS = {
     "asymptotic": "the origin is asymptotically stable, and every trajectory of the closed loop that starts in "
@@ -171,23 +171,8 @@ def _network(network: Network) -> str:
     sha256 = hashed("certify-lyapunov/1\0", arrays, network.words())
     if network.is_chain:
         return f"{'-'.join(map(str, network.widths))} tanh, sha256 {sha256}"
-    return f"{'; '.join(f'v{k} = {_step(step)}' for k, step in enumerate(network.steps, 1))}; sha256 {sha256}"
-
-
-def _step(step: Step) -> str:
-    of = [f"v{i}" for i in step.of]
-    match step:
-        case Map():
-            return f"{step.function}({of[0]})"
-        case Sum():
-            return " + ".join(of)
-        case Product():
-            return " * ".join(of)
-        case Observe():
-            made = ", ".join(expression(tree) for tree in step.tape.trees)
-            return f"({made}) of ({', '.join(step.names)}) = {of[0]}"
-    word = {"Affine": "W {} + b", "Clip": "clip({})", "Concat": "({})"}[type(step).__name__]
-    return f"{word.format(', '.join(of))}, {step.size} entries"
+    steps = (f"v{k} = {step.said([f'v{i}' for i in step.of])}" for k, step in enumerate(network.steps, 1))
+    return f"{'; '.join(steps)}; sha256 {sha256}"
 
 
 def _matrix(A: Array) -> str:

@@ -25,8 +25,10 @@ from certify.checker.functions import FUNCTIONS
 from certify.checker.jets import Jet, Units, constant
 from certify.checker.near import Near, Vector, triples
 from certify.checker.networks import FUNCTIONS as MAPS
-from certify.checker.networks import Affine, Concat, Map, Network, Observe, Step, Sum
+from certify.checker.networks import Affine, Map, Network, Step
 from certify.checker.ring import Ring
+from certify.checker.smooth import add as add_smooth
+from certify.checker.wiring import Concat, Observe, Sum
 from certify.reference import contraction as other
 from certify.reference.balls import PRECISION
 from certify.reference.document import read
@@ -43,6 +45,7 @@ from tests.support.earlier import newer
 from tests.support.reference import judge_bytes
 
 add_activations()
+add_smooth()
 
 
 Array = Any

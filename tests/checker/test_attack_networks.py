@@ -21,10 +21,11 @@ from certify.checker.expression import Call, Tape, evaluate, parse
 from certify.checker.jets import Units
 from certify.checker.near import Above, Form, triples
 from certify.checker.network import enclose
-from certify.checker.networks import Affine, Algebra, Clip, Concat, Map, Observe, Product, Sum
+from certify.checker.networks import Affine, Algebra, Map
 from certify.checker.ring import Ring
 from certify.checker.taylor import Taylor, constants
 from certify.checker.taylor import affine as form_of
+from certify.checker.wiring import Clip, Concat, Observe, Others, Product, Sum
 from tests.checker.test_networks import a_jet, a_network, hash_of, odd_loop
 from tests.support.certificates import Document, encode
 from tests.support.earlier import newer
@@ -78,7 +79,7 @@ PHI: dict[str, Callable[[arb], arb]] = {
 }
 
 
-class Truths(Algebra[list[arb]]):
+class Truths(Algebra[list[arb]], Others[list[arb]]):
     """Networks in Arb."""
 
     def affine(self, step: Affine, v: list[arb]) -> list[arb]:

@@ -26,6 +26,7 @@ from certify.checker.jets import Jet as Batch
 from certify.checker.jets import Units, unpacked
 from certify.checker.near import Above, Cubic, Near, Square, Vector, symmetric
 from certify.checker.pairs import in_binary64
+from certify.checker.smooth import add as add_smooth
 from tests.checker.test_ball import curved as every_function
 from tests.checker.test_path import linear as along
 from tests.checker.test_path import placed
@@ -51,6 +52,7 @@ from tests.support.plain import chain, elementary, layers
 
 Generator = np.random.Generator
 JUST = 1 - 2.0**-40
+add_smooth()
 FUNCTIONS = ["sin", "cos", "tanh", "exp", "atan", "inv", "sqrt"]
 
 

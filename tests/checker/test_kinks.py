@@ -16,7 +16,8 @@ from certify.checker.ball import OnBall
 from certify.checker.case import Case
 from certify.checker.jets import Units, constant, unpacked
 from certify.checker.near import Vector
-from certify.checker.networks import Affine, Clip, Map, Network
+from certify.checker.networks import Affine, Map, Network
+from certify.checker.wiring import Clip
 from tests.support.certificates import LEAF, Document, edited, encode, parse, verdict
 from tests.support.kinked import even, kinked, mirrored, pi
 from tests.support.network_loops import affine, hashed, joined, mapped, with_policy

@@ -16,16 +16,19 @@ import pytest
 from scipy.special import erf
 
 from certify.checker import ball, document, network, rules
+from certify.checker.activations import add as add_activations
 from certify.checker.errors import Rejected
 from certify.checker.exact import Exact, Exactly
 from certify.checker.expression import Tape, evaluate, parse
 from certify.checker.functions import Undecided
 from certify.checker.jets import Jet, Units, constant
 from certify.checker.near import Above, Form, Near, Vector
-from certify.checker.networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Product, Step, Sum
+from certify.checker.networks import Affine, Algebra, Map, Network, Step
 from certify.checker.outer import Dual, InRows
+from certify.checker.smooth import add as add_smooth
 from certify.checker.taylor import Taylor, constants
 from certify.checker.taylor import affine as form_of
+from certify.checker.wiring import Clip, Concat, Observe, Others, Product, Sum
 from tests.support.certificates import Document, decode, encode, grow, make
 from tests.support.earlier import newer
 from tests.support.reference import judge_bytes
@@ -33,6 +36,8 @@ from tests.support.reference import judge_bytes
 Array = Any
 SEEDS = range(100)
 WITH_PRODUCTS = 60  # from this seed on networks have products, too
+add_activations()
+add_smooth()
 FUNCTIONS: dict[str, Callable[[Array], Array]] = {
     "tanh": np.tanh,
     "sin": np.sin,
@@ -65,7 +70,7 @@ def has_corners(net: Network) -> bool:
     return any(isinstance(step, Clip) or getattr(step, "function", "") in CORNERED for step in net.steps)
 
 
-class Numbers(Algebra[Array]):
+class Numbers(Algebra[Array], Others[Array]):
     """Plain numbers, (width, B)."""
 
     def affine(self, step: Affine, v: Array) -> Array:

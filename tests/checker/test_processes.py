@@ -453,7 +453,7 @@ def test_each_feature_has_a_chapter_and_a_page_of_the_site() -> None:
         ("rotor", set()),
         ("enlarged", {"tube", "sections", "demands"}),
         ("sampled", {"flow"}),
-        ("outer, a network", {"outer", "sections", "demands"}),
+        ("outer, a network", {"outer", "sections", "demands", "wiring", "elementary"}),
     ],
 )
 def test_an_answer_rests_on_the_modules_that_it_needs(name: str, used: set[str], tmp_path: Path) -> None:

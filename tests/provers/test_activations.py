@@ -24,6 +24,7 @@ from certify.checker.activations import add as add_activations
 from certify.checker.functions import FUNCTIONS
 from certify.checker.near import Above, Form
 from certify.checker.network import enclose_on_boxes, fold
+from certify.checker.smooth import add as add_smooth
 from certify.errors import CertificateFormatError, InputError
 from certify.loop.activations import ACTIVATIONS
 from certify.loop.closed_loop import ClosedLoop
@@ -43,6 +44,7 @@ from tests.support.loops import saturated_lqr, scalar_tanh
 from tests.support.ways import WAYS, Way, bounded
 
 add_activations()
+add_smooth()
 
 
 NEW = [name for name in ACTIVATIONS if name != "tanh"]
