@@ -14,7 +14,6 @@ from functools import cache, cached_property
 import numpy as np
 
 from .document import Policy
-from .expression import Call
 from .functions import FUNCTIONS
 from .near import (
     ZERO,
@@ -31,7 +30,6 @@ from .near import (
     stacked,
 )
 from .networks import Affine, Algebra, Map, Network, Step
-from .taylor import Taylor, affine
 
 TANH = Map((0,), 0, "tanh")  # the policy's squash
 
@@ -190,37 +188,6 @@ class OnBoxes(Algebra[Enclosed]):
         """The number of entries of vector k."""
         step = self.steps[k]
         return self.network.reads if step is None else step.size
-
-
-def enclose(network: Network, x: Form, entries: Sequence[int]) -> Form:
-    """Some entries of the network's value on boxes, x (k + 1, reads, B) being the argument."""
-    boxes, rows = OnBoxes(network, x), np.zeros((len(entries), network.gives))
-    rows[range(len(entries)), list(entries)] = 1.0
-    return Form(boxes.last.h.value[:, list(entries)], boxes.backwards(rows))
-
-
-def entries(call: Call, arguments: Sequence[Taylor], first: int) -> list[Taylor]:
-    """The entries that a call in equations uses, as models: the error of each has a symbol of its own, from `first` on,
-    which no argument knows."""
-    u, found = enclose(call.network, forms(arguments), call.entries), list[Taylor]()
-    for j in range(len(call.entries)):
-        g = u.value[1:, j].copy()
-        own = first + call.first + j
-        g[own] = np.where(g[own] == 0, u.error.top[j], np.nan)
-        found.append(affine(u.value[0, j], g))
-    return found
-
-
-def models(h: Form, error: Above) -> list[Taylor]:
-    """The entries of a vector as models."""
-    wide = error.top + 0 * h.value[0]
-    return [affine(h.value[0, i], h.value[1:, i], Above(wide[i])) for i in range(h.value.shape[1])]
-
-
-def forms(v: Sequence[Taylor]) -> Form:
-    """Models as forms: what is of second order becomes an error."""
-    value = np.stack([np.concatenate([x.c[None], x.g]) for x in v], 1)
-    return Form(value, Above(np.stack([(x.r + x.quadratic).top + 0 * x.c for x in v])))
 
 
 # ---------------------------------------------------------------------------------------------------------- the policy

@@ -10,7 +10,6 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from functools import reduce
 from operator import add
 from typing import Any, Generic
@@ -21,13 +20,12 @@ from .ball import OnBall, Rows
 from .elementary import clip_of, lines_around_product
 from .exact import Exact, Exactly, clipped
 from .expression import Tape, evaluate, parse
-from .functions import Undecided
 from .jets import Jet, constant
 from .near import ZERO, Above, Array, Form, Near, Uniform, Vector, norm, size
-from .network import Enclosed, OnBoxes, forms, models
+from .network import Enclosed, OnBoxes
 from .networks import MAX_STEPS, MAX_WIDTH, Algebra, Step, V, vectors_of
 from .schema import Value
-from .taylor import constants
+from .taylor import constants, forms, models
 from .words import expression
 
 MAX_NAMES = 64
@@ -91,7 +89,7 @@ class Observe(Step):
 
     def said(self, of: list[str]) -> str:
         made = ", ".join(expression(tree) for tree in self.tape.trees)
-        return f"({made}) of ({', '.join(self.names)}) = {of[0]}, {self.size} entries"
+        return f"({made}) of ({', '.join(self.names)}) = {of[0]}"
 
 
 def read(value: Value, sizes: Sequence[int]) -> Step:
@@ -304,8 +302,6 @@ class BallSteps(Others[Rows]):
     def clip(self, step: Clip, v: Rows) -> Rows:
         """Entries that are certainly not clipped stay, those that certainly are become constant, others NaN."""
         value = self.ball.jets(v)
-        if self.ball.cone is not None:
-            return self.ball.bent(step, v, value)
         lo, hi = value.range.ends
         free, low, high = (lo > step.lo) & (hi < step.hi), hi < step.lo, lo > step.hi
         slope = np.where(free, 1.0, np.where(low | high, 0.0, np.nan))
@@ -314,11 +310,10 @@ class BallSteps(Others[Rows]):
 
     def sum(self, step: Sum, vectors: Sequence[Rows]) -> Rows:
         units = self.ball.R.shape[2]
-        y, X, at_0 = vectors[0].y, self.ball.columns(vectors[0], units), vectors[0].at_0
+        y, X = vectors[0].y, self.ball.columns(vectors[0], units)
         for v in vectors[1:]:
             y, X = y + v.y, X + self.ball.columns(v, units)
-            at_0 = None if at_0 is None else at_0 & v.at_0
-        return Rows(y, X, at_0=at_0)
+        return Rows(y, X)
 
     def concat(self, step: Concat, vectors: Sequence[Rows]) -> Rows:
         parts, error = [self.ball.columns(v, self.ball.R.shape[2]) for v in vectors], ZERO
@@ -326,8 +321,7 @@ class BallSteps(Others[Rows]):
             error = error + X.error * X.error
         y = np.concatenate([v.y.value for v in vectors])
         of_y = np.concatenate([v.y.error.top + 0 * v.y.value for v in vectors])
-        at_0 = None if self.ball.cone is None else np.concatenate([v.at_0 for v in vectors])
-        return Rows(Near(y, Above(of_y)), Vector(np.concatenate([X.value for X in parts]), error.root), at_0=at_0)
+        return Rows(Near(y, Above(of_y)), Vector(np.concatenate([X.value for X in parts]), error.root))
 
     def product(self, step: Product, v: Rows, w: Rows) -> Rows:
         """The units are products of both without their values at d = 0, as of jets without constants."""
@@ -338,7 +332,7 @@ class BallSteps(Others[Rows]):
         made = replace(first, c=none) * replace(second, c=none, units=first.units)
         X = y.X.times(x.y) + x.X.times(y.y)
         of_units = self.ball.with_units(made.Q.value, made.K.value, made.remainder, made.lipschitz)
-        return Rows(x.y * y.y, X, of_units, None if v.at_0 is None or w.at_0 is None else v.at_0 | w.at_0)
+        return Rows(x.y * y.y, X, of_units)
 
     def repeated(self, v: Rows, width: int, units: int) -> Rows:
         """A vector of so many entries, all of them the same if it has a single one, with columns for all units."""
@@ -350,17 +344,8 @@ class BallSteps(Others[Rows]):
 
     def observe(self, step: Observe, v: Rows) -> Rows:
         u = self.ball.jets(v)
-        nothing = Near(np.zeros(0)), Vector(np.zeros((self.ball.k, 0)))
         entries = [
-            Jet(u.c[j], u.a[j], u.Q[j], u.K[j], u.E[j], Near(u.B.value[:, j]), u.units, *nothing, u.lip[j])
+            Jet(u.c[j], u.a[j], u.Q[j], u.K[j], u.E[j], Near(u.B.value[:, j]), u.units, u.lip[j])
             for j in range(len(v.y.value))
         ]
-        made = evaluate(step.tape, lambda q: constant(q, u.units, 0), entries)
-        found = self.ball.entered(made)
-        if v.at_0 is None:
-            return found
-        try:
-            known = evaluate(step.tape, Exact, [Exact(Fraction(0) if still else None) for still in v.at_0.tolist()])
-        except Undecided:  # nothing is known to be 0
-            return replace(found, at_0=np.zeros(step.size, dtype=bool))
-        return replace(found, at_0=np.array([x.value == 0 for x in known]))
+        return self.ball.entered(evaluate(step.tape, lambda q: constant(q, u.units), entries))

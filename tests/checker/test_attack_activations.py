@@ -238,7 +238,7 @@ def test_a_network_with_kinks_lies_in_its_model_to_the_last_bit(seed: int) -> No
 
 def on_a_line(c: float, a: float) -> tuple[Jet, Model]:
     """c + a d for |d| <= 1, in both programs."""
-    x = constant(Fraction(0), Units(np.zeros((1, 1, 0)), np.zeros((0, 0))), 0)
+    x = constant(Fraction(0), Units(np.zeros((1, 1, 0)), np.zeros((0, 0))))
     return replace(x, c=Near(np.float64(c)), a=Vector(np.array([a]))), Model.affine(arb(c), [arb(a)], lip=ZERO)
 
 
@@ -500,7 +500,7 @@ def contracts(data: Document) -> set[str]:
         by = c.evidence.contraction
         assert by is not None
         try:
-            rules.Tally().hold(contraction.OF_CONTRACTION, contraction.Contracted(Case(c), by))
+            rules.Tally().hold(contraction.OF_CONTRACTION, contraction.Contracted.of(Case(c), by))
             found.add("checker")
         except Rejected:
             pass
@@ -602,6 +602,6 @@ def test_arguments_on_leaves_are_counted() -> None:
     """One array of a batch has four times as many numbers as may be held in all."""
     case = many_arguments(1, 2**14)
     case = Case(replace(case.c, levels={"local": 0.25, "roa": 1.0}))
-    ring = Ring(case)
+    ring = Ring.of(case)
     held = (1 + ring.symbols) * 2**14 * ring.batch
     assert held <= limits.MOST_NUMBERS or [at for at, _ in limits.is_bearable(case)] != []

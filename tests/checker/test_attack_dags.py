@@ -11,10 +11,10 @@ import pytest
 from flint import arb, ctx
 
 from certify.checker import ball
+from certify.checker.calls import enclose
 from certify.checker.expression import evaluate, parse
 from certify.checker.jets import Units
 from certify.checker.near import Above, Form, triples
-from certify.checker.network import enclose
 from certify.checker.networks import FUNCTIONS as MAPS
 from certify.checker.networks import Affine, Map, Network, Step
 from certify.checker.outer import Dual, InRows

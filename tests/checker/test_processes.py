@@ -27,8 +27,8 @@ import pytest
 from certify.certificates import checking, run_checker
 from certify.checker import boxes, outer, processes, rules
 from certify.checker.__main__ import main
+from certify.checker.boxes import Batch, in_order
 from certify.checker.errors import Rejected
-from certify.checker.processes import Batch, in_order
 from certify.checker.ring import Ring
 from certify.errors import BackendError, InputError
 from tests.checker.test_rules import HONEST, honest, scalar_claim
@@ -345,7 +345,7 @@ ENDLESS = """
 import os, sys
 import numpy as np
 sys.path.insert(0, sys.argv[1])
-from certify.checker.processes import in_order
+from certify.checker.boxes import in_order
 batches = ((first, np.zeros((1, 1)), np.zeros((1, 1))) for first in range(10**9))
 for who in in_order(lambda first, lo, hi: (os.getpid(), "x" * 1000), batches, 10**9, 3):
     print(who[0], flush=True)
@@ -434,7 +434,7 @@ CHAPTERS = {  # the core page's table: the modules that a chapter is about
         r"^\| \[(\w+)\]\(format/\1\.md\) \| [^|]* \|([^|]*)\|$", (PACKAGE / "FORMAT.md").read_text(), re.M
     )
 }
-FEATURES = {"sections", "clauses", "demands"}.union(*CHAPTERS.values())  # those three are of several features
+FEATURES = {"sections", "clauses", "demands", "processes"}.union(*CHAPTERS.values())  # those four are of several
 
 
 def test_each_feature_has_a_chapter_and_a_page_of_the_site() -> None:
@@ -452,8 +452,8 @@ def test_each_feature_has_a_chapter_and_a_page_of_the_site() -> None:
     [
         ("rotor", set()),
         ("enlarged", {"tube", "sections", "demands"}),
-        ("sampled", {"flow"}),
-        ("outer, a network", {"outer", "sections", "demands", "wiring", "elementary"}),
+        ("sampled", {"flow", "ranges", "sections", "stepping"}),
+        ("outer, a network", {"outer", "sections", "demands", "wiring", "elementary", "calls"}),
     ],
 )
 def test_an_answer_rests_on_the_modules_that_it_needs(name: str, used: set[str], tmp_path: Path) -> None:
