@@ -113,7 +113,8 @@ def results(c: Certificate, answer: dict[str, Any]) -> tuple[str, str, list[str]
         rest = words.margins(c, answer, "D" if c.step else "Vdot")
     if c.then is None:
         return rest, verdict, [], []
-    counted = f"of the certificate that takes over: {words.counts(answer['then']['rules'])}"
+    counts = ", ".join(f"{rule} {count}" for rule, count in answer["then"]["rules"].items())
+    counted = f"of the certificate that takes over: {counts}"
     return rest, verdict, [*handed_over(c, c.then), *words.stated(c.then)], [counted]
 
 

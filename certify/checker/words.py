@@ -59,16 +59,12 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
     return [
         *stated(c),
         *then,
-        f"rules that held: {counts(answer['rules'])}",
+        "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items() if count),
         *counted,
         "modules that were used: " + ", ".join(answer["modules"]),
         rest,
         f"{verdict} {_levels(c)}sha256={c.sha256}",
     ]
-
-
-def counts(rules: dict[str, int]) -> str:
-    return ", ".join(f"{rule} {count}" for rule, count in rules.items() if count)
 
 
 def margins(c: Certificate, answer: dict[str, Any], change: str) -> str:
@@ -80,7 +76,8 @@ def margins(c: Certificate, answer: dict[str, Any], change: str) -> str:
         "ring": f"smallest bound of -{change} on a ring's leaf {{:.3g}}",
         "outer": "smallest bound of -N'F on a leaf of the outer set {:.3g}",
     }
-    return "margins: " + "; ".join(said.format(found[name]) for name, said in words.items() if found[name] is not None)
+    known = ((said, found.get(name)) for name, said in words.items())
+    return "margins: " + "; ".join(said.format(margin) for said, margin in known if margin is not None)
 
 
 def stated(c: Certificate) -> list[str]:

@@ -5,6 +5,7 @@ Batches are made small, so that the leaves of a small certificate are those of m
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import pickle
@@ -434,7 +435,8 @@ CHAPTERS = {  # the core page's table: the modules that a chapter is about
         r"^\| \[(\w+)\]\(format/\1\.md\) \| [^|]* \|([^|]*)\|$", (PACKAGE / "FORMAT.md").read_text(), re.M
     )
 }
-FEATURES = {"sections", "clauses", "demands", "processes"}.union(*CHAPTERS.values())  # those four are of several
+SHARED = {"sections", "clauses", "demands", "processes"}  # by several features
+FEATURES = SHARED.union(*CHAPTERS.values())
 
 
 def test_each_feature_has_a_chapter_and_a_page_of_the_site() -> None:
@@ -445,6 +447,22 @@ def test_each_feature_has_a_chapter_and_a_page_of_the_site() -> None:
     assert set(nav) == pages == {path.stem for path in (root / "docs" / "format").glob("*.md")}
     core = len((PACKAGE / "FORMAT.md").read_text().split())
     assert core <= 5_000 and len(FEATURES) > 8
+
+
+def test_a_chapter_names_all_modules_that_its_own_load() -> None:
+    """By what they import when they are loaded themselves."""
+    imported: dict[str, set[str]] = {}
+    for path in PACKAGE.glob("*.py"):
+        own = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.ImportFrom) and node.level]
+        imported[path.stem] = {name for node in own for name in ([node.module] if node.module else _names(node))}
+    for chapter, modules in CHAPTERS.items():
+        assert modules == {name for module in modules for name in imported[module] & FEATURES - SHARED} | modules, (
+            chapter
+        )
+
+
+def _names(node: ast.ImportFrom) -> list[str]:
+    return [alias.name for alias in node.names]
 
 
 @pytest.mark.parametrize(
