@@ -2,8 +2,9 @@
 
 It imports nothing from the rest of the project (numpy and python-flint only), searches nothing and
 trusts nothing in the file. Run it as `python -I -m certify.checker FILE`. FORMAT.md has the format, the claims and the
-rules; docs/mathematics/ proves that the rules imply the claims. Reading order: errors, strict, schema, document,
-expression, near, functions, exact, networks, network, case, limits, processes, rules, taylor, boxes, ring, jets, ball,
-pairs, decrease, local, words; then what only some certificates need: sections, clauses, demands, activations, flow,
-tube, contraction, outer, invariant, periodic, ranks, data, handover.
+rules; docs/mathematics/ proves that the rules imply the claims. Reading order of what every certificate needs: rules,
+case, exact; near, functions, jets, ball, pairs, decrease, local; networks, network, taylor, boxes, ring; then what
+proves nothing: strict, schema, expression, document, errors, limits, words. What only some need, by the chapters that
+FORMAT.md has it in: smooth, activations, elementary; wiring, calls; ranges; stepping, flow; tube; contraction; outer,
+invariant; periodic, ranks; kinks; keep; data; handover; and sections, clauses, demands, processes for several of them.
 """

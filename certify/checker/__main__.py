@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import sys
 import time
@@ -64,7 +63,6 @@ def _examine(path: str, jobs: int, patient: bool) -> tuple[int, dict[str, Any]]:
     c = document.read(path)
     start = time.perf_counter()
     from . import rules  # after parsing: a malformed file needs no tables
-    from .boxes import LEAF
 
     ready = time.perf_counter()
     tally = rules.check(c, jobs, patient)
@@ -74,27 +72,12 @@ def _examine(path: str, jobs: int, patient: bool) -> tuple[int, dict[str, Any]]:
     answer |= {"rate": c.rate, "sample": sample, "discrete": c.discrete}
     answer["origin"] = None if c.policy.origin is None else c.policy.origin.tolist()  # the hash does not tell
     answer |= {"levels": c.levels, "rules": tally.rules, "modules": _modules(), "seconds": seconds}
-    if isinstance(c.evidence, document.Trusted):
-        answers = [": ".join(pair) for pair in c.evidence.queries]
-        answer |= {"solver": c.evidence.solver, "version": c.evidence.version, "answers": answers}
-    elif isinstance(c.evidence, document.Partition):
-        margins = {"local": tally.local_margin, "ring": tally.ring_margin, "outer": tally.outer_margin}
-        answer |= {"leaves": tally.rules["tree"], "ring_leaves": tally.rules["ring"], "margins": margins}
-    elif isinstance(c.evidence, document.OuterTree):
-        answer |= {"leaves": tally.rules["outer"], "margins": {"outer": tally.outer_margin}}
-    tree = c.evidence.outer if isinstance(c.evidence, document.Partition) else c.evidence
-    if c.outer is not None and isinstance(tree, document.OuterTree):
-        leaves = {"leaves": tree.tree.count(LEAF), "face_leaves": tally.rules["faces"]}
-        answer["outer"] = {"level": c.outer.level, **leaves}
-    if c.ranks is not None:
-        answer["ranks"] = {"leaves": len(c.ranks.steps), "steps": c.ranks.most, "of": sum(map(bool, c.ranks.steps))}
-    if c.then is not None and tally.then is not None:
-        margins = {"local": tally.then.local_margin, "ring": tally.then.ring_margin, "outer": tally.then.outer_margin}
-        stated = {"claim": c.then.claim, "levels": c.then.levels, "rules": tally.then.rules, "margins": margins}
-        answer["then"] = {"plant": c.then.name, **stated, "leaves": tally.then.rules["tree"]}
-    if c.start is not None:
-        centre, longest = None if c.centre is None else c.centre.tolist(), words.duration(c)
-        answer |= {"start": c.start.tolist(), "centre": centre, "time": longest if math.isfinite(longest) else None}
+    if isinstance(c.evidence, document.Partition):
+        answer |= {"leaves": tally.rules["tree"], "ring_leaves": tally.rules["ring"], "margins": tally.margins}
+    if words.has_more(c):
+        from . import clauses
+
+        answer |= clauses.answers(c, tally)
     status, result = (3, "TRUSTED") if "solver" in answer else (0, "ACCEPTED")
     answer = {"result": result, **answer}
     return status, answer | {"text": words.report(c, answer)}

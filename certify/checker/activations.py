@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from fractions import Fraction
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from flint import arb, arb_series
 
-from .functions import FUNCTIONS, Constant, Derivative, Expansion, Four, FourBounds, Function, Lines, Three
-from .near import ZERO, Above, Array, Near, Polynomials, exp, halfway, inverse, lines_around_tanh, lower, near
+from .elementary import Polynomials, exp, halfway, inverse
+from .functions import FUNCTIONS, ONE, THIRD, UNIT, Derivative, Expansion, Four, FourBounds, Function, Lines, Three
+from .near import ZERO, Above, Array, Near, lines_around_tanh, lower
 
-_NONE, _ONE, _THIRD, _UNIT = Near(np.float64(0)), Near(np.float64(1)), near(Fraction(1, 3)), Above(1.0)
+_NONE = Near(np.float64(0))
 
 
 class _Sigmoid(Function):
@@ -113,9 +113,6 @@ class _Sign(Function):
     def fourth(self, e: Expansion) -> Above:
         return _no_more(e.v)
 
-    def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
-        return [v[0].function("sign"), *[constant(Fraction(0))] * (count - 1)]
-
 
 class _Bent(Function):
     """A function that is smooth but at 0: it has derivatives where the sign of v is certain."""
@@ -159,7 +156,7 @@ class _Kink(_Bent):
 
     def slopes(self, v0: Near) -> FourBounds:
         none = _no_more(v0)
-        return _UNIT, none, none, none
+        return UNIT, none, none, none
 
     def third(self, e: Expansion) -> Above:
         return ZERO
@@ -173,13 +170,8 @@ class _Kink(_Bent):
 
     def leap(self, v0: Near) -> Above:
         """Beyond 0 |v - v0| is at least |v0|."""
-        p = _UNIT.over(lower(v0))
+        p = UNIT.over(lower(v0))
         return p * p * p * float(self.right - self.left)
-
-    def series(self, v: list[Any], count: int, constant: Constant) -> list[Any]:
-        """The series of |v|; equations have no other."""
-        sign = v[0].function("sign") if count > 1 else None
-        return [v[0].function("abs"), *(sign * v[k] if k < len(v) else constant(Fraction(0)) for k in range(1, count))]
 
     def lines(self, centre: Array, radius: Above) -> Lines:
         """Lines of slopes near the chord's; phi(v) - s v is linear to both sides of 0, so extreme at ends or at 0."""
@@ -201,13 +193,13 @@ class _Elu(_Bent):
 
     def at(self, c: Near) -> Three:
         below, e = c.value < 0, exp(_up_to_0(c))
-        return _either(below, e - _ONE, c), _either(below, e, _ONE), _either(below, e * 0.5, _NONE)
+        return _either(below, e - ONE, c), _either(below, e, ONE), _either(below, e * 0.5, _NONE)
 
     def sixth(self, c: Near, f: Three) -> Near:
-        return f[2] * _THIRD
+        return f[2] * THIRD
 
     def slopes(self, v0: Near) -> FourBounds:
-        return _UNIT, _UNIT, Above(0.5) + _no_more(v0), Above(0.25) + _no_more(v0)
+        return UNIT, UNIT, Above(0.5) + _no_more(v0), Above(0.25) + _no_more(v0)
 
     def third(self, e: Expansion) -> Above:
         return exp(_up_to_0(Near(e.v.ends[1]))).size.over(6.0)
@@ -219,7 +211,7 @@ class _Elu(_Bent):
 class _Softsign(_Bent):
     """v / (1 + |v|), with the derivatives 1, -2 sign(v), 6, -24 sign(v), by (1 + |v|)^2, ^3, ^4, ^5."""
 
-    name, half = "softsign", _UNIT
+    name, half = "softsign", UNIT
 
     def exact(self, q: Fraction) -> Fraction | None:
         return q / (1 + abs(q))
@@ -232,7 +224,7 @@ class _Softsign(_Bent):
         return f[1] * f[1]
 
     def slopes(self, v0: Near) -> FourBounds:
-        return _UNIT, _UNIT * 2, Above(3.0) + _no_more(v0), Above(4.0) + _no_more(v0)
+        return UNIT, UNIT * 2, Above(3.0) + _no_more(v0), Above(4.0) + _no_more(v0)
 
     def third(self, e: Expansion) -> Above:
         r = self._inverse(Near(np.maximum(lower(e.v), 0.0))).size
@@ -242,7 +234,7 @@ class _Softsign(_Bent):
         return self.third(e) * self._inverse(Near(lower(e.v))).size
 
     def _inverse(self, c: Near) -> Near:
-        return inverse(Near(np.abs(c.value), c.error) + _ONE)
+        return inverse(Near(np.abs(c.value), c.error) + ONE)
 
 
 class _Corner(Expansion):

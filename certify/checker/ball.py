@@ -6,23 +6,22 @@ on a line: x = m + J z + w sigma, d = (z, sigma).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from .case import Case, Failures
 from .document import Intervals
-from .exact import Exact
-from .expression import Call, evaluate
-from .functions import FUNCTIONS, Undecided
-from .jets import First, Jet, Units, between, constant, no_kinks, uncertain
-from .near import ZERO, Above, Array, Cubic, Near, Square, Vector, all_near, mixed, near, size, stacked, triples, within
+from .expression import evaluate
+from .functions import FUNCTIONS
+from .jets import Jet, Units, constant
+from .near import Above, Array, Cubic, Near, Square, Vector, all_near, mixed, near, size, stacked, triples, within
 from .network import norm2
-from .networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Product, Sum
+from .networks import Affine, Algebra, Map, Network
 
 if TYPE_CHECKING:
     from .kinks import Cone
@@ -39,9 +38,7 @@ class Ball:
     case: Case
     J: Array
     at: str
-    cone: Cone | None = field(
-        default=None, kw_only=True
-    )  # of d, on which relus and clips have kinks; None if there are none
+    cone: Cone | None = field(default=None, kw_only=True)  # of d, on which entries have kinks; None if there are none
 
     @property
     def motion(self) -> tuple[list[Fraction], list[Fraction]] | None:
@@ -64,13 +61,31 @@ class Ball:
         lo, hi = self.case.c.sample or (0, 0)
         return len(self.case.c.ranges) + (lo < hi)
 
+    def on_cones(self, directions: tuple[bytes, ...] | None, close: bool = False) -> Iterator[Self]:
+        """It, or it on each cone of d that trees of directions make; `close` as in kinks.py."""
+        if not directions:
+            yield self
+            return
+        from .kinks import cones
+
+        for cone in cones(directions, len(self.J), close):
+            yield replace(self, cone=cone)
+
+    def algebra(self, k: int) -> OnBall:
+        """That of networks, in k symbols."""
+        if self.cone is None:
+            return OnBall(k)
+        from .kinks import OnCone
+
+        return OnCone(k, self.cone)
+
     @cached_property
     def states(self) -> list[Jet]:
         """x on the ball, exact but for rounding."""
         n, still = len(self.J), self.motion is None
         m, w = ([Fraction(0)] * n, [Fraction(0)] * n) if self.motion is None else self.motion
         k = n if still else n + 1
-        nothing = constant(Fraction(0), Units(np.zeros((k, k, 0))), self.count)
+        nothing = constant(Fraction(0), Units(np.zeros((k, k, 0))))
         jets = []
         for row, at, by in zip(self.J, m, w, strict=True):
             step = near(by)
@@ -82,7 +97,7 @@ class Ball:
     def outputs(self) -> Jet:
         """The network's values, squashed if the policy is: a batch of jets, whose errors belong to the units."""
         net = self.case.net
-        h = OnBall(len(self.states[0].a.value), self.cone).value(net.network, self.states, net.origin, net.shift)
+        h = self.algebra(len(self.states[0].a.value)).value(net.network, self.states, net.origin, net.shift)
         return h.function("tanh") if net.squash else h
 
     @cached_property
@@ -104,14 +119,14 @@ class Ball:
         """
         h, scale = self.outputs, Near(self.case.net.scale)
         at_0 = all_near(self.case.c.u_eq) if self.starts_at_u_eq else h.c * scale + self.case.net.offset
-        a = (h.a * scale).wider(h.by_kinks(self.reach.error + h.B.error * size(scale.value)))
+        a = (h.a * scale).wider(h.units.tilt(self.reach.error + h.B.error * size(scale.value)))
         u = replace(h, c=at_0, a=a, Q=Square(h.Q.value) * scale, K=Cubic(h.K.value) * scale)
         E, lip = mixed(Square(h.units.U), Near(self.reach.error.top)), h.lipschitz * size(scale.value)
-        return rows(replace(u, E=E, lip=lip), range(len(self.case.c.inputs)), self.units, 0, self.count)
+        return self.of_y(rows(replace(u, E=E, lip=lip), range(len(self.case.c.inputs)), self.units, 0))
 
     def constant(self, q: Fraction) -> Jet:
         """A rational among the jets of this ball."""
-        return constant(q, self.units, self.count)
+        return constant(q, self.units)
 
     def F(self, cell: Intervals = ()) -> list[Jet]:
         """The components of F on the ball, for all values of the uncertain quantities in a cell. At rest F(0) = 0, but
@@ -125,44 +140,33 @@ class Ball:
         return [f + -x for f, x in zip(self.F(cell), self.shared(self.states), strict=True)]
 
     def f(self, states: Sequence[Jet], quantities: Sequence[Jet]) -> list[Jet]:
-        """f(x, pi(x), q) at such states and quantities, all components in one family of errors: the inputs', and then
-        those of each call."""
-        units = self.units
+        """f(x, pi(x), q) at such states and quantities, all components in one family of errors."""
+        dynamics, variables = self.case.c.dynamics, [*self.shared(states), *self.inputs, *quantities]
+        if not dynamics.calls:
+            return evaluate(dynamics, self.constant, variables)
+        from .calls import on_ball
 
-        def called(call: Call, arguments: list[Jet]) -> list[Jet]:
-            nonlocal units
-            h = OnBall(len(units.R), self.cone).value(call.network, arguments)
-            h = h.at(list(call.entries))
-            first, units = units.count, units.with_more(reached(h, h.B.value, np.ones(len(call.entries))))
-            plain = replace(
-                h,
-                a=h.a.wider(h.by_kinks(h.B.error)),
-                Q=Square(h.Q.value),
-                K=Cubic(h.K.value),
-                E=Square(np.zeros_like(h.E.value)),
-            )
-            return rows(replace(plain, lip=h.lipschitz), range(len(call.entries)), units, first, self.count)
-
-        F = evaluate(self.case.c.dynamics, self.constant, [*self.shared(states), *self.inputs, *quantities], called)
-        return [f if f.units is units else f.among(units) for f in F]
-
-    def constraints(self, states: Sequence[Jet], quantities: Sequence[Jet]) -> list[Jet]:
-        """The expressions that have to stay negative."""
-        keep = self.case.c.keep
-        return evaluate(keep, self.constant, [*self.shared(states), *self.inputs, *quantities]) if keep else []
+        return on_ball(self, variables)
 
     def shared(self, states: Sequence[Jet]) -> list[Jet]:
         """The states as jets with the inputs' errors."""
-        return [replace(x, B=Near(np.zeros(self.units.count)), units=self.units) for x in states]
+        return self.of_y([replace(x, B=Near(np.zeros(self.units.count)), units=self.units) for x in states])
+
+    def of_y(self, jets: list[Jet]) -> list[Jet]:
+        """The same as functions of y too, if there are such numbers."""
+        if not self.count:
+            return jets
+        from .ranges import in_y
+
+        return [in_y(v, self.count) for v in jets]
 
     def symbols(self, cell: Intervals) -> list[Jet]:
         """The uncertain quantities of a cell, as the numbers y have them."""
-        return [uncertain(lo, hi, self.units, j, self.count) for j, (lo, hi) in enumerate(cell)]
+        if not cell:
+            return []
+        from .ranges import uncertain
 
-    @property
-    def ranges(self) -> list[Jet]:
-        """The uncertain quantities, of which only their whole ranges are known."""
-        return [between(lo, hi, self.units, self.count) for lo, hi in self.case.c.ranges]
+        return [uncertain(lo, hi, self.units, j, self.count) for j, (lo, hi) in enumerate(cell)]
 
 
 def fits(ball: Ball) -> Failures:
@@ -186,14 +190,6 @@ def keeps_inputs(ball: Ball) -> Failures:
             if not within(bounds, u.range):
                 yield ball.at, f"{name} may leave its bounds"
     return len(c.inputs)
-
-
-def keeps_constraints(ball: Ball, constraints: Sequence[Jet]) -> Failures:
-    """`keep`: every constraint is negative on the ball."""
-    for j, g in enumerate(constraints):
-        if not g.range.ends[1] < 0:
-            yield ball.at, f"constraint {j} may be violated"
-    return len(constraints)
 
 
 def is_not_clipped(ball: Ball) -> Failures:
@@ -229,17 +225,13 @@ def is_too_large(network: Network, k: int, arguments: int) -> bool:
 def reached(h: Jet, reach: Array, scale: Array) -> Units:
     """The errors of the rows of a batch of jets, scaled, as sums over units: those of its family, which reach them by
     `reach` (N, m), and for each row what else it does not know."""
-    first, count = h.units.first, h.remainder.shape[2]
-    first = None if first is None else first.beside(no_kinks(len(h.units.R), count))
-    R, L = np.concatenate([h.units.U, h.remainder], 2), np.concatenate([reach, np.diag(scale)]).T
-    return Units(R, L, first=first)
+    return h.units.beside(Units(h.remainder), np.concatenate([reach, np.diag(scale)]).T)
 
 
-def rows(u: Jet, of: Sequence[int], units: Units, first: int, count: int) -> list[Jet]:
+def rows(u: Jet, of: Sequence[int], units: Units, first: int) -> list[Jet]:
     """Some rows of a batch of jets, whose error is the one of its own number, from `first` on, in a family."""
-    k, one = len(u.a.value), np.eye(units.count)
-    nothing = Near(np.zeros(count)), Vector(np.zeros((k, count)))
-    return [Jet(u.c[j], u.a[j], u.Q[j], u.K[j], u.E[j], Near(one[first + j]), units, *nothing, u.lip[j]) for j in of]
+    one = np.eye(units.count)
+    return [Jet(u.c[j], u.a[j], u.Q[j], u.K[j], u.E[j], Near(one[first + j]), units, u.lip[j]) for j in of]
 
 
 @dataclass(frozen=True)
@@ -251,7 +243,7 @@ class Rows:
     y: Near
     X: Vector
     own: int | None = None  # the number of the first
-    at_0: Array | None = None  # which y(0) are exactly 0, where kinks ask
+    at_0: Array = None  # which y(0) are exactly 0, where kinks.py asks
 
 
 class OnBall(Algebra[Rows]):
@@ -263,9 +255,8 @@ class OnBall(Algebra[Rows]):
     Lipschitz constant lips_q.
     """
 
-    def __init__(self, k: int, cone: Cone | None = None) -> None:
-        self.k, self.cone = k, cone
-        self.first = None if cone is None else no_kinks(k, 0)
+    def __init__(self, k: int) -> None:
+        self.k = k
         self.H, self.C, self.R = np.zeros((k, k, 0)), np.zeros((len(triples(k)[0]), 0)), np.zeros((k, k, 0))
         self.lips = Above(np.zeros(0))
 
@@ -276,28 +267,28 @@ class OnBall(Algebra[Rows]):
         units."""
         x = self.entered(arguments)
         if origin is not None and np.any(origin):
-            x = replace(x, y=x.y + Near(origin), at_0=None if x.at_0 is None else x.at_0 & (origin == 0))
+            x = self.moved(x, origin)
         h = self.run(network, x)
         return self.jets(h if shift is None else replace(h, y=h.y + shift))
 
+    def moved(self, x: Rows, origin: Array) -> Rows:
+        """The sum with exact numbers."""
+        return replace(x, y=x.y + Near(origin))
+
     def entered(self, jets: Sequence[Jet]) -> Rows:
         """Jets as a vector. What they have beyond a.d becomes units, unless there is nothing."""
-        y, at_0 = stacked([v.v0 for v in jets]), None
-        if self.cone is not None:
-            at_0 = np.array([v.v0.value == 0 and v.v0.error.v == 0 for v in jets])  # a bound of 0 is 0
+        y = stacked([v.v0 for v in jets])
         errors = stacked([Near(0.0, v.gradient.error) for v in jets]).error.norm()
         X = Vector(np.array([v.a.value for v in jets]), errors * np.ones(self.k))
         if not any(np.any(part) for v in jets for part in (v.Q.value, v.K.value, v.remainder, v.B.value)):
-            return Rows(y, X, at_0=at_0)
+            return Rows(y, X)
         H, C = np.stack([v.Q.value for v in jets], -1), np.stack([v.K.value for v in jets], -1)
         R = np.stack([(Square(v.remainder) + v.shares).majorant for v in jets], -1)
         own = self.with_units(H, C, R, Above(np.array([v.lipschitz.top for v in jets])))
-        return Rows(y, X, own, at_0)
+        return Rows(y, X, own)
 
-    def with_units(self, H: Array, C: Array, R: Array, lips: Above, first_order: First | None = None) -> int:
+    def with_units(self, H: Array, C: Array, R: Array, lips: Above) -> int:
         """Add units; the number of the first."""
-        if self.first is not None:
-            self.first = self.first.beside(first_order or no_kinks(self.k, R.shape[2]))
         first = self.R.shape[2]
         self.H, self.C, self.R = (np.concatenate(pair, -1) for pair in ((self.H, H), (self.C, C), (self.R, R)))
         self.lips = self.lips.beside(lips)
@@ -312,17 +303,14 @@ class OnBall(Algebra[Rows]):
         """A vector as a batch of jets."""
         X, k = v.X if v.own is None else self.columns(v, v.own + len(v.X.value)), self.k
         B, ones = Near(X.value[:, k:].T, X.error[k:, None]), np.ones(len(X.value))
-        N = len(B.value)
-        R = self.R[..., :N]
-        a, Q, K = Vector(X.value[:, :k].T, (X.error[:k].norm() + self.doubt_of_kinks(B)) * ones), *self.beyond(B)
-        E = Square(np.zeros_like(Q.value), (B.error * Square(R).size[:, None]).sum() * ones)
-        of_y = Near(np.zeros((0, len(ones)))), Vector(np.zeros((k, 0, len(ones))))  # a network knows nothing of y
-        units = Units(R, first=None if self.first is None else self.first.of(N))
-        return Jet(v.y, a, Q, K, E, Near(B.value), units, *of_y, (B.size * self.lips[:N, None]).sum())
+        units = self.units(len(B.value))
+        a, Q, K = Vector(X.value[:, :k].T, (X.error[:k].norm() + units.tilt(B.error)) * ones), *self.beyond(B)
+        E = Square(np.zeros_like(Q.value), (B.error * Square(units.R).size[:, None]).sum() * ones)
+        return Jet(v.y, a, Q, K, E, Near(B.value), units, (B.size * self.lips[: units.count, None]).sum())
 
-    def doubt_of_kinks(self, B: Near) -> Above:
-        """Upper bound of what kinks add by the errors of B, over ||d||: their R is 0, so that E does not have it."""
-        return ZERO if self.first is None else (B.error * Above(self.first.rho[: len(B.value), None])).sum()
+    def units(self, count: int) -> Units:
+        """So many of the units, as a family of errors."""
+        return Units(self.R[..., :count])
 
     def beyond(self, B: Near) -> tuple[Square, Cubic]:
         """Q and K of vectors that units reach by B (N, width)."""
@@ -334,94 +322,16 @@ class OnBall(Algebra[Rows]):
         X = X.mapped(step.weight, norm2(step))
         if v.own is not None:  # the units of the step just before arrive through W alone
             X = X.beside(step.weight)
-        at_0 = None if v.at_0 is None else (step.bias == 0) & ~np.any((step.weight != 0) & ~v.at_0, 1)
-        return Rows(v.y.through(step.weight) + Near(step.bias), X, at_0=at_0)
+        return Rows(v.y.through(step.weight) + Near(step.bias), X)
 
     def map(self, step: Map, v: Rows) -> Rows:
         value = self.jets(v)
-        if self.cone is not None and step.function == "relu":
-            return self.bent(step, v, value)
         phi = FUNCTIONS[step.function].expansion(value.v0, value.radius)
         bent, twisted, rest = value.beyond_tangent(phi)
         rest = rest.wider(bent.error + twisted.error)
         lips = value.lip_beyond_tangent(phi) + bent.error * 2 + twisted.error * 3
         X = self.columns(v, value.units.count).times(phi.f[1])
-        at_0 = None if v.at_0 is None else v.at_0 & (FUNCTIONS[step.function].at_0 == 0)
-        return Rows(phi.f[0], X, self.with_units(bent.value, twisted.value, rest.majorant, lips), at_0)
-
-    def bent(self, step: Map | Clip, v: Rows, value: Jet) -> Rows:
-        """Entries that are known to first order."""
-        if self.cone is None:
-            raise TypeError("kinks are asked for on a cone")
-        found = self.cone.bent(step, value, v.at_0)
-        X, N, k = self.columns(v, value.units.count).times(Near(found.slope)), len(found.slope), self.k
-        nothing = np.zeros((k, k, N)), np.zeros((len(triples(k)[0]), N)), np.zeros((k, k, N)), Above(np.zeros(N))
-        at_0 = v.at_0 & (found.y.value == 0)  # relu(0) = 0, and a clip of 0 is exact
-        return Rows(found.y, X, self.with_units(*nothing, found.first), at_0)
-
-    def clip(self, step: Clip, v: Rows) -> Rows:
-        """Entries that are certainly not clipped stay, those that certainly are become constant, others NaN."""
-        value = self.jets(v)
-        if self.cone is not None:
-            return self.bent(step, v, value)
-        lo, hi = value.range.ends
-        free, low, high = (lo > step.lo) & (hi < step.hi), hi < step.lo, lo > step.hi
-        slope = np.where(free, 1.0, np.where(low | high, 0.0, np.nan))
-        y = Near(np.where(free, v.y.value, np.where(low, step.lo, step.hi)), v.y.error * slope)
-        return Rows(y, self.columns(v, value.units.count).times(Near(slope)))
-
-    def sum(self, step: Sum, vectors: Sequence[Rows]) -> Rows:
-        units = self.R.shape[2]
-        y, X, at_0 = vectors[0].y, self.columns(vectors[0], units), vectors[0].at_0
-        for v in vectors[1:]:
-            y, X = y + v.y, X + self.columns(v, units)
-            at_0 = None if at_0 is None else at_0 & v.at_0
-        return Rows(y, X, at_0=at_0)
-
-    def concat(self, step: Concat, vectors: Sequence[Rows]) -> Rows:
-        parts, error = [self.columns(v, self.R.shape[2]) for v in vectors], ZERO
-        for X in parts:
-            error = error + X.error * X.error
-        y = np.concatenate([v.y.value for v in vectors])
-        of_y = np.concatenate([v.y.error.top + 0 * v.y.value for v in vectors])
-        at_0 = None if self.cone is None else np.concatenate([v.at_0 for v in vectors])
-        return Rows(Near(y, Above(of_y)), Vector(np.concatenate([X.value for X in parts]), error.root), at_0=at_0)
-
-    def product(self, step: Product, v: Rows, w: Rows) -> Rows:
-        """The units are products of both without their values at d = 0, as of jets without constants."""
-        units = self.R.shape[2]
-        x, y = (self.repeated(part, step.size, units) for part in (v, w))
-        first, second = self.jets(x), self.jets(y)
-        none = Near(np.zeros(step.size))
-        made = replace(first, c=none) * replace(second, c=none, units=first.units)
-        X = y.X.times(x.y) + x.X.times(y.y)
-        of_units = self.with_units(made.Q.value, made.K.value, made.remainder, made.lipschitz)
-        return Rows(x.y * y.y, X, of_units, None if v.at_0 is None or w.at_0 is None else v.at_0 | w.at_0)
-
-    def repeated(self, v: Rows, width: int, units: int) -> Rows:
-        """A vector of so many entries, all of them the same if it has a single one, with columns for all units."""
-        X = self.columns(v, units)
-        if len(X.value) == width:
-            return Rows(v.y, X)
-        ones = np.ones((width, 1))
-        return Rows(v.y.through(ones), X.mapped(ones, size(ones).norm((0, 1))))
-
-    def observe(self, step: Observe, v: Rows) -> Rows:
-        u = self.jets(v)
-        nothing = Near(np.zeros(0)), Vector(np.zeros((self.k, 0)))
-        entries = [
-            Jet(u.c[j], u.a[j], u.Q[j], u.K[j], u.E[j], Near(u.B.value[:, j]), u.units, *nothing, u.lip[j])
-            for j in range(len(v.y.value))
-        ]
-        made = evaluate(step.tape, lambda q: constant(q, u.units, 0), entries)
-        found = self.entered(made)
-        if v.at_0 is None:
-            return found
-        try:
-            known = evaluate(step.tape, Exact, [Exact(Fraction(0) if still else None) for still in v.at_0.tolist()])
-        except Undecided:  # nothing is known to be 0
-            return replace(found, at_0=np.zeros(step.size, dtype=bool))
-        return replace(found, at_0=np.array([x.value == 0 for x in known]))
+        return Rows(phi.f[0], X, self.with_units(bent.value, twisted.value, rest.majorant, lips))
 
 
 def wider(X: Vector, columns: int) -> Vector:

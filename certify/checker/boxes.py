@@ -7,23 +7,28 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import islice
-from typing import Any
+from itertools import chain, islice
+from typing import Any, TypeVar
 
 import numpy as np
 from flint import fmpq_mat
 
 from .case import Case, Failures
 from .exact import fraction
-from .expression import Call, evaluate
+from .expression import evaluate
 from .near import Above, Array, Form, Near, all_near, near, size, within
-from .network import entries, prepare
+from .network import prepare
 from .networks import Network
-from .processes import Batch
 from .taylor import Taylor, affine, combination, constant, pairs, upper_bound
 
 LEAF = 255
 MAX_DEPTH = 4096
+
+
+Batch = tuple[int, Array, Array]  # the number of the first leaf, and their corners (n, B)
+Result = TypeVar("Result")
+Work = Callable[[int, Array, Array], Result]
+Answers = Iterator[tuple[int, int, Result]]  # the number of the first leaf, how many there are, and their result
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,10 @@ class Leaves:
     bound: Array  # an upper bound of the margin
     hold: Array  # where what is asked holds
     kept: Array  # where each constraint holds, (K, B)
+
+    @property
+    def case(self) -> Case:
+        return self.boxes.case
 
 
 class Boxes(ABC):
@@ -118,15 +127,20 @@ class Boxes(ABC):
 
     def f(self, states: list[Taylor], held: list[Taylor]) -> list[Taylor]:
         """f of states, and of inputs and uncertain quantities."""
-        return evaluate(self.c.dynamics, self.constant(len(held[0].c)), [*states, *held], self.called)
+        constant, variables = self.constant(len(held[0].c)), [*states, *held]
+        if not self.c.dynamics.calls:
+            return evaluate(self.c.dynamics, constant, variables)
+        from .calls import entries
 
-    def constraints(self, states: list[Taylor], held: list[Taylor]) -> list[Taylor]:
-        """The expressions that have to stay negative, of states, and of inputs and uncertain quantities."""
-        return evaluate(self.c.keep, self.constant(len(held[0].c)), [*states, *held]) if self.c.keep else []
+        return evaluate(self.c.dynamics, constant, variables, lambda call, given: entries(call, given, self.calls))
 
-    def called(self, call: Call, arguments: list[Taylor]) -> list[Taylor]:
-        """Entries of a network's value, each with its symbol for the error."""
-        return entries(call, arguments, self.calls)
+    def kept(self, states: list[Taylor], held: list[Taylor], gaps: Sequence[Callable[[Array], Taylor]]) -> Array:
+        """True for each constraint and box on which it is negative where no gap is, (K, B)."""
+        if self.c.keep is None:
+            return np.zeros((0, len(held[0].c)), dtype=bool)
+        from .keep import on_boxes
+
+        return on_boxes(self, states, held, gaps)
 
     def number(self, pair: tuple[Fraction, Fraction], symbol: int, batch: int) -> Taylor:
         """A number of a range, by its symbol."""
@@ -198,14 +212,6 @@ def keeps_inputs(leaves: Leaves) -> Failures:
     return int(leaves.inputs.value.size)
 
 
-def keeps_constraints(leaves: Leaves) -> Failures:
-    """`keep`: every constraint is negative."""
-    for j, hold in enumerate(leaves.kept):
-        if not np.all(hold):
-            yield f"{leaves.place}{leaves.numbers[np.argmin(hold)]}", f"constraint {j} may be violated"
-    return int(leaves.kept.size)
-
-
 def is_whole(tree: bytes, axes: Sequence[int], where: str = "") -> Failures:
     """The bytes are a tree of leaves and of splits of these axes in preorder, and nothing else."""
     boxes, allowed = 1, {*axes, LEAF}
@@ -244,3 +250,35 @@ def _walk(tree: bytes, lo: list[float], hi: list[float]) -> Iterator[tuple[list[
         left, right = hi.copy(), lo.copy()
         left[axis] = right[axis] = 0.5 * lo[axis] + 0.5 * hi[axis]
         stack += [(right, hi), (lo, left)]
+
+
+def in_order(work: Work[Result], batches: Iterator[Batch], leaves: int, jobs: int) -> Iterator[Result]:
+    """Yield `work(*batch)` of each batch of a tree's leaves, made in up to so many processes, as if in one.
+
+    The results are taken in the order of the leaves and without a gap, or not at all, and there must be as many leaves
+    as the tree has: if one is left out, that makes an error, and neither yes nor no.
+
+    Raises
+    ------
+    ArithmeticError : the results are not those of all leaves.
+    """
+    first, examined = list(islice(batches, jobs)), 0
+    batches = chain(first, batches)
+    if len(first) < 2:
+        found = answers(work, batches)
+    else:
+        from .processes import by_processes
+
+        found = by_processes(work, batches, len(first))
+    for number, count, result in found:
+        if number != examined:
+            break
+        examined += count
+        yield result
+    if examined != leaves:
+        raise ArithmeticError(f"leaves have been passed over: after {examined} of {leaves}")
+
+
+def answers(work: Work[Result], batches: Iterator[Batch]) -> Answers[Result]:
+    for first, lo, hi in batches:
+        yield first, lo.shape[1], work(first, lo, hi)

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
+from importlib import import_module
 from itertools import product
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, TypeVar
 
 from flint import fmpq_mat
 
-from .document import Array, Certificate, Intervals, LocalBall, Outer, OuterTree, Partition, Trusted
+from .document import Array, Certificate, Intervals, LocalBall, Partition
 from .exact import exactly, gershgorin_lower, inverse_diagonal
-from .near import near
 from .network import Folded, fold
-
-if TYPE_CHECKING:
-    from .sections import Data, Ranks, Slab
 
 T = TypeVar("T")
 AT_CORNERS = 6  # uncertain quantities of which rule `local` decides every corner
@@ -41,33 +38,9 @@ class Case:
         return self.c.evidence
 
     @property
-    def then(self) -> Certificate:
-        """The certificate that takes over, of one that has such."""
-        if self.c.then is None:
-            raise TypeError("this rule is about a certificate that takes over")
-        return self.c.then
-
-    @property
-    def order(self) -> int:
-        """The order of the series in time on leaves."""
-        evidence = self.c.evidence
-        order = None if isinstance(evidence, Trusted | OuterTree) else evidence.order
-        return _given(order, "leaves with a series in time")
-
-    @property
-    def ranks(self) -> Ranks:
-        """The ranks, of a certificate that has them."""
-        return _given(self.c.ranks, "ranks")
-
-    @property
-    def data(self) -> Data:
-        """The measurements, of a certificate that has them."""
-        return _given(self.c.data, "data")
-
-    @property
     def local(self) -> LocalBall:
         """The evidence of rule `local`, of a certificate that has it."""
-        return _given(self.partition.local, "a local ball")
+        return given(self.partition.local)
 
     @property
     def cells(self) -> Iterator[Intervals]:
@@ -82,22 +55,6 @@ class Case:
     def covered(self) -> bool:
         """True if there is a local ball, so that leaves inside {V < c1} need nothing."""
         return self.partition.local is not None
-
-    @property
-    def longest(self) -> float:
-        """At or above the longest period."""
-        return float(near(self.c.step).ends[1])
-
-    @property
-    def tube(self) -> tuple[Slab, ...]:
-        """The slabs, none but for an enlarged claim."""
-        return self.partition.tube
-
-    @property
-    def outer(self) -> tuple[Outer, OuterTree]:
-        """The second function N and its evidence, of a claim with an outer set."""
-        tree = self.c.evidence if isinstance(self.c.evidence, OuterTree) else self.partition.outer
-        return _given(self.c.outer, "an outer set"), _given(tree, "an outer set")
 
     @cached_property
     def P_inverse(self) -> list[Fraction]:
@@ -145,8 +102,20 @@ class Case:
         return all(lo <= a and b <= hi for (a, b), (lo, hi) in zip(ranges, bounds, strict=True))
 
 
-def _given(value: T | None, what: str) -> T:
+def given(value: T | None) -> T:
     """The part that a rule is about, of a certificate that has it."""
     if value is None:
-        raise TypeError(f"this rule is about {what}")
+        raise TypeError("this rule is about what the certificate has not")
     return value
+
+
+def only_where(has: Callable[[Certificate], object], module: str, name: str) -> Callable[[Any], Failures]:
+    """The rule of this name in a module that only some certificates need; it looks at nothing of others."""
+
+    def rule(subject: Any) -> Failures:
+        if not has(subject.case.c):
+            return 0
+        found: Callable[[Any], Failures] = getattr(import_module(f".{module}", __package__), name)
+        return (yield from found(subject))
+
+    return rule

@@ -2,11 +2,129 @@
 
 from __future__ import annotations
 
+import math
 from fractions import Fraction
+from typing import TYPE_CHECKING, Any
 
-from .document import MAX_RANK, Certificate, Outer
-from .sections import Data, Ranks
+from . import words
+from .boxes import LEAF
+from .document import Certificate, Partition
+from .sections import MAX_RANK, Data, Outer, OuterTree, Ranks, Trusted
 from .words import expression, interval, number
+
+if TYPE_CHECKING:
+    from .rules import Tally
+
+
+CLAIMS = {
+    **words.CLAIMS,
+    "enlarged": "the origin is asymptotically stable; every trajectory of the closed loop that starts in V <= {c.c2!r} "
+    "stays there and converges to the origin, and every one that starts in x'Sx <= 1 stays in the domain, is in "
+    "V <= {c.c2!r} after {time!r} units of time at the latest, and converges to the origin",
+    "reached": "the origin is asymptotically stable; every trajectory of the closed loop that starts in V <= {c.c2!r} "
+    "stays there and converges to the origin, and every one that starts in (x - c)'S(x - c) <= 1 stays in the domain, "
+    "is in V <= {c.c2!r} after {time!r} units of time at the latest, and converges to the origin",
+    "nearby": "every trajectory of the closed loop that starts in V <= {c.c2!r} {when[stays]}, enters V <= {c.c0!r} "
+    "{when[enters]} and {when[remains]} from then on; and where what is uncertain is constant in time, there is "
+    "exactly one equilibrium in V <= {c.c0!r}, and all of these trajectories converge to it",
+}
+_BY_STEPS = {
+    "start": "",
+    "stays": "is there at every later step",
+    "enters": "after finitely many steps",
+    "remains": "is there at every step",
+}
+_SAMPLED = {
+    "start": " at a sampling instant",
+    "stays": "is there at every later sampling instant, is in the domain at all times",
+    "enters": "at some sampling instant",
+    "remains": "is there at every sampling instant",
+}
+_SAMPLED_FROM_0 = {**_SAMPLED, "stays": "is there at all later times", "remains": "is there at all times"}
+
+
+def claim(c: Certificate) -> list[str]:
+    """The claim in sentences: its trajectories, and the additions of a sample, a rate, an outer set and others."""
+    when, lines = _BY_STEPS if c.discrete else words.AT_ONCE, list[str]()
+    bound, latest = "V(x(t)) <= V(x(0)) exp(-2 lambda t)", "after {} units of time at the latest"
+    if c.discrete:
+        bound, latest = "V(x_k) <= V(x_0) exp(-2 lambda k) after k steps", "after {} steps, rounded up, at the latest"
+    if c.sample is not None:
+        lo, hi = c.sample
+        when = _SAMPLED if lo else _SAMPLED_FROM_0
+        each = f"any sequence of periods in {interval(c.sample)}" if lo < hi else f"exactly {number(hi)}"
+        lines.append(f"  the input is held from each sampling instant to the next, for {each} units of time")
+        bound = "V(x(t_k)) <= V(x(t_0)) exp(-2 lambda (t_k - t_0)) at sampling instants"
+        latest = "at every sampling instant that comes {} units of time or more after the start"
+    lines += [*words.falls(c, bound, latest), *additions(c, when["start"])]
+    if c.without_V:
+        return [f"claim: {without_V(c, when['start'])}", *lines]
+    return [words.said(CLAIMS[c.claim].format(c=c, time=duration(c), when=when)), *lines]
+
+
+def besides(c: Certificate) -> list[str]:
+    """What else the claim is about, line by line."""
+    target = [] if c.target is None else [f"{expression(tree)} <= 0" for tree in c.target.trees]
+    return [
+        *([f"target: {', '.join(target)}"] if target else []),
+        *([] if c.start is None else [f"S = {words.matrix(c.start)}"]),
+        *([] if c.centre is None else [f"c = {' '.join(map(repr, c.centre.tolist()))}"]),
+        *([] if c.outer is None else [f"N(x) = {expression(c.outer.function.trees[0])}"]),
+    ]
+
+
+def answers(c: Certificate, tally: Tally) -> dict[str, Any]:
+    """What an answer has more."""
+    answer, evidence = dict[str, Any](), c.evidence
+    if isinstance(evidence, Trusted):
+        said = [": ".join(pair) for pair in evidence.queries]
+        answer |= {"solver": evidence.solver, "version": evidence.version, "answers": said}
+    elif isinstance(evidence, OuterTree):
+        answer |= {"leaves": tally.rules["outer"], "margins": {"outer": tally.outer_margin}}
+    tree = evidence.outer if isinstance(evidence, Partition) else evidence
+    if c.outer is not None and isinstance(tree, OuterTree):
+        leaves = {"leaves": tree.tree.count(LEAF), "face_leaves": tally.rules["faces"]}
+        answer["outer"] = {"level": c.outer.level, **leaves}
+    if c.ranks is not None:
+        answer["ranks"] = {"leaves": len(c.ranks.steps), "steps": c.ranks.most, "of": sum(map(bool, c.ranks.steps))}
+    if c.then is not None and tally.then is not None:
+        stated = {"claim": c.then.claim, "levels": c.then.levels}
+        of_rules = {"rules": tally.then.rules, "margins": tally.then.margins, "leaves": tally.then.rules["tree"]}
+        answer["then"] = {"plant": c.then.name, **stated, **of_rules}
+    if c.start is not None:
+        centre, longest = None if c.centre is None else c.centre.tolist(), duration(c)
+        answer |= {"start": c.start.tolist(), "centre": centre, "time": longest if math.isfinite(longest) else None}
+    return answer
+
+
+def results(c: Certificate, answer: dict[str, Any]) -> tuple[str, str, list[str], list[str]]:
+    """Margins, verdict, the statements of a certificate that takes over, and the counts of its rules."""
+    verdict = answer["result"]
+    if c.claim == "reaches":
+        rest = f"leaves {answer['ranks']['leaves']}"
+    elif c.claim == "invariant":
+        margin = answer["margins"]["outer"]
+        least = "" if margin is None else f"; smallest bound of -N'F on a leaf on which N may be its level {margin:.3g}"
+        rest = f"leaves {answer['outer']['leaves']}{least}"
+    elif verdict == "TRUSTED":
+        rest = f"not checked, the solver's word: {', '.join(answer['answers'])}"
+        verdict = f"TRUSTED {answer['solver']} {answer['version']}"
+    else:
+        rest = words.margins(c, answer, "D" if c.step else "Vdot")
+    if c.then is None:
+        return rest, verdict, [], []
+    counts = ", ".join(f"{rule} {count}" for rule, count in answer["then"]["rules"].items())
+    counted = f"of the certificate that takes over: {counts}"
+    return rest, verdict, [*handed_over(c, c.then), *words.stated(c.then)], [counted]
+
+
+def duration(c: Certificate) -> float:
+    """The tube's duration, rounded up; infinite if it exceeds all binary64 numbers."""
+    slabs = c.evidence.tube if isinstance(c.evidence, Partition) else ()
+    try:
+        return math.nextafter(math.fsum(slab.duration for slab in slabs), math.inf)
+    except OverflowError:
+        return math.inf
 
 
 def additions(c: Certificate, start: str) -> list[str]:

@@ -4,7 +4,8 @@ stay in {V <= c0} converge."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,46 +14,34 @@ from flint import fmpq, fmpq_mat
 from . import ball
 from .ball import Ball
 from .case import Case, Failures
-from .decrease import Models, are_finite, diagonal, lengths_of_forms, rational, vectors
-from .document import Contraction
+from .decrease import Models, are_finite, diagonal, rational, vectors
 from .exact import exactly, is_definite, root_above
 from .jets import unpacked
 from .local import is_large_enough
 from .near import Above, Array, Tensor, size
 from .pairs import bound_of_pairs, in_binary64
+from .sections import Contraction
+from .stepping import lengths_of_forms
 
 if TYPE_CHECKING:
     from .kinks import Cone
+    from .rules import Tally
 
 
+@dataclass(frozen=True)
 class Contracted(Ball):
     """The ball of the section `contraction`."""
 
-    def __init__(self, case: Case, evidence: Contraction, cone: Cone | None = None) -> None:
-        super().__init__(case, evidence.J, "contraction", cone=cone)
-        object.__setattr__(self, "by", evidence)
+    by: Contraction
 
     @classmethod
-    def whole(cls, case: Case, evidence: Contraction) -> Contracted:
-        """The one of all d."""
-        if evidence.directions is None:
-            return cls(case, evidence)
-        from .kinks import CLOSE
+    def of(cls, case: Case, by: Contraction, cone: Cone | None = None) -> Contracted:
+        """That of a certificate, or on a cone of it."""
+        if cone is None and by.directions is not None:
+            from .kinks import CLOSE
 
-        return cls(case, evidence, CLOSE)
-
-    @property
-    def parts(self) -> Iterator[Contracted]:
-        """It, or it on each cone of d."""
-        if not self.by.directions:
-            yield self
-            return
-        from .kinks import cones
-
-        for cone in cones(self.by.directions, len(self.J), close=True):
-            yield Contracted(self.case, self.by, cone)
-
-    by: Contraction
+            cone = CLOSE
+        return cls(case, by.J, "contraction", by, cone=cone)
 
 
 def fits(ball_: Contracted) -> Failures:
@@ -68,14 +57,15 @@ def contracts(ball_: Contracted) -> Failures:
     """V(e + h g) - V(e), over h, is negative for any two points of the ball; e is their difference, g that of G, and h
     is 0 in continuous time, where this is 2 e'P g."""
     P, h, count = exactly(ball_.case.c.P), int(ball_.case.c.discrete), 0
-    for part, cell in ((part, cell) for part in ball_.parts for cell in ball_.case.cells):
+    parts = ball_.on_cones(ball_.by.directions, close=True)
+    for part, cell in ((part, cell) for part in parts for cell in ball_.case.cells):
         G = part.change(cell)
         doubts = [g.lipschitz + g.slack for g in G]
         models = Models(ball_.J, G, rest=True) if are_finite(G) and all(np.isfinite(v.top) for v in doubts) else None
         if models is not None and part.cone is not None:
             from .kinks import Kinks
 
-            models.kinks = Kinks.of(part.cone, models, ball_.case.c.P)
+            models.more.append(Kinks.of(part.cone, models, ball_.case.c.P))
         beyond = 0.0 if models is None or not h else _size_beyond(models, doubts, ball_.case.c.P)
         if models is None or not np.isfinite(beyond):
             yield ball_.at, "F has no finite model"
@@ -87,13 +77,18 @@ def contracts(ball_: Contracted) -> Failures:
             crossed = models.J.transpose() * P * corner.A
             form = crossed + crossed.transpose()
             if h:
-                most = rational(beyond) + (fmpq(0) if models.kinks is None else models.kinks.length)
+                most = sum((more.lengths(models, P)[1] for more in models.more), rational(beyond))
                 form += corner.A.transpose() * P * corner.A + diagonal([most**2] * b.ncols())
                 rest = _rest(models, P * (models.J + corner.A), sizes, ball_.by)
             count += 1
             if not is_definite(-form - rest):
                 yield ball_.at, "it is not shown that trajectories come closer"
     return count
+
+
+def examine(tally: Tally, case: Case) -> None:
+    if case.partition.contraction is not None:
+        tally.hold(OF_CONTRACTION, Contracted.of(case, case.partition.contraction))
 
 
 OF_CONTRACTION = (("contraction", fits), ("contraction", ball.is_not_clipped), ("contraction", contracts))
@@ -104,7 +99,7 @@ def _rest(models: Models, b: fmpq_mat, doubts: Sequence[fmpq], by: Contraction) 
     lengths = [root_above(sum((v * v for v in row), fmpq(0))) for row in b.tolist()]
     along = 2 * sum((length * doubt for length, doubt in zip(lengths, doubts, strict=True)), fmpq(0))
     found = _turning(models, b, by.weights.tolist()) + _twisting(models, b, by.weight) + diagonal([along] * b.ncols())
-    return found if models.kinks is None else found + models.kinks.bound(models, b, by.weight)
+    return sum((more.bound(models, b, by.weight) for more in models.more), found)
 
 
 def _size_beyond(models: Models, doubts: Sequence[Above], P: Array) -> float:

@@ -11,18 +11,22 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .boxes import LEAF, is_whole
-from .case import Case, Failures
+from .case import Case, Failures, given
 from .document import Array, Intervals
 from .expression import evaluate
 from .flow import enclosed, later
 from .near import Above, Near, all_near, combined, near, size
 from .sections import Data, Round
 from .taylor import Taylor, affine, constants, pairs
+
+if TYPE_CHECKING:
+    from .rules import Tally
 
 _BATCH_NUMBERS = 800_000
 
@@ -170,7 +174,7 @@ def _holds(outer: tuple[Fraction, Fraction], inner: tuple[Fraction, Fraction]) -
 
 def is_whole_tree(case: Case) -> Failures:
     """`data`: the bytes are a partition of the priors, with rounds for each leaf."""
-    data = case.data
+    data = given(case.c.data)
     leaves = yield from is_whole(data.tree, range(len(data.parameters)), "data, ")
     if leaves != len(data.leaves):
         yield "evidence.data.leaves", f"there must be rounds for each of {leaves} leaves"
@@ -179,7 +183,8 @@ def is_whole_tree(case: Case) -> Failures:
 
 def in_ranges(case: Case) -> Failures:
     """`data`: what the measurements leave of the priors lies in the claim's ranges."""
-    data, flows, left = case.data, Flows(case, case.data), list[Intervals]()
+    data, left = given(case.c.data), list[Intervals]()
+    flows = Flows(case, data)
     for leaf, (box, rounds) in enumerate(zip(_leaves(data), data.leaves, strict=True)):
         part, shown = narrowed(flows, box, rounds)
         if shown < len(rounds):
@@ -214,6 +219,10 @@ def _leaves(data: Data) -> Iterator[Intervals]:
         waiting += [
             tuple(end if k == axis else pair for k, pair in enumerate(box)) for end in ((middle, hi), (lo, middle))
         ]
+
+
+def examine(tally: Tally, case: Case) -> None:
+    tally.hold(OF_DATA, case)
 
 
 OF_DATA = (("data", is_whole_tree), ("data", in_ranges))

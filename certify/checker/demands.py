@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from .document import Certificate, OuterTree, Partition, Trusted
+from .document import Certificate, Partition
 from .limits import LEAF, Net, Sizes, called
+from .sections import OuterTree, Trusted
 
 
 def numbers(sizes: Sizes) -> int:

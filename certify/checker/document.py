@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
@@ -17,20 +17,17 @@ from .expression import Tape, parse
 from .networks import Network, hashed
 from .networks import read as read_networks
 from .schema import Value
-from .strict import MAX_VALUES, load
+from .strict import load
 
 if TYPE_CHECKING:
-    from .sections import Data, Ranks, Slab
+    from .sections import Contraction, Data, Outer, OuterTree, Ranked, Ranks, Slab, Trusted
 
-MAX_STATES, MAX_SLABS = 64, 10**4
-MAX_ORDER = 8  # of a series in time
+MAX_STATES = 64
 MAX_CELLS, MAX_CUTS = 4096, 64  # of the box of uncertain quantities in all, and of one range
-MAX_CONSTRAINTS, MAX_RANK = 64, 2**16 - 1  # that rank is none
 CLAIMS = ("asymptotic", "practical", "nearby", "enlarged", "reached", "reaches", "invariant")
+PLAIN = ("asymptotic", "practical")
 WITHOUT_V = ("reaches", "invariant")
 PRACTICAL = ("practical", "nearby")
-TAKING_OVER = ("asymptotic", "nearby")
-WITH_TUBE = ("enlarged", "reached")
 Array = NDArray[np.float64]
 Intervals = tuple[tuple[Fraction, Fraction], ...]
 
@@ -52,14 +49,6 @@ class Policy:
         arrays = [array for step in self.network.steps for array in step.arrays]
         heading = f"certify-policy/1\0{self.squash}\0{self.centre}\0"
         return hashed(heading, (*arrays, self.scale, self.offset, *(self.clip or ())), self.network.words())
-
-
-@dataclass(frozen=True)
-class Outer:
-    """The function N, an expression's tape, and the level n2 of {N <= n2}."""
-
-    function: Tape
-    level: float
 
 
 @dataclass(frozen=True)
@@ -85,17 +74,6 @@ class LocalBall:
 
 
 @dataclass(frozen=True)
-class Contraction:
-    """The ball x = J d, ||d|| <= 1, on which trajectories come closer, and on it the weights g of one bound, and the
-    weight of another; with kinks, trees of directions."""
-
-    J: Array
-    weights: Array
-    weight: Array
-    directions: tuple[bytes, ...] | None = None
-
-
-@dataclass(frozen=True)
 class Partition:
     """Evidence that is replayed: a partition tree of the box |z| <= root, x = T z; the local ball; the tube's slabs."""
 
@@ -105,35 +83,9 @@ class Partition:
     order: int  # of the series in time on leaves
     cells: tuple[int, ...]  # number of parts of each uncertain quantity's range
     local: LocalBall | None
-    contraction: Contraction | None
-    tube: tuple[Slab, ...]
-    outer: OuterTree | None
-
-
-@dataclass(frozen=True)
-class OuterTree:
-    """A partition tree of the box |z| <= root, x = T z, that contains the domain, and one of each of its faces."""
-
-    T: Array
-    root: Array
-    tree: bytes
-    faces: tuple[bytes, ...]
-
-
-@dataclass(frozen=True)
-class Ranked:
-    """Evidence by ranks alone, of a claim without V; the order of the series in time on leaves."""
-
-    order: int
-
-
-@dataclass(frozen=True)
-class Trusted:
-    """Evidence that cannot be replayed: a solver's name and version, and its answers as (query, answer)."""
-
-    solver: str
-    version: str
-    queries: tuple[tuple[str, ...], ...]
+    contraction: Contraction | None = None
+    tube: tuple[Slab, ...] = ()
+    outer: OuterTree | None = None
 
 
 @dataclass(frozen=True)
@@ -236,76 +188,26 @@ def certificate(data: Any, sha256: str, at: str = "", kinds: tuple[str, ...] = C
 
 def _attracting(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: Value, evidence: Value) -> Certificate:
     """The rest of a certificate with V."""
-    n, networks, kind = len(stated["states"]), {net.name: net for net in stated["networks"]}, claim.raw["kind"]
-    stated_of = {"enlarged": "start", "reached": "start centre"}.get(kind, "").split()
-    may_be = "".join(map(claim.maybe, ("keep",) if kind in WITH_TUBE else ("ranks", "keep", "data")))
-    _, rate, sample, beyond, *more = claim.keys(" ".join(("kind rate sample outer", *stated_of)) + may_be)
-    of_tube, others = more[: len(stated_of)], more[len(stated_of) :]
-    optional = dict(zip(may_be.split(), others, strict=True))
-    fall, periods = rate.binary64(), periods_of(sample)
-    rate.must(0 <= fall < math.inf and (fall == 0 or kind not in WITH_TUBE), "0, or a rate where a claim may have one")
-    plain = periods is None and not stated["discrete"]
-    sample.must(plain or kind not in WITH_TUBE, "null, and the plant continuous, under this claim")
-    sample.must(periods is None or kind != "nearby", "null under this claim")
-    sample.must(periods is None or not stated["discrete"], "null where time is discrete")
-    outer = None
-    if beyond.raw is not None:
+    n, kind, plain = len(stated["states"]), claim.raw["kind"], {"kind", "rate", "sample", "outer"}
+    more, besides = dict[str, Any](), dict[str, Value]()  # what only some claims have
+    if kind in PLAIN and {*claim.raw} <= plain and claim.raw.get("sample") is claim.raw.get("outer") is None:
+        _, rate, *_ = claim.keys("kind rate sample outer")
+    else:
         from . import sections
 
-        outer = sections.read_outer(beyond, stated["states"], networks)
-    beyond.must(outer is None or (plain and fall == 0 and kind not in WITH_TUBE), "null under this claim")
+        rate, more, besides = sections.of_claim(claim, stated)
+    fall = rate.binary64()
+    rate.must(0 <= fall < math.inf, "0, or a rate where a claim may have one")
     form, P = lyapunov.keys("kind P")
     form.choice("quadratic")
     edges = (*(("floor",) if kind in PRACTICAL else ()), "local", "roa")
     numbers = {edge: level.binary64() for edge, level in zip(edges, levels.keys(" ".join(edges)), strict=True)}
-    ranks, keep = optional.get("ranks"), optional.get("keep")
-    by_tree = _evidence(
-        evidence,
-        n,
-        len(stated["uncertain"]),
-        kind,
-        most_order(stated, periods),
-        outer is not None,
-        plain and fall == 0 and outer is None and not optional,
-        "".join(f" {name}" for name in ("ranks", "data") if name in optional),
-    )
-    besides = dict[str, Any]()
-    if ranks is not None or "data" in optional:
+    by_tree = _evidence(evidence, stated, kind, {**more, **besides, "rate": fall})
+    if besides:
         from . import sections
 
-        if ranks is not None:
-            besides["ranks"] = sections.read_ranks(ranks, evidence.entry("ranks"), n, stated, periods)
-        if "data" in optional:
-            besides["data"] = sections.read_data(optional["data"], evidence.entry("data"), stated)
-    return Certificate(
-        kind,
-        **stated,
-        **besides,
-        evidence=by_tree,
-        P=P.array(n, n),
-        levels=numbers,
-        rate=fall,
-        sample=periods,
-        start=of_tube[0].array(n, n) if of_tube else None,
-        centre=of_tube[1].array(n) if kind == "reached" else None,
-        outer=outer,
-        keep=kept([] if keep is None else [keep], stated),
-    )
-
-
-def most_order(stated: Mapping[str, Any], periods: tuple[Fraction, Fraction] | None) -> int:
-    return MAX_ORDER if periods is not None and not stated["dynamics"].calls else 1
-
-
-def kept(values: Sequence[Value], stated: Mapping[str, Any]) -> Tape | None:
-    """The constraints, if the claim has any."""
-    names = (*stated["states"], *stated["inputs"], *stated["uncertain"])
-    return constraints(values[0], names) if values else None
-
-
-def constraints(value: Value, names: tuple[str, ...]) -> Tape:
-    """Expressions that call no networks."""
-    return parse(value.listed(lambda tree: tree.raw, 1, MAX_CONSTRAINTS), names, value.at)
+        more |= sections.beside(besides, evidence, stated, more["sample"])
+    return Certificate(kind, **stated, **more, evidence=by_tree, P=P.array(n, n), levels=numbers, rate=fall)
 
 
 def _plant(plant: Value, networks: Mapping[str, Network]) -> dict[str, Any]:
@@ -328,14 +230,6 @@ def _plant(plant: Value, networks: Mapping[str, Network]) -> dict[str, Any]:
         "domain": domain.listed(Value.interval, n),
         "input_bounds": bounds.listed(Value.interval, m),
     }
-
-
-def periods_of(value: Value) -> tuple[Fraction, Fraction] | None:
-    if value.raw is None:
-        return None
-    lo, hi = value.listed(Value.rational, 2)
-    value.must(0 <= lo <= hi and hi > 0, "two periods, 0 <= lo <= hi and hi > 0")
-    return lo, hi
 
 
 def quantity(value: Value) -> tuple[str, tuple[Fraction, Fraction]]:
@@ -366,37 +260,12 @@ def _local(value: Value, n: int, claim: str, most: int) -> LocalBall | None:
     J, multipliers, weight, edge, order, *directions = value.keys(names)
     k = edge.binary64()
     edge.must(0 <= k < math.inf and (k == 0 or claim in PRACTICAL), "0, or a multiplier under a practical claim")
-    by = multipliers_of(multipliers, weight, n, n)
-    return LocalBall(J.array(n, n), by, k, order.integer(1, most), _directions(directions, n))
+    trees = None
+    if directions:
+        from .sections import trees_of
 
-
-def _directions(found: list[Value], n: int) -> tuple[bytes, ...] | None:
-    if not found:
-        return None
-    found[0].must(found[0].raw == [] or isinstance(found[0].raw, list), "a list")
-    return found[0].listed(Value.octets, 2 * n) if found[0].raw else ()
-
-
-def _contraction(value: Value, n: int, claim: str) -> Contraction | None:
-    if claim != "nearby":
-        value.must(value.raw is None, "null under this claim")
-        return None
-    J, weights, weight, *directions = value.keys(f"J weights weight{value.maybe('directions')}")
-    return Contraction(J.array(n, n), weights.array(n), weight.array(n, n), _directions(directions, n))
-
-
-def _slabs(value: Value, n: int, claim: str) -> tuple[Slab, ...]:
-    if claim not in WITH_TUBE:
-        return value.listed(lambda slab: slab.raw, 0)
-    from . import sections
-
-    return value.listed(lambda slab: sections.read_slab(slab, n, claim), 1, MAX_SLABS)
-
-
-def _beyond(value: Value, n: int) -> OuterTree:
-    from . import sections
-
-    return sections.read_outer_tree(value, n)
+        trees = trees_of(directions, n)
+    return LocalBall(J.array(n, n), multipliers_of(multipliers, weight, n, n), k, order.integer(1, most), trees)
 
 
 def multipliers_of(value: Value, weight: Value, n: int, k: int) -> Multipliers:
@@ -419,30 +288,28 @@ def check_hash(policy: Policy, stated: Any) -> None:
         raise Rejected("hash", "policy.sha256", "does not match the network in the file")
 
 
-def _evidence(
-    value: Value, n: int, k: int, claim: str, most: int, outer: bool, plain: bool, others: str
-) -> Partition | Trusted:
-    """k quantities are uncertain; series in time have an order of at most `most`; `outer` says that a function is
-    stated, `plain` that none is, nor a rate, of a loop without steps; `others` are keys that the claim has too."""
-    kinds = (
-        "partition-tree",
-        *(("trusted-solver",) if plain and not k and claim not in (*WITH_TUBE, "nearby") else ()),
+def _evidence(value: Value, stated: Mapping[str, Any], claim: str, more: Mapping[str, Any]) -> Partition | Trusted:
+    """The evidence of a claim that has more."""
+    n, k, most = len(stated["states"]), len(stated["uncertain"]), 1
+    if not isinstance(value.raw, dict) or value.raw.get("kind") != "partition-tree":
+        from . import sections
+
+        plain = claim in PLAIN and not (k or stated["discrete"] or any(v is not None and v != 0 for v in more.values()))
+        return sections.read_trusted(value, plain)
+    keys = "kind T root tree order cells local contraction tube outer"
+    if claim not in PLAIN or more.keys() != {"rate"}:
+        from . import sections
+
+        most, keys = sections.most_order(stated, more["sample"]), keys + sections.keys_of(more)
+    _, T, root, tree, order, cells, local, contraction, tube, beyond, *_ = value.keys(keys)
+    cuts = cells.listed(lambda cut: cut.integer(1, MAX_CUTS), k)
+    cells.must(math.prod(cuts) <= MAX_CELLS, f"{MAX_CELLS} parts in all")
+    ball, by_boxes = (
+        _local(local, n, claim, most),
+        (T.array(n, n), root.array(n), tree.octets(), order.integer(1, most)),
     )
-    known = isinstance(value.raw, dict) and value.raw.get("kind") in kinds
-    value.must(known, f"an object of kind {' or '.join(kinds)}")
-    if value.raw["kind"] == "partition-tree":
-        keys = f"kind T root tree order cells local contraction tube outer{others}"
-        _, T, root, tree, order, cells, local, contraction, tube, beyond, *_ = value.keys(keys)
-        cuts = cells.listed(lambda cut: cut.integer(1, MAX_CUTS), k)
-        cells.must(math.prod(cuts) <= MAX_CELLS, f"{MAX_CELLS} parts in all")
-        value.must(k == 0 or claim not in WITH_TUBE, "another where quantities are uncertain")
-        slabs = _slabs(tube, n, claim)
-        ball = _local(local, n, claim, most)
-        close = _contraction(contraction, n, claim)
-        by_boxes = T.array(n, n), root.array(n), tree.octets(), order.integer(1, most)
-        beyond.must(outer or beyond.raw is None, "null where the claim has none")
-        return Partition(*by_boxes, cuts, ball, close, slabs, _beyond(beyond, n) if outer else None)
-    _, solver, version, precision, queries = value.keys("kind solver version precision queries")
-    precision.must(precision.binary64() > 0, "positive")
-    answers = queries.listed(lambda pair: pair.listed(Value.word, 2), 0, MAX_VALUES)
-    return Trusted(solver.word(), version.word(), answers)
+    if contraction.raw is None and tube.raw == [] and beyond.raw is None and claim in PLAIN and not more.get("outer"):
+        return Partition(*by_boxes, cuts, ball)
+    from . import sections
+
+    return Partition(*by_boxes, cuts, ball, *sections.others(claim, n, k, contraction, tube, beyond, more.get("outer")))

@@ -13,11 +13,10 @@ from flint import fmpq, fmpq_mat, fmpz
 from numpy.typing import NDArray
 
 from .document import Policy
-from .expression import MAX_BITS, evaluate
+from .expression import MAX_BITS
 from .functions import FUNCTIONS, Undecided
-from .networks import Affine, Clip, Observe, OnNumbers
+from .networks import Affine, OnNumbers
 
-MAX_INVERSE_BITS = 2**14  # of a number in a matrix all of whose inverse is wanted, times the matrix's size
 MAX_MATRIX_BITS = 2**16  # of a number in a matrix, times the matrix's size: beyond, a decision takes minutes
 
 
@@ -32,14 +31,6 @@ def inverse_diagonal(A: fmpq_mat) -> list[Fraction]:
         return []
     inverse = A.inv()
     return [fraction(inverse[i, i]) for i in range(A.nrows())]
-
-
-def inverse(A: fmpq_mat) -> fmpq_mat | None:
-    """`A^-1`; None if there is none, or A is too large to tell soon."""
-    numerator, _ = A.numer_denom()
-    if A.nrows() * max(v.height_bits() for v in numerator.entries()) > MAX_INVERSE_BITS or numerator.det() == 0:
-        return None
-    return A.inv()
 
 
 def is_definite(A: fmpq_mat) -> bool:
@@ -124,23 +115,17 @@ class Exactly(OnNumbers):
     def affine(self, step: Affine, v: list[Exact]) -> list[Exact]:
         return [_row(row, bias, v) for row, bias in zip(step.weight.tolist(), step.bias.tolist(), strict=True)]
 
-    def clip(self, step: Clip, v: list[Exact]) -> list[Exact]:
-        return [_clipped(x, *ends) for x, *ends in zip(v, step.lo.tolist(), step.hi.tolist(), strict=True)]
-
-    def observe(self, step: Observe, v: list[Exact]) -> list[Exact]:
-        return evaluate(step.tape, Exact, v)
-
 
 def policy_at_origin(policy: Policy) -> list[Fraction | None]:
     """pi(0) without centring, None where it is not known."""
     values, u = Exactly().run(policy.network, [Exact(Fraction(0))] * policy.network.reads), list[Exact]()
     for j, (v, scale, offset) in enumerate(zip(values, policy.scale.tolist(), policy.offset.tolist(), strict=True)):
         raw = Exact(Fraction(offset)) + Exact(Fraction(scale)) * (v.function("tanh") if policy.squash == "tanh" else v)
-        u.append(_clipped(raw, *(end.tolist()[j] for end in policy.clip)) if policy.clip else raw)
+        u.append(clipped(raw, *(end.tolist()[j] for end in policy.clip)) if policy.clip else raw)
     return [x.value for x in u]
 
 
-def _clipped(x: Exact, lo: float, hi: float) -> Exact:
+def clipped(x: Exact, lo: float, hi: float) -> Exact:
     return x if x.value is None else Exact(min(max(x.value, Fraction(lo)), Fraction(hi)))
 
 

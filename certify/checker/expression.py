@@ -125,6 +125,18 @@ def parse(trees: Sequence[Any], names: Sequence[str], at: str, networks: Mapping
     return Tape(tuple(operation for _, operation in builder.tape.values()), outputs, tuple(trees))
 
 
+def load(function: str) -> None:
+    """Add the function's row to the table of functions, if it is one that only some certificates need."""
+    if function in ("inv", "exp", "atan", "sqrt"):
+        from . import smooth
+
+        smooth.add()
+    elif function not in (*_OPERATORS, "sin", "cos", "tanh"):
+        from . import activations
+
+        activations.add()
+
+
 class _Builder:
     """Appends operations; an operation that already stands on the tape is shared."""
 
@@ -136,6 +148,7 @@ class _Builder:
         """An operation on parts; a number where all of them are numbers, and it is not a function's."""
         numbers = [part for part in parts if isinstance(part, Fraction)]
         if len(numbers) < len(parts) or (name not in _OPERATORS and name != "inv"):
+            load(name)
             return self.push(name, tuple(map(self.index, parts)))
         if name == "inv" and numbers[0] == 0:
             strict.fail(self.at, "a division by the number 0")
@@ -180,10 +193,8 @@ class _Builder:
                 return self.apply("+", a, self.apply("neg", b))
             case "/", [a, b]:
                 return self.apply("*", a, self.apply("inv", b))
-            case (("sin" | "cos" | "tanh" | "exp" | "atan" | "sqrt"), [a]):
+            case (("sin" | "cos" | "tanh" | "exp" | "atan" | "sqrt" | "abs"), [a]):
                 return self.apply(name, a)
-            case "abs", [a]:
-                return self.abs(a)
             case "tan", [a]:
                 return self.apply("*", self.apply("sin", a), self.apply("inv", self.apply("cos", a)))
             case (("min" | "max"), [first, *others]) if others:
@@ -192,15 +203,9 @@ class _Builder:
                 return self.extreme("min", self.extreme("max", v, lo), hi)
         strict.fail(at, f"operator {name[:20]!a} with {len(arguments)} operands is not in the grammar")
 
-    def abs(self, a: Part) -> Part:
-        from . import activations
-
-        activations.add()
-        return self.apply("abs", a)
-
     def extreme(self, name: str, a: Part, b: Part) -> Part:
         """The larger of two numbers, (a + b + |a - b|)/2, or the lesser one, with -|a - b|."""
-        apart = self.abs(self.apply("+", a, self.apply("neg", b)))
+        apart = self.apply("abs", self.apply("+", a, self.apply("neg", b)))
         apart = apart if name == "max" else self.apply("neg", apart)
         return self.apply("*", Fraction(1, 2), self.apply("+", self.apply("+", a, b), apart))
 

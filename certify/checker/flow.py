@@ -1,4 +1,5 @@
-"""The mean of f over a period in which the input is held: G, with x(h) = x + h G, in models of a ball or of leaves.
+"""The mean of f over a period in which the input is held: G, with x(h) = x + h G, in models of a ball or of leaves; and
+rule `flow`: during a period the state stays in the interior of the domain.
 
 Taylor's formula in time: G = x_1 + h x_2 + ... + h^(r-1) x_r, the last coefficient, which is the remainder, taken where
 the state may be during the period. Power series give the coefficients in any arithmetic (Moore). Uncertain quantities
@@ -9,22 +10,31 @@ mean.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import reduce
+from functools import cached_property, partial, reduce
 from operator import add
 from typing import Any
 
 import numpy as np
+from flint import fmpq
 
+from .case import Failures
+from .decrease import rational
+from .document import Certificate, Intervals
+from .exact import fraction, root_above
 from .expression import Tape, evaluate
-from .functions import FUNCTIONS
-from .near import Above, Array, Near, size
-from .ring import Motion, Moving
+from .jets import Jet
+from .near import Above, Array, Near, near, norm, size
+from .ranges import Swayed, between, uncertain
+from .ring import Motion, Moving, RingLeaves
+from .stepping import Stepping
 from .taylor import Taylor, affine, pairs
 
 Constant = Callable[[Fraction], Any]
+Way = tuple[Array, Array]  # the largest move of each state in a period: a number, and one times ||d||
+Enclosed = tuple[Way, list[Jet]]  # and f on the way
 _ATTEMPTS = 4  # at the a-priori enclosure
 
 
@@ -56,9 +66,9 @@ class Series:
         return self._of(found)
 
     def function(self, name: str) -> Series:
-        """phi(v) for a function phi of the table."""
+        """phi(v) for a function phi that equations may have."""
         count = self.count if len(self.parts) > 1 else 1
-        return self._of(FUNCTIONS[name].series(self.parts, count, self.constant))
+        return self._of(SERIES[name](self.parts, count, self.constant))
 
 
 def coefficients(
@@ -123,20 +133,129 @@ def enclosed(
     return during, F
 
 
+class Held(Stepping):
+    """The ball of the section `local`, where inputs are held."""
+
+    @property
+    def order(self) -> int:
+        return self.case.local.order
+
+    @property
+    def ranges(self) -> list[Jet]:
+        """The uncertain quantities, of which only their whole ranges are known."""
+        return self.of_y([between(lo, hi, self.units) for lo, hi in self.case.c.ranges])
+
+    @cached_property
+    def enclosed(self) -> Enclosed | None:
+        """The a-priori enclosure of the states during a period, and of f there, the first that holds of a few attempts:
+        what f may come to, over the longest period, is less. None if none does."""
+        n, h = len(self.J), longest(self.case.c)
+        far, along = np.zeros(n), np.zeros(n)
+        for _ in range(1 + _ATTEMPTS):
+            F = self.f(self.during((far, along)), self.ranges)
+            most = np.array([0.0 if self.at_rest else (f.v0.size * h).top for f in F])
+            steepest = np.array([(f.radius * h).top for f in F])
+            if np.all((most < far) | self.at_rest) and np.all(steepest < along):
+                return (far, along), F
+            far, along = (0 * most if self.at_rest else 1.25 * most), 1.25 * steepest
+        return None
+
+    @property
+    def way(self) -> Way | None:
+        """The one of the enclosure, if there is one."""
+        return None if self.enclosed is None else self.enclosed[0]
+
+    def during(self, way: Way) -> list[Jet]:
+        """The states within a way of the ball's."""
+        moved = zip(self.states, *way, strict=True)
+        return [replace(x, c=x.c.wider(far), a=x.a.wider(along)) for x, far, along in moved]
+
+    def courses(self) -> Iterator[tuple[list[Jet], list[Jet]]]:
+        if self.way is None:
+            yield from super().courses()
+        else:
+            yield self.during(self.way), self.ranges
+
+    def settled(self, v: Jet) -> Jet:
+        """Set the value at d = 0 to exactly 0 at rest, where it is 0 in truth."""
+        if not self.at_rest:
+            return v
+        v = replace(v, c=Near(np.float64(0)))
+        return replace(v, c_y=Near(0 * v.c_y.value)) if isinstance(v, Swayed) else v
+
+    @property
+    def period(self) -> Jet:
+        """h, by the last of the numbers y if it has a range."""
+        lo, hi = self.case.c.sample or (Fraction(0), Fraction(0))
+        return uncertain(lo, hi, self.units, self.count - 1, self.count) if lo < hi else self.constant(hi)
+
+    @cached_property
+    def later(self) -> list[Jet]:
+        """The terms of G beyond x_1, divided by h; uncertain quantities enter them with their whole range alone."""
+        if self.way is None or self.order == 1:
+            return []
+        start, during = self.shared(self.states), self.shared(self.during(self.way))
+        held, dynamics = [*self.inputs, *self.ranges], self.case.c.dynamics
+        return later(dynamics, self.constant, start, during, held, self.period, self.order, self.settled)
+
+    def G(self, cell: Intervals) -> list[Jet] | None:
+        """Within a period uncertain quantities may leave the cell: the cell counts only for their mean, in which D is
+        convex."""
+        if self.way is None:  # on a cone it may not be found, though it is on all
+            return None
+        first = self.f(self.during(self.way) if self.order == 1 else self.states, self.symbols(cell))
+        rising = self.later or [self.constant(Fraction(0))] * len(first)
+        return [self.settled(x) + self.period * more for x, more in zip(first, rising, strict=True)]
+
+
+def stays_on_ball(local: Held) -> Failures:
+    """`flow`: during a period the state stays in the interior of the domain."""
+    c = local.case.c
+    if local.enclosed is None:
+        yield local.at, "the state is not shown to stay near during a period"
+        return 0
+    _, F = local.enclosed
+    for i, (f, name, (lo, hi)) in enumerate(zip(F, c.states, c.domain, strict=True)):
+        p = local.case.P_inverse[i]
+        reach = root_above(rational(c.c1) * fmpq(p.numerator, p.denominator))
+        of_ball = float(norm(local.J[i]).top)
+        reach = min(reach, rational(of_ball)) if np.isfinite(of_ball) else reach
+        moved = float(((f.radius if local.at_rest else f.radius + f.v0.size) * longest(c)).top)
+        if not (np.isfinite(moved) and fraction(reach + rational(moved)) < min(-lo, hi)):
+            yield local.at, f"{name} may leave the domain during a period"
+    return len(c.states)
+
+
+def stays_on_leaves(leaves: RingLeaves) -> Failures:
+    """`flow`: during a period the state stays in the interior of the domain."""
+    c, ends = leaves.boxes.c, leaves.motion.ends
+    for i, (name, (lo, hi)) in enumerate(zip(c.states, c.domain, strict=True)):
+        (_, least), (most, _) = near(lo).ends, near(hi).ends
+        hold = (ends[0, i] > least) & (ends[1, i] < most)
+        if not np.all(hold):
+            yield f"leaf {leaves.numbers[np.argmin(hold)]}", f"{name} may leave the domain during a period"
+    return int(ends[0].size)
+
+
+def longest(c: Certificate) -> float:
+    """At or above the longest period."""
+    return float(near(c.step).ends[1])
+
+
 def motion(
     boxes: Moving, period: tuple[Fraction, Fraction], states: list[Taylor], inputs: list[Taylor], ranges: list[Taylor]
 ) -> Motion:
     """G over a period, and where the state may be until it is over."""
-    c, longest = boxes.c, boxes.case.longest
+    c, most = boxes.c, longest(boxes.c)
     loose = [*inputs, *(affine(v.c, np.zeros_like(v.g), v.moved) for v in ranges)]  # by their ranges, without symbols
-    during, F = enclosed(lambda x: boxes.f(x, loose), states, longest)
+    during, F = enclosed(lambda x: boxes.f(x, loose), states, most)
     h = boxes.number(period, boxes.symbols - 1, len(inputs[0].c))
     G = [of_mean(boxes, f) for f in boxes.f(during if boxes.order == 1 else states, [*inputs, *ranges])]
     if boxes.order > 1:
         number = boxes.constant(len(inputs[0].c))
         rising = later(c.dynamics, number, states, during, loose, h, boxes.order, lambda v: v)
         G = [x + h * more for x, more in zip(G, rising, strict=True)]
-    return Motion(G, during, loose, hull(states, F, boxes.widest, longest))
+    return Motion(G, during, loose, hull(states, F, boxes.widest, most))
 
 
 def hull(states: list[Taylor], F: list[Taylor], widest: list[float], longest: float) -> Array:
@@ -159,3 +278,82 @@ def of_mean(boxes: Moving, f: Taylor) -> Taylor:
     p = f.p.copy()
     p[own] = 0.0
     return Taylor(f.c, p, f.r + size(f.p[own]).sum())
+
+
+# ---------------------------------------------------------------------------------------- power series of functions
+
+
+def _tanh(v: list[Any], count: int, constant: Constant) -> list[Any]:
+    y, slope = [v[0].function("tanh")], list[Any]()
+    for k in range(1, count):
+        square = reduce(add, [y[i] * y[k - 1 - i] for i in range(k)])
+        slope.append(constant(Fraction(1)) + -square if k == 1 else -square)
+        y.append(_step(v, slope, k, constant))
+    return y
+
+
+def _sine(name: str, v: list[Any], count: int, constant: Constant) -> list[Any]:
+    """sin, and cos, which is the sine of v + pi/2."""
+    y, other = [v[0].function(name)], [v[0].function("cos" if name == "sin" else "sin")]
+    for k in range(1, count):
+        rise, fall = _step(v, other, k, constant), _step(v, y, k, constant)
+        y.append(rise if name == "sin" else -rise)
+        other.append(-fall if name == "sin" else fall)
+    return y
+
+
+def _inv(v: list[Any], count: int, constant: Constant) -> list[Any]:
+    y = [v[0].function("inv")]
+    for k in range(1, count):
+        y.append(-(reduce(add, [v[j] * y[k - j] for j in range(1, min(k, len(v) - 1) + 1)]) * y[0]))
+    return y
+
+
+def _exp(v: list[Any], count: int, constant: Constant) -> list[Any]:
+    y = [v[0].function("exp")]
+    for k in range(1, count):
+        y.append(_step(v, y, k, constant))
+    return y
+
+
+def _atan(v: list[Any], count: int, constant: Constant) -> list[Any]:
+    square = [
+        reduce(add, [v[i] * v[k - i] for i in range(max(0, k - len(v) + 1), min(k, len(v) - 1) + 1)])
+        for k in range(min(count, 2 * len(v) - 1))
+    ]
+    slopes = _inv([constant(Fraction(1)) + square[0], *square[1:]], count, constant)
+    y = [v[0].function("atan")]
+    for k in range(1, count):
+        y.append(_step(v, slopes, k, constant))
+    return y
+
+
+def _sqrt(v: list[Any], count: int, constant: Constant) -> list[Any]:
+    y = [v[0].function("sqrt")]
+    half = constant(Fraction(1, 2)) * y[0].function("inv")
+    for k in range(1, count):
+        known = [v[k]] if k < len(v) else []
+        known += [-(y[i] * y[k - i]) for i in range(1, k)]
+        y.append(half * reduce(add, known) if known else constant(Fraction(0)))
+    return y
+
+
+def _abs(v: list[Any], count: int, constant: Constant) -> list[Any]:
+    sign = v[0].function("sign") if count > 1 else None
+    return [v[0].function("abs"), *(sign * v[k] if k < len(v) else constant(Fraction(0)) for k in range(1, count))]
+
+
+def _sign(v: list[Any], count: int, constant: Constant) -> list[Any]:
+    return [v[0].function("sign"), *[constant(Fraction(0))] * (count - 1)]
+
+
+def _step(v: list[Any], w: list[Any], k: int, constant: Constant) -> Any:
+    """sum_(j=1..k) j v_j w_(k-j) / k."""
+    terms = [constant(Fraction(j, k)) * (v[j] * w[k - j]) for j in range(1, min(k, len(v) - 1) + 1)]
+    return reduce(add, terms) if terms else constant(Fraction(0))
+
+
+SERIES: dict[str, Callable[[list[Any], int, Constant], list[Any]]] = {  # the first coefficients of phi(v_0 + v_1 t ...)
+    **{"tanh": _tanh, "sin": partial(_sine, "sin"), "cos": partial(_sine, "cos"), "inv": _inv, "exp": _exp},
+    **{"atan": _atan, "sqrt": _sqrt, "abs": _abs, "sign": _sign},
+}

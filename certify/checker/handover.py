@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from flint import fmpq, fmpq_mat
 
-from .case import Case, Failures
+from .case import Case, Failures, given
 from .document import Certificate
 from .exact import exactly, is_definite
+
+if TYPE_CHECKING:
+    from .rules import Tally
 
 
 def difference(c: Certificate, then: Certificate) -> fmpq_mat:
@@ -19,7 +24,7 @@ def difference(c: Certificate, then: Certificate) -> fmpq_mat:
 
 def is_same_loop(case: Case) -> Failures:
     """Numbers of both mean the same, the policy is one function, and inputs are held for the same times."""
-    c, then = case.c, case.then
+    c, then = case.c, given(case.c.then)
     for at, one, other in (
         ("plant.time", c.discrete, then.discrete),
         ("plant.states", c.states, then.states),
@@ -42,9 +47,13 @@ def _point(c: Certificate) -> list[float] | None:
 
 
 def is_entered(case: Case) -> Failures:
-    if not is_definite(difference(case.c, case.then)):
+    if not is_definite(difference(case.c, given(case.c.then))):
         yield "then.levels.roa", "{V <= c0} must lie in {V <= c2} of the certificate that takes over"
     return 1
+
+
+def examine(tally: Tally, case: Case) -> None:
+    tally.hold(OF_HANDOVER, case)
 
 
 OF_HANDOVER = (("handover", is_same_loop), ("handover", is_entered))

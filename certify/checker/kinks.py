@@ -8,23 +8,148 @@ leaf c.b = (|c|^2 + |b|^2 - |s|^2)/2 is at least (t^2 + |b|^2)/2, and so at leas
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import cached_property
 
 import numpy as np
 from flint import fmpq, fmpq_mat
 
+from .ball import OnBall, Rows
 from .boxes import batches, is_whole
 from .case import Failures
 from .decrease import OF_ONE, Models, rational, vectors
-from .exact import exactly, fraction
-from .jets import First, Jet
-from .near import Above, Array, Near, Tensor, Vector, at_least_0, least_share, near, sqrt
-from .networks import Clip, Map
+from .elementary import least_share, sqrt
+from .exact import Exact, exactly, fraction
+from .expression import evaluate
+from .functions import FUNCTIONS, Undecided
+from .jets import Jet, Units
+from .near import ZERO, Above, Array, Near, Tensor, Vector, at_least_0, near, norm, triples
+from .networks import Affine, Map, Step
 from .pairs import bound_of_pairs, in_binary64
+from .wiring import BallSteps, Clip, Concat, Observe, Product, Sum
 
 _AT_ONCE = 4096  # leaves
 _COARSE, _FINE = np.arange(-4.0, 24.0), np.arange(-7.0, 8.0) / 8  # powers of 2 to choose a multiplier from
+
+
+@dataclass(frozen=True)
+class First:
+    """Kinks among N units: |e_q(d)| is at most |alpha_q.d| + beta_q ||d||, and at most rho_q ||d||; alpha (k, N), beta
+    and rho (N,), 0 of other units. In rule `contraction` so is the difference at any two d, d being theirs."""
+
+    alpha: Array
+    beta: Array
+    rho: Array
+
+    def beside(self, other: First) -> First:
+        """These, and then others."""
+        parts = zip((self.alpha, self.beta, self.rho), (other.alpha, other.beta, other.rho), strict=True)
+        return First(*(np.concatenate(pair, -1) for pair in parts))
+
+    def of(self, count: int) -> First:
+        """So many of them."""
+        return First(self.alpha[:, :count], self.beta[:count], self.rho[:count])
+
+
+def no_kinks(k: int, count: int) -> First:
+    """Units that are no kinks."""
+    return First(np.zeros((k, count)), np.zeros(count), np.zeros(count))
+
+
+@dataclass(frozen=True)
+class KinkedUnits(Units):
+    """Errors of which some are of first order: U knows nothing of what `first` has."""
+
+    first: First = field(kw_only=True)
+
+    @cached_property
+    def tilts(self) -> Above:
+        """Upper bounds of what kinks add to each of the common errors, over ||d||."""
+        return Above(self.first.rho) if self.L is None else Above(self.first.rho).through(self.L)
+
+    @property
+    def norms(self) -> list[Above]:
+        first = self.first
+        return [*super().norms, norm(first.alpha, (0, 1)), norm(first.beta), norm(first.rho)]
+
+    def beside(self, more: Units, L: Array) -> KinkedUnits:
+        others = more.first if isinstance(more, KinkedUnits) else no_kinks(len(more.R), more.R.shape[2])
+        return KinkedUnits(np.concatenate([self.R, more.R], 2), L, self, first=self.first.beside(others))
+
+    def tilt(self, size: Above) -> Above:
+        if size is ZERO:
+            return ZERO
+        return (size * self.tilts[(slice(None), *[None] * (np.ndim(size.v) - 1))]).sum()
+
+
+class OnCone(OnBall):
+    """Networks on a ball, or on a cone of it, whose relus and clips may have kinks there."""
+
+    def __init__(self, k: int, cone: Cone) -> None:
+        super().__init__(k)
+        self.cone, self.first = cone, no_kinks(k, 0)
+
+    def units(self, count: int) -> Units:
+        return KinkedUnits(super().units(count).R, first=self.first.of(count))
+
+    def with_units(self, H: Array, C: Array, R: Array, lips: Above, first: First | None = None) -> int:
+        self.first = self.first.beside(first or no_kinks(self.k, R.shape[2]))
+        return super().with_units(H, C, R, lips)
+
+    def moved(self, x: Rows, origin: Array) -> Rows:
+        return replace(super().moved(x, origin), at_0=x.at_0 & (origin == 0))
+
+    def entered(self, jets: Sequence[Jet]) -> Rows:
+        at_0 = np.array([v.v0.value == 0 and v.v0.error.v == 0 for v in jets])  # a bound of 0 is 0
+        return replace(super().entered(jets), at_0=at_0)
+
+    def affine(self, step: Affine, v: Rows) -> Rows:
+        at_0 = (step.bias == 0) & ~np.any((step.weight != 0) & ~v.at_0, 1)
+        return replace(super().affine(step, v), at_0=at_0)
+
+    def map(self, step: Map, v: Rows) -> Rows:
+        if step.function == "relu":
+            return self.bent(step, v)
+        return replace(super().map(step, v), at_0=v.at_0 & (FUNCTIONS[step.function].at_0 == 0))
+
+    def make(self, step: Step, vectors: Sequence[Rows]) -> Rows:
+        return super().make(step, vectors) if isinstance(step, Affine | Map) else ConeSteps(self).other(step, vectors)
+
+    def bent(self, step: Step, v: Rows) -> Rows:
+        """Entries that are known to first order."""
+        value = self.jets(v)
+        found = self.cone.bent(step, value, v.at_0)
+        X, N, k = self.columns(v, value.units.count).times(Near(found.slope)), len(found.slope), self.k
+        nothing = np.zeros((k, k, N)), np.zeros((len(triples(k)[0]), N)), np.zeros((k, k, N)), Above(np.zeros(N))
+        at_0 = v.at_0 & (found.y.value == 0)  # relu(0) = 0, and a clip of 0 is exact
+        return Rows(found.y, X, self.with_units(*nothing, found.first), at_0)
+
+
+class ConeSteps(BallSteps):
+    """The other steps, which know what is exactly 0 too."""
+
+    ball: OnCone
+
+    def clip(self, step: Clip, v: Rows) -> Rows:
+        return self.ball.bent(step, v)
+
+    def sum(self, step: Sum, vectors: Sequence[Rows]) -> Rows:
+        return replace(super().sum(step, vectors), at_0=np.all([v.at_0 for v in vectors], axis=0))
+
+    def concat(self, step: Concat, vectors: Sequence[Rows]) -> Rows:
+        return replace(super().concat(step, vectors), at_0=np.concatenate([v.at_0 for v in vectors]))
+
+    def product(self, step: Product, v: Rows, w: Rows) -> Rows:
+        return replace(super().product(step, v, w), at_0=v.at_0 | w.at_0)
+
+    def observe(self, step: Observe, v: Rows) -> Rows:
+        found = super().observe(step, v)
+        try:
+            known = evaluate(step.tape, Exact, [Exact(Fraction(0) if still else None) for still in v.at_0.tolist()])
+        except Undecided:  # nothing is known to be 0
+            return replace(found, at_0=np.zeros(step.size, dtype=bool))
+        return replace(found, at_0=np.array([x.value == 0 for x in known]))
 
 
 @dataclass(frozen=True)
@@ -62,7 +187,7 @@ class Cone:
         """The weight of directions that are of interest here: no bound depends on it."""
         return np.outer(self.c, self.c) + float(self.r @ self.r) * np.eye(len(self.c))
 
-    def bent(self, step: Map | Clip, v: Jet, at_0: Array) -> Bent:
+    def bent(self, step: Step, v: Jet, at_0: Array) -> Bent:
         """The units of a step of a vector, a batch of jets; `at_0` says which v(0) are exactly 0."""
         below, above, falls, rises = self.reach(v)
         if isinstance(step, Clip):
@@ -165,15 +290,18 @@ class Kinks:
     length: fmpq
 
     @classmethod
-    def of(cls, cone: Cone | None, models: Models, P: Array) -> Kinks | None:
-        """None if there are none; the length is NaN or infinite nowhere, if the models are finite."""
-        first = models.units.first
-        if cone is None or first is None:
-            return None
-        c = Near(models.units.reach).through(models.shares)
+    def of(cls, cone: Cone, models: Models, P: Array) -> Kinks:
+        """The length is NaN or infinite nowhere, if the models are finite."""
+        if not isinstance(models.units, KinkedUnits):
+            raise TypeError("models on a cone have such units")
+        first, c = models.units.first, Near(models.units.reach).through(models.shares)
         each = at_least_0((c * c.through(P)).sum()).root * Above(first.rho)
         most = float(each.sum().top)
         return cls(cone, first, rational(most) if np.isfinite(most) else fmpq(2) ** 1100)
+
+    def lengths(self, models: Models, P: fmpq_mat) -> tuple[fmpq, fmpq]:
+        """What a step charges to the errors of f, and to those of A."""
+        return fmpq(0), self.length
 
     def bound(self, models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:
         """S_kinks: twice the sum of |p_q.y| (|alpha_q.d| + beta_q ||d||), y = d or (1, d), row i of b being b_i."""

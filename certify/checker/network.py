@@ -14,7 +14,6 @@ from functools import cache, cached_property
 import numpy as np
 
 from .document import Policy
-from .expression import Call, evaluate
 from .functions import FUNCTIONS
 from .near import (
     ZERO,
@@ -24,16 +23,13 @@ from .near import (
     Near,
     Uniform,
     all_near,
-    clip_of,
-    lines_around_product,
     near_atanh,
     norm,
     size,
     spectral_norm,
     stacked,
 )
-from .networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Product, Step, Sum
-from .taylor import Taylor, affine, constants
+from .networks import Affine, Algebra, Map, Network, Step
 
 TANH = Map((0,), 0, "tanh")  # the policy's squash
 
@@ -134,10 +130,6 @@ class OnBoxes(Algebra[Enclosed]):
         lines = FUNCTIONS[step.function].lines(v.h.value[0], v.spread + v.error)
         return self.by_lines(v, (v.plain * Near(lines[0])).raised(Near(lines[1])), lines[0], lines[2])
 
-    def clip(self, step: Clip, v: Enclosed) -> Enclosed:
-        h, slope, gap = clipped(v.plain, v.spread + v.error, step.lo, step.hi)
-        return self.by_lines(v, h, slope, gap)
-
     def by_lines(self, v: Enclosed, h: Form, slope: Array, gap: Above) -> Enclosed:
         """A function of v that lies within `gap` of lines of these slopes, at v with all of its errors; h are the lines
         of the forms. So errors of v pass times the slopes, exactly, and `gap` and the roundings of h are new.
@@ -160,44 +152,6 @@ class OnBoxes(Algebra[Enclosed]):
         """True if what step k adds reaches the value through the step in hand alone, and is all that is fresh there:
         the centring and the squash come after the network's last vector, which no step reads."""
         return isinstance(self.steps[k], Affine) and len(self.network.readers.get(k, ())) <= 1
-
-    def sum(self, step: Sum, vectors: Sequence[Enclosed]) -> Enclosed:
-        h, (first, *others) = vectors[0].h, vectors
-        fresh, old, ball = first.fresh, first.old, first.ball
-        for v in others:
-            h, fresh, old, ball = h + v.h, fresh + v.fresh, old + v.old, ball + v.ball
-        self.added[-1] = h.error
-        return Enclosed(Form(h.value), fresh + h.error, old, ball, len(self.steps) - 1)
-
-    def concat(self, step: Concat, vectors: Sequence[Enclosed]) -> Enclosed:
-        h = Form(np.concatenate([v.h.value for v in vectors], 1))
-        fresh, old = (
-            Above(np.concatenate([part.top + 0 * v.spread.v for part, v in zip(parts, vectors, strict=True)]))
-            for parts in ([v.fresh for v in vectors], [v.old for v in vectors])
-        )
-        squares = ZERO
-        for v in vectors:
-            squares = squares + v.ball * v.ball
-        return Enclosed(h, fresh, old, squares.root, len(self.steps) - 1)
-
-    def product(self, step: Product, v: Enclosed, w: Enclosed) -> Enclosed:
-        """With v = c + V and w = e + W it is c e + c W + e V + V W: errors of v and w pass times e and c, exact
-        numbers, and V W is between bounds."""
-        c, e = v.h.value[0], w.h.value[0]
-        moved, other = v.h.unmoved, w.h.unmoved
-        shift, gap = lines_around_product(moved, v.error, other, w.error, v.step == w.step)
-        h = (w.plain * Near(c) + moved * Near(e)).raised(Near(shift))
-        passed, added = v.error * size(e) + w.error * size(c), gap + h.error
-        self.added[-1], self.factors[len(self.steps) - 1] = added, (e, c)
-        ball = (_length(v, e) + _length(w, c)).least(passed.norm())
-        return Enclosed(Form(h.value), added, passed, ball, len(self.steps) - 1)
-
-    def observe(self, step: Observe, v: Enclosed) -> Enclosed:
-        x = models(v.h, v.error)
-        y = evaluate(step.tape, constants(x[0]), x)
-        h = forms(y)
-        self.added[-1] = h.error
-        return Enclosed(Form(h.value), h.error, ZERO, ZERO, len(self.steps) - 1)
 
     def backwards(self, rows: Array) -> Above:
         """Bounds of the errors of `rows` (m, width) times the value, (m, B).
@@ -222,85 +176,18 @@ class OnBoxes(Algebra[Enclosed]):
         match step:
             case Affine():
                 return [(of[0], weight.through(step.weight.T))]
-            case Map() | Clip():
+            case Map():
                 return [(of[0], weight.times(self.slopes[k][:, None]))]  # type: ignore[index]
-            case Sum():
-                return [(i, weight) for i in of]
-            case Product():
-                return [
-                    (i, _gathered(weight.times(factor[:, None]), self.width(i)))
-                    for i, factor in zip(of, self.factors[k], strict=True)
-                ]
-            case Concat():
-                ends = np.cumsum([0, *(self.width(i) for i in of)])
-                return [
-                    (i, Uniform(weight.value[a:b], weight.error))
-                    for i, a, b in zip(of, ends[:-1], ends[1:], strict=True)
-                ]
-        return []  # the argument, or expressions, which keep no way back
+            case None:  # the argument
+                return []
+        from . import wiring
+
+        return wiring.BoxSteps(self).before(k, step, weight)
 
     def width(self, k: int) -> int:
         """The number of entries of vector k."""
         step = self.steps[k]
         return self.network.reads if step is None else step.size
-
-
-def _length(v: Enclosed, factor: Array) -> Above:
-    """Upper bound of the 2-norm of the errors of v times factors, of an error for all of them if v has one entry."""
-    steep = norm(factor) if v.h.value.shape[1] == 1 else size(factor).max()
-    return steep * (v.ball + v.fresh.norm())
-
-
-def _gathered(weight: Uniform, width: int) -> Uniform:
-    """The weights of a vector of this width that is multiplied; of a single entry, those of all products together."""
-    count = len(weight.value)
-    return weight.through(np.ones((1, count))) if width == 1 < count else weight
-
-
-def enclose(network: Network, x: Form, entries: Sequence[int]) -> Form:
-    """Some entries of the network's value on boxes, x (k + 1, reads, B) being the argument."""
-    boxes, rows = OnBoxes(network, x), np.zeros((len(entries), network.gives))
-    rows[range(len(entries)), list(entries)] = 1.0
-    return Form(boxes.last.h.value[:, list(entries)], boxes.backwards(rows))
-
-
-def entries(call: Call, arguments: Sequence[Taylor], first: int) -> list[Taylor]:
-    """The entries that a call in equations uses, as models: the error of each has a symbol of its own, from `first` on,
-    which no argument knows."""
-    u, found = enclose(call.network, forms(arguments), call.entries), list[Taylor]()
-    for j in range(len(call.entries)):
-        g = u.value[1:, j].copy()
-        own = first + call.first + j
-        g[own] = np.where(g[own] == 0, u.error.top[j], np.nan)
-        found.append(affine(u.value[0, j], g))
-    return found
-
-
-def models(h: Form, error: Above) -> list[Taylor]:
-    """The entries of a vector as models."""
-    wide = error.top + 0 * h.value[0]
-    return [affine(h.value[0, i], h.value[1:, i], Above(wide[i])) for i in range(h.value.shape[1])]
-
-
-def forms(v: Sequence[Taylor]) -> Form:
-    """Models as forms: what is of second order becomes an error."""
-    value = np.stack([np.concatenate([x.c[None], x.g]) for x in v], 1)
-    return Form(value, Above(np.stack([(x.r + x.quadratic).top + 0 * x.c for x in v])))
-
-
-def clipped(v: Form, error: Above, least: Array, most: Array) -> tuple[Form, Array, Above]:
-    """Lines around `min(max(v, least), most)`, of numbers within `error` of the first coefficients of the forms v:
-    these lines of the forms, their slopes, and how far from them it may be; least and most (m,).
-
-    Nothing changes where v certainly stays between them.
-    """
-    numbers = Near(v.value[0], error)
-    lo, hi = numbers.ends
-    inside = (lo >= least[:, None]) & (hi <= most[:, None])
-    slope, shift, gap = clip_of(numbers, least[:, None], most[:, None])
-    cut = (v * Near(slope)).raised(Near(shift))
-    kept = Form(np.where(inside, v.value, cut.value), Above(np.where(inside, 0.0, cut.error.top)))
-    return kept, np.where(inside, 1.0, slope), Above(np.where(inside, 0.0, gap.top))
 
 
 # ---------------------------------------------------------------------------------------------------------- the policy
@@ -363,5 +250,7 @@ def enclose_on_boxes(net: Folded, x: Form) -> Form:
     u = u.wider(boxes.backwards(np.diag(net.scale)))
     if net.clip is None:
         return u
-    cut, slope, gap = clipped(Form(u.value), u.range.error, *net.clip)
+    from .wiring import clip_forms
+
+    cut, slope, gap = clip_forms(Form(u.value), u.range.error, *net.clip)
     return cut.wider(u.error * slope + gap)

@@ -7,24 +7,25 @@ value. An algebra says what each kind of step does to its vectors; `run` takes a
 from __future__ import annotations
 
 import hashlib
-import json
 import struct
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce
-from operator import add
+from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .expression import Call, Tape, parse
+from .expression import Call, load
 from .schema import Value
 
-MAX_NETWORKS, MAX_STEPS, MAX_WIDTH, MAX_NAMES = 64, 256, 2**14, 64
-PLAIN = ("sin", "cos", "tanh", "exp", "atan", "sqrt")
-FUNCTIONS = (*PLAIN, "relu", "elu", "sigmoid", "silu", "gelu", "softplus", "mish", "softsign")
+MAX_NETWORKS, MAX_STEPS, MAX_WIDTH = 64, 256, 2**14
+KINDS = ("affine", "map", "clip", "sum", "concat", "product", "observe")  # all but two in wiring.py
+FUNCTIONS = (
+    *("sin", "cos", "tanh", "exp", "atan", "sqrt"),
+    *("relu", "elu", "sigmoid", "silu", "gelu", "softplus", "mish", "softsign"),
+)
 Array = NDArray[np.float64]
 V = TypeVar("V")
 
@@ -44,7 +45,21 @@ class Step:
     @property
     def units(self) -> int:
         """Entries that add something to their tangents on a ball, at most."""
-        return 0 if isinstance(self, Affine | Sum | Concat) else self.size
+        return self.size
+
+    @property
+    def operations(self) -> int:
+        """Operations of expressions."""
+        return 0
+
+    @property
+    def words(self) -> str:
+        """The step but for its numbers, for the hash: FORMAT.md has it."""
+        return " ".join([type(self).__name__.lower(), *map(str, self.of)]) + "\0"
+
+    def said(self, of: list[str]) -> str:
+        """The step for people, of vectors with these names."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +73,13 @@ class Affine(Step):
     def arrays(self) -> tuple[Array, ...]:
         return self.weight, self.bias
 
+    @property
+    def units(self) -> int:
+        return 0
+
+    def said(self, of: list[str]) -> str:
+        return f"W {of[0]} + b, {self.size} entries"
+
 
 @dataclass(frozen=True, eq=False)
 class Map(Step):
@@ -65,37 +87,12 @@ class Map(Step):
 
     function: str
 
-
-@dataclass(frozen=True, eq=False)
-class Clip(Step):
-    """`min(max(h, lo), hi)`."""
-
-    lo: Array
-    hi: Array
-
     @property
-    def arrays(self) -> tuple[Array, ...]:
-        return self.lo, self.hi
+    def words(self) -> str:
+        return f"{super().words[:-1]} {self.function}\0"
 
-
-class Sum(Step):
-    """The sum of vectors, from left to right."""
-
-
-class Concat(Step):
-    """Vectors one behind the other."""
-
-
-class Product(Step):
-    """The product of two vectors, entry by entry; one of a single entry multiplies every entry of the other."""
-
-
-@dataclass(frozen=True, eq=False)
-class Observe(Step):
-    """Expressions of the entries, by their names."""
-
-    names: tuple[str, ...]
-    tape: Tape
+    def said(self, of: list[str]) -> str:
+        return f"{self.function}({of[0]})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +121,7 @@ class Network:
     @property
     def operations(self) -> int:
         """Operations of all expressions of `observe`."""
-        return sum(len(step.tape.operations) for step in self.steps if isinstance(step, Observe))
+        return sum(step.operations for step in self.steps)
 
     @cached_property
     def shapes(self) -> list[tuple[int, int, int]]:
@@ -170,14 +167,7 @@ class Network:
 
     def words(self) -> str:
         """The steps but for their numbers, where they are not those of a chain; FORMAT.md has the hash."""
-        text = ""
-        for step in () if self.is_chain else self.steps:
-            text += " ".join([type(step).__name__.lower(), *map(str, step.of)])
-            text += f" {step.function}\0" if isinstance(step, Map) else "\0"
-            if isinstance(step, Observe):
-                trees = json.dumps(step.tape.trees, separators=(",", ":"))
-                text += "".join(f"{name}\0" for name in step.names) + f"{trees}\0"
-        return text
+        return "" if self.is_chain else "".join(step.words for step in self.steps)
 
 
 def hashed(heading: str, arrays: Iterable[Array], words: str) -> str:
@@ -215,66 +205,34 @@ def _network(value: Value) -> Network:
     return network
 
 
-KEYS = {
-    "affine": "shape weight bias",
-    "map": "function",
-    "clip": "lo hi",
-    "sum": "",
-    "concat": "",
-    "product": "",
-    "observe": "names expressions",
-}
-
-
 def _step(value: Value, sizes: Sequence[int]) -> Step:
     """A step after vectors of these sizes."""
-    known = isinstance(value.raw, dict) and isinstance(value.raw.get("kind"), str) and value.raw["kind"] in KEYS
-    value.must(known, f"an object of kind {' or '.join(KEYS)}")
+    known = isinstance(value.raw, dict) and value.raw.get("kind") in KINDS
+    value.must(known, f"an object of kind {' or '.join(KINDS)}")
     kind = value.raw["kind"]
-    _, of, *others = value.keys(f"kind of {KEYS[kind]}")
-    least, most = {"sum": (2, MAX_STEPS), "concat": (2, MAX_STEPS), "product": (2, 2)}.get(kind, (1, 1))
-    read = of.listed(lambda i: i.integer(0, len(sizes) - 1), least, most)
-    width = sizes[read[0]]
-    match kind:
-        case "affine":
-            return _affine(read, width, *others)
-        case "map":
-            function = others[0].choice(*FUNCTIONS)
-            if function not in PLAIN:
-                from . import activations
+    if kind not in ("affine", "map"):
+        from . import wiring
 
-                activations.add()
-            return Map(read, width, function)
-        case "clip":
-            lo, hi = (end.array(width) for end in others)
-            value.must(bool(np.all(lo < hi)), "lower, then upper ends")
-            return Clip(read, width, lo, hi)
-        case "sum":
-            of.must(all(sizes[i] == width for i in read), "vectors of equal length")
-            return Sum(read, width)
-        case "concat":
-            size = sum(sizes[i] for i in read)
-            of.must(size <= MAX_WIDTH, f"vectors of at most {MAX_WIDTH} entries in all")
-            return Concat(read, size)
-        case "product":
-            size = max(sizes[i] for i in read)
-            of.must(all(sizes[i] in (1, size) for i in read), "vectors of equal length, or one of a single entry")
-            return Product(read, size)
-        case _:
-            return _observe(read, width, *others)
+        return wiring.read(value, sizes)
+    _, of, *others = value.keys(f"kind of {'function' if kind == 'map' else 'shape weight bias'}")
+    read = vectors_of(of, sizes, 1, 1)
+    width = sizes[read[0]]
+    if kind == "affine":
+        return _affine(read, width, *others)
+    function = others[0].choice(*FUNCTIONS)
+    load(function)
+    return Map(read, width, function)
+
+
+def vectors_of(of: Value, sizes: Sequence[int], least: int, most: int) -> tuple[int, ...]:
+    """The numbers of the vectors that a step reads, after vectors of these sizes."""
+    return of.listed(lambda i: i.integer(0, len(sizes) - 1), least, most)
 
 
 def _affine(of: tuple[int, ...], width: int, shape: Value, weight: Value, bias: Value) -> Affine:
     rows, _ = shape.listed(lambda size: size.integer(1, MAX_WIDTH), 2)
     shape.must(shape.raw[1] == width, f"[out, {width}]")
     return Affine(of, rows, weight.array(rows, width), bias.array(rows))
-
-
-def _observe(of: tuple[int, ...], width: int, names: Value, expressions: Value) -> Observe:
-    named = names.listed(Value.name, width, min(width, MAX_NAMES))
-    names.must(len(set(named)) == width, "different names")
-    trees = expressions.listed(lambda tree: tree.raw, 1, MAX_NAMES)
-    return Observe(of, len(trees), named, parse(trees, named, expressions.at))
 
 
 # --------------------------------------------------------------------------------------------------------- interpreting
@@ -290,26 +248,6 @@ class Algebra(ABC, Generic[V]):
     @abstractmethod
     def map(self, step: Map, v: V) -> V:
         """The function of each entry."""
-
-    @abstractmethod
-    def clip(self, step: Clip, v: V) -> V:
-        """`min(max(v, lo), hi)`."""
-
-    @abstractmethod
-    def sum(self, step: Sum, vectors: Sequence[V]) -> V:
-        """The sum of vectors of equal length."""
-
-    @abstractmethod
-    def concat(self, step: Concat, vectors: Sequence[V]) -> V:
-        """Vectors one behind the other."""
-
-    @abstractmethod
-    def product(self, step: Product, v: V, w: V) -> V:
-        """The product of two vectors, of which one may have a single entry."""
-
-    @abstractmethod
-    def observe(self, step: Observe, v: V) -> V:
-        """Expressions of the entries."""
 
     def run(self, network: Network, argument: V) -> V:
         """The network's value. A vector is kept no longer than steps read it."""
@@ -328,17 +266,10 @@ class Algebra(ABC, Generic[V]):
                 return self.affine(step, vectors[0])
             case Map():
                 return self.map(step, vectors[0])
-            case Clip():
-                return self.clip(step, vectors[0])
-            case Sum():
-                return self.sum(step, vectors)
-            case Concat():
-                return self.concat(step, vectors)
-            case Product():
-                return self.product(step, *vectors)
-            case Observe():
-                return self.observe(step, vectors[0])
-        raise TypeError(f"no kind of step: {type(step).__name__}")
+        from . import wiring
+
+        found: V = wiring.meaning(self).other(step, vectors)
+        return found
 
 
 class OnNumbers(Algebra[list[Any]]):
@@ -346,15 +277,6 @@ class OnNumbers(Algebra[list[Any]]):
 
     def map(self, step: Map, v: list[Any]) -> list[Any]:
         return [x.function(step.function) for x in v]
-
-    def sum(self, step: Sum, vectors: Sequence[list[Any]]) -> list[Any]:
-        return [reduce(add, entries) for entries in zip(*vectors, strict=True)]
-
-    def concat(self, step: Concat, vectors: Sequence[list[Any]]) -> list[Any]:
-        return [x for v in vectors for x in v]
-
-    def product(self, step: Product, v: list[Any], w: list[Any]) -> list[Any]:
-        return [v[i % len(v)] * w[i % len(w)] for i in range(step.size)]
 
     def entries(self, call: Call, arguments: list[Any]) -> list[Any]:
         """A call in equations."""

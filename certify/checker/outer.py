@@ -14,21 +14,28 @@ from fractions import Fraction
 from functools import partial, reduce
 from math import nextafter
 from operator import add
+from typing import TYPE_CHECKING
 
 import numpy as np
 from flint import fmpq, fmpq_mat
 
-from .boxes import LEAF, Boxes, Leaves, batches, is_whole, keeps_constraints, keeps_inputs, middle
-from .case import Case, Failures
-from .exact import exactly, inverse
+from .boxes import LEAF, Batch, Boxes, Leaves, batches, in_order, is_whole, keeps_inputs, middle
+from .calls import entries
+from .case import Case, Failures, given, only_where
+from .exact import exactly
 from .expression import Call, Tape, evaluate
 from .functions import FUNCTIONS
 from .near import Above, Array, Form, Near, near
-from .network import enclose_on_boxes, entries, models, prepare
-from .networks import Affine, Algebra, Clip, Concat, Map, Observe, Product, Sum
-from .processes import Batch, in_order
-from .taylor import Taylor, constant, constants, upper_bound
+from .network import enclose_on_boxes, prepare
+from .networks import Affine, Algebra, Map
+from .sections import Outer, OuterTree
+from .taylor import Taylor, constant, constants, models, upper_bound
+from .wiring import Clip, Concat, Observe, Others, Product, Sum
 
+if TYPE_CHECKING:
+    from .rules import Tally
+
+_MOST_BITS = 2**14  # of a number in a matrix all of whose inverse is wanted, times the matrix's size
 _BATCH_NUMBERS = 1_000_000  # in the largest array of a batch
 _MOST_NUMBERS, _MOST_VALUES = 2**22, 2**26  # of a box: in the models of a network, and of all of an expression's values
 
@@ -67,7 +74,7 @@ class Dual:
         return Dual(_through(W, self.value, b), None if self.rate is None else _through(W, self.rate))
 
 
-class InRows(Algebra[Dual]):
+class InRows(Algebra[Dual], Others[Dual]):
     """Networks of such models, each vector in rows (width, B)."""
 
     def affine(self, step: Affine, v: Dual) -> Dual:
@@ -160,7 +167,7 @@ def is_small(case: Case) -> Failures:
 
 def is_above_on_faces(case: Case) -> Failures:
     """`faces`: N > n2 on every leaf of every face of the domain."""
-    claim, evidence = case.outer
+    claim, evidence = of(case)
     function, n, count = _function(case), len(case.c.states), 0
     widest = [(_below(lo), _above(hi)) for lo, hi in case.c.domain]
     for k, tree in enumerate(evidence.faces):
@@ -189,9 +196,17 @@ def _below_on_face(function: Function, level: float, doubt: Above, first: int, l
     return first + np.flatnonzero(below)
 
 
+def inverse(A: fmpq_mat) -> fmpq_mat | None:
+    """`A^-1`; None if there is none, or A is too large to tell soon."""
+    numerator, _ = A.numer_denom()
+    if A.nrows() * max(v.height_bits() for v in numerator.entries()) > _MOST_BITS or numerator.det() == 0:
+        return None
+    return A.inv()
+
+
 def contains_domain(case: Case) -> Failures:
     """`outer`: |z_i| <= sum_j |(T^-1)_ij| max |x_j| in rationals."""
-    _, evidence = case.outer
+    _, evidence = of(case)
     to_z = inverse(exactly(evidence.T))
     if to_z is None:
         yield "evidence.outer.T", "T must be invertible"
@@ -207,7 +222,7 @@ def contains_domain(case: Case) -> Failures:
 
 def is_partition(case: Case) -> Failures:
     """`outer`: the bytes are a partition of the root box."""
-    return (yield from is_whole(case.outer[1].tree, range(len(case.c.states))))
+    return (yield from is_whole(of(case)[1].tree, range(len(case.c.states))))
 
 
 def falls(leaves: Leaves) -> Failures:
@@ -236,7 +251,7 @@ class Beyond(Boxes):
     """The bounds that rule `outer` asks for, on boxes lo and hi (n, B) in the coordinates z of its tree."""
 
     def __init__(self, case: Case) -> None:
-        claim, evidence = case.outer
+        claim, evidence = of(case)
         none = fmpq_mat(len(case.c.states), len(case.c.states))
         super().__init__(case, evidence.T, none if case.c.without_V else case.seen_from(evidence.T))
         self.function, self.level, self.evidence = _function(case), claim.level, evidence
@@ -260,13 +275,8 @@ class Beyond(Boxes):
         gaps = [course.below.at, lambda few: self.gap(centre[:, few], radius[:, few], self.c.c2, -1.0)]
         bound = self.least_bound(course.rise, gaps)
         hold = (bound < 0) & course.finite
-        kept = self.kept(course, gaps)
+        kept = self.kept(course.states, course.held, gaps)
         return Leaves(self, first + left, "outer leaf ", course.inputs.range, bound, hold, kept)
-
-    def kept(self, course: Course, gaps: Sequence[Callable[[Array], Taylor]]) -> Array:
-        """True for each constraint and box on which it is negative where no gap is."""
-        kept = [self.least_bound(g, gaps) < 0 for g in self.constraints(course.states, course.held)]
-        return np.array(kept, dtype=bool).reshape(len(kept), len(course.finite))
 
     def close(self, x: Form, free: Array) -> Array:
         """The numbers of boxes that are not free, may meet the domain, and have N at its level or below somewhere."""
@@ -294,14 +304,37 @@ class Beyond(Boxes):
         return outside
 
 
+def examine(tally: Tally, case: Case) -> None:
+    """The rules about a second function."""
+    for table in (OF_OUTER, ON_FACES, OF_OUTER_TREE):
+        tally.hold(table, case)
+    bounds = Beyond(case)
+    if case.c.without_V:
+        from . import invariant
+
+        bounds = invariant.Staying(case)
+    tree = of(case)[1].tree
+    tally.outer_margin = tally.hold_on_leaves(ON_OUTER_LEAVES, bounds, tree, lambda leaves: leaves.bound)
+
+
 OF_OUTER = (("outer", is_small),)
 ON_FACES = (("faces", is_above_on_faces),)
 OF_OUTER_TREE = (("outer", contains_domain), ("outer", is_partition))
-ON_OUTER_LEAVES = (("inputs", keeps_inputs), ("keep", keeps_constraints), ("outer", falls))
+ON_OUTER_LEAVES = (
+    ("inputs", keeps_inputs),
+    ("keep", only_where(lambda c: c.keep, "keep", "on_leaves")),
+    ("outer", falls),
+)
+
+
+def of(case: Case) -> tuple[Outer, OuterTree]:
+    """N and its evidence."""
+    evidence = case.c.evidence
+    return given(case.c.outer), evidence if isinstance(evidence, OuterTree) else given(case.partition.outer)
 
 
 def _function(case: Case) -> Function:
-    return Function(case.outer[0].function)
+    return Function(of(case)[0].function)
 
 
 def _batch(numbers: int) -> int:

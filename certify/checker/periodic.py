@@ -12,9 +12,10 @@ from fractions import Fraction
 from functools import reduce
 from operator import add
 
-from .case import Case, Failures
+from .case import Case, Failures, given
 from .expression import Tape, evaluate
-from .networks import Affine, Clip, Observe, OnNumbers
+from .networks import Affine, OnNumbers
+from .wiring import Clip, NumberSteps, Observe
 
 MOST_TURNS = 2**32  # so that no product of many integers takes hours
 
@@ -63,7 +64,7 @@ class Winding:
         return Winding((0,) * len(self.turns)) if name in ("sin", "cos") else self.still()
 
 
-class Windings(OnNumbers):
+class Windings(OnNumbers, NumberSteps):
     """Networks of such numbers."""
 
     def affine(self, step: Affine, v: list[Winding]) -> list[Winding]:
@@ -87,7 +88,7 @@ def windings(tape: Tape, variables: Sequence[Winding]) -> list[Winding]:
 
 def is_periodic(case: Case) -> Failures:
     """`angles`: policy, constraints, target and equations do not see a full turn; in discrete time a step adds it."""
-    c, angles = case.c, case.ranks.angles
+    c, angles = case.c, given(case.c.ranks).angles
     n = len(c.states)
     states = [Winding(tuple(int(i == j) for j in angles)) for i in range(n)]
     still = Winding((0,) * len(angles))

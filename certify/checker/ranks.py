@@ -11,20 +11,23 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property, reduce
 from operator import add
+from typing import TYPE_CHECKING
 
 import numpy as np
 from flint import fmpq_mat
 
-from .boxes import LEAF, batches, is_whole, middle
-from .case import Case, Failures
-from .document import MAX_RANK
+from .boxes import LEAF, Batch, batches, is_whole, middle
+from .case import Case, Failures, given
 from .expression import evaluate
 from .near import TURN, Above, Array, Form, Near, near, size, within
-from .network import enclose_on_boxes, forms
+from .network import enclose_on_boxes
 from .periodic import is_periodic
-from .processes import Batch
 from .ring import Moving
-from .taylor import Taylor, affine, combination, constants, upper_bound
+from .sections import MAX_RANK, Ranked
+from .taylor import Taylor, affine, combination, constants, forms, upper_bound
+
+if TYPE_CHECKING:
+    from .rules import Tally
 
 _MOST_NODES = 2**14  # of the tree that an image may meet
 Failing = tuple[str, str]  # a place, and what fails there
@@ -48,7 +51,7 @@ class Cover:
     """The tree as arrays: which boxes meet only leaves of low ranks."""
 
     def __init__(self, case: Case) -> None:
-        ranks = case.ranks
+        ranks = given(case.c.ranks)
         self.lo, self.hi, self.angles = ranks.lo, ranks.hi, ranks.angles
         count = len(ranks.tree)
         self.axis = np.frombuffer(ranks.tree, dtype=np.uint8).astype(np.int64)
@@ -137,7 +140,8 @@ class Steps(Moving):
         n, (lo, hi) = len(case.c.states), case.c.sample or (0, 0)
         identity = fmpq_mat([[int(i == j) for j in range(n)] for i in range(n)])
         super().__init__(case, np.eye(n), identity, lo < hi, n)
-        self.order, self.widest, self.ranks = case.order, [np.inf] * n, case.ranks
+        self.widest, self.ranks = [np.inf] * n, given(case.c.ranks)
+        self.order = _order(case)
         self.rank, self.count = two_bytes(self.ranks.ranks), np.frombuffer(self.ranks.steps, np.uint8).astype(np.int64)
         self.straight = [i for i in range(n) if i not in self.ranks.angles]  # states that are no angles
 
@@ -183,7 +187,7 @@ class Steps(Moving):
             hold = self.in_domain(*motion.ends)
             course.note("flow", hold, numbers, "the state may leave the domain during a period")
         if c.keep is not None:
-            hold = [upper_bound(g) < 0 for g in self.constraints(motion.states, motion.held)]
+            hold = self.kept(motion.states, motion.held, ())
             course.note("keep", np.all(hold, axis=0), numbers, "a constraint may be violated")
         hold = self.in_domain(*whole.range.ends)
         course.note("ranks", hold, numbers, "the state may leave the domain")
@@ -236,6 +240,12 @@ class Steps(Moving):
         return [reduce(add, [*V, number(Fraction(-self.c.c2))])]
 
 
+def _order(case: Case) -> int:
+    """The order of the series in time."""
+    evidence = case.c.evidence
+    return evidence.order if isinstance(evidence, Ranked) else case.partition.order
+
+
 def moved(x: Array, turns: Array) -> tuple[Array, Array]:
     """Numbers moved by so many turns, rounded down and up."""
     below, above = (Near(x) + TURN * Near(turns)).ends
@@ -249,7 +259,7 @@ def two_bytes(octets: bytes) -> Array:
 
 def is_stated(case: Case) -> Failures:
     """`ranks`: a root box with its tree, that has all places of an angle, and for each leaf a rank and its steps."""
-    ranks, n = case.ranks, len(case.c.states)
+    ranks, n = given(case.c.ranks), len(case.c.states)
     for i, (lo, hi) in enumerate(zip(ranks.lo.tolist(), ranks.hi.tolist(), strict=True)):
         least = Fraction(TURN.ends[1]) if i in ranks.angles else Fraction(0)
         if not Fraction(hi) - Fraction(lo) > least:
@@ -274,6 +284,11 @@ def _holds(rule: str) -> Callable[[Course], Failures]:
         return course.counts.get(rule, 0)
 
     return holds
+
+
+def examine(tally: Tally, case: Case) -> None:
+    tally.hold(OF_RANKS, case)
+    tally.hold_on_leaves(ON_RANK_LEAVES, Steps(case), given(case.c.ranks).tree, lambda _: np.zeros(0))
 
 
 OF_RANKS = (("angles", is_periodic), ("ranks", is_stated))

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import reduce
 from operator import add
 
 import numpy as np
 from flint import fmpq
 
-from .boxes import Boxes, Leaves, batches, is_whole, middle, multipliers
+from .boxes import Batch, Boxes, Leaves, batches, is_whole, middle
 from .case import Case, Failures
 from .exact import fraction, root_above
 from .near import Array, near
 from .network import enclose_on_boxes
-from .processes import Batch
-from .taylor import Taylor, combination, upper_bound
+from .taylor import Taylor, combination
 
 _BATCH_NUMBERS = 800_000  # in the largest array of a batch: more would not stay in a cache
 
@@ -28,18 +26,18 @@ class RingLeaves(Leaves):
     then. An inside leaf holds if every component of F has a finite model, or if a step does not leave the set."""
 
     meet: Array  # which of them may meet the ring
-    ends: Array  # (2, n, B): the state lies between these during a period; none if nothing is held
+    motion: Motion
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A step on boxes: G; states and what else f reads, as they may be at any time of the step; between what a state
-    lies during a period, (2, n, B), of no entries if nothing is held."""
+    """On boxes G, which is F, or the increment in a step over its length; states and what else f reads, as they may be
+    at any time of the step; where inputs are held, between what a state lies during a period, (2, n, B)."""
 
     G: list[Taylor]
     states: list[Taylor]
     held: list[Taylor]
-    ends: Array
+    ends: Array = None
 
 
 class Moving(Boxes):
@@ -56,20 +54,26 @@ class Moving(Boxes):
         return int(max(1, min(4096, _BATCH_NUMBERS // numbers)))
 
     def motion(self, states: list[Taylor], inputs: list[Taylor]) -> Motion:
-        """G, and where the state may be until the step is done."""
-        batch, nothing = len(inputs[0].c), np.zeros((2, 0, 0))
-        ranges = self.quantities(batch)
-        if not self.c.sample:
-            F = self.f(states, [*inputs, *ranges])
-            G = [f + -x for f, x in zip(F, states, strict=True)] if self.c.discrete else F
-            return Motion(G, states, [*inputs, *ranges], nothing)
-        from .flow import motion
+        """G, and where the state may be until a step is done."""
+        if self.c.step:
+            from .stepping import motion
 
-        return motion(self, self.c.sample, states, inputs, ranges)
+            return motion(self, states, inputs)
+        held = [*inputs, *self.quantities(len(inputs[0].c))]
+        return Motion(self.f(states, held), states, held)
 
 
 class Ring(Moving):
     """The bounds on boxes, lo and hi (n, B) in the coordinates z, that the rules for a leaf ask for."""
+
+    @staticmethod
+    def of(case: Case) -> Ring:
+        """Those of a certificate."""
+        if not case.c.step:
+            return Ring(case)
+        from .stepping import StepRing
+
+        return StepRing(case)
 
     def __init__(self, case: Case) -> None:
         lo, hi = case.c.sample or (0, 0)
@@ -96,18 +100,18 @@ class Ring(Moving):
         rise = self.rise(states, motion.G)
         if self.c.rate:
             rise = combination((1.0, rise), (2 * self.c.rate, self.gap(centre, radius, 0.0, -1.0)))
-        if self.case.covered or not self.c.step:
-            bound = self.bound(rise, centre, radius)
-        else:
-            bound = np.where(beyond, self.bound(rise, centre, radius), self.bound_of_steps(rise, centre, radius))
-        hold = bound < 0
-        if not (self.case.covered or self.c.step or np.all(meet)):
-            # a division by a range that contains 0 has no finite model
-            hold = np.where(meet, hold, np.all([np.isfinite(g.size.top) for g in motion.G], axis=0))
+        bound = self.bound(rise, centre, radius, beyond)
         gaps = [lambda left: self.gap(centre[:, left], radius[:, left], self.c.c2, 1.0)]
-        kept = [self.least_bound(g, gaps) < 0 for g in self.constraints(motion.states, motion.held)]
-        held_back = np.array(kept, dtype=bool).reshape(len(kept), len(met))
-        return RingLeaves(self, first + met, "leaf ", u.range, bound, hold, held_back, meet, motion.ends)
+        kept = self.kept(motion.states, motion.held, gaps)
+        hold = self.hold(bound, meet, motion.G)
+        return RingLeaves(self, first + met, "leaf ", u.range, bound, hold, kept, meet, motion)
+
+    def hold(self, bound: Array, meet: Array, G: list[Taylor]) -> Array:
+        """True where the bound is negative or, on leaves that cannot meet the ring, all of G has a finite model: a
+        division by a range that contains 0 has none."""
+        if self.case.covered or np.all(meet):
+            return bound < 0
+        return np.where(meet, bound < 0, np.all([np.isfinite(g.size.top) for g in G], axis=0))
 
     def misses(self, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
         """True on boxes with certainly V > c2 everywhere; with certainly V < c1; with certainly V >= c1."""
@@ -115,27 +119,15 @@ class Ring(Moving):
         return least > self.c.c2, most < self.c.c1, least >= self.c.c1
 
     def rise(self, states: list[Taylor], G: list[Taylor]) -> Taylor:
-        """D = sum_i G_i (2 P x + h P G)_i."""
-        along = [v.scaled(2.0) for v in states]
-        if self.c.step:
-            step = self.number(self.c.sample or (self.c.step,) * 2, self.symbols - 1, len(states[0].c))
-            along = [v + step * g for v, g in zip(along, G, strict=True)]
-        rows = [combination(*zip(row, along, strict=True)) for row in self.c.P.tolist()]
-        return reduce(add, [row * g for row, g in zip(rows, G, strict=True)])
+        """D = 2 sum_i G_i (P x)_i."""
+        return self.product(G, [v.scaled(2.0) for v in states])
 
-    def bound_of_steps(self, rise: Taylor, centre: Array, radius: Array) -> Array:
-        """Upper bound of D' + k (V - c0) on boxes for the best of some k between 0 and 1/h: where V >= c0 it bounds D',
-        and where V < c0, a step does not lead out of {V <= c0}."""
-        most = float(1 / self.c.step)
-        most = most if Fraction(most) * self.c.step <= 1 else float(np.nextafter(most, 0.0))
-        gap = self.gap(centre, radius, self.c.c0, -1.0)
-        tried = multipliers(rise.g[: self.n], gap.g[: self.n], gap.c)
-        bound = upper_bound(rise)
-        for k in [*np.minimum(tried, most), np.full_like(bound, most)]:
-            bound = np.fmin(bound, upper_bound(combination((1.0, rise), (k, gap))))
-        return bound
+    def product(self, x: list[Taylor], y: list[Taylor]) -> Taylor:
+        """x'P y."""
+        rows = [combination(*zip(row, y, strict=True)) for row in self.c.P.tolist()]
+        return reduce(add, [row * v for row, v in zip(rows, x, strict=True)])
 
-    def bound(self, rise: Taylor, centre: Array, radius: Array) -> Array:
+    def bound(self, rise: Taylor, centre: Array, radius: Array, beyond: Array = None) -> Array:
         """Upper bound of D' on the part of each box that lies in the ring.
 
         There c2 - V and V - c1 are not negative, so D' is at most D' + k (c2 - V), and at most D' + k (V - c1),
@@ -149,19 +141,6 @@ class Ring(Moving):
 def is_partition(case: Case) -> Failures:
     """`tree`: the bytes are a partition of the root box."""
     return (yield from is_whole(case.partition.tree, range(len(case.c.states))))
-
-
-def stays(leaves: RingLeaves) -> Failures:
-    """`flow`: during a period the state stays in the interior of the domain."""
-    c = leaves.boxes.c
-    if not c.sample:
-        return 0
-    for i, (name, (lo, hi)) in enumerate(zip(c.states, c.domain, strict=True)):
-        (_, least), (most, _) = near(lo).ends, near(hi).ends
-        hold = (leaves.ends[0, i] > least) & (leaves.ends[1, i] < most)
-        if not np.all(hold):
-            yield f"leaf {leaves.numbers[np.argmin(hold)]}", f"{name} may leave the domain during a period"
-    return int(leaves.ends[0].size)
 
 
 def decreases(leaves: RingLeaves) -> Failures:

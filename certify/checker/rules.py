@@ -12,12 +12,14 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from importlib import import_module
 from typing import Any, TypeVar
 
 import numpy as np
 
 from . import ball, boxes, limits, local, ring
-from .case import Case, Failures
+from .boxes import in_order
+from .case import Case, Failures, only_where
 from .document import Certificate, Partition
 from .errors import Rejected
 from .exact import Exact, Exactly, policy_at_origin
@@ -25,7 +27,6 @@ from .expression import evaluate
 from .functions import Undecided
 from .near import Array, self_test
 from .network import reaches
-from .processes import in_order
 
 
 def levels(case: Case) -> Failures:
@@ -113,16 +114,25 @@ ON_THE_BALL: Table[local.Local] = (
     ("local", local.fits),
     ("inputs", ball.keeps_inputs),
     ("local", ball.is_not_clipped),
-    ("flow", local.stays),
-    ("keep", local.keeps_constraints),
+    ("flow", only_where(lambda c: c.sample, "flow", "stays_on_ball")),
+    ("keep", only_where(lambda c: c.keep, "keep", "on_local_ball")),
     ("local", local.decreases),
 )
 OF_THE_TREE: Table[Case] = (("tree", ring.is_partition),)
 ON_LEAVES: Table[ring.RingLeaves] = (
     ("inputs", boxes.keeps_inputs),
-    ("flow", ring.stays),
-    ("keep", boxes.keeps_constraints),
+    ("flow", only_where(lambda c: c.sample, "flow", "stays_on_leaves")),
+    ("keep", only_where(lambda c: c.keep, "keep", "on_leaves")),
     ("ring", ring.decreases),
+)
+OTHERS: Sequence[tuple[str, Callable[[Certificate], object]]] = (  # modules with rules of their own, and who needs them
+    ("handover", lambda c: c.then),
+    ("data", lambda c: c.data),
+    ("", lambda c: isinstance(c.evidence, Partition)),  # the rules about ball and tree
+    ("tube", lambda c: c.start is not None),
+    ("contraction", lambda c: isinstance(c.evidence, Partition) and c.evidence.contraction),
+    ("outer", lambda c: c.outer),
+    ("ranks", lambda c: c.ranks),
 )
 _KEPT = 4_000_000  # numbers, just below the 2^25 bytes up to which glibc adapts
 READ = {"format": 1, "hash": 1}  # rules of document.py, which have held
@@ -142,6 +152,11 @@ class Tally:
     outer_margin: float | None = None  # smallest -N'F bound over the leaves of which it is asked
     local_margin: float | None = None  # 1 - the remainder's largest part of the decay
     then: Tally | None = None  # of the certificate that takes over
+
+    @property
+    def margins(self) -> dict[str, float | None]:
+        """Those of the rules, by name."""
+        return {"local": self.local_margin, "ring": self.ring_margin, "outer": self.outer_margin}
 
     def hold(self, table: Table[Subject], subject: Subject) -> None:
         """Raise `Rejected` at the first failure of the first rule that fails; count what the rules have looked at."""
@@ -187,24 +202,10 @@ def check(c: Certificate, jobs: int = 1, patient: bool = False) -> Tally:
     with np.errstate(all="ignore"):  # overflow becomes infinity or NaN, and every test then fails
         tally, case = Tally(), Case(c, jobs, patient)
         tally.hold([(name, rule) for name, rule in STATED if not spared.get(name)], case)
-        if c.then is not None:
-            from . import handover
-
-            tally.hold(handover.OF_HANDOVER, case)
-        if c.data is not None:
-            from . import data
-
-            tally.hold(data.OF_DATA, case)
-        if replayed:
-            _examine(tally, case)
-        if c.outer is not None:
-            _examine_outer(tally, case)
-        if c.ranks is not None:
-            from . import ranks
-
-            tally.hold(ranks.OF_RANKS, case)
-            steps = ranks.Steps(case)
-            tally.hold_on_leaves(ranks.ON_RANK_LEAVES, steps, c.ranks.tree, lambda _: np.zeros(0))
+        for module, needs in OTHERS:
+            if needs(c):
+                examine = import_module(f".{module}", __package__).examine if module else _examine
+                examine(tally, case)
     if c.then is not None:
         try:
             tally.then = check(c.then, jobs, patient)
@@ -214,39 +215,14 @@ def check(c: Certificate, jobs: int = 1, patient: bool = False) -> Tally:
 
 
 def _examine(tally: Tally, case: Case) -> None:
-    """The rules about evidence."""
+    """The rules about ball and tree."""
     c = case.c
     if case.covered:
-        origin = local.Local.whole(case)
+        origin = local.Local.of(case)
         tally.hold(ON_THE_BALL, origin)
         if np.isfinite(origin.margin):  # binary64 may not hold the sides of an inequality that rationals decide
             tally.local_margin = origin.margin
     tally.hold(OF_THE_TREE, case)
     if not case.covered or c.c1 != c.c2:
-        bounds, tree = ring.Ring(case), case.partition.tree
+        bounds, tree = ring.Ring.of(case), case.partition.tree
         tally.ring_margin = tally.hold_on_leaves(ON_LEAVES, bounds, tree, lambda leaves: leaves.bound[leaves.meet])
-    if c.start is not None:
-        from . import tube
-
-        tally.hold(tube.OF_THE_TUBE, case)
-        for piece in tube.pieces(case):
-            tally.hold(tube.ON_SLABS, piece)
-    if case.partition.contraction is not None:
-        from . import contraction
-
-        tally.hold(contraction.OF_CONTRACTION, contraction.Contracted.whole(case, case.partition.contraction))
-
-
-def _examine_outer(tally: Tally, case: Case) -> None:
-    """The rules about a second function."""
-    from . import outer
-
-    for table in (outer.OF_OUTER, outer.ON_FACES, outer.OF_OUTER_TREE):
-        tally.hold(table, case)
-    bounds = outer.Beyond(case)
-    if case.c.without_V:
-        from . import invariant
-
-        bounds = invariant.Staying(case)
-    tree = case.outer[1].tree
-    tally.outer_margin = tally.hold_on_leaves(outer.ON_OUTER_LEAVES, bounds, tree, lambda leaves: leaves.bound)

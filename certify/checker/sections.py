@@ -4,37 +4,184 @@ certificate, and the claims without V."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
 from .document import (
     MAX_CUTS,
-    MAX_ORDER,
-    MAX_RANK,
-    TAKING_OVER,
     Array,
     Certificate,
     Intervals,
     Multipliers,
-    Outer,
-    OuterTree,
     Partition,
-    Ranked,
     certificate,
-    constraints,
-    kept,
-    most_order,
     multipliers_of,
-    periods_of,
     quantity,
 )
-from .expression import parse
+from .expression import Tape, parse
 from .networks import Network
 from .schema import Value
+from .strict import MAX_VALUES
 
+MAX_SLABS = 10**4
+MAX_ORDER = 8  # of a series in time
+MAX_CONSTRAINTS, MAX_RANK = 64, 2**16 - 1  # that rank is none
+TAKING_OVER = ("asymptotic", "nearby")
+WITH_TUBE = ("enlarged", "reached")
 MAX_TRANSITIONS, MAX_ROUNDS, MAX_PARTS = 2**16, 64, 4096  # of data; rounds of a part of the priors
+
+
+@dataclass(frozen=True)
+class Outer:
+    """The function N, an expression's tape, and the level n2 of {N <= n2}."""
+
+    function: Tape
+    level: float
+
+
+@dataclass(frozen=True)
+class Contraction:
+    """The ball x = J d, ||d|| <= 1, on which trajectories come closer, and on it the weights g of one bound, and the
+    weight of another; with kinks, trees of directions."""
+
+    J: Array
+    weights: Array
+    weight: Array
+    directions: tuple[bytes, ...] | None = None
+
+
+@dataclass(frozen=True)
+class OuterTree:
+    """A partition tree of the box |z| <= root, x = T z, that contains the domain, and one of each of its faces."""
+
+    T: Array
+    root: Array
+    tree: bytes
+    faces: tuple[bytes, ...]
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """Evidence by ranks alone, of a claim without V; the order of the series in time on leaves."""
+
+    order: int
+
+
+@dataclass(frozen=True)
+class Trusted:
+    """Evidence that cannot be replayed: a solver's name and version, and its answers as (query, answer)."""
+
+    solver: str
+    version: str
+    queries: tuple[tuple[str, ...], ...]
+
+
+def of_claim(claim: Value, stated: dict[str, Any]) -> tuple[Value, dict[str, Any], dict[str, Value]]:
+    """The rate, what else a claim with V states, and what stands in the evidence too."""
+    kind, discrete = claim.raw["kind"], stated["discrete"]
+    stated_of = {"enlarged": "start", "reached": "start centre"}.get(kind, "").split()
+    may_be = "".join(map(claim.maybe, ("keep",) if kind in WITH_TUBE else ("ranks", "keep", "data")))
+    _, rate, sample, beyond, *more = claim.keys(" ".join(("kind rate sample outer", *stated_of)) + may_be)
+    of_tube, others = more[: len(stated_of)], more[len(stated_of) :]
+    besides = dict(zip(may_be.split(), others, strict=True))
+    fall, periods, n = rate.binary64(), periods_of(sample), len(stated["states"])
+    rate.must(fall == 0 or kind not in WITH_TUBE, "0, or a rate where a claim may have one")
+    plain = periods is None and not discrete
+    sample.must(plain or kind not in WITH_TUBE, "null, and the plant continuous, under this claim")
+    sample.must(periods is None or kind != "nearby", "null under this claim")
+    sample.must(periods is None or not discrete, "null where time is discrete")
+    outer = None
+    if beyond.raw is not None:
+        outer = read_outer(beyond, stated["states"], {net.name: net for net in stated["networks"]})
+    beyond.must(outer is None or (plain and fall == 0 and kind not in WITH_TUBE), "null under this claim")
+    found = {
+        "sample": periods,
+        "outer": outer,
+        "start": of_tube[0].array(n, n) if of_tube else None,
+        "centre": of_tube[1].array(n) if kind == "reached" else None,
+        "keep": kept([besides.pop("keep")] if "keep" in besides else [], stated),
+    }
+    return rate, found, besides
+
+
+def beside(
+    besides: Mapping[str, Value], evidence: Value, stated: Mapping[str, Any], periods: tuple[Fraction, Fraction] | None
+) -> dict[str, Any]:
+    """Ranks and data, of claim and evidence."""
+    found = dict[str, Any]()
+    if "ranks" in besides:
+        n = len(stated["states"])
+        found["ranks"] = read_ranks(besides["ranks"], evidence.entry("ranks"), n, stated, periods)
+    if "data" in besides:
+        found["data"] = read_data(besides["data"], evidence.entry("data"), stated)
+    return found
+
+
+def keys_of(more: Mapping[str, Any]) -> str:
+    """The keys of evidence for what a claim has more."""
+    return "".join(f" {name}" for name in ("ranks", "data") if name in more)
+
+
+def read_trusted(value: Value, may_be: bool) -> Trusted:
+    kinds = ("partition-tree", *(("trusted-solver",) if may_be else ()))
+    known = isinstance(value.raw, dict) and value.raw.get("kind") in kinds
+    value.must(known, f"an object of kind {' or '.join(kinds)}")
+    _, solver, version, precision, queries = value.keys("kind solver version precision queries")
+    precision.must(precision.binary64() > 0, "positive")
+    answers = queries.listed(lambda pair: pair.listed(Value.word, 2), 0, MAX_VALUES)
+    return Trusted(solver.word(), version.word(), answers)
+
+
+def others(
+    claim: str, n: int, k: int, contraction: Value, tube: Value, beyond: Value, outer: Outer | None
+) -> tuple[Contraction | None, tuple[Slab, ...], OuterTree | None]:
+    """The other parts of evidence for a claim, where k quantities are uncertain."""
+    tube.must(k == 0 or claim not in WITH_TUBE, "of another claim where quantities are uncertain")
+    slabs = tube.listed(lambda slab: read_slab(slab, n, claim), *((1, MAX_SLABS) if claim in WITH_TUBE else (0,)))
+    close = _contraction(contraction, n, claim)
+    beyond.must(outer is not None or beyond.raw is None, "null where the claim has none")
+    return close, slabs, None if outer is None else read_outer_tree(beyond, n)
+
+
+def _contraction(value: Value, n: int, claim: str) -> Contraction | None:
+    if claim != "nearby":
+        value.must(value.raw is None, "null under this claim")
+        return None
+    J, weights, weight, *directions = value.keys(f"J weights weight{value.maybe('directions')}")
+    return Contraction(J.array(n, n), weights.array(n), weight.array(n, n), trees_of(directions, n))
+
+
+def trees_of(found: list[Value], n: int) -> tuple[bytes, ...] | None:
+    """Trees of directions, if they are stated."""
+    if not found:
+        return None
+    found[0].must(found[0].raw == [] or isinstance(found[0].raw, list), "a list")
+    return found[0].listed(Value.octets, 2 * n) if found[0].raw else ()
+
+
+def periods_of(value: Value) -> tuple[Fraction, Fraction] | None:
+    if value.raw is None:
+        return None
+    lo, hi = value.listed(Value.rational, 2)
+    value.must(0 <= lo <= hi and hi > 0, "two periods, 0 <= lo <= hi and hi > 0")
+    return lo, hi
+
+
+def most_order(stated: Mapping[str, Any], periods: tuple[Fraction, Fraction] | None) -> int:
+    return MAX_ORDER if periods is not None and not stated["dynamics"].calls else 1
+
+
+def kept(values: Sequence[Value], stated: Mapping[str, Any]) -> Tape | None:
+    """The constraints, if the claim has any."""
+    names = (*stated["states"], *stated["inputs"], *stated["uncertain"])
+    return constraints(values[0], names) if values else None
+
+
+def constraints(value: Value, names: tuple[str, ...]) -> Tape:
+    """Expressions that call no networks."""
+    return parse(value.listed(lambda tree: tree.raw, 1, MAX_CONSTRAINTS), names, value.at)
 
 
 def taking_over(c: Certificate, value: Value) -> Certificate:

@@ -8,7 +8,7 @@ H = sum |q_ij|. Arrays carry the batch on their last axis.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache, cached_property
@@ -157,6 +157,18 @@ def constant(q: Fraction, symbols: int, batch: int) -> Taylor:
 def constants(like: Taylor) -> Callable[[Fraction], Taylor]:
     """The function that gives a rational's model among such models."""
     return lambda q: constant(q, like.symbols, like.c.shape[-1])
+
+
+def models(h: Form, error: Above) -> list[Taylor]:
+    """The entries of a vector as models."""
+    wide = error.top + 0 * h.value[0]
+    return [affine(h.value[0, i], h.value[1:, i], Above(wide[i])) for i in range(h.value.shape[1])]
+
+
+def forms(v: Sequence[Taylor]) -> Form:
+    """Models as forms: what is of second order becomes an error."""
+    value = np.stack([np.concatenate([x.c[None], x.g]) for x in v], 1)
+    return Form(value, Above(np.stack([(x.r + x.quadratic).top + 0 * x.c for x in v])))
 
 
 def upper_bound(model: Taylor) -> Array:

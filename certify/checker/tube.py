@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import TYPE_CHECKING
 
 import numpy as np
 from flint import fmpq, fmpq_mat
@@ -18,10 +19,14 @@ from flint import fmpq, fmpq_mat
 from . import ball
 from .ball import Ball
 from .case import Case, Failures
-from .decrease import Models, are_finite, are_usable, rational, shows
+from .decrease import Inequality, Models, are_finite, are_usable, rational
+from .document import Multipliers
 from .exact import contains_ball, exactly, inverse_diagonal, is_definite, root_above
 from .near import Array
-from .sections import Slab
+from .sections import Path, Slab
+
+if TYPE_CHECKING:
+    from .rules import Tally
 
 _MOST_WORK = 2**26  # slabs times n^4, which is what an inequality takes
 
@@ -72,7 +77,7 @@ class Piece(Ball):
 def pieces(case: Case) -> Iterator[Piece]:
     """The slabs in their order."""
     node, centre = case.c.start, case.c.centre
-    for k, slab in enumerate(case.tube):
+    for k, slab in enumerate(case.partition.tube):
         if node is not None:
             yield Piece(case, slab.J, f"tube[{k}]", node, centre, slab)
         node, centre = slab.end, None if slab.path is None else slab.path.centre
@@ -80,7 +85,7 @@ def pieces(case: Case) -> Iterator[Piece]:
 
 def nodes_are_sound(case: Case) -> Failures:
     """`tube`: positive definite matrices, whose ellipsoids lie in the interior of the domain, the last in {V <= c2}."""
-    if len(case.tube) * len(case.c.states) ** 4 > _MOST_WORK:
+    if len(case.partition.tube) * len(case.c.states) ** 4 > _MOST_WORK:
         yield "tube", "the tube is too long for this rule"
     last = None
     for piece in pieces(case):
@@ -123,10 +128,57 @@ def fits(piece: Piece) -> Failures:
         room = 1 / (1 - Fraction(path.share) ** 2)
     if not all(contains_ball(J, P, room) for P in piece.coefficients):
         yield piece.at, "the ball must contain the ellipsoids of start, middle and end"
-    if not are_usable(piece.slab.multipliers, path):
+    if not are_all_usable(piece.slab.multipliers, path):
         yield piece.at, "no multiplier may be negative, none of g 0 where some beta is"
     yield from ball.fits(piece)
     return 0
+
+
+class AlongPath(Inequality):
+    """The inequality z'J'RJ z + 2 z'J'P (F - v) < 0 where z'J'PJ z = 1, over (1, d), d = (z, sigma)."""
+
+    share = fmpq(1)
+    path: Path
+
+    def position(self) -> fmpq_mat:
+        return padded(self.models.J, 0, 1)
+
+    @property
+    def joint(self) -> list[fmpq]:
+        return [*self.by.joint, rational(self.path.joint)]
+
+    def form(self) -> fmpq_mat:
+        """With the multipliers of edge and motion."""
+        path, k = self.path, self.k
+        share, edge, motion = rational(path.share), rational(path.edge), rational(path.motion)
+        inner = padded(self.models.J.transpose() * self.P * self.models.J, 1, 1)
+        form = super().form() + edge * fmpq_mat([[0] * (k + 1), *([0, *row] for row in inner.tolist())])
+        form[k, k] -= motion
+        form[0, 0] += motion * share * share - edge
+        return form
+
+
+def are_all_usable(by: Multipliers, path: Path | None) -> bool:
+    """None is negative, and g is positive where it is used, that of the motion too."""
+    if path is None:
+        return are_usable(by)
+    signs = all(v >= 0 for v in (path.edge, path.motion, path.joint))
+    return are_usable(by) and signs and (path.joint > 0 or all(beta > 0 for beta in by.apart))
+
+
+def inequality(models: Models, P: fmpq_mat, R: fmpq_mat, by: Multipliers, path: Path | None) -> Inequality:
+    """What is asked of models."""
+    if path is None:
+        return Inequality(models, P, R, by)
+    made = AlongPath(models, P, R, by)
+    made.path = path
+    return made
+
+
+def padded(A: fmpq_mat, rows: int, columns: int) -> fmpq_mat:
+    """A with that many rows and columns of zeros more."""
+    wider = [[*row, *[0] * columns] for row in A.tolist()]
+    return fmpq_mat([*wider, *([0] * (A.ncols() + columns) for _ in range(rows))])
 
 
 def decreases(piece: Piece) -> Failures:
@@ -136,14 +188,24 @@ def decreases(piece: Piece) -> Failures:
         yield piece.at, "F has no finite model"
     models = Models(piece.J, F, piece.slab.path is None, piece.velocity)
     for P, rate in zip(piece.coefficients, piece.rates, strict=True):
-        if not shows(models, P, rate, piece.slab.multipliers, piece.slab.path):
+        if not inequality(models, P, rate, piece.slab.multipliers, piece.slab.path).holds:
             yield piece.at, "the decrease of x'P(t)x is not shown"
     return 1
 
 
 def keeps_constraints(piece: Piece) -> Failures:
     """`keep`: every constraint is negative on the ball, and so on the ellipsoids between nodes, which lie in it."""
-    return (yield from ball.keeps_constraints(piece, piece.constraints(piece.states, ())))
+    if piece.case.c.keep is None:
+        return 0
+    from .keep import on_ball
+
+    return (yield from on_ball(piece, piece.states, ()))
+
+
+def examine(tally: Tally, case: Case) -> None:
+    tally.hold(OF_THE_TUBE, case)
+    for piece in pieces(case):
+        tally.hold(ON_SLABS, piece)
 
 
 OF_THE_TUBE = (("tube", nodes_are_sound),)

@@ -2,123 +2,82 @@
 
 from __future__ import annotations
 
-import math
 from fractions import Fraction
 from typing import Any
 
-from .document import Array, Certificate, Partition, Policy
-from .expression import Tape
-from .networks import Map, Network, Observe, Product, Step, Sum, hashed
+from .document import PLAIN, Array, Certificate, Partition, Policy
+from .networks import Network, hashed
 
 CLAIMS = {
     "asymptotic": "the origin is asymptotically stable, and every trajectory of the closed loop that starts in "
     "V <= {c.c2!r}{when[start]} {when[stays]} and converges to the origin",
-    "enlarged": "the origin is asymptotically stable; every trajectory of the closed loop that starts in V <= {c.c2!r} "
-    "stays there and converges to the origin, and every one that starts in x'Sx <= 1 stays in the domain, is in "
-    "V <= {c.c2!r} after {time!r} units of time at the latest, and converges to the origin",
-    "reached": "the origin is asymptotically stable; every trajectory of the closed loop that starts in V <= {c.c2!r} "
-    "stays there and converges to the origin, and every one that starts in (x - c)'S(x - c) <= 1 stays in the domain, "
-    "is in V <= {c.c2!r} after {time!r} units of time at the latest, and converges to the origin",
-    "nearby": "every trajectory of the closed loop that starts in V <= {c.c2!r} {when[stays]}, enters V <= {c.c0!r} "
-    "{when[enters]} and {when[remains]} from then on; and where what is uncertain is constant in time, there is "
-    "exactly one equilibrium in V <= {c.c0!r}, and all of these trajectories converge to it",
     "practical": "every trajectory of the closed loop that starts in V <= {c.c2!r}{when[start]} {when[stays]}, enters "
     "V <= {c.c0!r} {when[enters]} and {when[remains]} from then on; nothing is claimed about what happens inside "
     "V <= {c.c0!r}, and the origin need not be an equilibrium",
 }
+AT_ONCE = {"start": "", "stays": "stays there", "enters": "in finite time", "remains": "stays there"}
 
-_AT_ONCE = {"start": "", "stays": "stays there", "enters": "in finite time", "remains": "stays there"}
-_BY_STEPS = {
-    "start": "",
-    "stays": "is there at every later step",
-    "enters": "after finitely many steps",
-    "remains": "is there at every step",
-}
-_SAMPLED = {
-    "start": " at a sampling instant",
-    "stays": "is there at every later sampling instant, is in the domain at all times",
-    "enters": "at some sampling instant",
-    "remains": "is there at every sampling instant",
-}
-_SAMPLED_FROM_0 = {**_SAMPLED, "stays": "is there at all later times", "remains": "is there at all times"}
+
+def has_more(c: Certificate) -> bool:
+    """True if clauses.py has words of the claim: it is of another kind, of steps, or states more."""
+    parts = (c.outer, c.ranks, c.keep, c.data, c.then)
+    return c.claim not in PLAIN or c.step > 0 or any(parts) or not isinstance(c.evidence, Partition)
 
 
 def claim(c: Certificate) -> list[str]:
-    """The claim in sentences: its trajectories, and the additions of a sample, a rate, an outer set."""
-    when = _BY_STEPS if c.discrete else _AT_ONCE
-    lines = []
-    if c.sample is not None:
-        lo, hi = c.sample
-        when = _SAMPLED if lo else _SAMPLED_FROM_0
-        each = f"any sequence of periods in {interval(c.sample)}" if lo < hi else f"exactly {number(hi)}"
-        lines.append(f"  the input is held from each sampling instant to the next, for {each} units of time")
-    if c.rate:
-        lines.append(f"  {_falls(c)}, lambda = {c.rate!r}")
-    if c.outer or c.ranks or c.keep or c.data:
+    """The claim in sentences: its trajectories, and the additions."""
+    if has_more(c):
         from . import clauses
 
-        lines += clauses.additions(c, when["start"])
-        if c.without_V:
-            return [f"claim: {clauses.without_V(c, when['start'])}", *lines]
-    said = CLAIMS[c.claim].format(c=c, time=duration(c), when=when)
-    return [f"claim: {said}; u stays in its bounds", *lines]
+        return clauses.claim(c)
+    bound, latest = "V(x(t)) <= V(x(0)) exp(-2 lambda t)", "after {} units of time at the latest"
+    return [said(CLAIMS[c.claim].format(c=c, when=AT_ONCE)), *falls(c, bound, latest)]
 
 
-def _falls(c: Certificate) -> str:
+def said(trajectories: str) -> str:
+    return f"claim: {trajectories}; u stays in its bounds"
+
+
+def falls(c: Certificate, bound: str, latest: str) -> list[str]:
     """The bound of V under a rate, and the time to reach c0, if there is one."""
-    if c.discrete:
-        bound, latest = "V(x_k) <= V(x_0) exp(-2 lambda k) after k steps", "after {} steps, rounded up, at the latest"
-    elif c.sample is None:
-        bound, latest = "V(x(t)) <= V(x(0)) exp(-2 lambda t)", "after {} units of time at the latest"
-    else:
-        bound = "V(x(t_k)) <= V(x(t_0)) exp(-2 lambda (t_k - t_0)) at sampling instants"
-        latest = "at every sampling instant that comes {} units of time or more after the start"
-    if "floor" not in c.levels:
-        return bound
+    if not c.rate:
+        return []
     reached = latest.format("log(c2/c0)/(2 lambda)")
-    return f"{bound}, until V <= {c.c0!r}, where the trajectory is {reached}"
-
-
-def _falling(c: Certificate) -> str:
-    """The expression that rule `ring` bounds from above."""
-    name = "Vdot" if not c.discrete and c.sample is None else "D"
-    return f"({name} + 2 lambda V)" if c.rate else name
+    until = f", until V <= {c.c0!r}, where the trajectory is {reached}" if "floor" in c.levels else ""
+    return [f"  {bound}{until}, lambda = {c.rate!r}"]
 
 
 def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
     """The plant, the policy, V, what is claimed of them, what held, and the verdict, line by line."""
-    if c.claim == "reaches":
-        rest, verdict = f"leaves {answer['ranks']['leaves']}", answer["result"]
-    elif c.claim == "invariant":
-        margin = answer["margins"]["outer"]
-        least = "" if margin is None else f"; smallest bound of -N'F on a leaf on which N may be its level {margin:.3g}"
-        rest, verdict = f"leaves {answer['outer']['leaves']}{least}", answer["result"]
-    elif answer["result"] == "TRUSTED":
-        rest = f"not checked, the solver's word: {', '.join(answer['answers'])}"
-        verdict = f"TRUSTED {answer['solver']} {answer['version']}"
+    then, counted = list[str](), list[str]()  # of a certificate that takes over
+    if has_more(c):
+        from . import clauses
+
+        rest, verdict, then, counted = clauses.results(c, answer)
     else:
-        local, ring = answer["margins"]["local"], answer["margins"]["ring"]
-        margins = [] if local is None else [f"local {local:.1%}"]
-        margins += [] if ring is None else [f"smallest bound of -{_falling(c)} on a ring's leaf {ring:.3g}"]
-        outer = None if c.outer is None else answer["margins"]["outer"]
-        margins += [] if outer is None else [f"smallest bound of -N'F on a leaf of the outer set {outer:.3g}"]
-        rest, verdict = f"margins: {'; '.join(margins)}", answer["result"]
-    takes_over = _taking_over(c, c.then) if c.then else []
+        rest, verdict = margins(c, answer, "Vdot"), answer["result"]
     return [
         *stated(c),
-        *takes_over,
+        *then,
         "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items() if count),
-        *([] if c.then is None else [_counted(answer["then"]["rules"])]),
+        *counted,
         "modules that were used: " + ", ".join(answer["modules"]),
         rest,
         f"{verdict} {_levels(c)}sha256={c.sha256}",
     ]
 
 
-def _taking_over(c: Certificate, then: Certificate) -> list[str]:
-    from . import clauses
-
-    return [*clauses.handed_over(c, then), *stated(then)]
+def margins(c: Certificate, answer: dict[str, Any], change: str) -> str:
+    """The smallest margins of the rules, `change` being what V changes by."""
+    found = answer["margins"]
+    change = f"({change} + 2 lambda V)" if c.rate else change
+    words = {
+        "local": "local {:.1%}",
+        "ring": f"smallest bound of -{change} on a ring's leaf {{:.3g}}",
+        "outer": "smallest bound of -N'F on a leaf of the outer set {:.3g}",
+    }
+    known = ((said, found.get(name)) for name, said in words.items())
+    return "margins: " + "; ".join(said.format(margin) for said, margin in known if margin is not None)
 
 
 def stated(c: Certificate) -> list[str]:
@@ -139,23 +98,20 @@ def stated(c: Certificate) -> list[str]:
         f"policy: network {c.policy.network.name}, squash {c.policy.squash}, centred by {c.policy.centre}, "
         f"{_clip(c.policy)}"
         f"sha256 {c.policy.sha256()}",
-        *([] if c.policy.origin is None else [f"  its network reads ({_matrix(c.policy.origin[None])}) + x"]),
-        *([] if c.without_V else [f"V(x) = x'Px with P = {_matrix(c.P)}"]),
-        *([] if c.target is None else _target(c.target)),
-        *([] if c.start is None else [f"S = {_matrix(c.start)}"]),
-        *([] if c.centre is None else [f"c = {' '.join(map(repr, c.centre.tolist()))}"]),
-        *([] if c.outer is None else [f"N(x) = {expression(c.outer.function.trees[0])}"]),
+        *([] if c.policy.origin is None else [f"  its network reads ({matrix(c.policy.origin[None])}) + x"]),
+        *([] if c.without_V else [f"V(x) = x'Px with P = {matrix(c.P)}"]),
+        *_besides(c),
         *claim(c),
     ]
 
 
-def _counted(rules: dict[str, int]) -> str:
-    return "of the certificate that takes over: " + ", ".join(f"{rule} {count}" for rule, count in rules.items())
+def _besides(c: Certificate) -> list[str]:
+    """What else the claim is about."""
+    if not has_more(c):
+        return []
+    from . import clauses
 
-
-def _target(target: Tape) -> list[str]:
-    """The region that is reached."""
-    return [f"target: {', '.join(f'{expression(tree)} <= 0' for tree in target.trees)}"]
+    return clauses.besides(c)
 
 
 def _levels(c: Certificate) -> str:
@@ -171,36 +127,12 @@ def _network(network: Network) -> str:
     sha256 = hashed("certify-lyapunov/1\0", arrays, network.words())
     if network.is_chain:
         return f"{'-'.join(map(str, network.widths))} tanh, sha256 {sha256}"
-    return f"{'; '.join(f'v{k} = {_step(step)}' for k, step in enumerate(network.steps, 1))}; sha256 {sha256}"
+    steps = (f"v{k} = {step.said([f'v{i}' for i in step.of])}" for k, step in enumerate(network.steps, 1))
+    return f"{'; '.join(steps)}; sha256 {sha256}"
 
 
-def _step(step: Step) -> str:
-    of = [f"v{i}" for i in step.of]
-    match step:
-        case Map():
-            return f"{step.function}({of[0]})"
-        case Sum():
-            return " + ".join(of)
-        case Product():
-            return " * ".join(of)
-        case Observe():
-            made = ", ".join(expression(tree) for tree in step.tape.trees)
-            return f"({made}) of ({', '.join(step.names)}) = {of[0]}"
-    word = {"Affine": "W {} + b", "Clip": "clip({})", "Concat": "({})"}[type(step).__name__]
-    return f"{word.format(', '.join(of))}, {step.size} entries"
-
-
-def _matrix(A: Array) -> str:
+def matrix(A: Array) -> str:
     return "; ".join(" ".join(map(repr, row)) for row in A.tolist())
-
-
-def duration(c: Certificate) -> float:
-    """The tube's duration, rounded up; infinite if it exceeds all binary64 numbers."""
-    slabs = c.evidence.tube if isinstance(c.evidence, Partition) else ()
-    try:
-        return math.nextafter(math.fsum(slab.duration for slab in slabs), math.inf)
-    except OverflowError:
-        return math.inf
 
 
 def expression(tree: Any) -> str:

@@ -25,8 +25,10 @@ from certify.checker.functions import FUNCTIONS
 from certify.checker.jets import Jet, Units, constant
 from certify.checker.near import Near, Vector, triples
 from certify.checker.networks import FUNCTIONS as MAPS
-from certify.checker.networks import Affine, Concat, Map, Network, Observe, Step, Sum
+from certify.checker.networks import Affine, Map, Network, Step
 from certify.checker.ring import Ring
+from certify.checker.smooth import add as add_smooth
+from certify.checker.wiring import Concat, Observe, Sum
 from certify.reference import contraction as other
 from certify.reference.balls import PRECISION
 from certify.reference.document import read
@@ -44,6 +46,7 @@ from tests.support.marks import slow_after
 from tests.support.reference import judge_bytes
 
 add_activations()
+add_smooth()
 
 
 Array = Any
@@ -236,7 +239,7 @@ def test_a_network_with_kinks_lies_in_its_model_to_the_last_bit(seed: int) -> No
 
 def on_a_line(c: float, a: float) -> tuple[Jet, Model]:
     """c + a d for |d| <= 1, in both programs."""
-    x = constant(Fraction(0), Units(np.zeros((1, 1, 0)), np.zeros((0, 0))), 0)
+    x = constant(Fraction(0), Units(np.zeros((1, 1, 0)), np.zeros((0, 0))))
     return replace(x, c=Near(np.float64(c)), a=Vector(np.array([a]))), Model.affine(arb(c), [arb(a)], lip=ZERO)
 
 
@@ -498,7 +501,7 @@ def contracts(data: Document) -> set[str]:
         by = c.evidence.contraction
         assert by is not None
         try:
-            rules.Tally().hold(contraction.OF_CONTRACTION, contraction.Contracted(Case(c), by))
+            rules.Tally().hold(contraction.OF_CONTRACTION, contraction.Contracted.of(Case(c), by))
             found.add("checker")
         except Rejected:
             pass
@@ -600,6 +603,6 @@ def test_arguments_on_leaves_are_counted() -> None:
     """One array of a batch has four times as many numbers as may be held in all."""
     case = many_arguments(1, 2**14)
     case = Case(replace(case.c, levels={"local": 0.25, "roa": 1.0}))
-    ring = Ring(case)
+    ring = Ring.of(case)
     held = (1 + ring.symbols) * 2**14 * ring.batch
     assert held <= limits.MOST_NUMBERS or [at for at, _ in limits.is_bearable(case)] != []

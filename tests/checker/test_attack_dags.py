@@ -11,15 +11,16 @@ import pytest
 from flint import arb, ctx
 
 from certify.checker import ball
+from certify.checker.calls import enclose
 from certify.checker.expression import evaluate, parse
 from certify.checker.jets import Units
 from certify.checker.near import Above, Form, triples
-from certify.checker.network import enclose
 from certify.checker.networks import FUNCTIONS as MAPS
-from certify.checker.networks import Affine, Clip, Concat, Map, Network, Observe, Step, Sum
+from certify.checker.networks import Affine, Map, Network, Step
 from certify.checker.outer import Dual, InRows
 from certify.checker.taylor import Taylor, constants
 from certify.checker.taylor import affine as form_of
+from certify.checker.wiring import Clip, Concat, Observe, Sum
 from certify.reference.affine import OnBoxes
 from certify.reference.balls import PRECISION
 from certify.reference.model import Model

@@ -14,17 +14,18 @@ import numpy as np
 import pytest
 from flint import arb, ctx, fmpq
 
-from certify.checker import ball, document, flow, limits, network, rules
+from certify.checker import ball, calls, document, flow, limits, network, rules
+from certify.checker.calls import enclose
 from certify.checker.case import Case
 from certify.checker.errors import Rejected
 from certify.checker.expression import Call, Tape, evaluate, parse
 from certify.checker.jets import Units
 from certify.checker.near import Above, Form, triples
-from certify.checker.network import enclose
-from certify.checker.networks import Affine, Algebra, Clip, Concat, Map, Observe, Product, Sum
+from certify.checker.networks import Affine, Algebra, Map
 from certify.checker.ring import Ring
 from certify.checker.taylor import Taylor, constants
 from certify.checker.taylor import affine as form_of
+from certify.checker.wiring import Clip, Concat, Observe, Others, Product, Sum
 from tests.checker.test_networks import a_jet, a_network, hash_of, odd_loop
 from tests.support.certificates import Document, encode
 from tests.support.earlier import newer
@@ -79,7 +80,7 @@ PHI: dict[str, Callable[[arb], arb]] = {
 }
 
 
-class Truths(Algebra[list[arb]]):
+class Truths(Algebra[list[arb]], Others[list[arb]]):
     """Networks in Arb."""
 
     def affine(self, step: Affine, v: list[arb]) -> list[arb]:
@@ -156,7 +157,7 @@ def test_calls_hold_in_all_equations_with_one_symbol_each(seed: int) -> None:
     forms: list[Taylor] = []
 
     def called(call: Call, given: list[Taylor]) -> list[Taylor]:
-        found = network.entries(call, given, 2)
+        found = calls.entries(call, given, 2)
         forms.extend(found)
         return found
 
@@ -347,7 +348,7 @@ def test_products_of_errors_of_calls_do_not_stand_for_means() -> None:
     data = loop(["-", ["*", call("f", "x"), call("f", ["+", "x", "1"])], "x"], net("f", TANH), leaves=1)
     data["claim"]["sample"] = ["1/20", "1/10"]
     data["policy"]["sha256"] = hash_of(data)
-    ring = Ring(Case(document.certificate(json.loads(json.dumps(data)), "")))
+    ring = Ring.of(Case(document.certificate(json.loads(json.dumps(data)), "")))
     n, i, j = ring.symbols, *np.triu_indices(ring.symbols)
     of_calls = (i >= ring.calls) & (j >= ring.calls) & (j < n - 1)
     p = np.ones((n + len(i), 1))

@@ -20,7 +20,8 @@ import numpy as np
 import pytest
 
 from certify.checker import flow, local
-from certify.checker.decrease import Models
+from certify.checker import stepping as steps
+from certify.checker.decrease import Inequality, Models
 from certify.checker.jets import Jet
 from certify.checker.near import ZERO
 from certify.checker.ring import Ring
@@ -156,12 +157,17 @@ def in_steps_of_euler(dynamics: Any, constant: Any, states: Any, *rest: Any) -> 
     return [constant(Fraction(0)) for _ in states]
 
 
-def without_the_square(models: Any, P: Any, R: Any, by: Any, path: Any, h: Any, *rest: Any) -> Any:
-    return SIDES(models, P, R, by, path, 0 * h, *rest)
+def without_the_square(ball: Any, models: Any) -> Any:
+    return Inequality(models, *ball.terms)
 
 
-def without_the_rate(models: Any, P: Any, R: Any, *rest: Any) -> Any:
-    return SIDES(models, P, 0 * R, *rest)
+def without_the_rate(ball: Any) -> Any:
+    P, R, *rest = TERMS(ball)
+    return P, 0 * R, *rest
+
+
+def without_doubt(ball: Any, models: Any) -> Any:
+    return INEQUALITY(ball, certain(models))
 
 
 def from_any_level(ring: Ring, rise: Any, centre: Any, radius: Any) -> Any:
@@ -169,14 +175,15 @@ def from_any_level(ring: Ring, rise: Any, centre: Any, radius: Any) -> Any:
     return np.min([upper_bound(rise + gap.scaled(k)) for k in (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)], axis=0)
 
 
-SIDES = local.sides
+TERMS, INEQUALITY = local.Local.terms.func, steps.Stepping.inequality
+NO_RATE = property(without_the_rate)
 BROKEN: dict[str, tuple[str, Any, str, Any]] = {
     "Euler's steps": ("a period", flow, "later", in_steps_of_euler),
-    "no square of the step": ("a rate of steps", local, "sides", without_the_square),
-    "no rate": ("a rate of samples", local, "sides", without_the_rate),
+    "no square of the step": ("a rate of steps", steps.Stepping, "inequality", without_the_square),
+    "no rate": ("a rate of samples", local.Local, "terms", NO_RATE),
     "one corner": ("a range that moves all", Models, "corners", lambda models, P: iter([models])),
-    "no doubt": ("a level of samples", local, "sides", lambda models, *rest: SIDES(certain(models), *rest)),
-    "any multiplier of the level": ("a jump from within", Ring, "bound_of_steps", from_any_level),
+    "no doubt": ("a level of samples", steps.Stepping, "inequality", without_doubt),
+    "any multiplier of the level": ("a jump from within", steps.StepRing, "bound_of_steps", from_any_level),
 }
 
 
@@ -410,13 +417,15 @@ def test_random_loops_hold_what_is_accepted_last(kind: str, level: bool, seeds: 
 
 
 @pytest.mark.parametrize(
-    ("kind", "rule", "broken"),
+    ("kind", "owner", "rule", "broken"),
     [
-        ("steps", "sides", without_the_square),
-        pytest.param("flow", "sides", without_the_rate, marks=pytest.mark.slow),
-        pytest.param("samples", "mean", in_steps_of_euler, marks=pytest.mark.slow),
+        ("steps", steps.Stepping, "inequality", without_the_square),
+        pytest.param("flow", local.Local, "terms", NO_RATE, marks=pytest.mark.slow),
+        pytest.param("samples", flow, "later", in_steps_of_euler, marks=pytest.mark.slow),
     ],
 )
-def test_random_loops_catch_a_broken_rule(kind: str, rule: str, broken: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(local, rule, broken)
+def test_random_loops_catch_a_broken_rule(
+    kind: str, owner: Any, rule: str, broken: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(owner, rule, broken)
     assert max(excess for excess, *_ in found(kind, False, range(4))) > 0

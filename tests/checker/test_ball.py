@@ -215,7 +215,7 @@ def test_what_is_not_finite_does_not_decrease(part: str) -> None:
     data = honest("enlarged")
     case = Case(parse(data))
     with np.errstate(all="ignore"):
-        pieces: list[tuple[Any, Any]] = [(local.Local(case), local.decreases)]
+        pieces: list[tuple[Any, Any]] = [(local.Local.of(case), local.decreases)]
         pieces += [(piece, tube.decreases) for piece in tube.pieces(case)][:1]
         for subject, decreases in pieces:
             assert first(decreases(subject)) is None
@@ -232,7 +232,7 @@ def test_the_local_margin_is_the_share_that_is_left() -> None:
     """In one state, of -x + E: 1 - E by hand; the rest grows with the ball, and the margin falls."""
     data, margins = honest("scalar"), []
     for level in (1e-6, 1e-4, 1e-2, 0.1):
-        subject = local.Local(Case(parse(with_ball(edited(data, "levels.local", level.hex())))))
+        subject = local.Local.of(Case(parse(with_ball(edited(data, "levels.local", level.hex())))))
         assert first(local.decreases(subject)) is None
         [found] = subject.sides()
         assert found is not None

@@ -51,7 +51,7 @@ def passes_the_checker(data: Document) -> bool:
         by = case.partition.contraction
         assert by is not None
         try:
-            rules.Tally().hold(contraction.OF_CONTRACTION, contraction.Contracted(case, by))
+            rules.Tally().hold(contraction.OF_CONTRACTION, contraction.Contracted.of(case, by))
         except Rejected as no:
             assert no.rule == "contraction"
             return False

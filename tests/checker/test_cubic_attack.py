@@ -21,13 +21,13 @@ from flint import arb, ctx, fmpq, fmpq_mat
 from certify.checker import tube
 from certify.checker.ball import Ball
 from certify.checker.case import Case
-from certify.checker.decrease import Models, are_finite, sides
+from certify.checker.decrease import Models, are_finite
 from certify.checker.document import Certificate, Multipliers
 from certify.checker.exact import exactly
 from certify.checker.sections import Path, Slab
 from tests.support.balls import with_ball
 from tests.support.certificates import Document, decode, edited, encode, make, parse, verdict
-from tests.support.jets import Jet, curved, seen
+from tests.support.jets import Jet, curved, seen, sides
 from tests.support.marks import slow_after
 from tests.support.oracle import ball, policies_in_arb, quadratic
 from tests.support.reached import dot, field_in_arb

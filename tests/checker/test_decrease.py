@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
-from certify.checker.decrease import are_finite, are_usable, shows, sides
+from certify.checker.decrease import are_finite, are_usable
 from certify.checker.document import Multipliers
 from certify.checker.exact import exactly
 from certify.reference import decrease as reference
 from certify.reference.evidence import Ball
 from certify.reference.model import Model
-from tests.support.jets import Jet, models_of, no_units, plain
+from tests.support.jets import Jet, models_of, no_units, plain, shows, sides
 from tests.support.marks import slow_after
 
 Generator = np.random.Generator

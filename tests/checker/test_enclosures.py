@@ -139,8 +139,8 @@ def test_tanh_is_odd_in_every_bit() -> None:
 
 
 def test_tables_are_accurate_to_one_rounding() -> None:
-    tanh, sech2 = (near._table(function, near._TANH_END) for function in (arb.tanh, near._sech2))
-    others = [(function, near._table(function, near._ANGLE_END)) for function in (arb.sin, arb.cos)]
+    tanh, sech2 = (near.table(function, near._TANH_END) for function in (arb.tanh, near._sech2))
+    others = [(function, near.table(function, near._ANGLE_END)) for function in (arb.sin, arb.cos)]
     with ctx.workprec(200):
         for k in range(0, 641, 8):
             t = (arb(k) / 32).tanh()

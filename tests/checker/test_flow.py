@@ -16,13 +16,14 @@ from flint import arb, ctx, fmpq, fmpq_mat
 from numpy.random import Generator
 
 from certify.checker.case import Case
-from certify.checker.decrease import Level, sides, size_beyond
+from certify.checker.decrease import Level
 from certify.checker.document import Multipliers
 from certify.checker.exact import exactly
 from certify.checker.flow import Series
 from certify.checker.jets import Units
 from certify.checker.local import Local
 from certify.checker.ring import Ring
+from certify.checker.stepping import size_beyond
 from tests.checker.test_ball import points
 from tests.checker.test_cubic import FUNCTIONS, JUST, Member, closeness, derivatives, random_jet, shares, value
 from tests.checker.test_uncertain import holds
@@ -38,6 +39,7 @@ from tests.support.jets import (
     plain,
     remainders,
     seen,
+    sides,
     uncertain,
     units_of,
 )
@@ -208,7 +210,7 @@ def test_the_ball_holds_the_mean_over_a_period_in_which_what_is_uncertain_switch
     for wide in (1.0, 1 / 64):
         data, generator = curved_plant(disturbed, lo, hi, order, wide), np.random.default_rng(order)
         with np.errstate(all="ignore"):
-            local = Local(Case(parse(data)))
+            local = Local.of(Case(parse(data)))
             [cell] = local.case.cells
             G, way = seen(local.G(cell)), local.way
         assert way is not None and all(np.isfinite(g.E).all() for g in G)
@@ -232,7 +234,7 @@ def test_leaves_hold_the_mean_over_a_period_in_which_what_is_uncertain_switches(
 ) -> None:
     data, generator = curved_plant(disturbed, lo, hi, order), np.random.default_rng(order + 10)
     c = replace(parse(data), levels={"floor": 1.0, "local": 1.0, "roa": 4.0})
-    ring = Ring(Case(c))
+    ring = Ring.of(Case(c))
     centre, radius = 0.3 * generator.standard_normal((2, 6)), 10.0 ** generator.uniform(-4, -1.5, (2, 6))
     with np.errstate(all="ignore"):
         states, G, between_ = on_boxes(ring, centre, radius)
@@ -276,9 +278,9 @@ def idle(equations: list[Any], names: str, h: str, order: int = 1) -> Document:
 def test_a_symbol_in_the_place_of_the_mean_is_not_enough_for_its_square() -> None:
     """x' = q^2, q = 1 and -1 for half a period each: the mean of q is 0, that of q^2 is 1."""
     case = Case(parse(idle([["**", "q", 2]], "q", "1/8")))
-    [g] = map(Taylor.of, on_boxes(Ring(case), np.zeros((1, 1)), np.full((1, 1), 0.1))[1])
+    [g] = map(Taylor.of, on_boxes(Ring.of(case), np.zeros((1, 1)), np.full((1, 1), 0.1))[1])
     assert float(g.c[0] + g.r[0]) >= 1.0
-    [jet] = seen(Local(case).G(next(iter(case.cells))))
+    [jet] = seen(Local.of(case).G(next(iter(case.cells))))
     assert jet.c + jet.error >= 1.0
 
 
@@ -286,9 +288,11 @@ def test_a_symbol_in_the_place_of_the_mean_is_not_enough_for_its_square() -> Non
 def test_the_order_of_values_within_a_period_counts(order: int) -> None:
     """x' = q, y' = x: the same, and linear in q."""
     h, case = 0.25, Case(parse(idle(["q", "x"], "q", "1/4", order)))
-    for jet, each in zip(seen(Local(case).G(next(iter(case.cells)))), (0.0, h / 4), strict=True):
+    for jet, each in zip(seen(Local.of(case).G(next(iter(case.cells)))), (0.0, h / 4), strict=True):
         assert within_jet(jet, [0.0], np.zeros(2), each, 1e-12)
-    for model, each in zip(on_boxes(Ring(case), np.zeros((2, 1)), np.full((2, 1), 0.01))[1], (0.0, h / 4), strict=True):
+    for model, each in zip(
+        on_boxes(Ring.of(case), np.zeros((2, 1)), np.full((2, 1), 0.01))[1], (0.0, h / 4), strict=True
+    ):
         assert holds(replace_slack(Taylor.of(model)), 0, 2, 1, [0.0, 0.0, 0.0], arb(each))
 
 
@@ -299,9 +303,9 @@ def test_what_switches_within_a_period_may_do_what_no_constant_does(order: int) 
     path = travelled(np.zeros(2), lambda at, w: np.array([w, at[0]]), [(h / 2, 1.0), (h / 2, -1.0)])
     true = path[-1] / h
     assert true == pytest.approx([0, h / 4], abs=1e-12)
-    for jet, each in zip(seen(Local(case).G(next(iter(case.cells)))), true, strict=True):
+    for jet, each in zip(seen(Local.of(case).G(next(iter(case.cells)))), true, strict=True):
         assert within_jet(jet, [0.0, 1.0], np.zeros(2), each, 1e-12)
-    for model, each in zip(on_boxes(Ring(case), np.zeros((2, 1)), np.full((2, 1), 0.01))[1], true, strict=True):
+    for model, each in zip(on_boxes(Ring.of(case), np.zeros((2, 1)), np.full((2, 1), 0.01))[1], true, strict=True):
         assert holds(replace_slack(Taylor.of(model)), 0, 2, 2, [0.0, 0.0, 0.0, 1.0], arb(each))
 
 

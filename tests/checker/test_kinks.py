@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from certify.checker import kinks, limits
-from certify.checker.ball import OnBall
 from certify.checker.case import Case
 from certify.checker.jets import Units, constant, unpacked
 from certify.checker.near import Vector
-from certify.checker.networks import Affine, Clip, Map, Network
+from certify.checker.networks import Affine, Map, Network
+from certify.checker.wiring import Clip
 from tests.support.certificates import LEAF, Document, edited, encode, parse, verdict
 from tests.support.kinked import even, kinked, mirrored, pi
 from tests.support.marks import slow_after
@@ -184,17 +184,17 @@ def test_models_hold_what_a_network_does_on_a_cone(seed: int, close: bool) -> No
     n = int(rng.integers(1, 4))
     network, f, _ = random_network(rng, n)
     J = rng.normal(size=(n, n)) * 10.0 ** rng.uniform(-3, 0.5)
-    nothing = constant(0, Units(np.zeros((n, n, 0))), 0)
+    nothing = constant(0, Units(np.zeros((n, n, 0))))
     x = [replace(nothing, a=Vector(row)) for row in J]
     with np.errstate(all="ignore"):
         for cone in cones_of(rng, n, close):
-            y = OnBall(n, cone).value(network, x)
+            y = kinks.OnCone(n, cone).value(network, x)
             d = directions_in(cone, rng, n, 400)
             left = beyond(f, y, J, d)
             size = np.linalg.norm(d, axis=1)
             whole = y.E.majorant + y.shares.majorant
             quadratic = np.einsum("ti,ijm,tj->tm", d, whole, d)
-            doubt = y.slack.top + y.by_kinks(y.B.size).top
+            doubt = y.slack.top + y.units.tilt(y.B.size).top
             assert np.all(left <= quadratic + size[:, None] * doubt + 1e-12)
             if close:
                 e = directions_in(cone, rng, n, 400)
@@ -212,11 +212,11 @@ def test_a_kink_is_within_its_sector(seed: int, close: bool, monkeypatch: pytest
     n = int(rng.integers(1, 4))
     network, f, _ = random_network(rng, n)
     J = rng.normal(size=(n, n)) * 10.0 ** rng.uniform(-3, 0.5)
-    x = [replace(constant(0, Units(np.zeros((n, n, 0))), 0), a=Vector(row)) for row in J]
+    x = [replace(constant(0, Units(np.zeros((n, n, 0)))), a=Vector(row)) for row in J]
     for cone in cones_of(rng, n, close):
         seen.clear()
         with np.errstate(all="ignore"):
-            OnBall(n, cone).value(network, x)
+            kinks.OnCone(n, cone).value(network, x)
         d, e = directions_in(cone, rng, n, 400), directions_in(cone, rng, n, 400) * float(close)
         bent = [
             k

@@ -14,16 +14,17 @@ from flint import arb, arb_mat, ctx
 from numpy.typing import NDArray
 
 from certify.checker.case import AT_CORNERS
-from certify.checker.decrease import Level, Models, sides, size_beyond
+from certify.checker.decrease import Level, Models
 from certify.checker.document import Multipliers
 from certify.checker.exact import exactly
+from certify.checker.stepping import size_beyond
 from certify.provers.ball.models import AT_CORNERS as PRODUCER_S
 from certify.reference import decrease as reference
 from certify.reference.limits import AT_CORNERS as REFERENCE_S
 from tests.checker.test_flow import beyond, models_of, numbers, q, stepped
 from tests.support.balls import with_ball
 from tests.support.certificates import Document, edited, encode, grow, make, verdict
-from tests.support.jets import changed, given
+from tests.support.jets import changed, given, sides
 from tests.support.marks import slow_after
 from tests.support.reference import judge
 
@@ -48,7 +49,7 @@ def test_what_moves_nothing_has_no_corner() -> None:
 def corner_of(models: Models, P: Array, jets: list[Any], y: Array) -> Models:
     """The one of the corners that y belongs to, found by its A."""
     found, level = list(models.corners(P)), bool(models.f)
-    others = [Y.tolist() for Y in found[0].others]
+    others = [Y.tolist() for Y in found[0].more[0].parts]
 
     def added(j: int) -> list[Any]:
         c_y = [[jet.c_y[j] for jet in jets]] if level else []

@@ -8,6 +8,7 @@ beforehand. The others may be accepted.
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -89,7 +90,8 @@ def verdict_on(path: Path, package_document: ModuleType = document, package_rule
         package_rules.check(certificate)
     except Rejected as no:
         return no.rule
-    return "TRUSTED" if isinstance(certificate.evidence, package_document.Trusted) else "ACCEPTED"
+    trusted = importlib.import_module(f"{package_document.__package__}.sections").Trusted
+    return "TRUSTED" if isinstance(certificate.evidence, trusted) else "ACCEPTED"
 
 
 def judged(one: Mutant, path: Path) -> Judged:

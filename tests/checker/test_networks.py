@@ -15,17 +15,20 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from certify.checker import ball, document, network, rules
+from certify.checker import ball, calls, document, rules
+from certify.checker.activations import add as add_activations
 from certify.checker.errors import Rejected
 from certify.checker.exact import Exact, Exactly
 from certify.checker.expression import Tape, evaluate, parse
 from certify.checker.functions import Undecided
 from certify.checker.jets import Jet, Units, constant
 from certify.checker.near import Above, Form, Near, Vector
-from certify.checker.networks import Affine, Algebra, Clip, Concat, Map, Network, Observe, Product, Step, Sum
+from certify.checker.networks import Affine, Algebra, Map, Network, Step
 from certify.checker.outer import Dual, InRows
+from certify.checker.smooth import add as add_smooth
 from certify.checker.taylor import Taylor, constants
 from certify.checker.taylor import affine as form_of
+from certify.checker.wiring import Clip, Concat, Observe, Others, Product, Sum
 from tests.support.certificates import Document, decode, encode, grow, make
 from tests.support.earlier import newer
 from tests.support.marks import slow_after
@@ -34,6 +37,8 @@ from tests.support.reference import judge_bytes
 Array = Any
 SEEDS = slow_after(40, [*range(60, 80), *range(60), *range(80, 100)])  # with products first
 WITH_PRODUCTS = 60  # from this seed on networks have products, too
+add_activations()
+add_smooth()
 FUNCTIONS: dict[str, Callable[[Array], Array]] = {
     "tanh": np.tanh,
     "sin": np.sin,
@@ -66,7 +71,7 @@ def has_corners(net: Network) -> bool:
     return any(isinstance(step, Clip) or getattr(step, "function", "") in CORNERED for step in net.steps)
 
 
-class Numbers(Algebra[Array]):
+class Numbers(Algebra[Array], Others[Array]):
     """Plain numbers, (width, B)."""
 
     def affine(self, step: Affine, v: Array) -> Array:
@@ -177,7 +182,7 @@ def test_a_value_lies_within_its_enclosure_on_boxes(seed: int) -> None:
     x = np.concatenate([rng.normal(size=(1, 3, 5)), rng.normal(size=(4, 3, 5)) * radius])
     doubt = np.abs(rng.normal(size=(3, 5))) * radius * 0.1
     with np.errstate(all="ignore"):
-        u = network.enclose(net, Form(x, Above(doubt)), (1, 0, 1))
+        u = calls.enclose(net, Form(x, Above(doubt)), (1, 0, 1))
     for _ in range(40):
         d = np.sign(rng.normal(size=(4, 5))) * rng.random((4, 5)) ** rng.choice([0.0, 0.2, 1.0])
         at = x[0] + np.einsum("kb,knb->nb", d, x[1:]) + doubt * np.sign(rng.normal(size=(3, 5)))
@@ -202,7 +207,7 @@ def test_a_call_in_equations_is_one_with_its_value(seed: int) -> None:
         form_of(np.array([centre[i]]), np.concatenate([wide[i], np.zeros(tape.entries)])[:, None]) for i in range(2)
     ]
     with np.errstate(all="ignore"):
-        (f,) = evaluate(tape, constants(states[0]), states, lambda call, given: network.entries(call, given, 2))
+        (f,) = evaluate(tape, constants(states[0]), states, lambda call, given: calls.entries(call, given, 2))
     for _ in range(40):
         d = rng.uniform(-1, 1, 2)
         (value,) = Plain.of(tape, [np.array([v]) for v in centre + wide @ d])
@@ -217,13 +222,11 @@ def test_a_call_in_equations_is_one_with_its_value(seed: int) -> None:
 def a_jet(rng: Any, k: int, scale: float, units: Units) -> tuple[Jet, Callable[[Array], Array]]:
     """x on a ball, exactly, and its function of d."""
     c, a = float(rng.normal()), rng.normal(size=k) * scale
-    x = constant(Fraction(0), units, 0)
+    x = constant(Fraction(0), units)
     jet = Jet(
         Near(np.float64(c)),
         Vector(a),
-        *(getattr(x, name) for name in ("Q", "K", "E", "B", "units", "c_y")),
-        x.a_y,
-        x.lip,
+        *(getattr(x, name) for name in ("Q", "K", "E", "B", "units", "lip")),
     )
     return jet, lambda d: c + a @ d
 
@@ -329,7 +332,7 @@ def test_corners_of_equations_lie_in_their_models(seed: int) -> None:
     jets = [a_jet(rng, 2, radius, units) for _ in range(2)]
     with np.errstate(all="ignore"):
         on_box = evaluate(tape, constants(states[0]), states)
-        on_ball = evaluate(tape, lambda q: constant(q, units, 0), [jet for jet, _ in jets])
+        on_ball = evaluate(tape, lambda q: constant(q, units), [jet for jet, _ in jets])
     for _ in range(40):
         d = rng.uniform(-1, 1, 2)
         for model, value in zip(on_box, Plain.of(tape, [np.array([v]) for v in centre + radius * d]), strict=True):

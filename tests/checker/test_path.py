@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,12 +22,13 @@ from flint import arb, ctx, fmpq, fmpq_mat
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from certify.checker import tube, words
+from certify.checker import clauses, tube
 from certify.checker.case import Case
-from certify.checker.decrease import Models, are_finite, are_usable, shows, sides
+from certify.checker.decrease import Models, are_finite
 from certify.checker.document import Certificate, Multipliers
 from certify.checker.exact import exactly
 from certify.checker.sections import Path
+from certify.checker.tube import are_all_usable
 from tests.checker.test_rules import (
     array,
     at,
@@ -52,7 +54,7 @@ from tests.checker.test_tube import (
 )
 from tests.support.balls import enlarged_from, reached_from
 from tests.support.certificates import ASYMPTOTIC, Document, decode, edited, encode, make, parse, rehash, verdict
-from tests.support.jets import Jet, curved, models_of, no_units, plain, seen
+from tests.support.jets import Jet, curved, models_of, no_units, plain, seen, shows, sides
 from tests.support.marks import slow_after
 from tests.support.oracle import ball as exact
 from tests.support.oracle import policy_in_arb, quadratic
@@ -900,11 +902,11 @@ def test_multipliers_that_a_path_can_use() -> None:
         return Path(np.zeros(1), 0.5, edge, motion, joint)
 
     apart, jointly = by([0.0], [1.0], [0.0]), by([0.0], [0.0], [1.0])
-    assert are_usable(apart, path(0.0, 0.0, 0.0)) and are_usable(jointly, path(0.0, 0.0))
-    assert not are_usable(jointly, path(joint=0.0))
+    assert are_all_usable(apart, path(0.0, 0.0, 0.0)) and are_all_usable(jointly, path(0.0, 0.0))
+    assert not are_all_usable(jointly, path(joint=0.0))
     for key in ("edge", "motion", "joint"):
         for value in (-5e-324, -1.0, math.nan):
-            assert not are_usable(apart, path(**{key: value}))
+            assert not are_all_usable(apart, path(**{key: value}))
 
 
 def test_the_homogenised_matrix_is_refused_at_its_edges() -> None:
@@ -1050,7 +1052,7 @@ def blinkered() -> Document:
 CLAUSES: dict[str, tuple[Callable[[], Document], str, Any]] = {
     "the ellipsoids lie in the domain": (beyond_the_wall, "lies_in", lambda *_: True),
     "the last ellipsoid lies in {V <= c2}": (unfinished, "is_attracted", lambda *_: True),
-    "each slab decreases": (standing, "shows", lambda *_: True),
+    "each slab decreases": (standing, "inequality", lambda *_: SimpleNamespace(holds=True)),
 }
 
 
@@ -1077,7 +1079,7 @@ def test_the_velocity_is_part_of_the_inequality(monkeypatch: pytest.MonkeyPatch)
 def test_the_claim_is_printed_with_its_centre_and_time() -> None:
     data = glide()
     c = parse(data)
-    said = words.CLAIMS["reached"].format(c=c, time=words.duration(c))
+    said = clauses.CLAIMS["reached"].format(c=c, time=clauses.duration(c))
     time = said.split(" after ")[1].split(" units")[0]
     assert Fraction(time) >= sum(Fraction(float.fromhex(s["duration"])) for s in data["evidence"]["tube"])
     assert "(x - c)'S(x - c) <= 1" in said and "stays in the domain" in said

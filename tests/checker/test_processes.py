@@ -5,6 +5,7 @@ Batches are made small, so that the leaves of a small certificate are those of m
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import pickle
@@ -27,8 +28,8 @@ import pytest
 from certify.certificates import checking, run_checker
 from certify.checker import boxes, outer, processes, rules
 from certify.checker.__main__ import main
+from certify.checker.boxes import Batch, in_order
 from certify.checker.errors import Rejected
-from certify.checker.processes import Batch, in_order
 from certify.checker.ring import Ring
 from certify.errors import BackendError, InputError
 from tests.checker.test_rules import HONEST, honest, scalar_claim
@@ -347,7 +348,7 @@ ENDLESS = """
 import os, sys
 import numpy as np
 sys.path.insert(0, sys.argv[1])
-from certify.checker.processes import in_order
+from certify.checker.boxes import in_order
 batches = ((first, np.zeros((1, 1)), np.zeros((1, 1))) for first in range(10**9))
 for who in in_order(lambda first, lo, hi: (os.getpid(), "x" * 1000), batches, 10**9, 3):
     print(who[0], flush=True)
@@ -436,7 +437,8 @@ CHAPTERS = {  # the core page's table: the modules that a chapter is about
         r"^\| \[(\w+)\]\(format/\1\.md\) \| [^|]* \|([^|]*)\|$", (PACKAGE / "FORMAT.md").read_text(), re.M
     )
 }
-FEATURES = {"sections", "clauses", "demands"}.union(*CHAPTERS.values())  # those three are of several features
+SHARED = {"sections", "clauses", "demands", "processes"}  # by several features
+FEATURES = SHARED.union(*CHAPTERS.values())
 
 
 def test_each_feature_has_a_chapter_and_a_page_of_the_site() -> None:
@@ -449,13 +451,29 @@ def test_each_feature_has_a_chapter_and_a_page_of_the_site() -> None:
     assert core <= 5_000 and len(FEATURES) > 8
 
 
+def test_a_chapter_names_all_modules_that_its_own_load() -> None:
+    """By what they import when they are loaded themselves."""
+    imported: dict[str, set[str]] = {}
+    for path in PACKAGE.glob("*.py"):
+        own = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.ImportFrom) and node.level]
+        imported[path.stem] = {name for node in own for name in ([node.module] if node.module else _names(node))}
+    for chapter, modules in CHAPTERS.items():
+        assert modules == {name for module in modules for name in imported[module] & FEATURES - SHARED} | modules, (
+            chapter
+        )
+
+
+def _names(node: ast.ImportFrom) -> list[str]:
+    return [alias.name for alias in node.names]
+
+
 @pytest.mark.parametrize(
     ("name", "used"),
     [
         ("rotor", set()),
         ("enlarged", {"tube", "sections", "demands"}),
-        ("sampled", {"flow"}),
-        ("outer, a network", {"outer", "sections", "demands"}),
+        ("sampled", {"flow", "ranges", "sections", "stepping"}),
+        ("outer, a network", {"outer", "sections", "demands", "wiring", "elementary", "calls"}),
     ],
 )
 def test_an_answer_rests_on_the_modules_that_it_needs(name: str, used: set[str], tmp_path: Path) -> None:

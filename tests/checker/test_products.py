@@ -10,11 +10,14 @@ import pytest
 from flint import arb, ctx
 
 from certify.checker import ball
+from certify.checker.calls import enclose
+from certify.checker.elementary import lines_around_product
 from certify.checker.expression import parse
 from certify.checker.jets import Units
-from certify.checker.near import Above, Form, lines_around_product
-from certify.checker.network import OnBoxes, enclose
-from certify.checker.networks import Affine, Concat, Map, Network, Observe, Product, Step, Sum
+from certify.checker.near import Above, Form
+from certify.checker.network import OnBoxes
+from certify.checker.networks import Affine, Map, Network, Step
+from certify.checker.wiring import Concat, Observe, Product, Sum
 from certify.reference.affine import OnBoxes as Theirs
 from certify.reference.affine import moved_together
 from certify.reference.model import Model

@@ -49,7 +49,7 @@ def covered(chance: np.random.Generator, n: int, angles: tuple[int, ...]) -> tup
     low, high = centre - wide, centre + wide
     for i in set(range(n)).difference(angles):
         low[i], high[i] = np.clip(low[i], lo[i], hi[i]), np.clip(high[i], lo[i], hi[i])
-    return Cover(cast(Case, SimpleNamespace(ranks=ranks))), low, high
+    return Cover(cast(Case, SimpleNamespace(c=SimpleNamespace(ranks=ranks)))), low, high
 
 
 @pytest.mark.parametrize("seed", range(4))

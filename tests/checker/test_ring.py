@@ -28,7 +28,7 @@ CASES = ("scalar", "linear", "rotor", "rotor, preactivation")
 
 @cache
 def ring_of(name: str) -> Ring:
-    return Ring(Case(parse(honest(name))))
+    return Ring.of(Case(parse(honest(name))))
 
 
 def vdot_on(ring: Ring, centre: Array, radius: Array) -> Taylor:

@@ -819,7 +819,7 @@ def test_a_leaf_is_missed_only_if_it_lies_outside_the_ring(exponent: int) -> Non
         c = replace(c, levels={"local": float(levels[0]), "roa": float(levels[1])})
         with np.errstate(all="ignore"):
             P = np.array([[float(v) for v in row] for row in S])
-            ring = Ring(Case(replace(c, P=P, evidence=replace(c.evidence, T=np.eye(2)))))
+            ring = Ring.of(Case(replace(c, P=P, evidence=replace(c.evidence, T=np.eye(2)))))
             lo = generator.uniform(-3, 3, (2, 40))
             hi = lo + generator.uniform(0, 1, (2, 40))
             result = np.logical_or(*ring.misses(lo, hi)[:2])
@@ -841,7 +841,7 @@ def test_a_lower_bound_of_V_that_overflows_puts_no_leaf_outside() -> None:
         near = float(np.sqrt(2.0**1023 / s) * np.sqrt(2.0))
         for _ in range(3):
             with np.errstate(all="ignore"):
-                ring = Ring(Case(replace(c, P=np.array([[s]]))))
+                ring = Ring.of(Case(replace(c, P=np.array([[s]]))))
                 overflows = not np.isfinite(s * near * near)
                 outside, *_ = ring.misses(np.array([[near]]), np.array([[1.001 * near]]))
             if overflows and Fraction(s) * Fraction(near) ** 2 < Fraction(c.c2):

@@ -26,10 +26,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from certify.certificates import checking
-from certify.checker import tube, words
+from certify.checker import clauses, tube
 from certify.checker.ball import Ball
 from certify.checker.case import Case
-from certify.checker.decrease import are_finite, are_usable, shows, sides
+from certify.checker.decrease import are_finite, are_usable
 from certify.checker.document import Multipliers
 from certify.checker.exact import MAX_MATRIX_BITS, exactly, is_definite, root_above
 from certify.reference import rules as second
@@ -48,7 +48,7 @@ from tests.support.certificates import (
     write,
 )
 from tests.support.earlier import earlier
-from tests.support.jets import curved, models_of, no_units, plain, seen
+from tests.support.jets import curved, models_of, no_units, plain, seen, shows, sides
 from tests.support.marks import slow_after
 from tests.support.oracle import policy_in_arb, quadratic, value_of
 
@@ -751,7 +751,7 @@ def test_a_time_that_runs_backwards() -> None:
 def test_the_time_in_words_is_no_less_than_the_durations(durations: list[float]) -> None:
     slabs = [slab(0.25, 0.25, h, 2.125, NO_CURVATURE) for h in durations]
     c = parse(decay_from(0.25, slabs))
-    said = words.CLAIMS["enlarged"].format(c=c, time=words.duration(c))
+    said = clauses.CLAIMS["enlarged"].format(c=c, time=clauses.duration(c))
     time = said.split(" after ")[1].split(" units")[0]
     assert Fraction(time) >= sum(map(Fraction, durations))
 

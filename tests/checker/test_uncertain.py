@@ -560,7 +560,7 @@ def spans(jet: Jet, true: arb, at_0: arb, d: list[float]) -> bool:
 @pytest.mark.parametrize("seed", range(8))
 def test_leaf_models_enclose_Vdot_at_every_value(seed: int) -> None:
     data = random_plant(100 + seed, practical=bool(seed % 2))
-    ring, generator = Ring(Case(parse(data))), np.random.default_rng(seed)
+    ring, generator = Ring.of(Case(parse(data))), np.random.default_rng(seed)
     n, k = ring.n, ring.k
     centre, radius = 0.2 * generator.standard_normal((n, 3)), 10.0 ** generator.uniform(-3, -0.7, (n, 3))
     with np.errstate(all="ignore"):

@@ -17,6 +17,7 @@ from certify.checker.document import Policy as Stated
 from certify.checker.functions import FUNCTIONS
 from certify.checker.networks import FUNCTIONS as OF_MAPS
 from certify.checker.networks import Affine, Map, Network
+from certify.checker.smooth import add as add_smooth
 from certify.errors import InputError
 from certify.loop.activations import ACTIVATIONS, Activation
 from certify.loop.plants import get_system
@@ -28,6 +29,7 @@ from certify.loop.rigorous import precision
 from tests.support.loops import pendulum_network
 
 add_activations()
+add_smooth()
 
 
 NEW = [name for name in ACTIVATIONS if name != "tanh"]

@@ -26,8 +26,9 @@ from certify.certificates import read_certificate, run_checker
 from certify.certificates.claims import Asymptotic, conditions
 from certify.certificates.claims.queries import query
 from certify.certificates.verdict import Verdict
-from certify.checker import network as checker
 from certify.checker.near import Form
+from certify.checker.network import fold
+from certify.checker.wiring import clip_forms
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number
@@ -139,7 +140,7 @@ def own_of_a_clip(mid: float, slopes: list[float], error: float) -> tuple[float,
     """What the checker's clip to [-1, 1] makes of a form whose own error is elsewhere: the slope by which that counts,
     how far the clip is from this line, and what has been rounded."""
     v = plain.form(np.array([[mid, *slopes]])[:, :, None], np.array([[error]]))
-    cut, slope, gap = checker.clipped(Form(v.value), v.range.error, np.array([-1.0]), np.array([1.0]))
+    cut, slope, gap = clip_forms(Form(v.value), v.range.error, np.array([-1.0]), np.array([1.0]))
     return float(slope[0, 0]), float(gap.top[0, 0]), float(cut.error.top[0, 0])
 
 
@@ -183,7 +184,7 @@ def test_the_policy_on_boxes_and_at_points(squash: str, centre: str) -> None:
     for size in (1e-3, 0.05, 0.4, 3.0):
         x = generator.standard_normal((2, 3, 6)) * np.array([1.0, size, size])[None, :, None]
         nothing = np.zeros((2, 6))
-        forms = [plain.enclose_on_boxes(checker.fold(theirs, loop.u_eq), x, nothing)]
+        forms = [plain.enclose_on_boxes(fold(theirs, loop.u_eq), x, nothing)]
         forms.append(producer.policy_enclosure(loop)(x, nothing)[:3])
         with ctx.workprec(300):
             for b, d in itertools.product(range(6), [*itertools.product([-1.0, 1.0], repeat=2), (0.25, -0.5)]):

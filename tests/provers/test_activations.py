@@ -26,6 +26,7 @@ from certify.checker.activations import add as add_activations
 from certify.checker.functions import FUNCTIONS
 from certify.checker.near import Above, Form
 from certify.checker.network import enclose_on_boxes, fold
+from certify.checker.smooth import add as add_smooth
 from certify.effort import UNLIMITED
 from certify.errors import CertificateFormatError, InputError
 from certify.loop.activations import ACTIVATIONS
@@ -48,6 +49,7 @@ from tests.support.marks import slow_after
 from tests.support.ways import WAYS, Way, bounded
 
 add_activations()
+add_smooth()
 
 
 NEW = [name for name in ACTIVATIONS if name != "tanh"]

@@ -16,7 +16,6 @@ from certify.certificates.verdict import Verdict
 from certify.checker.ball import Ball
 from certify.checker.case import Case
 from certify.checker.decrease import Models as TheirModels
-from certify.checker.decrease import sides
 from certify.checker.exact import exactly
 from certify.checker.jets import unpacked
 from certify.effort import UNIT, Effort
@@ -32,7 +31,7 @@ from certify.provers.tube.enlarge import Found, enlarge
 from certify.provers.tube.tube import Tube, find_tube
 from tests.support.cases import case_of
 from tests.support.certificates import parse
-from tests.support.jets import remainders, seen
+from tests.support.jets import remainders, seen, sides
 from tests.support.loops import chain, pendulum_network, scalar_tanh, tank, valve
 
 

@@ -11,8 +11,8 @@ import pytest
 
 from certify.certificates.encoding import network_section, read_network
 from certify.checker import networks as theirs
+from certify.checker.calls import enclose
 from certify.checker.near import Above, Form
-from certify.checker.network import enclose
 from certify.checker.schema import Value
 from certify.errors import InputError
 from certify.loop.expressions import Symbol, sqrt

@@ -20,7 +20,8 @@ import numpy as np
 import pytest
 
 from certify.analysis.run import RoaOptions, certify_roa
-from certify.checker.networks import Affine, Clip, Map, Observe, Step
+from certify.checker.networks import Affine, Map, Step
+from certify.checker.wiring import Clip, Observe
 from certify.loop.plants import System, get_system, load_system
 from certify.loop.policies import PolicyNetwork, load_policy
 from certify.loop.policies.importers import ImportOptions, import_policy

@@ -20,6 +20,7 @@ from flint import arb, arb_mat, arb_series, ctx, fmpq
 from certify.checker.activations import add as add_activations
 from certify.checker.functions import FUNCTIONS as CHECKERS
 from certify.checker.near import Above, Near
+from certify.checker.smooth import add as add_smooth
 from certify.reference.balls import ON_LEAVES, PRECISION, SPREAD
 from certify.reference.networks import MAPS
 from certify.reference.rational import UNTOLD, Exact
@@ -36,6 +37,7 @@ from tests.support.marks import slow_after
 from tests.support.reference import judge_bytes
 
 add_activations()
+add_smooth()
 
 
 ACTIVATIONS = ("relu", "elu", "sigmoid", "silu", "gelu", "softplus", "mish", "softsign")

@@ -15,6 +15,7 @@ import pytest
 from flint import arb, arb_mat, ctx, fmpq
 
 from certify.checker import networks as theirs
+from certify.checker import wiring
 from certify.reference.affine import OnBoxes, called
 from certify.reference.balls import PRECISION
 from certify.reference.document import read as read_certificate
@@ -44,9 +45,9 @@ def described(step: theirs.Step) -> dict[str, Any]:
             result |= {"shape": shape, "weight": encode(step.weight), "bias": encode(step.bias)}
         case theirs.Map():
             result |= {"function": step.function}
-        case theirs.Clip():
+        case wiring.Clip():
             result |= {"lo": encode(step.lo), "hi": encode(step.hi)}
-        case theirs.Observe():
+        case wiring.Observe():
             result |= {"names": list(step.names), "expressions": list(step.tape.trees)}
     return result
 

@@ -191,7 +191,7 @@ def grow(data: Document, max_leaves: int = 5000, depth: int = 40) -> Document:
     """
     c = parse(data)
     with np.errstate(all="ignore"):
-        ring = Ring(Case(c))
+        ring = Ring.of(Case(c))
         return with_tree(data, halved(c.evidence.root, lambda *box: passes(ring, *box), max_leaves, depth))
 
 

@@ -12,13 +12,16 @@ from typing import Any
 from weakref import WeakValueDictionary
 
 import numpy as np
-from flint import arb
+from flint import arb, fmpq, fmpq_mat
 
-from certify.checker import ball, jets, pairs
-from certify.checker.decrease import Models
+from certify.checker import ball, jets, pairs, ranges, tube
+from certify.checker.decrease import Inequality, Level, Models
+from certify.checker.document import Multipliers
 from certify.checker.jets import Units
 from certify.checker.near import ZERO, Above, Cubic, Near, Square, Tensor, Vector
 from certify.checker.network import Folded
+from certify.checker.sections import Path
+from certify.checker.stepping import OfStep
 from tests.support.oracle import quadratic
 from tests.support.plain import top
 
@@ -48,11 +51,13 @@ class Jet:
         lip: Any = 0.0,
     ) -> None:  # fmt: skip
         Q, E, a_y = (np.asarray(v, dtype=np.float64) for v in (Q, E, a_y))
-        self.model = jets.Jet(
+        self.model: jets.Jet = jets.Jet(
             Near(np.float64(c), bound(error)), Vector(np.asarray(a, dtype=np.float64), bound(slack)), Square(Q),
-            Cubic(np.asarray(K, dtype=np.float64)), Square(E), Near(np.asarray(B, dtype=np.float64)),
-            family(U), Near(np.asarray(c_y, dtype=np.float64)), Vector(a_y.T), bound(lip),
+            Cubic(np.asarray(K, dtype=np.float64)), Square(E), Near(np.asarray(B, dtype=np.float64)), family(U),
+            bound(lip),
         )  # fmt: skip
+        if len(c_y):
+            self.model = ranges.Swayed.of(self.model, Near(np.asarray(c_y, dtype=np.float64)), Vector(a_y.T))
 
     @classmethod
     def of(cls, model: jets.Jet) -> Jet:
@@ -65,7 +70,8 @@ class Jet:
         if name == "model":
             raise AttributeError(name)
         with np.errstate(all="ignore"):
-            found = top(getattr(self.model, "lipschitz" if name == "lip" else name))
+            nothing = ZERO if name in ("sway", "tilt") else None  # of what knows nothing of y
+            found = top(getattr(self.model, "lipschitz" if name == "lip" else name, nothing))
         return found if np.ndim(found) else float(found)
 
     @property
@@ -94,11 +100,11 @@ class Jet:
 
     @property
     def c_y(self) -> Any:
-        return self.model.c_y.value
+        return self.model.c_y.value if isinstance(self.model, ranges.Swayed) else np.zeros(0)
 
     @property
     def a_y(self) -> Any:
-        return self.model.a_y.value.T
+        return self.model.a_y.value.T if isinstance(self.model, ranges.Swayed) else np.zeros((0, len(self.a)))
 
     @property
     def E(self) -> Any:
@@ -136,15 +142,9 @@ def seen(models: Iterable[jets.Jet]) -> list[Jet]:
 def members(batch: jets.Jet) -> list[Jet]:
     """The jets of a batch as numbers."""
     count = len(batch.c.value)
-    parts = (batch.c, batch.a, batch.Q, batch.K, batch.E, batch.B)
-    y = [(batch.c_y[:, j], Vector(batch.a_y.value[..., j])) for j in range(count)]
+    parts = (batch.c, batch.a, batch.Q, batch.K, batch.E)
     return [
-        Jet.of(
-            jets.Jet(
-                *(part[..., j] if part is batch.B else part[j] for part in parts), batch.units, *y[j], batch.lip[j]
-            )
-        )
-        for j in range(count)
+        Jet.of(jets.Jet(*(part[j] for part in parts), batch.B[..., j], batch.units, batch.lip[j])) for j in range(count)
     ]
 
 
@@ -155,15 +155,15 @@ def enclose_on_ball(net: Folded, states: Sequence[jets.Jet]) -> jets.Jet:
 
 
 def constant(q: Fraction, U: Any, count: int) -> Jet:
-    return Jet.of(jets.constant(q, family(U), count))
+    return Jet.of(ranges.in_y(jets.constant(q, family(U)), count) if count else jets.constant(q, family(U)))
 
 
 def uncertain(lo: Fraction, hi: Fraction, U: Any, number: int, count: int) -> Jet:
-    return Jet.of(jets.uncertain(lo, hi, family(U), number, count))
+    return Jet.of(ranges.uncertain(lo, hi, family(U), number, count))
 
 
 def between(lo: Fraction, hi: Fraction, U: Any, count: int) -> Jet:
-    return Jet.of(jets.between(lo, hi, family(U), count))
+    return Jet.of(ranges.in_y(ranges.between(lo, hi, family(U)), count))
 
 
 def plain(c: Any, error: Any, a: Any, slack: Any, Q: Any, E: Any, K: Any = None) -> Jet:
@@ -213,6 +213,36 @@ def changed(jet: Jet, **parts: Any) -> Jet:
 def models_of(J: Any, F: Iterable[Jet], units: Units, rest: bool, velocity: Sequence[Any] = ()) -> Models:
     """The models of these jets in the inequality, their errors being sums over these units."""
     return Models(J, [replace(f.model, units=units) for f in F], rest, velocity)
+
+
+def inequality(
+    models: Models,
+    P: fmpq_mat,
+    R: fmpq_mat,
+    by: Multipliers,
+    path: Path | None = None,
+    h: fmpq | None = None,
+    beyond: fmpq | None = None,
+    level: Level | None = None,
+) -> Inequality:
+    """The checker's inequality of models: of a step of length h, whose Gamma is `beyond`, if that is positive."""
+    if path is not None:
+        return tube.inequality(models, P, R, by, path)
+    if not h:
+        return Inequality(models, P, R, by, level)
+    made = OfStep(models, P, R, by, level)
+    made.h, models.beyond = h, beyond or fmpq(0)
+    return made
+
+
+def sides(*parts: Any) -> tuple[fmpq_mat, fmpq_mat]:
+    """The decay and the rest of such an inequality."""
+    return inequality(*parts).sides()
+
+
+def shows(*parts: Any) -> bool:
+    """Whether it holds."""
+    return inequality(*parts).holds
 
 
 def remainders(units: Units) -> Any:

@@ -8,11 +8,11 @@ import numpy as np
 
 from certify.checker.boxes import middle
 from certify.checker.near import Form
-from certify.checker.network import enclose_on_boxes, models
+from certify.checker.network import enclose_on_boxes
 from certify.checker.outer import Beyond, Function
 from certify.checker.ring import Ring
 from certify.checker.taylor import Taylor as Model
-from certify.checker.taylor import constants, upper_bound
+from certify.checker.taylor import constants, models, upper_bound
 from tests.support.plain import Array, Taylor, shown
 
 

@@ -11,7 +11,8 @@ import numpy as np
 from flint import arb
 from numpy.typing import NDArray
 
-from certify.checker import near, network, taylor
+from certify.checker import elementary as rounding
+from certify.checker import near, network, taylor, wiring
 from certify.checker.activations import add as add_activations
 from certify.checker.document import Policy
 from certify.checker.expression import parse
@@ -19,8 +20,10 @@ from certify.checker.functions import FUNCTIONS
 from certify.checker.near import Above, Form, Near
 from certify.checker.networks import Affine, Map, Network, Step
 from certify.checker.outer import Function
+from certify.checker.smooth import add as add_smooth
 
 add_activations()
+add_smooth()
 
 
 if TYPE_CHECKING:
@@ -50,11 +53,11 @@ def sin_cos(y: Array) -> tuple[Any, Any, Any, Any]:
 
 
 def exp(y: Array) -> Pair:
-    return parts(near.exp(Near(y)))
+    return parts(rounding.exp(Near(y)))
 
 
 def atan(y: Array) -> Pair:
-    return parts(near.atan(Near(y)))
+    return parts(rounding.atan(Near(y)))
 
 
 def relax_tanh(centre: Array, radius: Array) -> tuple[Array, Array, Array]:
@@ -187,7 +190,7 @@ def enclose_on_boxes(net: network.Folded, x: Array, x_error: Array) -> tuple[Arr
 def clipped(mid: Array, slopes: Array, error: Array, least: Array, most: Array) -> tuple[Array, Array, Array]:
     """Forms within `error` of numbers, clipped as `enclose_on_boxes` does it."""
     v = form(np.concatenate([mid[:, None], slopes], axis=1), error)
-    cut, slope, gap = network.clipped(Form(v.value), v.range.error, least, most)
+    cut, slope, gap = wiring.clip_forms(Form(v.value), v.range.error, least, most)
     return shown(cut.wider(v.error * slope + gap))
 
 

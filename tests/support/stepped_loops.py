@@ -35,7 +35,7 @@ def fitted(data: Document, edge: float = 0.0, order: int = 1, wider: float = 1e-
     rows = np.stack([np.full(n, TINY), np.full(n, TINY), np.ones(n)])
     try:
         with np.errstate(all="ignore"):
-            local = Local(Case(parse(data)))
+            local = Local.of(Case(parse(data)))
             G = seen(local.G(next(iter(local.case.cells))))
             A, Q, E = (np.array([getattr(g, part) for g in G]) for part in ("a", "Q", "E"))
             sizes = np.linalg.norm((J + float(local.case.c.step) * A).T @ P, axis=0)
