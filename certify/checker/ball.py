@@ -72,7 +72,7 @@ class Ball:
             yield replace(self, cone=cone)
 
     def algebra(self, k: int) -> OnBall:
-        """That of networks, in k symbols."""
+        """The algebra of networks, in k symbols."""
         if self.cone is None:
             return OnBall(k)
         from .kinks import OnCone

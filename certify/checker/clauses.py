@@ -63,7 +63,7 @@ def claim(c: Certificate) -> list[str]:
 
 
 def besides(c: Certificate) -> list[str]:
-    """What else the claim is about, line by line."""
+    """The target, the tube's start and the second function, line by line."""
     target = [] if c.target is None else [f"{expression(tree)} <= 0" for tree in c.target.trees]
     return [
         *([f"target: {', '.join(target)}"] if target else []),
@@ -74,7 +74,7 @@ def besides(c: Certificate) -> list[str]:
 
 
 def answers(c: Certificate, tally: Tally) -> dict[str, Any]:
-    """What an answer has more."""
+    """The parts of an answer that only some have."""
     answer, evidence = dict[str, Any](), c.evidence
     if isinstance(evidence, Trusted):
         said = [": ".join(pair) for pair in evidence.queries]

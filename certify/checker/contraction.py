@@ -36,7 +36,7 @@ class Contracted(Ball):
 
     @classmethod
     def of(cls, case: Case, by: Contraction, cone: Cone | None = None) -> Contracted:
-        """That of a certificate, or on a cone of it."""
+        """The ball of a certificate, or a cone of it."""
         if cone is None and by.directions is not None:
             from .kinks import CLOSE
 

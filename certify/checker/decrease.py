@@ -26,13 +26,13 @@ OF_ONE = 16  # the weight of 1 over that of all of d: any positive number would 
 
 
 class More(Protocol):
-    """What only some models have beside the rest, and bounds of it."""
+    """A part that only some models have beside the rest."""
 
     def bound(self, models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:
-        """Of twice its sum with b_i, row i of b, over d or y = (1, d)."""
+        """A bound of twice its sum with b_i, row i of b, over d or y = (1, d)."""
 
     def lengths(self, models: Models, P: fmpq_mat) -> tuple[fmpq, fmpq]:
-        """Of its length in the norm of P, of the part with 1, and of the part with d over ||d||."""
+        """Bounds of its length in the norm of P, of the part with 1, and of the part with d over ||d||."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class Inequality:
         return self.by.joint
 
     def form(self) -> fmpq_mat:
-        """What is of second order in d, or y."""
+        """The terms of second order in d, or y."""
         U, crossed = self.U, self.U.transpose() * self.P * self.Y
         form = U.transpose() * self.R * U + crossed + crossed.transpose()
         if self.level is not None:
@@ -169,8 +169,8 @@ class Inequality:
         return rest
 
     def doubts(self) -> tuple[fmpq, fmpq, fmpq]:
-        """What f's errors and a's slacks contribute to the entry of 1, and to each entry of d, and twice their products
-        of 1 and ||d||, each of which is at most share + ||d||^2 / share."""
+        """The contributions of f's errors and a's slacks to the entry of 1, and to each entry of d, and twice their
+        products of 1 and ||d||, each of which is at most share + ||d||^2 / share."""
         ends = [abs(row[0]) if self.first else fmpq(0) for row in self.b.tolist()]  # of the b_i, what meets f
         of_each = list(zip(ends, self.lengths, self.models.error, self.models.slack, strict=True))
         at_0 = 2 * sum((end * wrong for end, _, wrong, _ in of_each), fmpq(0))

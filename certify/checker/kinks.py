@@ -300,7 +300,7 @@ class Kinks:
         return cls(cone, first, rational(most) if np.isfinite(most) else fmpq(2) ** 1100)
 
     def lengths(self, models: Models, P: fmpq_mat) -> tuple[fmpq, fmpq]:
-        """What a step charges to the errors of f, and to those of A."""
+        """The charges of a step to the errors of f, and to those of A."""
         return fmpq(0), self.length
 
     def bound(self, models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:

@@ -38,7 +38,7 @@ class Local(Ball):
 
     @classmethod
     def of(cls, case: Case, cone: Cone | None = None) -> Local:
-        """That of a certificate, or on a cone of it."""
+        """The ball of a certificate, or a cone of it."""
         kind: type[Local] = cls
         if case.c.step:
             from .stepping import kind_of

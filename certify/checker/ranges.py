@@ -1,4 +1,4 @@
-"""What is uncertain, on a ball: jets that are affine in numbers y_j in [-1, 1], each the same in all jets of a ball,
+"""Uncertain quantities on a ball: jets that are affine in numbers y_j in [-1, 1], each the same in all jets of a ball,
 and the inequality at all y, by its corners."""
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Swayed(Jet):
         return Swayed.of(super().__neg__(), -self.c_y, -self.a_y)
 
     def __mul__(self, other: Jet) -> Swayed:
-        """What is of second order in y is lost."""
+        """The product; terms of second order in y are lost."""
         x, y = self._beside(other)
         v = Jet.__mul__(x, y)
         c, a = v.c.wider(x.sway * y.sway), v.a.wider(x.sway * y.tilt + y.sway * x.tilt)
@@ -140,7 +140,7 @@ def between(lo: Fraction, hi: Fraction, units: Units) -> Jet:
 
 @dataclass(frozen=True)
 class Others:
-    """What numbers y add that have no corners: to Y = (f, A), or at rest to A, (n, 1 + k) or (n, k) each."""
+    """Numbers y that have no corners, by what they add: to Y = (f, A), or at rest to A, (n, 1 + k) or (n, k) each."""
 
     parts: list[fmpq_mat]
 

@@ -68,7 +68,7 @@ class Ring(Moving):
 
     @staticmethod
     def of(case: Case) -> Ring:
-        """Those of a certificate."""
+        """The bounds of a certificate."""
         if not case.c.step:
             return Ring(case)
         from .stepping import StepRing

@@ -155,7 +155,7 @@ class Tally:
 
     @property
     def margins(self) -> dict[str, float | None]:
-        """Those of the rules, by name."""
+        """The margins of the rules, by name."""
         return {"local": self.local_margin, "ring": self.ring_margin, "outer": self.outer_margin}
 
     def hold(self, table: Table[Subject], subject: Subject) -> None:

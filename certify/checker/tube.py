@@ -167,7 +167,7 @@ def are_all_usable(by: Multipliers, path: Path | None) -> bool:
 
 
 def inequality(models: Models, P: fmpq_mat, R: fmpq_mat, by: Multipliers, path: Path | None) -> Inequality:
-    """What is asked of models."""
+    """The inequality that is asked of models."""
     if path is None:
         return Inequality(models, P, R, by)
     made = AlongPath(models, P, R, by)

@@ -106,7 +106,7 @@ def stated(c: Certificate) -> list[str]:
 
 
 def _besides(c: Certificate) -> list[str]:
-    """What else the claim is about."""
+    """The other things that the claim is about."""
     if not has_more(c):
         return []
     from . import clauses
