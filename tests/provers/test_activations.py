@@ -7,15 +7,15 @@ import math
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from certify import certify_roa
-from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
-from certify.analysis.suggested import by_centring
+from certify.certificates.checking import Program, run_checker
 from certify.certificates.claims.conditions import conditions
 from certify.certificates.claims.queries import query
 from certify.certificates.coq.data import read_claim
@@ -27,7 +27,6 @@ from certify.checker.functions import FUNCTIONS
 from certify.checker.near import Above, Form
 from certify.checker.network import enclose_on_boxes, fold
 from certify.checker.smooth import add as add_smooth
-from certify.effort import UNLIMITED
 from certify.errors import CertificateFormatError, InputError
 from certify.loop.activations import ACTIVATIONS
 from certify.loop.closed_loop import ClosedLoop
@@ -232,7 +231,8 @@ def test_a_corner_with_a_tangent_at_the_operating_point_is_proved(name: str, tmp
     result = certify_roa(PLANT, without_biases(name), tmp_path, effort=0.3, candidate="ellipsoid")
     assert result.verdict is Verdict.PROVED and result.claim == "asymptotic" and result.levels.floor is None
     assert result.volume is not None and result.volume > 10
-    for program in ("checker", "reference"):
+    programs: tuple[Program, ...] = ("checker", "reference")
+    for program in programs:
         assert run_checker(tmp_path / "certificate.json", program=program)["result"] == "ACCEPTED"
 
 

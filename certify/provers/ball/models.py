@@ -489,7 +489,7 @@ def _require_small(network: Network, k: int) -> None:
 
 
 def meets_corner(known: Paths) -> bool:
-    """True if a relu has its corner at the paths' middle itself, where no ball around that has a model: *kinks* have."""
+    """True if a relu has its corner at the paths' middle itself: around that *kinks* alone have models."""
     relus = (step for step in known.network.steps if isinstance(step, Map) and step.function == "relu")
     return any(np.any(np.abs(known.vectors[step.of[0]].y) <= _AT_CORNER) for step in relus)
 
