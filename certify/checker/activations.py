@@ -122,7 +122,7 @@ class _Bent(Function):
     def bend(self, v0: Near) -> Above:
         """phi(v) is within this times (v - v0)^2 of the tangent at v0, for all v, as |phi'(v) - phi'(v0)| is at most
         2 half |v - v0|; NaN where there may be no tangent."""
-        return self.half + 0 * v0.value
+        return self.half + Above(0 * v0.value)
 
     def leap(self, v0: Near) -> Above:
         """phi'(v) is within this times |v - v0|^3 of phi'(v0), for all v."""
