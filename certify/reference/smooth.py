@@ -200,8 +200,8 @@ class Cornered(BySeries):
         return [UNKNOWN] * count
 
     def derivatives(self, y: arb) -> Four:
-        """Where y may be 0 and phi' has no leap, what stands for phi'' has all chord slopes of phi' and, by 2, all that
-        phi is from its tangents by D^2: a third derivative is 0 beside it."""
+        """By series, but where y may be 0 and phi' has no leap. There the ball for phi'' has all chord slopes of phi',
+        half of it all that phi is from its tangents by D^2, and the third derivative is 0 beside it."""
         if self.bend is None or y > 0 or y < 0:
             return super().derivatives(y)
         return self.value(y), ONE.union(coefficients(self.left, -top(y), 2)[1]), 2 * self.bend * SPREAD, ZERO

@@ -559,7 +559,7 @@ def test_kinks_without_a_leap_have_no_constant(function: str, time: str) -> None
 
 
 @PROGRAMS
-@pytest.mark.parametrize("function", ["relu", "abs", "softplus"])
+@pytest.mark.parametrize("function", ["relu", "abs", "elu", "softsign", "softplus"])
 def test_a_function_with_a_kink_has_no_derivative(function: str, program: Callable[[bytes], str | None]) -> None:
     """N = x^2 + phi(4 (x - 3/2))/8 falls on both sides of 3/2, which is a corner of leaves, and has none of its own."""
     data = newer(earlier_attacks.odd_loop())
