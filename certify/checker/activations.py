@@ -120,8 +120,9 @@ class _Bent(Function):
     half: Above  # bounds |phi''|/2, and |phi'(v) - phi'(w)| / (2 |v - w|) across 0
 
     def bend(self, v0: Near) -> Above:
-        """phi(v) is within this times (v - v0)^2 of the tangent at v0, for all v; NaN where v0 may be 0."""
-        return self.half + _no_more(v0)
+        """phi(v) is within this times (v - v0)^2 of the tangent at v0, for all v, as |phi'(v) - phi'(v0)| is at most
+        2 half |v - v0|; NaN where there may be no tangent."""
+        return self.half + Above(0 * v0.value)
 
     def leap(self, v0: Near) -> Above:
         """phi'(v) is within this times |v - v0|^3 of phi'(v0), for all v."""
@@ -257,7 +258,7 @@ class _Corner(Expansion):
 
     @cached_property
     def f(self) -> Four:
-        c, known = Near(self.v0.value), _no_more(self.v0)
+        c, known = Near(self.v0.value), Above(0 * self.phi.bend(self.v0).top)
         three = self.phi.at(c)
         each = zip((*three, self.phi.sixth(c, three)), self.phi.slopes(self.v0), strict=True)
         f0, f1, f2, f3 = (v.wider(self.v0.error * steep + known) for v, steep in each)

@@ -95,13 +95,14 @@ class Swayed(Jet):
         """phi(v).
 
         With delta = v(0) - c, phi(v(0)) is phi(c) + phi'(c) delta within sup|phi''|/2 delta^2, and phi'(v(0)) is
-        phi'(c) + phi''(c) delta within sup|phi'''|/2 delta^2, the suprema over all that v(0) may be.
+        phi'(c) + phi''(c) delta within sup|phi'''|/2 delta^2, the suprema over all that v(0) may be; NaN where phi'
+        has no derivative among these.
         """
         f0, f1, half, _ = FUNCTIONS[name].expansion(Near(self.c.value), ZERO).f
-        _, _, bent, twisted = (f.size for f in FUNCTIONS[name].expansion(self.v0, ZERO).f)
+        _, bent, twisted = (f.size for f in FUNCTIONS[name].expansion(self.v0, ZERO).derivative.stored)
         off, twice = self.v0.error, half * 2
-        c = f0.wider(f1.size * self.c.error + bent * (off * off))
-        moved = f1.wider(twice.size * self.c.error + twisted * (off * off) * 3)  # phi' at y = 0
+        c = f0.wider(f1.size * self.c.error + bent * (off * off) * 0.5)
+        moved = f1.wider(twice.size * self.c.error + twisted * (off * off))  # phi' at y = 0
         by_y = twice.size * self.sway
         a = (self.a * moved).wider(by_y * (self.a.error + self.tilt))
         v = replaced(super().function(name), c, a)

@@ -106,7 +106,12 @@ def expansion(v: Model, name: str) -> Expansion:
     corner = row.corner(anywhere)
     if corner is None:
         raise Refused("local", "ball", row.undefined)
-    return Expansion(series, moved, corner[0] / (v.radius * v.radius), corner[1], cut=True)
+    if not (anywhere > 0 or anywhere < 0):  # one ball has the second derivatives of all v(0), on both sides
+        series, moved = (value, first, there[2] / 2, there[3]), (*moved[:2], ZERO, ZERO)
+    far = arb(v.radius.abs_upper())
+    if far.is_zero():
+        return Expansion(series, moved, ZERO, ZERO, cut=True)
+    return Expansion(series, moved, corner[0] / (far * far), corner[1], cut=True)
 
 
 def beyond_tangent(v: Model, phi: Expansion) -> Beyond:

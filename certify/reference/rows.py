@@ -60,7 +60,7 @@ class Function(ABC):
 
     def corner(self, y: arb) -> tuple[arb, arb] | None:
         """Bounds for a phi with a corner: it is within the first times D^2 of its tangent at y, and phi' within the
-        second, which may be infinite, times |D|^3 of phi'(y). None if y may be the corner, or there is none."""
+        second, which may be infinite, times |D|^3 of phi'(y). None without a corner, and if phi may have no tangent."""
         return None
 
     def line(self, middle: arb, reach: arb) -> Line | None:

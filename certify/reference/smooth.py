@@ -164,7 +164,10 @@ class Bumpy(Smooth):
 
 
 class Cornered(BySeries):
-    """A function that is smooth but at 0, by two formulas. |phi^(k)| never rises with |y|, for k >= 1."""
+    """A function that is smooth but at 0, by two formulas. |phi^(k)| never rises with |y|, for k >= 1.
+
+    With `bend` phi' has no leap, rises by at most 2 bend by unit, and is 1 at 0.
+    """
 
     cornered = True
 
@@ -196,6 +199,13 @@ class Cornered(BySeries):
             return coefficients(self.right if y > 0 else self.left, y, count)
         return [UNKNOWN] * count
 
+    def derivatives(self, y: arb) -> Four:
+        """By series, but where y may be 0 and phi' has no leap. There the ball for phi'' has all chord slopes of phi',
+        half of it all that phi is from its tangents by D^2, and the third derivative is 0 beside it."""
+        if self.bend is None or y > 0 or y < 0:
+            return super().derivatives(y)
+        return self.value(y), ONE.union(coefficients(self.left, -top(y), 2)[1]), 2 * self.bend * SPREAD, ZERO
+
     def largest(self, k: int, y: arb, reach: arb = ZERO) -> arb:
         size = arb((arb(y.abs_lower()) - reach).lower())
         if not size > 0:
@@ -205,10 +215,10 @@ class Cornered(BySeries):
     def corner(self, y: arb) -> tuple[arb, arb] | None:
         """`bend` where phi' has no leap. Where it leaps from the least slope to 1, a number beyond the corner is at
         least |y| away, and x - y <= x^2 / (4 y)."""
+        if self.bend is not None:
+            return self.bend, arb("inf")
         least, leap = arb(y.abs_lower()), ONE - self.slopes[0]
-        if not least > 0:
-            return None
-        return (leap / (4 * least), leap / least**3) if self.bend is None else (self.bend, arb("inf"))
+        return (leap / (4 * least), leap / least**3) if least > 0 else None
 
     def third(self, y: arb, at: Four, reach: arb) -> arb | None:
         return self.near(3, y, reach)

@@ -480,7 +480,7 @@ def test_a_kink_off_the_middle_limits_a_ball(name: str, program: Callable[[bytes
 
 
 @PROGRAMS
-@pytest.mark.parametrize("function", [*CORNERED, "abs"])
+@pytest.mark.parametrize("function", ["relu", "abs"])
 def test_a_kink_in_the_middle_has_no_model(function: str, program: Callable[[bytes], str | None]) -> None:
     """Also where it would do no harm, or its factor is 0, or the argument only touches 0."""
     phi = ["abs", "x"] if function == "abs" else F
@@ -559,7 +559,7 @@ def test_kinks_without_a_leap_have_no_constant(function: str, time: str) -> None
 
 
 @PROGRAMS
-@pytest.mark.parametrize("function", ["relu", "abs", "softplus"])
+@pytest.mark.parametrize("function", ["relu", "abs", "elu", "softsign", "softplus"])
 def test_a_function_with_a_kink_has_no_derivative(function: str, program: Callable[[bytes], str | None]) -> None:
     """N = x^2 + phi(4 (x - 3/2))/8 falls on both sides of 3/2, which is a corner of leaves, and has none of its own."""
     data = newer(earlier_attacks.odd_loop())

@@ -7,15 +7,15 @@ import math
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from certify import certify_roa
-from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
-from certify.analysis.suggested import by_centring
+from certify.certificates.checking import Program, run_checker
 from certify.certificates.claims.conditions import conditions
 from certify.certificates.claims.queries import query
 from certify.certificates.coq.data import read_claim
@@ -27,7 +27,6 @@ from certify.checker.functions import FUNCTIONS
 from certify.checker.near import Above, Form
 from certify.checker.network import enclose_on_boxes, fold
 from certify.checker.smooth import add as add_smooth
-from certify.effort import UNLIMITED
 from certify.errors import CertificateFormatError, InputError
 from certify.loop.activations import ACTIVATIONS
 from certify.loop.closed_loop import ClosedLoop
@@ -38,7 +37,7 @@ from certify.loop.policies.exact import at_origin
 from certify.loop.rigorous import evaluate_policy
 from certify.lyapunov import domain_limit
 from certify.provers.ball.local import prove_local
-from certify.provers.ball.models import corner_of, paths
+from certify.provers.ball.models import meets_corner, paths
 from certify.provers.bounds.lines import LINES
 from certify.provers.bounds.policy import policy_enclosure
 from tests.provers.test_models import beyond
@@ -221,35 +220,32 @@ def free_of_biases(law: PolicyNetwork, units: int) -> PolicyNetwork:
     return law.with_layers(biases=(first, *law.biases[1:]))
 
 
-def test_a_corner_at_the_operating_point_proves_nothing_but_of_relu() -> None:
-    case = case_of(PLANT, free_of_biases(policy("elu"), 1))
-    assert prove_local(case.problem, case.T, domain_limit(case.P, PLANT.domain)) is None
-    result = certify_roa(PLANT, case.loop.network, claim="asymptotic", effort=0.1)
-    assert result.verdict is Verdict.UNKNOWN and "a unit of elu has its corner at the operating point" in result.reason
-    assert "--claim practical" in result.reason
+def without_biases(name: str) -> PolicyNetwork:
+    """Every unit of the policy at its corner at the origin."""
+    law = policy(name)
+    return replace(law.with_layers(biases=tuple(0 * b for b in law.biases)), centre="none")
 
 
 @pytest.mark.parametrize("name", ["elu", "softsign"])
-def test_with_such_a_corner_the_claim_is_the_weaker_one(name: str) -> None:
-    """V is shown to fall from all of the set to next to the corner, where nothing is known."""
-    law = policy(name)
-    law = replace(law.with_layers(biases=tuple(0 * b for b in law.biases)), centre="none")
-    result = certify_roa(PLANT, law, effort=0.3, candidate="ellipsoid")
-    assert result.verdict is Verdict.PROVED and result.claim == "practical" and result.levels.floor is not None
-    assert result.levels.floor < 1e-9 and result.volume is not None and result.volume > 10
-    assert by_centring(result, RoaOptions(), (PLANT, law), UNLIMITED) is None  # pi(0) is u_eq as it is
+def test_a_corner_with_a_tangent_at_the_operating_point_is_proved(name: str, tmp_path: Path) -> None:
+    result = certify_roa(PLANT, without_biases(name), tmp_path, effort=0.3, candidate="ellipsoid")
+    assert result.verdict is Verdict.PROVED and result.claim == "asymptotic" and result.levels.floor is None
+    assert result.volume is not None and result.volume > 10
+    programs: tuple[Program, ...] = ("checker", "reference")
+    for program in programs:
+        assert run_checker(tmp_path / "certificate.json", program=program)["result"] == "ACCEPTED"
 
 
-def test_a_corner_of_elu_beside_one_of_relu_has_no_model() -> None:
-    """As in selu, which is a sum of both: directions resolve the relu, and not the elu."""
+def test_a_corner_of_elu_beside_one_of_relu_has_directions_for_the_relu() -> None:
+    """As in selu, which is a sum of both."""
     law = free_of_biases(policy("elu"), 1)
     first, middle, end = (Affine((of,), law.weights[k], law.biases[k]) for k, of in ((0, 0), (1, 4), (2, 6)))
     units = Map((1,), "elu"), Map((1,), "relu"), Sum((2, 3))
     net = Network(2, (first, *units, middle, Map((5,), "elu"), end))
-    both = PolicyNetwork(net, law.scale, law.offset, law.squash, law.centre)
-    case = case_of(PLANT, both)
-    assert corner_of(paths(case.loop)) == "elu"
-    assert prove_local(case.problem, case.T, domain_limit(case.P, PLANT.domain)) is None
+    case = case_of(PLANT, PolicyNetwork(net, law.scale, law.offset, law.squash, law.centre))
+    assert meets_corner(paths(case.loop))
+    result = certify_roa(PLANT, case.loop.network, effort=0.1, candidate="ellipsoid")
+    assert result.verdict is Verdict.PROVED and result.claim == "asymptotic"
 
 
 def test_a_relu_with_its_corner_at_the_operating_point_has_directions(tmp_path: Any) -> None:

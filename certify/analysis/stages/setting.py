@@ -24,7 +24,6 @@ from certify.errors import InputError, OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.equilibrium import Rest, find_rest, seen_from
 from certify.loop.plants import Measurements
-from certify.provers.ball.models import corner_of, paths
 
 
 @dataclass(frozen=True)
@@ -142,8 +141,6 @@ def _kind_of(loop: ClosedLoop, options: RoaOptions) -> tuple[Kind, str | None]:
         if options.claim == "asymptotic":
             raise
         return "practical", str(error).split(". ")[0].rstrip(".")
-    if options.claim == "auto" and not loop.network.is_moved and (name := corner_of(paths(loop))) not in (None, "relu"):
-        return "practical", f"a unit of {name} has its corner at the operating point, around which it has no model"
     return "asymptotic", None
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from certify.loop.plants.system import Interval
 from certify.provers.ball.decrease import corners_of
-from certify.provers.ball.models import corner_of
+from certify.provers.ball.models import meets_corner
 from certify.provers.ball.steps import Cell, Steps
 
 Array = NDArray[np.float64]
@@ -43,7 +43,7 @@ def cuts_for(steps: Steps, J: Array, P: Array, R: Array | None) -> tuple[int, ..
     """
     ranges = list(steps.known.loop.system.ranges.values())
     cuts, tiny = (1,) * len(ranges), J * 1e-6
-    if steps.is_plain or corner_of(steps.known) is not None:  # a look at the origin saves less than it takes
+    if steps.is_plain or meets_corner(steps.known):  # a look at the origin saves less than it takes
         return cuts
     left = _left(steps, tiny, P, R, cuts)
     if left is None:

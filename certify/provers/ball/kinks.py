@@ -226,9 +226,7 @@ class OnCone(Algebra[Vector]):
         L, E, tilt = self.reached(v)
         plain = sizes(v.G, v.Q, v.K, E)
         size = replace(plain, slope=plain.slope + tilt)
-        at, (y, slope, second, third, fourth) = v.y, step.phi.around(v.y, size.radius)
-        if not step.phi.is_smooth:  # at its corner itself the checker has no tangent
-            fourth = np.where(np.abs(at) <= _NONE, np.nan, fourth)
+        y, slope, second, third, fourth = step.phi.around(v.y, size.radius)
         squares = self.form.square(v.G)
         H, C = beyond_tangent(v.G, squares, v.Q, v.K, second, third)
         h, g, m = np.abs(second), np.abs(third), fourth * size.radius**2

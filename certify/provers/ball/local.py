@@ -29,7 +29,7 @@ from certify.provers.ball.decrease import (
     rests_of,
 )
 from certify.provers.ball.kinks import ALL, Cone, Directions, has_kinks, is_left
-from certify.provers.ball.models import AT_CORNERS, Models, Paths, corner_of, paths
+from certify.provers.ball.models import AT_CORNERS, Models, Paths, meets_corner, paths
 from certify.provers.ball.steps import Cell, Steps, steps_of
 from certify.provers.base import FEW
 
@@ -345,7 +345,7 @@ class Rule:
         known = self.steps.known
         if not has_kinks(known.network):
             return None
-        if corner_of(known) is not None:
+        if meets_corner(known):
             level = _TINY * domain_limit(self.problem.V.P, self.problem.loop.system.domain)
         found = self.directions_at(level, effort)
         return None if found is None else replace(self, directions=found)

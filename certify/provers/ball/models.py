@@ -331,7 +331,7 @@ class _OnBall(Algebra[_Part]):
         G, _, E = self._reached(v)
         size = sizes(G, v.Q, v.K, E)
         _, slope, second, third, fourth = step.phi.around(v.at.y, size.radius)
-        if not step.phi.is_smooth:  # at its corner itself the checker has no tangent
+        if step.function == "relu":  # at its corner itself there is no tangent
             fourth = np.where(np.abs(v.at.y) <= _AT_CORNER, np.nan, fourth)
         squares = self.form.square(G)
         H, cubic = beyond_tangent(G, squares, v.Q, v.K, second, third)
@@ -488,19 +488,10 @@ def _require_small(network: Network, k: int) -> None:
             raise InputError("The network is too large for the local proof: use fewer or narrower layers.")
 
 
-def corner_of(known: Paths) -> str | None:
-    """The activation with a corner at the paths' middle itself, where no ball around that has a model; or None.
-
-    It is relu, which *kinks* have models of, only if there is no other.
-    """
-    found = {
-        step.function
-        for step in known.network.steps
-        if isinstance(step, Map)
-        and not step.phi.is_smooth
-        and np.any(np.abs(known.vectors[step.of[0]].y) <= _AT_CORNER)
-    }
-    return min(found, key=lambda name: (name == "relu", name), default=None)
+def meets_corner(known: Paths) -> bool:
+    """True if a relu has its corner at the paths' middle itself: around that *kinks* alone have models."""
+    relus = (step for step in known.network.steps if isinstance(step, Map) and step.function == "relu")
+    return any(np.any(np.abs(known.vectors[step.of[0]].y) <= _AT_CORNER) for step in relus)
 
 
 def _room(loop: ClosedLoop, u: Array) -> Array:

@@ -16,7 +16,7 @@ from certify.certificates.verdict import Stop
 from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
 from certify.provers.ball.local import local_ball, prove_band, prove_local
-from certify.provers.ball.models import corner_of, paths
+from certify.provers.ball.models import meets_corner, paths
 from certify.provers.base import FEW, Attempt, Budget, Engine, Once, Proof, Report, SearchState, Task
 from certify.provers.boxes.search import Pass, RingProof, empty_ring, outwards, prove_inwards, prove_outwards
 from certify.provers.execution import Runner
@@ -233,16 +233,11 @@ class _Outwards:
         if self.inner is None:
             smaller = ", or a smaller --rate" if self.task.problem.rate else ""
             why = f"the linearisation does not dominate on any ball; try another --Q{smaller}"
-            if (name := corner_of(paths(self.task.problem.loop))) is not None:
+            if meets_corner(paths(self.task.problem.loop)):
                 why = (
-                    f"a unit of {name} has its corner at the operating point, around which it has no model; "
-                    "--claim practical needs none"
+                    "a unit of relu has its corner at the operating point, and V is not shown to fall in all "
+                    "directions there; try another P, or --claim practical"
                 )
-                if name == "relu":
-                    why = (
-                        "a unit of relu has its corner at the operating point, and V is not shown to fall in all "
-                        "directions there; try another P, or --claim practical"
-                    )
             return Proof(None, None, Stop.LOCAL, why, seconds=self.seconds)
         if self.ring is None:
             ring = empty_ring(self.task.problem, self.engine.T, self.inner)
