@@ -342,12 +342,15 @@ class Uncopied(Scaled):
         (Sneaky(small(), 1.0), "must agree with the framework's own evaluation"),
         (Pair(small(), 1.0), "the module Pair"),
         (Uncopied(small(), 1.0), "no copies"),
-        (torch.nn.Sequential(torch.nn.Linear(2, 3), torch.nn.PReLU(), torch.nn.Linear(3, 1)), "the module Sequential"),
+        (
+            torch.nn.Sequential(torch.nn.Linear(2, 3), torch.nn.Softshrink(), torch.nn.Linear(3, 1)),
+            "the module Sequential",
+        ),
         (torch.nn.Linear(3, 1), "cannot be copied and traced"),
         (torch.nn.LSTM(2, 1), "the module LSTM"),
-        (torch.nn.Sequential(torch.nn.Linear(2, 1), torch.nn.Dropout()).append(torch.nn.Sigmoid()), "Sequential"),
+        (torch.nn.Sequential(torch.nn.Linear(2, 4), torch.nn.Softmax(1), torch.nn.Linear(4, 1)), "Sequential"),
     ],
-    ids=["branch", "later", "pair", "copy", "prelu", "states", "lstm", "sigmoid"],
+    ids=["branch", "later", "pair", "copy", "softshrink", "states", "lstm", "softmax"],
 )
 def test_modules_that_are_no_chain_of_layers_are_refused(module: torch.nn.Module, said: str) -> None:
     with pytest.raises(InputError, match=said):
