@@ -31,7 +31,6 @@ UNKNOWN = (
     "1/",
     "",
 )
-KINKED = ("relu", "elu", "softsign")
 
 
 def place(data: Document, kind: str) -> int:
@@ -194,12 +193,11 @@ def of_loops(name: str, form: str) -> Iterator[Forgery]:
     asleep = hashed(array(data, first, "bias", lambda a: a - 12.0))
     if form != "clip" and unstable(asleep):
         yield "local", "all units asleep", asleep
-    if name in KINKED and form != "clip":
+    if name == "relu" and form != "clip":
         yield "inputs", "kinks in the ball's middle", hashed(array(data, first, "bias", lambda a: 0 * a))
-        if name == "relu":
-            near = hashed(array(data, first, "bias", lambda a: a * 0 - 2.0**-10))
-            if unstable(near):
-                yield "local", "kinks beside the ball's middle", near
+        near = hashed(array(data, first, "bias", lambda a: a * 0 - 2.0**-10))
+        if unstable(near):
+            yield "local", "kinks beside the ball's middle", near
     if form == "clip":
         k = place(data, "clip")
         phi = FUNCTIONS[name](biases(name))
