@@ -239,7 +239,7 @@ def test_constants_are_exact() -> None:
 
 
 def test_files_of_numbers(tmp_path: Path) -> None:
-    """Arrays of numpy, a module that was pickled whole, and layers without numbers are read as a state_dict is."""
+    """Arrays of numpy, and layers without numbers, are read as a state_dict is, a pickled module is not."""
     policy = Policy("", nn.ReLU()).eval()
     net = nn.Sequential(policy.first, nn.ReLU(), policy.last)
     names = {"fc1": policy.first, "mean": policy.last}
@@ -253,12 +253,13 @@ def test_files_of_numbers(tmp_path: Path) -> None:
     }
     np.savez(tmp_path / "flax.npz", **flax)
     for name, prefix in (
-        ("whole.pt", None),
         ("arrays.npz", None),
         ("plain.pt", "fc1,mean"),
         ("flax.npz", "params.fc1,params.mean"),
     ):
         agree(import_policy(tmp_path / name, PLANT, replace(LAYERS, prefix=prefix)).policy, net)
+    with pytest.raises(InputError, match=r"is a module that was pickled whole.* traced"):
+        import_policy(tmp_path / "whole.pt", PLANT, LAYERS)
     with pytest.raises(InputError, match=r"fc1 \(2 to 6\), mean \(6 to 1\).*--prefix fc1,fc2,fc3"):
         import_policy(tmp_path / "plain.pt", PLANT, LAYERS)
     with pytest.raises(InputError, match=r"name each layer once.*fc1 \(2 to 6\)"):
@@ -266,3 +267,60 @@ def test_files_of_numbers(tmp_path: Path) -> None:
     np.savez(tmp_path / "objects.npz", a=np.array([{}], dtype=object))
     with pytest.raises(InputError, match="no plain array"):
         import_policy(tmp_path / "objects.npz", PLANT, LAYERS)
+
+
+class Shared(nn.Module):  # type: ignore[misc]
+    """Memory that is written in one place and read in another, or numbers that a conversion rounds."""
+
+    def __init__(self, kind: str) -> None:
+        super().__init__()
+        torch.manual_seed(5)
+        self.kind = kind
+        self.a, self.b = nn.Linear(2, 6), nn.Linear(3 if kind == "whole" else 6, 1)
+        self.register_buffer("whole", torch.zeros(6, dtype=torch.int64))
+        self.register_buffer("short", torch.zeros(6, dtype=torch.float16))
+        self.register_buffer("plain", torch.ones(6))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        h = self.a(x)
+        if self.kind == "part":
+            h[:, :3].tanh_()
+        elif self.kind == "whole":
+            p = h[:, :3]
+            h.tanh_()
+            h = p
+        elif self.kind == "constant":
+            h = h * self.plain.mul_(0.5) + self.plain
+        elif self.kind == "integers":
+            h = h.type_as(self.whole).float()
+        elif self.kind == "half":
+            h = h.type_as(self.short).float()
+        result: torch.Tensor = self.b(h)
+        return result
+
+
+@pytest.mark.parametrize("how", ["trace", "script"])
+@pytest.mark.parametrize("kind", ["part", "whole", "constant", "integers", "half"])
+def test_what_is_written_elsewhere_or_rounded_is_refused(kind: str, how: str, tmp_path: Path) -> None:
+    """A reading of values alone would take what is no longer there, and so would the comparison with it."""
+    path = saved(Shared(kind).eval(), how, tmp_path / "p.pt")
+    with pytest.raises(InputError, match=r"overwrit|of constants alone|conversion to float32 or float64"):
+        import_policy(path, PLANT, SAID)
+
+
+class FromThird(nn.Module):  # type: ignore[misc]
+    """The entries from the third on, which a script writes without their end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(6)
+        self.a, self.b = nn.Linear(2, 6), nn.Linear(3, 1)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        result: torch.Tensor = self.b(torch.tanh(self.a(x))[:, 3:])
+        return result
+
+
+def test_a_part_without_an_end_is_read(tmp_path: Path) -> None:
+    module = FromThird().eval()
+    agree(import_policy(saved(module, "script", tmp_path / "p.pt"), PLANT, SAID).policy, module)

@@ -56,6 +56,8 @@ ADVICE: Mapping[str, str] = {
 }
 """The next step where an operation is not read, by its name."""
 _EVALUATED = "Call model.eval() before you save it."
+PARTS = ("chunk", "split", "slice", "narrow", "split_with_sizes")
+"""Operations whose results share their memory with what they are parts of."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +127,7 @@ def operation(name: str, given: list[Any], approximate: str | None, wide: int, a
         raise InputError(f"{at} reads a square root, which may only divide a value, as in a normalisation.")
     if (result := _unchanged(name, given, wide, at)) is not None:
         return result
-    if name in ("chunk", "split", "slice", "narrow", "split_with_sizes"):
+    if name in PARTS:
         return _parts(name, given, wide, at)
     if name == "cat" and len(given) == 2 and given[1] in (1, -1) and _all_depend(given[0]):
         return Value(graph.joined("concat", *(v.chain for v in given[0])), name, tuple(given[0]))
@@ -179,7 +181,8 @@ def _unchanged(name: str, given: list[Any], wide: int, at: str) -> Value | None:
     if name in ("contiguous", "detach", "clone", "alias") or (name == "flatten" and given[1:] in ([1], [1, -1])):
         return value
     if name in ("to", "type_as", "float", "double"):
-        if name == "to" and (len(given) < 2 or type(given[1]) is not int or given[1] not in _REAL):
+        to = given[1] if len(given) > 1 else None
+        if (name == "to" and (type(to) is not int or to not in _REAL)) or (name == "type_as" and not depends(to)):
             raise InputError(f"{at} must be a conversion to float32 or float64.")
         return value
     if name in ("view", "reshape") and len(given) == 2 and isinstance(given[1], list) and len(given[1]) == 2:
@@ -200,8 +203,8 @@ def _parts(name: str, given: list[Any], wide: int, at: str) -> Any:
     match name, said:
         case "slice", [] | [0] | [0, 0 | None] | [0, 0 | None, None | 9223372036854775807, *_] if said[3:] in ([], [1]):
             return value
-        case "slice", [1 | -1, start, stop, *step] if step in ([], [1]):
-            start, stop = (0 if start is None else start), (width if stop is None else stop)
+        case "slice", [1 | -1, start, *end] if end[1:] in ([], [1]):
+            start, stop = (0 if start is None else start), (width if not end or end[0] is None else end[0])
             return Value(graph.selected(value.chain, width, start, stop, at), name, tuple(given))
         case "narrow", [1 | -1, int(start), int(length)] if start >= 0:
             return Value(graph.selected(value.chain, width, start, start + length, at), name, tuple(given))
@@ -340,7 +343,7 @@ def _of_torch(name: str) -> Callable[..., Any]:
     return lambda torch, *given: getattr(torch, name)(*given)
 
 
-def _sliced(torch: Any, value: Any, axis: int, start: int | None, stop: int | None, *_: int) -> Any:
+def _sliced(torch: Any, value: Any, axis: int, start: int | None, stop: int | None = None, *_: int) -> Any:
     return value[:, start:stop]
 
 

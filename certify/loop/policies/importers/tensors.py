@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -21,17 +20,13 @@ _SAFE = {
 }  # fmt: skip
 
 
-_INSIDE_MODULES = re.compile(r"(?:^|(?<=\.))_(?:modules|parameters|buffers)\.")
-
-
 def load_tensors(raw: bytes, what: str, file: TorchFile | None = None) -> dict[str, Numbers]:
     """The tensors and arrays of a file of torch.save: the keys on the way to one are joined by dots.
 
-    Those of a module that was pickled whole are called as in its state_dict.
-
     Raises
     ------
-    InputError : the file is no archive of torch.save, two tensors have one name, or one cannot be read.
+    InputError : the file is no archive of torch.save, or a module that was pickled whole, whose `forward` is code that
+        the file does not hold; two tensors have one name, or one cannot be read.
     """
     file = file if file is not None else TorchFile(raw, what)
     found: dict[str, Numbers] = {}
@@ -39,7 +34,12 @@ def load_tensors(raw: bytes, what: str, file: TorchFile | None = None) -> dict[s
     while waiting:
         prefix, node = waiting.pop()
         if is_tensor(node) or is_array(node):
-            prefix = _INSIDE_MODULES.sub("", prefix)
+            if prefix.startswith(("_modules.", "_parameters.")):
+                raise InputError(
+                    f"{what} is a module that was pickled whole, and what its forward does with {prefix} is not in the "
+                    "file. Save it traced, torch.jit.trace(model.eval(), torch.zeros(1, n)).save(FILE), or its "
+                    "state_dict, of which you say what stands between the layers."
+                )
             if prefix in found:
                 raise InputError(f"{what} must name each tensor once; {prefix} stands there twice.")
             found[prefix] = file.tensor(node, prefix) if is_tensor(node) else array_of(node, prefix)

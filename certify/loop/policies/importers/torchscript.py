@@ -24,6 +24,7 @@ from certify.loop.policies.importers.operations import (
     ADVICE,
     CENTRED,
     KNOWN,
+    PARTS,
     WITHOUT_WEIGHT_NORM,
     Batch,
     Value,
@@ -58,8 +59,8 @@ _COMPARED: dict[str, Callable[[Any, Any], bool]] = {
 
 @dataclass(frozen=True, slots=True)
 class _Program:
-    """The archive's classes, functions and constants, how many operations were met, and the values that one of them
-    has overwritten."""
+    """The archive's classes, functions and constants, how many operations were met, the values that one of them has
+    overwritten, and those that share their memory with a part or a whole."""
 
     file: TorchFile
     classes: dict[Name, ast.ClassDef]
@@ -68,6 +69,7 @@ class _Program:
     observations: int
     count: list[int] = field(default_factory=lambda: [0])
     overwritten: list[Value] = field(default_factory=list)
+    shared: list[Value] = field(default_factory=list)
 
     def counted(self) -> None:
         """Count an operation or a call."""
@@ -364,6 +366,10 @@ def _operation(program: _Program, name: str, given: list[Any], node: ast.Call) -
     for value in [v for part in given for v in (part if isinstance(part, list) else [part])]:
         _require_kept(program, value)
     if name.removesuffix("_") in _IN_PLACE and name.endswith("_"):
+        if not depends(given[0]) or any(given[0] is value for value in program.shared):
+            raise InputError(
+                f"{at} must not overwrite a constant, a part of a value, or a value of which parts are read."
+            )
         program.overwritten.extend(v for v in given if isinstance(v, Value))
         name = name.removesuffix("_")
     if name in ADVICE:
@@ -376,7 +382,11 @@ def _operation(program: _Program, name: str, given: list[Any], node: ast.Call) -
         # alpha is written out even where it is 1, and then changes nothing
         elif said is not None and (word.arg != "alpha" or said != 1):
             raise InputError(f"{at} has {word.arg}, which is not read.")
-    return operation(name, given, approximate, program.observations, at)
+    made = operation(name, given, approximate, program.observations, at)
+    if name in PARTS:
+        parts = made if isinstance(made, list) else [made]
+        program.shared.extend(v for v in (given[0], *parts) if isinstance(v, Value))
+    return made
 
 
 def _shape(program: _Program, name: str, given: list[Any], at: str) -> Any:
