@@ -19,10 +19,6 @@ class OptionError(InputError):
     them as they are typed there."""
 
 
-class UnstableError(CertifyError):
-    """An eigenvalue enclosure of the closed loop has positive real part (verdict REFUTED)."""
-
-
 class CertificateFormatError(CertifyError, ValueError):
     """A certificate cannot be read."""
 

@@ -1,7 +1,7 @@
 """The nearest corner of a policy's units: relu has one in its values, elu and softsign have one in their slope.
 
-A unit's argument passes 0 there. The local part of a proof ends at the nearest corner, and there is none with a corner
-at the origin.
+A unit's argument passes 0 there. The local part of a proof ends near the nearest corner; one of relu at the origin
+itself leaves the policy without a Jacobian there.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The units of a network in torch: the values and slopes of an activation, and biases that keep its corner away.
 
-relu has a corner at 0, elu and softsign one in their slope. Where a unit's argument at the origin is 0, the policy has
-no Jacobian there, and nothing is proved; where it is nearly 0, little is. So biases begin at a distance from 0, and
-training keeps one.
+relu has a corner at 0, elu and softsign one in their slope. Where the argument of a relu is 0 at the origin, the policy
+has no Jacobian there; where one of these units has its corner nearby, the local part of a proof is small. So biases
+begin at a distance from 0, and training keeps one.
 """
 
 from __future__ import annotations

@@ -56,15 +56,6 @@ def below_leaf(problem: Problem, evidence: PartitionTree, leaf: int) -> float:
     return float(lowest[leaf]) * (1 - _SLACK)
 
 
-def level_with_leaves(problem: Problem, evidence: PartitionTree, claim: Claim, count: int) -> tuple[float, int]:
-    """A level of the ring below which about so many leaves meet it, the whole ring's if there are no more, and how
-    many the checker has to bound for it."""
-    lowest, highest = leaf_levels(problem, evidence)
-    met = np.sort(lowest[(highest >= claim.inner) & (lowest <= claim.roa)])
-    level = claim.roa if len(met) <= count else max(claim.inner, float(met[count]) * (1 - _SLACK))
-    return level, int(np.sum(met <= level))
-
-
 def leaf_levels(problem: Problem, evidence: PartitionTree) -> tuple[Array, Array]:
     """Bounds of V from below and above on the leaves, (N,) each, in the order of the tree."""
     lo, hi = leaves(evidence.tree, evidence.root)

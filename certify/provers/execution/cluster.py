@@ -123,7 +123,7 @@ class ClusterRunner:
         if self._failed or self._refused:
             said.append(
                 f"{self._failed} jobs of the cluster failed and {self._refused} had answers that were refused; they "
-                "were done here. Its workers need the same versions of certify, Python and numpy as this machine"
+                "were done here. Its workers need the same sources of certify and the same numpy as this machine"
             )
         return "; ".join(said) or None
 

@@ -11,12 +11,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
 from certify.certificates.verdict import Stop
-from certify.effort import UNLIMITED
 from certify.provers.base import Budget, Report
 from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.boxes.account import Account
@@ -159,11 +157,6 @@ class Cover:
     def tree(self) -> bytes:
         """The partition in preorder."""
         return self.partition.preorder()
-
-
-def without_end(budget: Budget) -> Budget:
-    """The same budget without an end of its effort."""
-    return replace(budget, effort=UNLIMITED)
 
 
 def count(tree: bytes) -> int:
