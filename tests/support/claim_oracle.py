@@ -810,7 +810,7 @@ def _outside(loop: Loop, T: Array, z: Array, j: int) -> bool:
 
 def _without_multiplier(loop: Loop, T: Array, z: Array, V: Array, vdot: Array, member: int) -> bool:
     """None of the three bounds can be negative: found in binary64, shown in balls."""
-    if not np.nanmax(vdot) >= 0:
+    if not np.fmax.reduce(vdot) >= 0:
         return False
     chosen = {"V": int(np.nanargmax(vdot))}
     for name, gap in (("c2", loop.c2 - V), ("c1", V - loop.c1)):

@@ -281,13 +281,13 @@ def rule_of(found: str) -> str:
     return "faces" if "boundary" in found else "inputs" if "an input" in found else "outer"
 
 
-def constants(tree: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """Places of an expression, and what stands there."""
-    yield path, tree
+def constants(tree: Any, path: str, below: bool = False) -> Iterator[tuple[str, Any, bool]]:
+    """Places of an expression, and what stands there; true in a denominator."""
+    yield path, tree, below
     if isinstance(tree, list):
         for i, part in enumerate(tree[1:], 1):
             if type(part) is not int:
-                yield from constants(part, f"{path}.{i}")
+                yield from constants(part, f"{path}.{i}", below or (tree[0] == "/" and i == 2))
 
 
 NUMBERS = {"-1 times": lambda q: -q, "twice": lambda q: 2 * q, "half": lambda q: q / 2, "plus 1": lambda q: q + 1,
@@ -307,12 +307,12 @@ def of_functions(data: Document) -> Iterator[tuple[str, Edit]]:
                     return a
 
                 yield f"{what} {part} {k}, {i}", array(f"{CLAIM}.layers.{k}.{part}", other)
-    for path, part in constants(outer.get("expression", "0"), f"{CLAIM}.expression"):
+    for path, part, below in constants(outer.get("expression", "0"), f"{CLAIM}.expression"):
         if isinstance(part, str) and part not in states:
             for what, change in NUMBERS.items():
                 yield f"{what} {path}", at(path, str(change(Fraction(part))))
         elif isinstance(part, str):
-            for other_part in (*states, "0", "1", ["-", "1", part], ["*", "1/2", part]):
+            for other_part in (*states, *(() if below else ("0",)), "1", ["-", "1", part], ["*", "1/2", part]):
                 yield f"{other_part} at {path}", at(path, other_part)
         elif part[0] == "**":
             for k in (1, 3, -2):
