@@ -5,6 +5,7 @@ Verdicts rest on `certify.loop.rigorous` and on the checker; the rounded numbers
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -147,13 +148,15 @@ class ClosedLoop:
 
 def _depends(expression: Expression, at_zero: Mapping[Symbol, Fraction], system: System) -> str:
     """The words for an equation that depends on what is uncertain at rest: by its value, or only as it is written."""
+    acting = [(name, ends) for name, ends in system.uncertain if name in symbols_of(expression)]
+    corners = itertools.islice(itertools.product(*(ends for _, ends in acting)), 64)
     try:
         values = [
-            evaluate_exactly(expression, {**at_zero, **{name: ends[side] for name, ends in system.uncertain}})
-            for side in (0, 1)
+            evaluate_exactly(expression, {**at_zero, **dict(zip((name for name, _ in acting), corner, strict=True))})
+            for corner in corners
         ]
     except InputError:
         return "depends on that there"
     if any(values):
         return "depends on that there"
-    return "is 0 there at both ends of the ranges, but its terms cancel only when (a - b)/m is written, not a/m - b/m"
+    return "is 0 there at the ends of the ranges, but its terms cancel only when (a - b)/m is written, not a/m - b/m"

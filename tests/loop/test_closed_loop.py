@@ -125,8 +125,12 @@ def test_terms_that_cancel_only_if_written_so_are_told_from_others(tmp_path: Pat
     for equation in ("-x + (1 + u)/m - 1/m", "-x + (1 + u - 1)/m", "-x + (1 + u)/m - 1"):
         (tmp_path / "p.toml").write_text(text.format(equation))
         loops.append(ClosedLoop(load_system(tmp_path / "p.toml"), scalar_tanh()[1]))
-    with pytest.raises(InputError, match=r"x' is 0 there at both ends of the ranges, but its terms cancel only"):
+    with pytest.raises(InputError, match=r"x' is 0 there at the ends of the ranges, but its terms cancel only"):
         loops[0].require_rest()
     loops[1].require_rest()
     with pytest.raises(InputError, match="x' depends on that there"):
         loops[2].require_rest()
+    both = text.replace("m = [1, 2]", "m = [1, 2]\nk = [1, 2]").format("-x + u + m - k")  # 0 where they are equal
+    (tmp_path / "p.toml").write_text(both)
+    with pytest.raises(InputError, match="x' depends on that there"):
+        ClosedLoop(load_system(tmp_path / "p.toml"), scalar_tanh()[1]).require_rest()

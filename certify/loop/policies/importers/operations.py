@@ -161,7 +161,8 @@ def _constant(name: str, given: list[Any], at: str) -> Any:
     exact = tuple(v.constant if isinstance(v, Value) else v for v in given)
     made = computed(name, exact, at) if all(is_constant(v) for v in exact) else None
     if made is None:
-        raise InputError(f"{at} is not read of constants alone. Save the policy with the result as a buffer. {CENTRED}")
+        centred = f" {CENTRED}" if name in ("linear", "addmm", "matmul", "mm") else ""
+        raise InputError(f"{at} is not read of constants alone. Save the policy with the result as a buffer.{centred}")
     if all(isinstance(v, int) for v in given) and name in ("add", "sub", "mul", "neg"):
         return int(made.item())
     if all(isinstance(v, int | float) for v in given) and name not in ("sqrt", "rsqrt", "pow"):
