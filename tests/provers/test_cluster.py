@@ -87,7 +87,7 @@ def test_answers_are_bytes_and_the_rest_is_none(local: ClusterRunner, capfd: pyt
         assert found == {n: None if job in (b"fail", b"wrong", b"number") else job for n, job in given.items()}
         assert answers(jobs, 1, 0.5) == {} and jobs.places == 2 and jobs.failed == 3
     assert (
-        local.remark is not None and "3 jobs of the cluster failed" in local.remark and "same versions" in local.remark
+        local.remark is not None and "3 jobs of the cluster failed" in local.remark and "same sources" in local.remark
     )
     assert capfd.readouterr() == ("", "")
 
@@ -251,7 +251,7 @@ def test_a_worker_with_another_version_of_the_code_is_of_no_harm(tmp_path: Path)
             wait_for(lambda: jobs.places == 1)
         found = prove_outwards(case.problem, case.T, 2.5e-4, 1e-3, budget, runner)
         assert found.tree == expected.tree
-        assert runner.remark is not None and "failed" in runner.remark and "same versions" in runner.remark
+        assert runner.remark is not None and "failed" in runner.remark and "same sources" in runner.remark
 
 
 # ------------------------------------------------------------------------------------------------------- whole commands
