@@ -469,14 +469,18 @@ OF_ONE_STATE: dict[str, tuple[Claim, float, float]] = {  # up to which r it is t
 }  # fmt: skip
 
 
+def is_limited(program: Callable[[bytes], str | None], claim: Claim, limit: float, share: float) -> None:
+    """A share of the limit up to which a claim is true is accepted, and nothing beyond the limit."""
+    assert program(claim(share * limit)) is None
+    for r in (1.001, 1.01, 1.1, 1.5, 3.0):
+        assert program(claim(r * limit)) == "local"
+
+
 @PROGRAMS
 @pytest.mark.parametrize("name", OF_ONE_STATE)
 def test_a_kink_off_the_middle_limits_a_ball(name: str, program: Callable[[bytes], str | None]) -> None:
     """The tangent alone would show any level: what lies beyond the kink turns outwards, or overshoots."""
-    claim, limit, share = OF_ONE_STATE[name]
-    assert program(claim(share * limit)) is None
-    for r in (1.001, 1.01, 1.1, 1.5, 3.0):
-        assert program(claim(r * limit)) == "local"
+    is_limited(program, *OF_ONE_STATE[name])
 
 
 @PROGRAMS

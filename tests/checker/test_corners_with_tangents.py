@@ -28,6 +28,7 @@ from certify.checker.ranges import Swayed, uncertain
 from certify.checker.wiring import Sum
 from tests.checker.test_attack_activations import (
     DEFINITIONS,
+    PROGRAMS,
     ZERO,
     Array,
     Values,
@@ -36,6 +37,7 @@ from tests.checker.test_attack_activations import (
     closer,
     contracts,
     directions,
+    is_limited,
     length,
     lies_in_the_checkers,
     lies_in_the_references,
@@ -47,16 +49,14 @@ from tests.checker.test_attack_activations import (
     written,
 )  # fmt: skip
 from tests.checker.test_attack_networks import affine, call, linear
-from tests.checker.test_networks import a_jet, checked, hash_of
+from tests.checker.test_networks import a_jet, hash_of
 from tests.support.certificates import Document, encode, make
 from tests.support.earlier import newer
 from tests.support.kinked import with_directions
 from tests.support.marks import slow_after
-from tests.support.reference import judge_bytes
 
 __all__ = ["many_digits"]
 NAMES = ("elu", "softsign")
-PROGRAMS = pytest.mark.parametrize("program", [checked, judge_bytes], ids=["checker", "reference"])
 
 
 # -------------------------------------------------------------------------------------------------------------- models
@@ -279,10 +279,7 @@ CLAIMS: dict[str, tuple[Callable[[float], bytes], float, float]] = {  # up to wh
 @pytest.mark.parametrize("name", CLAIMS)
 def test_what_bends_at_the_corner_limits_a_ball(name: str, program: Callable[[bytes], str | None]) -> None:
     """The tangent alone would show any level."""
-    claim, limit, share = CLAIMS[name]
-    assert program(claim(share * limit)) is None
-    for r in (1.001, 1.01, 1.1, 1.5, 3.0):
-        assert program(claim(r * limit)) == "local"
+    is_limited(program, *CLAIMS[name])
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -241,7 +241,7 @@ def test_a_worker_with_another_version_of_the_code_is_of_no_harm(tmp_path: Path)
     """There the classes of the search do not exist: its jobs fail, are done here, and that is said."""
     shutil.copytree(ROOT / "certify", tmp_path / "certify", ignore=shutil.ignore_patterns("__pycache__"))
     older = tmp_path / "certify" / "provers" / "boxes" / "ahead.py"
-    older.write_text(older.read_text().replace("class Subtrees", "class Subforests"))
+    older.write_text(older.read_text().replace("class Growing", "class Grown"))
     case, budget = cartpole_case(), Budget(batch=64, effort=Effort(120 * UNIT))
     expected = prove_outwards(case.problem, case.T, 2.5e-4, 1e-3, budget, ThreadRunner())
     with cluster(0) as dask, connect(dask.address) as client:

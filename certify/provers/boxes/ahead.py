@@ -86,8 +86,13 @@ class Growth(ABC):
     def opened(self, halves: Halves, found: Any, key: Array) -> tuple[Mask, Array]:
         """True for halves (H,) that still have to be decided, and the keys (H,) of all, by those of the batch (B,)."""
 
+    def reopen(self, frontier: Frontier, halves: Halves, found: Any, key: Array) -> None:
+        """Put the halves that still have to be decided on the frontier."""
+        keep, keys = self.opened(halves, found, key)
+        frontier.add(*(a.compress(keep, -1) for a in (halves.lo, halves.hi, keys, halves.number)))
 
-class Subtrees:
+
+class Growing:
     """The work on a job: boxes are bounded and halved as a pass does it whose levels stay."""
 
     def __init__(self, growth: Growth) -> None:
@@ -121,8 +126,7 @@ def _grow(growth: Growth, frontier: Frontier, now: Boxes, found: Any, least_widt
     rest = type(found)(*(value.compress(stays, -1) for value in found))
     lo, hi, number, key = (value.compress(stays, -1) for value in now)
     halves = split(frontier.partition, lo, hi, number, rest, least_width * growth.half)
-    keep, keys = growth.opened(halves, rest, key)
-    frontier.add(*(a.compress(keep, -1) for a in (halves.lo, halves.hi, keys, halves.number)))
+    growth.reopen(frontier, halves, rest, key)
 
 
 class Sent(NamedTuple):
@@ -344,7 +348,7 @@ def _read(job: bytes, answer: bytes, layout: Layout, n: int) -> Answer:
 @contextmanager
 def ahead(runner: Runner, growth: Growth, budget: Budget, alone: bool = False) -> Iterator[Ahead]:
     """A pass's bound on a runner, some of which is worked out elsewhere if that can be and nobody asks to be alone."""
-    with runner.start(growth.bound) as here, runner.jobs(Subtrees(growth)) as jobs:
+    with runner.start(growth.bound) as here, runner.jobs(Growing(growth)) as jobs:
         bound = Ahead(None if alone else jobs, growth, here, budget)
         try:
             yield bound

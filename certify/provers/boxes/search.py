@@ -238,8 +238,7 @@ class Pass:
             self.covered = self.covered and bool(found.smooth[small].all())
             if sweep.stuck(*rule.levels(lo.compress(small, -1), hi.compress(small, -1))):
                 self._stop = Stop.BOXES
-        keep, key = self.growth.opened(halves, found, np.zeros(0))  # the order is known without the old keys
-        self.frontier.add(*(a.compress(keep, -1) for a in (halves.lo, halves.hi, key, halves.number)))
+        self.growth.reopen(self.frontier, halves, found, np.zeros(0))  # the order is known without the old keys
         self.frontier.drop_above(sweep.last())
 
     @property

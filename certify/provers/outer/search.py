@@ -16,7 +16,7 @@ import numpy as np
 
 from certify.certificates.verdict import Stop
 from certify.provers.base import Budget, Report
-from certify.provers.bounds.arrays import Array, Index, Mask
+from certify.provers.bounds.arrays import Array, Mask
 from certify.provers.boxes.account import Account
 from certify.provers.boxes.ahead import Growth, ahead
 from certify.provers.boxes.frontier import Frontier
@@ -132,9 +132,6 @@ class Cover:
 
     def _step(self, bound: Bound, budget: Budget) -> None:
         lo, hi, number, key = self.frontier.take(budget.batch, math.inf)
-        self._examine(bound, lo, hi, number, key, budget)
-
-    def _examine(self, bound: Bound, lo: Array, hi: Array, number: Index, key: Array, budget: Budget) -> None:
         self.boxes += lo.shape[1]
         found: OuterBounds = bound(lo, hi, -math.inf, self.level)
         lowest = float(found.violated.min())
@@ -151,8 +148,7 @@ class Cover:
                 self.level, self.stop = bottom - self.slack, Stop.BOXES
         self.done_share += self._share(lo.compress(found.proved, -1), hi.compress(found.proved, -1))
         self.leaves += int(found.proved.sum())
-        _, keys = self.growth.opened(halves, found, key)
-        self.frontier.add(halves.lo, halves.hi, keys, halves.number)
+        self.growth.reopen(self.frontier, halves, found, key)
 
     def tree(self) -> bytes:
         """The partition in preorder."""
