@@ -206,8 +206,6 @@ class Written(nn.Module):  # type: ignore[misc]
         (lambda s, x: torch.tanh(torch.sqrt(s.net(x) ** 2 + 1.0)), "may only divide a value"),
         (lambda s, x: torch.sqrt(s.net(x) ** 2 + 1.0), "rows of actions"),
         (lambda s, x: torch.rsqrt(s.net(x) ** 2 + 1.0) / s.net(x), "may only divide a value"),
-        (lambda s, x: s.net(x) - s.net(s.zero), "--centre output"),
-        (lambda s, x: s.net(x) - s.net(torch.zeros_like(x)), "--centre output"),
         (lambda s, x: s.net(torch.stack([torch.cos(x[:, 0]), x[:, 1]], 1)), r"x\[:, :1\]"),
         (lambda s, x: torch.cos(s.net(x)), "--states 'cos"),
         (lambda s, x: s.net(x)[1:], "entries of a row"),
@@ -221,6 +219,85 @@ class Written(nn.Module):  # type: ignore[misc]
 def test_what_is_read_wrongly_otherwise_is_refused(function: Any, message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message):
         import_policy(saved(Written(function).eval(), "trace", tmp_path / "p.pt"), PLANT, SAID)
+
+
+CENTRED: dict[str, tuple[Any, str]] = {
+    "bare": (lambda s, x: s.net(x) - s.net(s.zero), "output"),
+    "turned": (lambda s, x: -s.net(s.zero) + s.net(x), "output"),
+    "like": (lambda s, x: s.net(x) - s.net(torch.zeros_like(x)), "output"),
+    "row": (lambda s, x: s.net(x) - s.net(torch.zeros(1, 2, dtype=x.dtype)), "output"),
+    "clipped": (lambda s, x: torch.clamp((s.net(x) - s.net(s.entries)) * 3, -2, 5), "output"),
+    "moved": (lambda s, x: s.net(x) + 0.25 - s.net(s.zero) - 0.25, "output"),
+    "squashed": (lambda s, x: 2 * torch.tanh(s.net(x) - s.net(s.zero)), "preactivation"),
+    "beside a gain": (lambda s, x: (s.gain(x) + (s.net(x) - s.net(s.zero))).clamp(-3, 3), "output"),
+    "behind a gain": (lambda s, x: torch.tanh(s.gain(x) + s.net(x) - s.net(s.zero)), "preactivation"),
+    "shares": (lambda s, x: torch.tanh(s.net(x / 4)) - torch.tanh(s.net(s.zero)), "output"),
+}
+UNCENTRED: dict[str, Any] = {
+    "another point": lambda s, x: s.net(x) - s.net(s.zero + 0.5),
+    "another network": lambda s, x: s.net(x) - torch.tanh(s.net(s.zero)),
+    "another sign": lambda s, x: s.net(x) + s.net(s.zero),
+    "another input": lambda s, x: s.net(x) - s.net(s.zero) + 0.25,
+    "a shift within": lambda s, x: torch.tanh(s.net(x) - s.net(s.zero) + 0.25),
+    "clips of each": lambda s, x: s.net(x).clamp(-0.1, 0.1) - s.net(s.zero).clamp(-0.1, 0.1),
+    "a clip within": lambda s, x: torch.tanh((s.net(x) - s.net(s.zero)).clamp(-0.1, 0.2)),
+    "one side": lambda s, x: torch.relu(s.net(x) - s.net(s.zero)),
+    "at the clip": lambda s, x: torch.clamp(s.net(x) - s.net(s.zero), 0, 1),
+    "beside a layer": lambda s, x: s.net[0](x)[:, :1] + s.net(x) - s.net(s.zero),
+    "beside a network": lambda s, x: torch.tanh(s.gain(x)) + s.net(x) - s.net(s.zero),
+    "scaled apart": lambda s, x: s.net(x) - 1.25 * s.net(s.zero),
+    "twice": lambda s, x: torch.tanh(torch.tanh(s.net(x) - s.net(s.zero)) + 0.25),
+    "moved before": lambda s, x: s.net(x + 0.125) - s.net(s.zero),
+}
+
+
+class Centred(Written):
+    """The same, of a network that a file may centre."""
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)
+        torch.manual_seed(8)
+        self.net = nn.Sequential(nn.Linear(2, 6), nn.Tanh(), nn.Linear(6, 1))
+        self.gain = nn.Linear(2, 1, bias=False)
+        self.register_buffer("entries", torch.zeros(2))
+        self.register_buffer("one", torch.tensor([[1.0, 0.0]]))
+
+
+@pytest.mark.parametrize("form", ["memory", "trace", "onnx"])
+@pytest.mark.parametrize("kind", [*CENTRED, *UNCENTRED])
+def test_a_file_may_centre_its_network_itself(kind: str, form: str, tmp_path: Path) -> None:
+    """A network that is read at the operating point too is centred, exactly, where pi(0) = u_eq follows; else it is a
+    network that reads a constant."""
+    function, centre = CENTRED[kind] if kind in CENTRED else (UNCENTRED[kind], "none")
+    module, path = Centred(function).eval(), tmp_path / f"p.{form}"
+    if form == "memory":
+        found = import_module(module, PLANT, SAID)
+    elif (form, kind) == ("onnx", "like"):
+        with pytest.raises(InputError, match="ConstantOfShape"):
+            import_policy(saved(module, form, path), PLANT, SAID)
+        return
+    else:
+        found = import_policy(saved(module, form, path), PLANT, SAID)
+    assert found.policy.network.centre == centre
+    assert ("net(o_eq)" in found.formula) == (centre != "none")
+    agree(found.policy, module)
+
+
+def test_the_point_at_which_a_file_centres_is_the_operating_point() -> None:
+    """The observations are 1 and 0 there; an option that says how to centre is followed."""
+    module = Centred(lambda s, x: s.net(x) - s.net(s.one)).eval()
+    for states, centre in (
+        ("cos(theta),sin(theta)", "output"),
+        ("1 + theta,theta_dot", "output"),
+        ("sin(theta),cos(theta)", "none"),
+        ("exp(theta_dot),tanh(theta)", "output"),
+        ("theta,theta_dot", "none"),
+    ):
+        found = import_module(module, PLANT, replace(SAID, states=tuple(states.split(","))))
+        assert found.policy.network.centre == centre
+    found = import_module(module, PLANT, replace(SAID, states=("theta", "theta_dot"), centre="output"))
+    assert found.policy.network.centre == "output"
+    assert found.centring["output"] > 0
 
 
 def test_constants_are_exact() -> None:

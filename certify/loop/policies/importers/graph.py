@@ -86,6 +86,19 @@ def affine(chain: Chain, weight: Any, bias: Any | None, what: str) -> Chain:
     return (*chain, Affine(matrix, offset))
 
 
+def held(value: Any, wide: int, what: str) -> Chain:
+    """A constant row, as 0 times the observation of `wide` numbers and the row.
+
+    Raises
+    ------
+    InputError : it is no row, or the width is not known.
+    """
+    numbers = real(value, what)
+    if not wide or numbers.ndim not in (1, 2) or numbers.shape[:-1] not in ((), (1,)):
+        raise InputError(f"a constant that {what} reads must be a row; its shape is {numbers.shape}.")
+    return (Affine(np.zeros((numbers.size, wide)), numbers.ravel()),)
+
+
 def scaled(chain: Chain, scale: Any, what: str, *, divide: bool = False) -> Chain:
     """`scale * h`, or `h / scale`."""
     values = row(scale, what)

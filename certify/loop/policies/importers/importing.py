@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -22,6 +22,7 @@ from certify.loop.files.archives import MAX_BYTES
 from certify.loop.networks import Affine, Network
 from certify.loop.policies.exact import require_centred
 from certify.loop.policies.file import Policy
+from certify.loop.policies.importers.centring import without_centring
 from certify.loop.policies.importers.comparing import Difference, compare_reading
 from certify.loop.policies.importers.folding import Bounds, Folded, fold
 from certify.loop.policies.importers.normalisers import load_normaliser
@@ -158,17 +159,19 @@ def import_bytes(
     require_equilibrium(reading, x_eq if moved else [Fraction(0)] * n)
     after = _action(options, plant.m)
     steps = (*before, *reading.steps, *after)
+    u_eq = plant.exact_u_eq()
+    steps, centre = _centred(steps, reading, reads, options, u_eq)
     folded = fold(steps, n)
     if reads.index is None and reads.may_leave(folded.inactive):
         folded = fold(steps, n, keep_clips=True)
-    network, valid = _network(folded, reads, reading, options)
-    u_eq = plant.exact_u_eq()
+    network, valid = _network(folded, reads, centre)
     if network.centre != "none":
         require_centred(network, u_eq)
     # It refuses another plant's beta, before the comparison does with less to say.
     Policy(network, plant.name, beta=reading.beta, valid=valid).beta_shift(u_eq)
     x = sample(plant, valid)
-    bare = network if reading.beta is not None else replace(network, centre="none")
+    own = "none" if options.centre and reading.beta is None else centre  # of the file's own policy
+    bare = network if own != "none" else replace(network, centre="none")
     values = bare(x, u_eq)
     difference = compare_reading(reading, before, after, reads(x), values, reads.is_inexact)
     known = {"file": name, "sha256": hashlib.sha256(raw).hexdigest(), "kind": kind}
@@ -177,14 +180,14 @@ def import_bytes(
     return Imported(
         policy=Policy(network, plant.name, _parameters(plant), {"imported": record}, reading.beta, valid),
         words=reading.words,
-        formula=_formula(normaliser, network, folded, reading),
+        formula=_formula(normaliser, network, folded, reading, own != "none"),
         difference=difference,
         compared_with=reading.program,
         assumed=reading.assumed,
         not_read=reading.unread,
         at_origin=np.asarray(bare(np.zeros(plant.n), u_eq)),
         u_eq=np.array([float(u) for u in u_eq]),
-        centring={} if reading.beta is not None else _centrings(bare, u_eq, x, values),
+        centring={} if own != "none" else _centrings(bare, u_eq, x, values),
     )
 
 
@@ -280,12 +283,20 @@ def _action(options: ImportOptions, m: int) -> tuple[Step, ...]:
     return tuple(steps)
 
 
-def _network(
-    folded: Folded, reads: Observed, reading: Reading, options: ImportOptions
-) -> tuple[PolicyNetwork, Array | None]:
+def _centred(
+    steps: tuple[Step, ...], reading: Reading, reads: Observed, options: ImportOptions, u_eq: Sequence[Fraction]
+) -> tuple[tuple[Step, ...], Centre]:
+    """The steps without what centres them, and the centring: the file's own, or the one that was asked for."""
+    if reading.beta is not None:
+        return steps, "preactivation"
+    if options.centre is not None:
+        return steps, options.centre
+    return without_centring(steps, reads.at_origin, u_eq) or (steps, "none")
+
+
+def _network(folded: Folded, reads: Observed, centre: Centre) -> tuple[PolicyNetwork, Array | None]:
     """The network over the plant's states, and the states where no observation is clipped, (n, 2), rounded inwards."""
     n = reads.plant.n
-    centre: Centre = "preactivation" if reading.beta is not None else options.centre or "none"
     network = PolicyNetwork(
         _over_states(folded.network, reads), folded.scale, folded.offset, folded.squash, centre, folded.clip
     )
@@ -346,7 +357,9 @@ def _centrings(bare: PolicyNetwork, u_eq: tuple[Fraction, ...], x: Array, values
     return changes
 
 
-def _formula(normaliser: tuple[Step, ...], network: PolicyNetwork, folded: Folded, reading: Reading) -> str:
+def _formula(
+    normaliser: tuple[Step, ...], network: PolicyNetwork, folded: Folded, reading: Reading, centred: bool
+) -> str:
     """The file's policy in the plant's units."""
     observation = "o"
     if normaliser:
@@ -355,8 +368,11 @@ def _formula(normaliser: tuple[Step, ...], network: PolicyNetwork, folded: Folde
     net = f"net({observation})"
     if reading.beta is not None:
         net = "net(x) - net(x_eq) + beta"
+    elif centred:
+        net = f"{net} - net(o_eq)"
     inner = f"tanh({net})" if network.squash == "tanh" else net
-    scaled = inner if np.all(folded.scale == 1) else f"{_short(folded.scale)} * {inner}"
+    factor = f"({inner})" if inner.endswith("net(o_eq)") else inner
+    scaled = inner if np.all(folded.scale == 1) else f"{_short(folded.scale)} * {factor}"
     scaled = scaled if not np.any(folded.offset) else f"{scaled} + {_short(folded.offset)}"
     if folded.clip is None:
         return f"u = {scaled}"

@@ -53,6 +53,14 @@ class Observed:
         return np.asarray(evaluated(self.expressions, self.plant.states, x))
 
     @property
+    def at_origin(self) -> tuple[Fraction | None, ...]:
+        """Their exact values at the operating point; None for one that is no rational."""
+        nothing = dict.fromkeys(self.plant.states, flint.arb(0))
+        values = [evaluate(expression, nothing, BallAlgebra()) for expression in self.expressions]
+        known = [v.is_exact() and v.is_finite() for v in values]
+        return tuple(Fraction(str(v.fmpq())) if is_known else None for v, is_known in zip(values, known, strict=True))
+
+    @property
     def count(self) -> int:
         """The number of observations."""
         return len(self.expressions)

@@ -15,7 +15,6 @@ from certify.loop.policies.importers import graph
 from certify.loop.policies.importers.constants import computed, is_constant
 from certify.loop.policies.importers.graph import Chain
 from certify.loop.policies.importers.operations import ADVICE as torch_advice
-from certify.loop.policies.importers.operations import CENTRED
 from certify.loop.policies.importers.options import WITH_TANH
 from certify.loop.policies.importers.reading import gives
 from certify.loop.policies.importers.steps import MOST_NORMALISED, Activate, Affine, Diagonal, activated
@@ -44,7 +43,6 @@ ADVICE: Mapping[str, str] = {
     **dict.fromkeys(("Sin", "Cos"), torch_advice["cos"]),
     **dict.fromkeys(("Unsqueeze", "Squeeze"), torch_advice["select"]),
     **dict.fromkeys(("ReduceL2", "Einsum"), "Write the weights out, as a matrix, before the export."),
-    "ConstantOfShape": CENTRED,
 }
 """The next step where an operator is not read, by its name."""
 
@@ -88,7 +86,7 @@ def applied(kind: str, given: list[Any], flags: dict[str, Any], wide: int, count
     InputError : the node is none that is read.
     """
     if all(v is None or is_constant(v) for v in given):
-        return [_constant(kind, given, flags, at)]
+        return [_constant(kind, given, flags, wide, at)]
     if kind == "Shape" and isinstance(given[0], tuple) and not flags:
         return [Shape(gives(given[0], wide))]
     if kind == "Gather" and isinstance(given[0], Shape) and np.ravel(given[1]).tolist() in ([1], [-1]):
@@ -104,8 +102,8 @@ def applied(kind: str, given: list[Any], flags: dict[str, Any], wide: int, count
     return [_apply(kind, given, flags, at)]
 
 
-def _constant(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Numbers:
-    """A node of constants alone."""
+def _constant(kind: str, given: list[Any], flags: dict[str, Any], wide: int, at: str) -> Made:
+    """A node of constants alone; a layer of a constant row is steps from 0 times the observation."""
     if kind == "Cast":
         _require_real(flags, at)
     if kind in ("Cast", "Identity") and len(given) == 1:
@@ -118,10 +116,12 @@ def _constant(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Nu
             raise InputError(f"{at} divides integers that are not positive.")
         return np.asarray(whole(one, other))
     made = computed(_CONSTANTS.get(kind, ""), tuple(values), at)
+    if made is None and kind in ("Gemm", "MatMul") and wide and len(values) == len(given) > 1:
+        return _apply(kind, [graph.held(given[0], wide, at), *given[1:]], flags, at)
     if made is None:
         raise InputError(
             f"{at} joins constants alone, and is not read of these; it must join one value that depends on the "
-            f"observation with constants. {CENTRED}"
+            "observation with constants."
         )
     return made
 

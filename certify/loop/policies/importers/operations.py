@@ -34,7 +34,7 @@ _NORMALISATIONS = ("group_norm", "instance_norm")
 _DEFAULTS: dict[str, tuple[Any, ...]] = {"hardtanh": (-1.0, 1.0), "clamp": (None, None)}
 _WITHOUT_DROPPING = ("dropout", "feature_dropout", "alpha_dropout", "feature_alpha_dropout")
 _SINGLE = float(np.finfo(np.float32).eps)  # RMSNorm's epsilon where none is said
-_REAL = (6, 7)  # torch's numbers for float32 and float64
+REAL = (6, 7)  # torch's numbers for float32 and float64
 _AS_OBSERVATIONS = (
     "Save the network behind it, and say what that reads with --states, as in --states "
     "'cos(theta),sin(theta),theta_dot'."
@@ -44,17 +44,15 @@ WITHOUT_WEIGHT_NORM = (
     "torch.nn.utils.remove_weight_norm(layer)."
 )
 """The next step where a weight is computed from others."""
-CENTRED = "Of net(x) - net(0) save net, and centre it with --centre output, or --centre preactivation before a tanh."
-"""The next step where a network is evaluated at a constant."""
 ADVICE: Mapping[str, str] = {
     **dict.fromkeys(_NORMALISATIONS, WITHOUT_NORMALISATION),
     **dict.fromkeys(("sin", "cos", "atan2"), _AS_OBSERVATIONS),
     **dict.fromkeys(("select", "unsqueeze", "squeeze"), "Keep the rows of a batch: x[:, :1], say, instead of x[:, 0]."),
     **dict.fromkeys(("_weight_norm", "mv", "vdot", "norm", "norm_except_dim"), WITHOUT_WEIGHT_NORM),
-    **dict.fromkeys(("zeros", "zeros_like"), CENTRED),
     **dict.fromkeys(("tensor", "device"), "Make a constant a buffer of the module, with register_buffer."),
 }
 """The next step where an operation is not read, by its name."""
+_LAYERS = {"linear": 0, "matmul": 0, "mm": 0, "addmm": 1}  # and the place of the row that they read
 _EVALUATED = "Call model.eval() before you save it."
 PARTS = ("chunk", "split", "slice", "narrow", "split_with_sizes")
 """Operations whose results share their memory with what they are parts of."""
@@ -122,7 +120,7 @@ def operation(name: str, given: list[Any], approximate: str | None, wide: int, a
         return given[0].T
     values = [v for part in given for v in (part if isinstance(part, list) else [part]) if depends(v)]
     if not values:
-        return _constant(name, given, at)
+        return _constant(name, given, wide, at)
     if any(v.under is not None for v in values) and not (name in ("mul", "div") and len(given) == len(values) == 2):
         raise InputError(f"{at} reads a square root, which may only divide a value, as in a normalisation.")
     if (result := _unchanged(name, given, wide, at)) is not None:
@@ -156,13 +154,28 @@ def _elementwise(name: str, given: list[Any], at: str) -> Value:
     return Value(_step(name, places[0], len(given), given[places[0]].chain, others, at), name, tuple(given))
 
 
-def _constant(name: str, given: list[Any], at: str) -> Any:
-    """An operation on constants: python's own numbers, or exact ones of arrays."""
+def held(constant: Any, wide: int, at: str) -> Value:
+    """A constant row as a value, so that a network may read it, as in net(x) - net(0).
+
+    Raises
+    ------
+    InputError : it is no row of numbers.
+    """
+    chain = graph.held(constant, wide, at)
+    exact = is_array(constant) and constant.dtype.kind == "f"
+    row = constant if exact else np.asarray(graph.real(constant, at), dtype=np.float32)
+    return Value(chain, "held", (row.reshape(1, -1),))
+
+
+def _constant(name: str, given: list[Any], wide: int, at: str) -> Any:
+    """An operation on constants: python's own numbers, or exact ones of arrays; a layer's is a value that is held."""
     exact = tuple(v.constant if isinstance(v, Value) else v for v in given)
     made = computed(name, exact, at) if all(is_constant(v) for v in exact) else None
+    if made is None and name in _LAYERS and len(given) > _LAYERS[name] and is_constant(exact[_LAYERS[name]]):
+        k = _LAYERS[name]
+        return operation(name, [*given[:k], held(exact[k], wide, at), *given[k + 1 :]], None, wide, at)
     if made is None:
-        centred = f" {CENTRED}" if name in ("linear", "addmm", "matmul", "mm") else ""
-        raise InputError(f"{at} is not read of constants alone. Save the policy with the result as a buffer.{centred}")
+        raise InputError(f"{at} is not read of constants alone. Save the policy with the result as a buffer.")
     if all(isinstance(v, int) for v in given) and name in ("add", "sub", "mul", "neg"):
         return int(made.item())
     if all(isinstance(v, int | float) for v in given) and name not in ("sqrt", "rsqrt", "pow"):
@@ -183,7 +196,7 @@ def _unchanged(name: str, given: list[Any], wide: int, at: str) -> Value | None:
         return value
     if name in ("to", "type_as", "float", "double"):
         to = given[1] if len(given) > 1 else None
-        if (name == "to" and (type(to) is not int or to not in _REAL)) or (name == "type_as" and not depends(to)):
+        if (name == "to" and (type(to) is not int or to not in REAL)) or (name == "type_as" and not depends(to)):
             raise InputError(f"{at} must be a conversion to float32 or float64.")
         return value
     if name in ("view", "reshape") and len(given) == 2 and isinstance(given[1], list) and len(given[1]) == 2:
@@ -390,6 +403,7 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
             *("hardtanh", "prelu"),
         )
     },
+    "held": lambda torch, row: row,
     "cat": lambda torch, *values: torch.cat(values, 1),
     "slice": _sliced,
     "gelu-tanh": lambda torch, h: torch.nn.functional.gelu(h, approximate="tanh"),

@@ -22,13 +22,14 @@ from certify.loop.files.pickles import Call, Name, brief
 from certify.loop.files.torchfile import TorchFile, is_tensor
 from certify.loop.policies.importers.operations import (
     ADVICE,
-    CENTRED,
     KNOWN,
     PARTS,
+    REAL,
     WITHOUT_WEIGHT_NORM,
     Batch,
     Value,
     depends,
+    held,
     is_array,
     operation,
     run,
@@ -291,11 +292,8 @@ def _evaluate(program: _Program, node: ast.expr, values: dict[str, Any], depth: 
         case ast.Call(func=ast.Attribute(value=inner, attr=method), args=arguments, keywords=[]):
             module = _evaluate(program, inner, values, depth)
             given = [_evaluate(program, argument, values, depth) for argument in arguments]
-            if _is_call(method) and given and not any(isinstance(v, Value) and depends(v) for v in given):
-                raise InputError(
-                    f"a module of {program.file.what} must be given what depends on the observation, not constants. "
-                    f"{CENTRED}"
-                )
+            if _is_call(method) and not any(depends(v) for v in given):
+                given = [_held(program, v) for v in given]
             return _forward(program, module, given, depth + 1, method)
     raise InputError(f"{program.file.what} has an expression that is not read: {_text(node)}. Known are {KNOWN}.")
 
@@ -372,6 +370,8 @@ def _operation(program: _Program, name: str, given: list[Any], node: ast.Call) -
             )
         program.overwritten.extend(v for v in given if isinstance(v, Value))
         name = name.removesuffix("_")
+    if name in ("zeros", "zeros_like"):
+        return _zeros(program, name, given, node, at)
     if name in ADVICE:
         raise InputError(f"{at} is not read. {ADVICE[name]}")
     approximate = None
@@ -387,6 +387,33 @@ def _operation(program: _Program, name: str, given: list[Any], node: ast.Call) -
         parts = made if isinstance(made, list) else [made]
         program.shared.extend(v for v in (given[0], *parts) if isinstance(v, Value))
     return made
+
+
+def _held(program: _Program, value: Any) -> Any:
+    """A constant row that a module reads, as a value; anything else as it is."""
+    constant = value.constant if isinstance(value, Value) else value
+    if not is_array(constant):
+        return value
+    row = held(constant, program.observations, program.file.what)
+    program.shared.append(row)  # with the constant
+    return row
+
+
+def _zeros(program: _Program, name: str, given: list[Any], node: ast.Call, at: str) -> Numbers:
+    """A row of zeros, of some width or of a value's."""
+    said = {word.arg: word.value for word in node.keywords}
+    kind = said.get("dtype")
+    if not isinstance(kind, ast.Constant | None) or (kind is not None and kind.value not in (None, *REAL)):
+        raise InputError(f"{at} must be of floating-point numbers.")
+    width = 0
+    match name, given:
+        case "zeros", [[int(size)] | [Batch() | 1, int(size)]]:
+            width = size
+        case "zeros_like", [Value(constant=None) as like]:
+            width = gives(like.chain, program.observations)
+    if width > 0:
+        return np.zeros((1, width), dtype=np.float32)
+    raise InputError(f"{at} must be a row of zeros.")
 
 
 def _shape(program: _Program, name: str, given: list[Any], at: str) -> Any:
