@@ -33,7 +33,7 @@ def to_dict(result: RoaResult) -> dict[str, Any]:
         "states": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.states],
         "operating_point": {name: str(q) for name, q in system.operating_point().items()},
         "inputs": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.inputs],
-        "policy": {"sha256": network.sha256(), "layers": list(network.layers)},
+        "policy": {"sha256": network.sha256(), "layers": list(network.layers), "words": network.words},
         "lyapunov": {
             "P": None if P is None else P.tolist(),
             "candidate": result.candidate,

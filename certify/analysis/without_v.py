@@ -61,7 +61,11 @@ class ResultWithoutV(ABC):
             "parameters": {name: str(q) for name, q in system.parameters.items()},
             "uncertain": {name: [str(lo), str(hi)] for name, (lo, hi) in system.ranges.items()},
             "states": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.states],
-            "policy": {"sha256": self.network.sha256(), "layers": list(self.network.layers)},
+            "policy": {
+                "sha256": self.network.sha256(),
+                "layers": list(self.network.layers),
+                "words": self.network.words,
+            },
             "nonlinearity": self._nonlinearity(),
             "boxes": self.boxes,
             "notice": self.notice,

@@ -163,7 +163,7 @@ def _operating_point(result: Mapping[str, Any]) -> tuple[str, str]:
 
 def _policy_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     policy = result["policy"]
-    rows = [("policy", "-".join(map(str, policy["layers"]))), ("its sha256", begun(str(policy["sha256"])))]
+    rows = [("policy", policy["words"]), ("its sha256", begun(str(policy["sha256"])))]
     if result.get("nonlinearity"):
         rows.append(("linear part", nonlinearity_in_words(result["nonlinearity"])))
     if result.get("eigenvalues"):

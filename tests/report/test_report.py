@@ -906,7 +906,7 @@ def practical_case(tmp_path_factory: pytest.TempPathFactory) -> Case:
         "reason": "requested",
         "system": "drifting",
         "claim": {"kind": "practical"},
-        "policy": {"sha256": network.sha256(), "layers": [2, 1]},
+        "policy": {"sha256": network.sha256(), "layers": [2, 1], "words": "2-1"},
         "levels": {"local": 1 / 3, "floor": 1 / 3, "roa": 1.7, "sampled_limit": None, "domain_limit": 4.0},
         "checked": "ACCEPTED",
         "volume": 5.0,
@@ -974,7 +974,7 @@ def test_every_claim_has_all_its_words() -> None:
 def test_summary_without_a_proof() -> None:
     refuted = {
         "schema": "certify-roa/1", "verdict": "REFUTED", "reason": "unstable linearisation: eigenvalues 3.1, -5.8",
-        "system": "pendulum", "policy": {"sha256": "ab", "layers": [2, 1]}, "lyapunov": {"P": None},
+        "system": "pendulum", "policy": {"sha256": "ab", "layers": [2, 1], "words": "2-1"}, "lyapunov": {"P": None},
         "levels": {"local": None, "roa": None, "sampled_limit": None, "domain_limit": None}, "witness": None,
         "eigenvalues": ["3.1", "-5.8"], "volume": None, "semi_axes": None, "extents": None, "boxes": 0, "leaves": 0,
         "seconds": {"load": 0.0, "total": 0.1}, "certificate": None, "checked": None,

@@ -39,12 +39,15 @@ class Programmed:
 
     @property
     def words(self) -> str:
-        """Widths and functions, such as `2-16-16-1 tanh`, for people."""
-        network, text = self.network, "-".join(map(str, self.layers))
-        text += "".join(f" {name}" for name in network.functions)
-        if network.observation is not None:
-            text += f" of {', '.join(map(str, network.observation.expressions))}"
-        return text if network.is_observed_chain else f"{text}, {len(network.steps)} steps"
+        """Widths and functions, such as `2-16-16-1 tanh`, or how many steps there are, for people."""
+        network, functions = self.network, "".join(f" {name}" for name in self.network.functions)
+        if network.is_observed_chain:
+            text = "-".join(map(str, self.layers)) + functions
+        else:
+            text = f"{self.n} to {self.m} in {len(network.steps)} steps" + (functions and f" with{functions}")
+        return (
+            text if network.observation is None else f"{text} of {', '.join(map(str, network.observation.expressions))}"
+        )
 
     def require_layers(self, what: str) -> None:
         """Reject a network that is not layers of the states with one function between them.
