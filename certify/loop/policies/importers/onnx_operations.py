@@ -109,7 +109,11 @@ def _constant(kind: str, given: list[Any], flags: dict[str, Any], wide: int, at:
     if kind in ("Cast", "Identity") and len(given) == 1:
         return np.asarray(given[0])
     values = [v for v in given if v is not None]
-    if kind in ("Add", "Sub", "Mul", "Div") and all(isinstance(v, np.ndarray) and v.dtype.kind == "i" for v in values):
+    if (
+        kind in ("Add", "Sub", "Mul", "Div")
+        and len(values) == 2
+        and all(isinstance(v, np.ndarray) and v.dtype.kind == "i" for v in values)
+    ):
         one, other = values  # sizes of a row
         whole = {"Add": np.add, "Sub": np.subtract, "Mul": np.multiply, "Div": np.floor_divide}[kind]
         if kind == "Div" and (np.any(other <= 0) or np.any(one < 0)):
