@@ -12,9 +12,10 @@ from typing import Any, TypeVar
 
 from flint import fmpq_mat
 
-from .document import Array, Certificate, Intervals, LocalBall, Partition
+from .document import Certificate, Intervals, LocalBall, Partition
 from .exact import exactly, gershgorin_lower, inverse_diagonal
 from .network import Folded, fold
+from .schema import Array
 
 T = TypeVar("T")
 AT_CORNERS = 6  # uncertain quantities of which rule `local` decides every corner

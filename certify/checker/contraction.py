@@ -13,7 +13,7 @@ from flint import fmpq, fmpq_mat
 
 from . import ball
 from .ball import Ball
-from .case import Case, Failures
+from .case import Case, Failures, given
 from .decrease import Models, are_finite, diagonal, rational, vectors
 from .exact import exactly, is_definite, root_above
 from .jets import unpacked
@@ -87,8 +87,7 @@ def contracts(ball_: Contracted) -> Failures:
 
 
 def examine(tally: Tally, case: Case) -> None:
-    if case.partition.contraction is not None:
-        tally.hold(OF_CONTRACTION, Contracted.of(case, case.partition.contraction))
+    tally.hold(OF_CONTRACTION, Contracted.of(case, given(case.c.contraction)))
 
 
 OF_CONTRACTION = (("contraction", fits), ("contraction", ball.is_not_clipped), ("contraction", contracts))

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from .document import Certificate, Partition
+from .document import Certificate
 from .limits import LEAF, Net, Sizes, called
-from .sections import OuterTree, Trusted
 
 
 def numbers(sizes: Sizes) -> int:
@@ -29,9 +28,9 @@ def of_function(sizes: Sizes) -> int:
 
 def of_following(sizes: Sizes) -> int:
     """Numbers for leaves that are followed by steps."""
-    if sizes.c.ranks is None or isinstance(sizes.evidence, Trusted | OuterTree):
+    if sizes.c.ranks is None:
         return 0
-    return 2**4 * len(sizes.c.ranks.tree) + sizes.on_leaves(sizes.evidence.order, sizes.s + sizes.n)
+    return 2**4 * len(sizes.c.ranks.tree) + sizes.on_leaves(sizes.c.ranks.order, sizes.s + sizes.n)
 
 
 def of_measured(sizes: Sizes) -> int:
@@ -46,10 +45,10 @@ def of_measured(sizes: Sizes) -> int:
 def of_ranks(sizes: Sizes) -> int:
     """Steps from leaves, and the leaves that their images meet."""
     ranks = sizes.c.ranks
-    if ranks is None or isinstance(sizes.evidence, Trusted | OuterTree):
+    if ranks is None:
         return 0
     leaves = len(ranks.steps)
-    of_all = sizes.of_leaves(leaves + sum(ranks.steps), sizes.evidence.order, sizes.s + sizes.n)
+    of_all = sizes.of_leaves(leaves + sum(ranks.steps), ranks.order, sizes.s + sizes.n)
     return 2**9 * len(ranks.tree) + 2**17 * leaves + of_all
 
 
@@ -78,19 +77,19 @@ def of_handover(sizes: Sizes, then: Certificate) -> int:
 
 
 def of_tube(sizes: Sizes) -> int:
-    if not isinstance(sizes.evidence, Partition):
+    tube = sizes.c.tube
+    if tube is None:
         return 0
     of_each = sizes.ball + sizes.equations + 3 * (sizes.inequality + sizes.decision(sizes.n))
-    tube, start = sizes.evidence.tube, sizes.c.start
-    nodes = [P for slab in tube for P in (slab.middle, slab.end)] + ([] if start is None else [start])
-    return len(tube) * of_each + sum(sizes.inverse(sizes.bits(P)) for P in nodes)
+    nodes = [tube.start, *(P for slab in tube.slabs for P in (slab.middle, slab.end))]
+    return len(tube.slabs) * of_each + sum(sizes.inverse(sizes.bits(P)) for P in nodes)
 
 
 def of_outer(sizes: Sizes) -> int:
-    evidence = sizes.evidence.outer if isinstance(sizes.evidence, Partition) else sizes.evidence
-    if sizes.c.outer is None or not isinstance(evidence, OuterTree):
+    evidence = sizes.c.outer
+    if evidence is None:
         return 0
-    tape = sizes.c.outer.function
+    tape = evidence.function
     N, of_tape = Net(called(tape)), tape.size
     calls, values = 200 * N.reads, max(N.widest, 2 * of_tape)
     faces, leaves = sum(tree.count(LEAF) for tree in evidence.faces), evidence.tree.count(LEAF)

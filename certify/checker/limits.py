@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from math import prod
 
 from .case import AT_CORNERS, Case, Failures
-from .document import Array, Certificate, Partition
+from .document import Certificate, Partition
 from .expression import Tape
 from .networks import Map, Network
+from .schema import Array
 
 MOST_NUMBERS = 2**25
 MOST_WORK, MOST_IN_PATIENCE = 3 * 2**37, 2**46  # ten minutes; many hours, if somebody says that there is time for it
@@ -111,7 +112,7 @@ class Sizes:
         values = (4 * order if self.c.sample else 1) * self.a + 2 * self.n + 8
         if self.asked and not self.c.outer:
             found += self.on_leaves(order, self.s)
-        if self.evidence.local or self.evidence.contraction or self.evidence.tube:
+        if self.evidence.local or self.c.contraction or self.c.tube:
             found += values * (self.t + self.d * self.y + self.m + self.z) + self.d**4 // 4
             found += self.net.held_on_a_ball(self.d, self.t)
         return found
@@ -119,7 +120,7 @@ class Sizes:
     def of_features(self) -> tuple[int, int]:
         """Numbers and operations of what only some certificates have."""
         c = self.c
-        if not (c.outer or c.ranks or c.data or c.start is not None):
+        if not (c.outer or c.ranks or c.data or c.tube):
             return 0, 0
         from . import demands
 
@@ -215,10 +216,10 @@ class Sizes:
             each = self.inequality + 2**8 * self.y * self.n * (self.d + 1) ** 2
             found += self.ball + times * self.equations + corners * each + self.decision(self.n)
             found += self.of_cones(evidence.local.directions, times, corners)
-        if evidence.contraction:
+        if self.c.contraction:
             corners = cells * 2**self.y
             found += self.ball + cells * self.equations + corners * self.inequality + self.decision(self.n)
-            found += self.of_cones(evidence.contraction.directions, cells, corners)
+            found += self.of_cones(self.c.contraction.directions, cells, corners)
         return found
 
     def of_cones(self, directions: Sequence[bytes] | None, times: int, corners: int) -> int:

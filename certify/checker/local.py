@@ -79,7 +79,7 @@ class Local(Ball):
         """P, R, the multipliers and the level of the inequality."""
         P, by, c = exactly(self.case.c.P), self.case.local, self.case.c
         level = None if self.at_rest else Level(rational(c.c0), rational(by.edge))
-        return P, 2 * rational(c.rate) * P, by.multipliers, level
+        return P, 2 * rational(c.rate) * P, by.by, level
 
     def inequality(self, models: Models) -> Inequality:
         return Inequality(models, *self.terms)
@@ -132,7 +132,7 @@ def fits(local: Local) -> Failures:
     """`local`: the ball contains {V <= c1}, and its jets take neither too much memory nor too much time."""
     c = local.case.c
     yield from is_large_enough(local, "levels.local", "c1", c.c1, local.case.local.directions, AT_CORNERS)
-    if not are_usable(local.case.local.multipliers):
+    if not are_usable(local.case.local.by):
         yield "evidence.local", "no multiplier may be negative, none of g 0 where some beta is"
     if c.step > 0 and Fraction(local.case.local.edge) * c.step > 1:
         yield "evidence.local.edge", "a step may lead out of {V <= c0}: the edge must be at most 1/h"

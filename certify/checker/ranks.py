@@ -23,7 +23,7 @@ from .near import TURN, Above, Array, Form, Near, near, size, within
 from .network import enclose_on_boxes
 from .periodic import is_periodic
 from .ring import Moving
-from .sections import MAX_RANK, Ranked
+from .sections import MAX_RANK
 from .taylor import Taylor, affine, combination, constants, forms, upper_bound
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ class Steps(Moving):
         identity = fmpq_mat([[int(i == j) for j in range(n)] for i in range(n)])
         super().__init__(case, np.eye(n), identity, lo < hi, n)
         self.widest, self.ranks = [np.inf] * n, given(case.c.ranks)
-        self.order = _order(case)
+        self.order = self.ranks.order
         self.rank, self.count = two_bytes(self.ranks.ranks), np.frombuffer(self.ranks.steps, np.uint8).astype(np.int64)
         self.straight = [i for i in range(n) if i not in self.ranks.angles]  # states that are no angles
 
@@ -238,12 +238,6 @@ class Steps(Moving):
         rows = [combination(*zip(row, states, strict=True)) for row in self.c.P.tolist()]
         V = [x * row for x, row in zip(states, rows, strict=True)]
         return [reduce(add, [*V, number(Fraction(-self.c.c2))])]
-
-
-def _order(case: Case) -> int:
-    """The order of the series in time."""
-    evidence = case.c.evidence
-    return evidence.order if isinstance(evidence, Ranked) else case.partition.order
 
 
 def moved(x: Array, turns: Array) -> tuple[Array, Array]:

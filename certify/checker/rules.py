@@ -129,8 +129,8 @@ OTHERS: Sequence[tuple[str, Callable[[Certificate], object]]] = (  # modules wit
     ("handover", lambda c: c.then),
     ("data", lambda c: c.data),
     ("", lambda c: isinstance(c.evidence, Partition)),  # the rules about ball and tree
-    ("tube", lambda c: c.start is not None),
-    ("contraction", lambda c: isinstance(c.evidence, Partition) and c.evidence.contraction),
+    ("tube", lambda c: c.tube),
+    ("contraction", lambda c: c.contraction),
     ("outer", lambda c: c.outer),
     ("ranks", lambda c: c.ranks),
 )

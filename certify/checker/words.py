@@ -5,8 +5,9 @@ from __future__ import annotations
 from fractions import Fraction
 from typing import Any
 
-from .document import PLAIN, Array, Certificate, Partition, Policy
+from .document import PLAIN, Certificate, Partition, Policy
 from .networks import Network, hashed
+from .schema import Array
 
 CLAIMS = {
     "asymptotic": "the origin is asymptotically stable, and every trajectory of the closed loop that starts in "
@@ -126,8 +127,8 @@ def _network(network: Network) -> str:
     arrays = [array for step in network.steps for array in step.arrays]
     sha256 = hashed("certify-lyapunov/1\0", arrays, network.words())
     if network.is_chain:
-        return f"{'-'.join(map(str, network.widths))} tanh, sha256 {sha256}"
-    steps = (f"v{k} = {step.said([f'v{i}' for i in step.of])}" for k, step in enumerate(network.steps, 1))
+        return f"{'-'.join(map(str, [network.reads, *network.sizes[1::2]]))} tanh, sha256 {sha256}"
+    steps = (f"v{k} = {step.said(', '.join(f'v{i}' for i in step.of))}" for k, step in enumerate(network.steps, 1))
     return f"{'; '.join(steps)}; sha256 {sha256}"
 
 
