@@ -175,7 +175,7 @@ def fits(ball: Ball) -> Failures:
     operations = (c.dynamics.size + c.policy.network.operations) * ball.order**2 * (1 + ball.count)
     if operations * numbers_of(symbols) > _MOST_JETS:
         yield "plant.dynamics", "the equations are too large for this rule"
-    called = [(call.network, call.network.reads) for call in c.dynamics.calls.values()]
+    called = [(network, network.reads) for network in c.dynamics.called]
     for network, arguments in ((c.policy.network, 0), *called):
         if is_too_large(network, symbols, arguments):
             yield "networks", f"the network {network.name} is too large for this rule"

@@ -74,7 +74,7 @@ class Boxes(ABC):
     @property
     def networks(self) -> list[Network]:
         """The policy's, and that of each call in the equations."""
-        return [self.c.policy.network, *(call.network for call in self.c.dynamics.calls.values())]
+        return [self.c.policy.network, *self.c.dynamics.called]
 
     @abstractmethod
     def leaves(self) -> Iterator[Batch]:

@@ -62,14 +62,16 @@ def claim(c: Certificate) -> list[str]:
     return [words.said(CLAIMS[c.claim].format(c=c, time=duration(c), when=when)), *lines]
 
 
-def besides(c: Certificate) -> list[str]:
-    """The target, the tube's start and the second function, line by line."""
+def stated(c: Certificate) -> list[str]:
+    """The plant, the policy, V, the target, the tube's start, the second function and the claim, line by line."""
     target = [] if c.target is None else [f"{expression(tree)} <= 0" for tree in c.target.trees]
     return [
+        *words.stated(c),
         *([f"target: {', '.join(target)}"] if target else []),
         *([] if c.tube is None else [f"S = {words.matrix(c.tube.start)}"]),
         *([] if c.tube is None or c.tube.centre is None else [f"c = {words.matrix(c.tube.centre[None])}"]),
         *([] if c.outer is None else [f"N(x) = {expression(c.outer.function.trees[0])}"]),
+        *claim(c),
     ]
 
 
@@ -80,7 +82,7 @@ def answers(c: Certificate, tally: Tally) -> dict[str, Any]:
         said = [": ".join(pair) for pair in evidence.queries]
         answer |= {"solver": evidence.solver, "version": evidence.version, "answers": said}
     elif c.claim == "invariant":
-        answer |= {"leaves": tally.rules["outer"], "margins": {"outer": tally.outer_margin}}
+        answer |= {"leaves": tally.rules["outer"], "margins": {"outer": tally.margins["outer"]}}
     if c.outer is not None:
         leaves = {"leaves": c.outer.tree.count(LEAF), "face_leaves": tally.rules["faces"]}
         answer["outer"] = {"level": c.outer.level, **leaves}
@@ -100,25 +102,24 @@ def answers(c: Certificate, tally: Tally) -> dict[str, Any]:
     return answer
 
 
-def results(c: Certificate, answer: dict[str, Any]) -> tuple[str, str, list[str], list[str]]:
-    """Margins, verdict, the statements of a certificate that takes over, and the counts of its rules."""
-    verdict = answer["result"]
+def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
+    """The whole answer, line by line, with the statements of a certificate that takes over."""
+    result, then, counted = answer["result"], list[str](), list[str]()
     if c.claim == "reaches":
         rest = f"leaves {answer['ranks']['leaves']}"
     elif c.claim == "invariant":
         margin = answer["margins"]["outer"]
         least = "" if margin is None else f"; smallest bound of -N'F on a leaf on which N may be its level {margin:.3g}"
         rest = f"leaves {answer['outer']['leaves']}{least}"
-    elif verdict == "TRUSTED":
+    elif result == "TRUSTED":
         rest = f"not checked, the solver's word: {', '.join(answer['answers'])}"
-        verdict = f"TRUSTED {answer['solver']} {answer['version']}"
+        result = f"TRUSTED {answer['solver']} {answer['version']}"
     else:
         rest = words.margins(c, answer, "D" if c.step else "Vdot")
-    if c.then is None:
-        return rest, verdict, [], []
-    counts = ", ".join(f"{rule} {count}" for rule, count in answer["then"]["rules"].items())
-    counted = f"of the certificate that takes over: {counts}"
-    return rest, verdict, [*handed_over(c, c.then), *words.stated(c.then)], [counted]
+    if c.then is not None:
+        counts = ", ".join(f"{rule} {count}" for rule, count in answer["then"]["rules"].items())
+        then, counted = [*handed_over(c, c.then), *stated(c.then)], [f"of the certificate that takes over: {counts}"]
+    return [*stated(c), *then, *words.held(answer, counted), rest, words.verdict(c, result)]
 
 
 def duration(c: Certificate) -> float:

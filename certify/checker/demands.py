@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from .document import Certificate
-from .limits import LEAF, Net, Sizes, called
+from collections.abc import Sequence
+from math import prod
+
+from .case import AT_CORNERS
+from .document import Certificate, Partition
+from .limits import LEAF, Net, Sizes
 
 
 def numbers(sizes: Sizes) -> int:
@@ -13,7 +17,7 @@ def numbers(sizes: Sizes) -> int:
 
 def work(sizes: Sizes) -> int:
     """Elementary operations."""
-    return of_ranks(sizes) + of_outer(sizes) + of_data(sizes) + of_tube(sizes)
+    return of_ranks(sizes) + of_outer(sizes) + of_data(sizes) + of_tube(sizes) + of_balls(sizes)
 
 
 def of_function(sizes: Sizes) -> int:
@@ -21,7 +25,7 @@ def of_function(sizes: Sizes) -> int:
     if sizes.c.outer is None:
         return 0
     tape, area = sizes.c.outer.function, (sizes.s + 1) ** 2
-    N, of_tape = Net(called(tape)), tape.size
+    N, of_tape = Net(tape.called), tape.size
     found = 4 * N.entries + sum(2 * rows * area for rows, *_ in N.steps) + 8 * of_tape * area
     return found + N.held_on_leaves(sizes.s + 1) + sizes.on_leaves(1, sizes.s)
 
@@ -85,12 +89,37 @@ def of_tube(sizes: Sizes) -> int:
     return len(tube.slabs) * of_each + sum(sizes.inverse(sizes.bits(P)) for P in nodes)
 
 
+def of_balls(sizes: Sizes) -> int:
+    """The rule `contraction`, and cones of both balls."""
+    evidence, close, found = sizes.evidence, sizes.c.contraction, 0
+    if not isinstance(evidence, Partition):
+        return 0
+    cells = prod(evidence.cells)
+    if evidence.local is not None:
+        times, corners = sizes.times(evidence, evidence.local.order), cells * 2 ** min(sizes.y, AT_CORNERS)
+        found += of_cones(sizes, evidence.local.directions, times, corners)
+    if close is not None:
+        corners = cells * 2**sizes.y
+        found += sizes.ball + cells * sizes.equations + corners * sizes.inequality + sizes.decision(sizes.n)
+        found += of_cones(sizes, close.directions, cells, corners)
+    return found
+
+
+def of_cones(sizes: Sizes, directions: Sequence[bytes] | None, times: int, corners: int) -> int:
+    """Models, for which the equations are evaluated so many times, and inequalities on cones."""
+    if directions is None:
+        return 0
+    leaves = max(1, sum(tree.count(LEAF) for tree in directions))
+    each = sizes.inequality + 2**8 * (sizes.y * sizes.n + sizes.net.units) * (sizes.d + 1) ** 2
+    return leaves * (sizes.ball + times * sizes.equations + corners * each) + 2**8 * sum(map(len, directions))
+
+
 def of_outer(sizes: Sizes) -> int:
     evidence = sizes.c.outer
     if evidence is None:
         return 0
     tape = evidence.function
-    N, of_tape = Net(called(tape)), tape.size
+    N, of_tape = Net(tape.called), tape.size
     calls, values = 200 * N.reads, max(N.widest, 2 * of_tape)
     faces, leaves = sum(tree.count(LEAF) for tree in evidence.faces), evidence.tree.count(LEAF)
     found = N.folded + sizes.inverse(sizes.bits(evidence.T))

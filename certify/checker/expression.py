@@ -73,6 +73,11 @@ class Tape:
         return found
 
     @property
+    def called(self) -> list[Network]:
+        """The network of each call."""
+        return [call.network for call in self.calls.values()]
+
+    @property
     def entries(self) -> int:
         """The number of entries of calls."""
         return sum(len(call.entries) for call in self.calls.values())
@@ -80,7 +85,7 @@ class Tape:
     @property
     def size(self) -> int:
         """The number of operations, with those in networks, for each call."""
-        return len(self.operations) + sum(call.network.operations for call in self.calls.values())
+        return len(self.operations) + sum(network.operations for network in self.called)
 
 
 def no_calls(call: Call, arguments: list[Any]) -> Sequence[Any]:

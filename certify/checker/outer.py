@@ -109,7 +109,7 @@ class Function:
     """N on boxes, and its derivative along F."""
 
     def __init__(self, tape: Tape) -> None:
-        self.tape, networks = tape, [call.network for call in tape.calls.values()]
+        self.tape, networks = tape, tape.called
         self.values = max(2 * tape.size, *(network.widest for network in networks), 0)
         self.shapes = [shape for net in networks for shape in net.shapes]
         prepare(*networks)
@@ -313,7 +313,7 @@ def examine(tally: Tally, case: Case) -> None:
 
         bounds = invariant.Staying(case)
     tree = bounds.outer.tree
-    tally.outer_margin = tally.hold_on_leaves(ON_OUTER_LEAVES, bounds, tree, lambda leaves: leaves.bound)
+    tally.margins["outer"] = tally.hold_on_leaves(ON_OUTER_LEAVES, bounds, tree, lambda leaves: leaves.bound)
 
 
 OF_OUTER = (("outer", is_small),)

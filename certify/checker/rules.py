@@ -145,18 +145,12 @@ RULES = (
 
 @dataclass
 class Tally:
-    """Each rule's count, and the margins, which are floats for people."""
+    """Each rule's count, and margins, which are floats for people: 1 - the remainder's largest part of the decay, and
+    the smallest bounds of -Vdot and -N'F on the leaves of which they are asked."""
 
     rules: Counter[str] = field(default_factory=lambda: Counter(dict.fromkeys(RULES, 0) | READ))
-    ring_margin: float | None = None  # smallest -Vdot bound over the ring's leaves
-    outer_margin: float | None = None  # smallest -N'F bound over the leaves of which it is asked
-    local_margin: float | None = None  # 1 - the remainder's largest part of the decay
+    margins: dict[str, float | None] = field(default_factory=lambda: dict.fromkeys(("local", "ring", "outer")))
     then: Tally | None = None  # of the certificate that takes over
-
-    @property
-    def margins(self) -> dict[str, float | None]:
-        """The margins of the rules, by name."""
-        return {"local": self.local_margin, "ring": self.ring_margin, "outer": self.outer_margin}
 
     def hold(self, table: Table[Subject], subject: Subject) -> None:
         """Raise `Rejected` at the first failure of the first rule that fails; count what the rules have looked at."""
@@ -221,8 +215,8 @@ def _examine(tally: Tally, case: Case) -> None:
         origin = local.Local.of(case)
         tally.hold(ON_THE_BALL, origin)
         if np.isfinite(origin.margin):  # binary64 may not hold the sides of an inequality that rationals decide
-            tally.local_margin = origin.margin
+            tally.margins["local"] = origin.margin
     tally.hold(OF_THE_TREE, case)
     if not case.covered or c.c1 != c.c2:
         bounds, tree = ring.Ring.of(case), case.partition.tree
-        tally.ring_margin = tally.hold_on_leaves(ON_LEAVES, bounds, tree, lambda leaves: leaves.bound[leaves.meet])
+        tally.margins["ring"] = tally.hold_on_leaves(ON_LEAVES, bounds, tree, lambda leaves: leaves.bound[leaves.meet])
