@@ -26,10 +26,6 @@ from .networks import Affine, Algebra, Map, Network
 if TYPE_CHECKING:
     from .kinks import Cone
 
-_MOST_JETS = 2**26  # numbers in the matrices and tensors of all jets
-_MOST_NUMBERS = 2**25  # in those of a layer and the paths to it
-_MOST_PRODUCTS = 2**33  # in the sums over paths
-
 
 @dataclass(frozen=True)
 class Ball:
@@ -169,19 +165,6 @@ class Ball:
         return [uncertain(lo, hi, self.units, j, self.count) for j, (lo, hi) in enumerate(cell)]
 
 
-def fits(ball: Ball) -> Failures:
-    """The jets take neither too much memory nor too much time."""
-    c, symbols = ball.case.c, len(ball.J) + (ball.motion is not None)
-    operations = (c.dynamics.size + c.policy.network.operations) * ball.order**2 * (1 + ball.count)
-    if operations * numbers_of(symbols) > _MOST_JETS:
-        yield "plant.dynamics", "the equations are too large for this rule"
-    called = [(network, network.reads) for network in c.dynamics.called]
-    for network, arguments in ((c.policy.network, 0), *called):
-        if is_too_large(network, symbols, arguments):
-            yield "networks", f"the network {network.name} is too large for this rule"
-    return 0
-
-
 def keeps_inputs(ball: Ball) -> Failures:
     """`inputs`: by form, or by the enclosure on the ball."""
     c = ball.case.c
@@ -200,23 +183,6 @@ def is_not_clipped(ball: Ball) -> Failures:
         if not limits[0] < low <= high < limits[1]:
             yield ball.at, f"{name} may be clipped: policy.clip"
     return 0
-
-
-def numbers_of(k: int) -> int:
-    """Numbers in the matrices and tensors of a jet."""
-    return k * k + len(triples(k)[0])
-
-
-def is_too_large(network: Network, k: int, arguments: int) -> bool:
-    """True if jets of a network in k symbols, of which so many arguments are units, take too much memory or time."""
-    products = 0
-    for rows, width, before in network.shapes:
-        if before + arguments:
-            columns = k + before + arguments
-            products += rows * columns * (width + numbers_of(k))
-            if columns * (rows + numbers_of(k)) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
-                return True
-    return False
 
 
 # ------------------------------------------------------------------------------------------------------------- networks

@@ -45,11 +45,10 @@ class Contracted(Ball):
 
 
 def fits(ball_: Contracted) -> Failures:
-    """The ball contains {V <= c0}, and its jets take neither too much memory nor too much time."""
-    yield from is_large_enough(ball_, "levels.floor", "c0", ball_.case.c.c0, ball_.by.directions)
+    """The ball contains {V <= c0}, and the weights are positive."""
+    yield from is_large_enough(ball_, "levels.floor", "c0", ball_.case.c.c0, ball_.by.directions, "contraction")
     if not np.all(ball_.by.weights > 0):
         yield "evidence.contraction.weights", "must be positive"
-    yield from ball.fits(ball_)
     return 0
 
 

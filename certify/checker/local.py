@@ -7,16 +7,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
-from math import prod
 from typing import TYPE_CHECKING
 
 import numpy as np
 from flint import fmpq_mat
 
-from . import ball
 from .ball import Ball
-from .boxes import LEAF
-from .case import AT_CORNERS, Case, Failures
+from .case import Case, Failures
 from .decrease import Inequality, Level, Models, are_finite, are_usable, rational
 from .document import Intervals, Multipliers
 from .exact import contains_ball, exactly, fraction, is_definite
@@ -24,9 +21,6 @@ from .jets import Jet
 
 if TYPE_CHECKING:
     from .kinks import Cone
-
-_MOST_CORNERS = 2**16  # of all cells
-_MOST_WORK = 2**26  # corners times n^4, which is what an inequality takes
 
 
 @dataclass(frozen=True)
@@ -110,33 +104,26 @@ def _margin(decay: fmpq_mat, rest: fmpq_mat) -> float:
 
 
 def is_large_enough(
-    ball: Ball, place: str, name: str, level: float, directions: tuple[bytes, ...] | None, most: int = 64
+    ball: Ball, place: str, name: str, level: float, directions: tuple[bytes, ...] | None, where: str
 ) -> Failures:
-    """The trees are trees; the ball contains {V <= level}, whose name and place are these; deciding an inequality at
-    each corner of each cell on each cone, of `most` of the numbers y, does not take too long."""
+    """The trees of directions, which stand at a place of the evidence, are trees; the ball contains {V <= level}."""
     if directions:
         from .kinks import are_whole
 
-        where = "local" if most < 64 else "contraction"
         yield from are_whole(directions, len(ball.J), f"evidence.{where}.directions")
     if not contains_ball(exactly(ball.J), exactly(ball.case.c.P), Fraction(level)):
         yield place, f"the ball must contain {{V <= {name}}}"
-    corners = prod(ball.case.partition.cells) * 2 ** min(ball.count, most)
-    corners *= max(1, sum(tree.count(LEAF) for tree in directions or ()))
-    if corners > _MOST_CORNERS or corners * len(ball.J) ** 4 > _MOST_WORK:
-        yield "evidence.cells", "there are too many cells for this rule"
     return 0
 
 
 def fits(local: Local) -> Failures:
-    """`local`: the ball contains {V <= c1}, and its jets take neither too much memory nor too much time."""
+    """`local`: the ball contains {V <= c1}, and multipliers may be used."""
     c = local.case.c
-    yield from is_large_enough(local, "levels.local", "c1", c.c1, local.case.local.directions, AT_CORNERS)
+    yield from is_large_enough(local, "levels.local", "c1", c.c1, local.case.local.directions, "local")
     if not are_usable(local.case.local.by):
         yield "evidence.local", "no multiplier may be negative, none of g 0 where some beta is"
     if c.step > 0 and Fraction(local.case.local.edge) * c.step > 1:
         yield "evidence.local.edge", "a step may lead out of {V <= c0}: the edge must be at most 1/h"
-    yield from ball.fits(local)
     return 0
 
 

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 _MOST_BITS = 2**14  # of a number in a matrix all of whose inverse is wanted, times the matrix's size
 _BATCH_NUMBERS = 1_000_000  # in the largest array of a batch
-_MOST_NUMBERS, _MOST_VALUES = 2**22, 2**26  # of a box: in the models of a network, and of all of an expression's values
 
 
 @dataclass(frozen=True)
@@ -111,13 +110,7 @@ class Function:
     def __init__(self, tape: Tape) -> None:
         self.tape, networks = tape, tape.called
         self.values = max(2 * tape.size, *(network.widest for network in networks), 0)
-        self.shapes = [shape for net in networks for shape in net.shapes]
         prepare(*networks)
-
-    def is_small(self, symbols: int) -> bool:
-        """True if the models in so many symbols take an acceptable amount of memory and time."""
-        numbers = sum(rows * (columns + symbols**2) for rows, columns, _ in self.shapes)
-        return numbers <= _MOST_NUMBERS and self.tape.size * symbols**2 <= _MOST_VALUES
 
     def along(self, states: Sequence[Taylor], F: Sequence[Taylor | None]) -> Dual:
         """N, and its derivative where F is given."""
@@ -154,14 +147,6 @@ class Function:
         wide = [x.widened(first + self.tape.entries) for x in states]
         N: Taylor = evaluate(self.tape, constants(wide[0]), wide, lambda call, given: entries(call, given, first))[0]
         return N
-
-
-def is_small(case: Case) -> Failures:
-    """`outer`: N is small enough."""
-    c = case.c
-    if not _function(case).is_small(len(c.states) + len(c.inputs) + len(c.uncertain) + c.dynamics.entries):
-        yield "claim.outer", "too many numbers or operations for so many symbols"
-    return 0
 
 
 def is_above_on_faces(case: Case) -> Failures:
@@ -305,7 +290,7 @@ class Beyond(Boxes):
 
 def examine(tally: Tally, case: Case) -> None:
     """The rules about a second function."""
-    for table in (OF_OUTER, ON_FACES, OF_OUTER_TREE):
+    for table in (ON_FACES, OF_OUTER_TREE):
         tally.hold(table, case)
     bounds = Beyond(case)
     if case.c.without_V:
@@ -316,7 +301,6 @@ def examine(tally: Tally, case: Case) -> None:
     tally.margins["outer"] = tally.hold_on_leaves(ON_OUTER_LEAVES, bounds, tree, lambda leaves: leaves.bound)
 
 
-OF_OUTER = (("outer", is_small),)
 ON_FACES = (("faces", is_above_on_faces),)
 OF_OUTER_TREE = (("outer", contains_domain), ("outer", is_partition))
 ON_OUTER_LEAVES = (
