@@ -47,11 +47,6 @@ class Ball:
         return self.motion is None and (self.case.c.policy.centre != "none" or not self.case.c.practical)
 
     @property
-    def order(self) -> int:
-        """The order of the series in time."""
-        return 1
-
-    @property
     def count(self) -> int:
         """The number of variables y: one per uncertain quantity, and one for the period if it has a range."""
         lo, hi = self.case.c.sample or (0, 0)

@@ -96,29 +96,24 @@ def no_calls(call: Call, arguments: list[Any]) -> Sequence[Any]:
 def evaluate(
     tape: Tape, constant: Callable[[Fraction], Any], variables: Sequence[Any], calling: Calling = no_calls
 ) -> list[Any]:
-    """The outputs of `tape` at `variables` (states, inputs, uncertain quantities), in their arithmetic; a value is kept
-    no longer than it is needed."""
-    last = {i: k for k, operation in enumerate(tape.operations) for i in operation.operands}
-    last |= dict.fromkeys(tape.outputs, len(tape.operations))
-    values: dict[int, Any] = {}
+    """The outputs of `tape` at `variables` (states, inputs, uncertain quantities), in their arithmetic."""
+    values: list[Any] = []
     for k, operation in enumerate(tape.operations):
         given, detail = [values[i] for i in operation.operands], operation.detail
         match operation.name:
             case "const":
-                values[k] = constant(detail)
+                value = constant(detail)
             case "var":
-                values[k] = variables[detail]
+                value = variables[detail]
             case "call":
-                values[k] = dict(zip(tape.calls[k].entries, calling(tape.calls[k], given), strict=True))
+                value = dict(zip(tape.calls[k].entries, calling(tape.calls[k], given), strict=True))
             case "entry":
-                values[k] = given[0][detail]
+                value = given[0][detail]
             case "+" | "*" | "neg":
-                values[k] = _OPERATORS[operation.name](*given)
+                value = _OPERATORS[operation.name](*given)
             case name:
-                values[k] = given[0].function(name)
-        for i in set(operation.operands):
-            if last[i] == k:
-                del values[i]
+                value = given[0].function(name)
+        values.append(value)
     return [values[i] for i in tape.outputs]
 
 

@@ -45,11 +45,6 @@ class Local(Ball):
         return kind(case, case.local.J, "local ball", cone=cone)
 
     @property
-    def margin(self) -> float:
-        """The least margin so far."""
-        return min(self.margins, default=float("nan"))
-
-    @property
     def at_rest(self) -> bool:
         """True if F vanishes at the origin, and so everything that is built from it."""
         return not self.case.c.practical

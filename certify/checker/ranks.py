@@ -14,12 +14,12 @@ from operator import add
 from typing import TYPE_CHECKING
 
 import numpy as np
-from flint import fmpq_mat
+from flint import arb, fmpq_mat
 
 from .boxes import LEAF, Batch, batches, is_whole, middle
 from .case import Case, Failures, given
 from .expression import evaluate
-from .near import TURN, Above, Array, Form, Near, near, size, within
+from .near import Above, Array, Form, Near, near, near_ball, size, within
 from .network import enclose_on_boxes
 from .periodic import is_periodic
 from .ring import Moving
@@ -29,6 +29,7 @@ from .taylor import Taylor, affine, combination, constants, forms, upper_bound
 if TYPE_CHECKING:
     from .rules import Tally
 
+TURN = near_ball(2 * arb.pi())
 _MOST_NODES = 2**14  # of the tree that an image may meet
 Failing = tuple[str, str]  # a place, and what fails there
 

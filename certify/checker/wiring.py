@@ -160,7 +160,7 @@ class BoxSteps:
         """With v = c + V and w = e + W it is c e + c W + e V + V W: errors of v and w pass times e and c, exact
         numbers, and V W is between bounds."""
         c, e = v.h.value[0], w.h.value[0]
-        moved, other = v.h.unmoved, w.h.unmoved
+        moved, other = _unmoved(v.h), _unmoved(w.h)
         shift, gap = lines_around_product(moved, v.error, other, w.error, v.step == w.step)
         h = (w.plain * Near(c) + moved * Near(e)).raised(Near(shift))
         passed, added = v.error * size(e) + w.error * size(c), gap + h.error
@@ -194,6 +194,11 @@ class BoxSteps:
                     for i, a, b in zip(step.of, ends[:-1], ends[1:], strict=True)
                 ]
         return []  # expressions keep no way back
+
+
+def _unmoved(h: Form) -> Form:
+    """The coefficients of the symbols alone, and 0 for that of 1."""
+    return Form(np.concatenate([np.zeros_like(h.value[:1]), h.value[1:]]))
 
 
 def _length(v: Enclosed, factor: Array) -> Above:
