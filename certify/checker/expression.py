@@ -48,9 +48,6 @@ class Call:
     first: int
 
 
-Calling = Callable[[Call, list[Any]], Sequence[Any]]  # the entries that a call uses, given the arguments
-
-
 @dataclass(frozen=True)
 class Tape:
     """`operations` in order of evaluation; `outputs` index the n components of f; `trees` are for people."""
@@ -88,15 +85,11 @@ class Tape:
         return len(self.operations) + sum(network.operations for network in self.called)
 
 
-def no_calls(call: Call, arguments: list[Any]) -> Sequence[Any]:
-    """The calling of expressions in which no network is called."""
-    raise TypeError("no network is called here")
-
-
 def evaluate(
-    tape: Tape, constant: Callable[[Fraction], Any], variables: Sequence[Any], calling: Calling = no_calls
+    tape: Tape, constant: Callable[[Fraction], Any], variables: Sequence[Any], calling: Any = None
 ) -> list[Any]:
-    """The outputs of `tape` at `variables` (states, inputs, uncertain quantities), in their arithmetic."""
+    """The outputs of `tape` at `variables` (states, inputs, uncertain quantities), in their arithmetic;
+    `calling` gives the entries that a call uses, of it and its arguments."""
     values: list[Any] = []
     for k, operation in enumerate(tape.operations):
         given, detail = [values[i] for i in operation.operands], operation.detail

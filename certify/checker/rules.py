@@ -22,7 +22,7 @@ from .boxes import in_order
 from .case import Case, Failures, only_where
 from .document import Certificate, Partition
 from .errors import Rejected
-from .exact import Exact, Exactly, policy_at_origin
+from .exact import Exact, Exactly, gershgorin_lower, policy_at_origin
 from .expression import evaluate
 from .functions import Undecided
 from .near import Array, self_test
@@ -72,7 +72,7 @@ def domain(case: Case) -> Failures:
 
 
 def coordinates(case: Case) -> Failures:
-    if not (case.S_inverse and case.least > 0):
+    if not (case.S_inverse and gershgorin_lower(case.S) > 0):
         yield "evidence.T", "T'PT must be positive definite and diagonally dominant"
     return 1
 
@@ -214,9 +214,7 @@ def _examine(tally: Tally, case: Case) -> None:
     if case.covered:
         origin = local.Local.of(case)
         tally.hold(ON_THE_BALL, origin)
-        if np.all(
-            np.isfinite(origin.margins)
-        ):  # binary64 may not hold what rationals decide
+        if np.all(np.isfinite(origin.margins)):  # binary64 may not hold what rationals decide
             tally.margins["local"] = min(origin.margins)
     tally.hold(OF_THE_TREE, case)
     if not case.covered or c.c1 != c.c2:
