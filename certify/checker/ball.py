@@ -24,6 +24,7 @@ from .network import norm2
 from .networks import Affine, Algebra, Map, Network
 
 if TYPE_CHECKING:
+    from .decrease import Models
     from .kinks import Cone
 
 
@@ -34,7 +35,9 @@ class Ball:
     case: Case
     J: Array
     at: str
-    cone: Cone | None = field(default=None, kw_only=True)  # of d, on which entries have kinks; None if there are none
+    directions: tuple[bytes, ...] | None = field(default=None, kw_only=True)  # trees of them; None if nothing has kinks
+    cone: Cone | None = field(default=None, kw_only=True)  # the leaf of a tree whose d these are; None for all d
+    close = False  # True if errors are meant for the difference of any two d
 
     @property
     def motion(self) -> tuple[list[Fraction], list[Fraction]] | None:
@@ -52,23 +55,30 @@ class Ball:
         lo, hi = self.case.c.sample or (0, 0)
         return len(self.case.c.ranges) + (lo < hi)
 
-    def on_cones(self, directions: tuple[bytes, ...] | None, close: bool = False) -> Iterator[Self]:
-        """It, or it on each cone of d that trees of directions make; `close` as in kinks.py."""
-        if not directions:
+    def on_cones(self) -> Iterator[Self]:
+        """It, or it on each cone of d that trees of directions make."""
+        if not self.directions:
             yield self
             return
         from .kinks import cones
 
-        for cone in cones(directions, len(self.J), close):
+        for cone in cones(self.directions, len(self.J), self.close):
             yield replace(self, cone=cone)
 
     def algebra(self, k: int) -> OnBall:
         """The algebra of networks, in k symbols."""
-        if self.cone is None:
+        if self.directions is None:
             return OnBall(k)
-        from .kinks import OnCone
+        from .kinks import OnCone, cone_of
 
-        return OnCone(k, self.cone)
+        return OnCone(k, cone_of(self))
+
+    def note_kinks(self, models: Models) -> None:
+        """Add to models what kinks have beyond them."""
+        if self.directions is not None:
+            from .kinks import Kinks, cone_of
+
+            models.more.append(Kinks.of(cone_of(self), models, self.case.c.P))
 
     @cached_property
     def states(self) -> list[Jet]:

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from flint import fmpq, fmpq_mat
 
-from .ball import OnBall, Rows
+from .ball import Ball, OnBall, Rows
 from .boxes import batches, is_whole
 from .case import Failures
 from .decrease import OF_ONE, Models, rational, vectors
@@ -241,7 +241,9 @@ class Cone:
         return decay - _best(decay - rest, C) * C
 
 
-ALL, CLOSE = Cone(), Cone(close=True)
+def cone_of(ball: Ball) -> Cone:
+    """The cone that a ball's d are of."""
+    return ball.cone or Cone(close=ball.close)
 
 
 def are_whole(directions: Sequence[bytes], n: int, at: str) -> Failures:
@@ -256,10 +258,8 @@ def are_whole(directions: Sequence[bytes], n: int, at: str) -> Failures:
     return count
 
 
-def cones(directions: Sequence[bytes], n: int, close: bool = False) -> Iterator[Cone]:
+def cones(directions: Sequence[bytes], n: int, close: bool) -> Iterator[Cone]:
     """Yield cones that together have all d, (n,), after `are_whole`."""
-    if not directions:
-        yield CLOSE if close else ALL
     for k, tree in enumerate(directions):
         for _, lo, hi in batches(tree, *_face(k, n), _AT_ONCE):
             for a, b in zip(lo.T, hi.T, strict=True):

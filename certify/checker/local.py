@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from flint import fmpq_mat
@@ -19,9 +18,6 @@ from .document import Intervals, Multipliers
 from .exact import contains_ball, exactly, fraction, is_definite
 from .jets import Jet
 
-if TYPE_CHECKING:
-    from .kinks import Cone
-
 
 @dataclass(frozen=True)
 class Local(Ball):
@@ -30,19 +26,15 @@ class Local(Ball):
     margins: list[float] = field(default_factory=list, kw_only=True)  # 1 - the largest share of the decay that the rest
     # takes at a corner, in floats for people
 
-    @classmethod
-    def of(cls, case: Case, cone: Cone | None = None) -> Local:
-        """The ball of a certificate, or a cone of it."""
-        kind: type[Local] = cls
+    @staticmethod
+    def of(case: Case) -> Local:
+        """The ball of a certificate."""
+        kind = Local
         if case.c.step:
             from .stepping import kind_of
 
             kind = kind_of(case)
-        if cone is None and case.local.directions is not None:
-            from .kinks import ALL
-
-            cone = ALL
-        return kind(case, case.local.J, "local ball", cone=cone)
+        return kind(case, case.local.J, "local ball", directions=case.local.directions)
 
     @property
     def at_rest(self) -> bool:
@@ -81,10 +73,7 @@ class Local(Ball):
             if models is None:
                 yield None
                 return
-            if self.cone is not None:
-                from .kinks import Kinks
-
-                models.more.append(Kinks.of(self.cone, models, self.case.c.P))
+            self.note_kinks(models)
             for corner in models.corners(self.case.c.P):
                 decay, rest = self.inequality(corner).sides()
                 yield (decay if self.cone is None else self.cone.within(decay, rest)), rest
@@ -98,14 +87,12 @@ def _margin(decay: fmpq_mat, rest: fmpq_mat) -> float:
         return float("nan")
 
 
-def is_large_enough(
-    ball: Ball, place: str, name: str, level: float, directions: tuple[bytes, ...] | None, where: str
-) -> Failures:
-    """The trees of directions, which stand at a place of the evidence, are trees; the ball contains {V <= level}."""
-    if directions:
+def is_large_enough(ball: Ball, place: str, name: str, level: float) -> Failures:
+    """The trees of directions are trees; the ball contains {V <= level}."""
+    if ball.directions:
         from .kinks import are_whole
 
-        yield from are_whole(directions, len(ball.J), f"evidence.{where}.directions")
+        yield from are_whole(ball.directions, len(ball.J), f"evidence.{ball.at.split()[0]}.directions")
     if not contains_ball(exactly(ball.J), exactly(ball.case.c.P), Fraction(level)):
         yield place, f"the ball must contain {{V <= {name}}}"
     return 0
@@ -114,7 +101,7 @@ def is_large_enough(
 def fits(local: Local) -> Failures:
     """`local`: the ball contains {V <= c1}, and multipliers may be used."""
     c = local.case.c
-    yield from is_large_enough(local, "levels.local", "c1", c.c1, local.case.local.directions, "local")
+    yield from is_large_enough(local, "levels.local", "c1", c.c1)
     if not are_usable(local.case.local.by):
         yield "evidence.local", "no multiplier may be negative, none of g 0 where some beta is"
     if c.step > 0 and Fraction(local.case.local.edge) * c.step > 1:
@@ -125,7 +112,7 @@ def fits(local: Local) -> Failures:
 def decreases(local: Local) -> Failures:
     """`local`: D + 2 lambda V < 0 on the ball without its centre, or as far as V >= c0."""
     count = 0
-    for both in (both for part in local.on_cones(local.case.local.directions) for both in part.sides()):
+    for both in (both for part in local.on_cones() for both in part.sides()):
         if both is None:
             yield "levels.local", "F has no finite model on the local ball"
             return count
