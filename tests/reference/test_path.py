@@ -405,8 +405,8 @@ def models_of(data: Document) -> list[tuple[list[Model], list[Model]]]:
     """Those of the inputs and of F on each slab, wide as the file's ball."""
     c = read(dump(data))
     loop, result = Loop(c), []
-    places = [c.centre, *(each.path.centre for each in c.tube.slabs)]  # type: ignore[union-attr]
-    for each, (before, after) in zip(c.tube.slabs, itertools.pairwise(places), strict=True):  # type: ignore[union-attr]
+    places = [c.centre, *(each.path.centre for each in c.evidence.tube)]  # type: ignore[union-attr]
+    for each, (before, after) in zip(c.evidence.tube, itertools.pairwise(places), strict=True):  # type: ignore[union-attr]
         w = (after - before) / (2 * fmpq(*each.path.share.as_integer_ratio()))  # type: ignore[union-attr,operator]
         wide = fmpq_mat([[*a, b] for a, b in zip(each.ball.J.tolist(), w.entries(), strict=True)])
         m = (before + after) / 2  # type: ignore[operator]

@@ -372,7 +372,7 @@ def test_the_inputs_on_a_slab() -> None:
 def inputs_of(data: Document) -> list[Any]:
     """The model of the input on each slab."""
     c = rules.read(dump(data))
-    return [inputs_on(c, each.ball.J)[0] for each in c.tube.slabs]  # type: ignore[union-attr]
+    return [inputs_on(c, each.ball.J)[0] for each in c.evidence.tube]  # type: ignore[union-attr]
 
 
 def test_by_form_the_inputs_need_no_model() -> None:
