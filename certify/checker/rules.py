@@ -214,8 +214,9 @@ def _examine(tally: Tally, case: Case) -> None:
     if case.covered:
         origin = local.Local.of(case)
         tally.hold(ON_THE_BALL, origin)
-        if np.all(np.isfinite(origin.margins)):  # binary64 may not hold what rationals decide
-            tally.margins["local"] = min(origin.margins)
+        least = min(origin.margins, default=np.nan)
+        if np.isfinite(least):  # binary64 may not hold the sides of an inequality that rationals decide
+            tally.margins["local"] = least
     tally.hold(OF_THE_TREE, case)
     if not case.covered or c.c1 != c.c2:
         bounds, tree = ring.Ring.of(case), case.partition.tree
