@@ -212,8 +212,9 @@ def completed(
     if any(part is not None and part.order > most for part in orders):
         shown["order"].must(False, "1, and that of the ball, where the equations call a network")
     wanted = {"contraction": kind == "nearby", "tube": kind in WITH_TUBE, "outer": "outer" in beyond}
-    for key in EMPTY.keys() & shown.keys() if kind != "invariant" else ():
-        shown[key].must(wanted[key] or shown[key].raw == EMPTY[key], "null, or empty, where the claim has none")
+    for key, none in EMPTY.items() if kind != "invariant" else ():
+        if key in shown and not wanted[key]:
+            shown[key].must(shown[key].raw == none, "null, or empty, where the claim has none")
     if "keep" in beyond:
         c = replace(c, keep=_constraints(said["keep"], (*c.states, *c.inputs, *c.uncertain)))
     if "target" in said:
