@@ -24,11 +24,8 @@ from .network import norm2
 from .networks import Affine, Algebra, Map, Network
 
 if TYPE_CHECKING:
+    from .decrease import Models
     from .kinks import Cone
-
-_MOST_JETS = 2**26  # numbers in the matrices and tensors of all jets
-_MOST_NUMBERS = 2**25  # in those of a layer and the paths to it
-_MOST_PRODUCTS = 2**33  # in the sums over paths
 
 
 @dataclass(frozen=True)
@@ -38,7 +35,9 @@ class Ball:
     case: Case
     J: Array
     at: str
-    cone: Cone | None = field(default=None, kw_only=True)  # of d, on which entries have kinks; None if there are none
+    directions: tuple[bytes, ...] | None = field(default=None, kw_only=True)  # trees of them; None if nothing has kinks
+    cone: Cone | None = field(default=None, kw_only=True)  # the leaf of a tree whose d these are; None for all d
+    close = False  # True if errors are meant for the difference of any two d
 
     @property
     def motion(self) -> tuple[list[Fraction], list[Fraction]] | None:
@@ -51,33 +50,35 @@ class Ball:
         return self.motion is None and (self.case.c.policy.centre != "none" or not self.case.c.practical)
 
     @property
-    def order(self) -> int:
-        """The order of the series in time."""
-        return 1
-
-    @property
     def count(self) -> int:
         """The number of variables y: one per uncertain quantity, and one for the period if it has a range."""
         lo, hi = self.case.c.sample or (0, 0)
         return len(self.case.c.ranges) + (lo < hi)
 
-    def on_cones(self, directions: tuple[bytes, ...] | None, close: bool = False) -> Iterator[Self]:
-        """It, or it on each cone of d that trees of directions make; `close` as in kinks.py."""
-        if not directions:
+    def on_cones(self) -> Iterator[Self]:
+        """It, or it on each cone of d that trees of directions make."""
+        if not self.directions:
             yield self
             return
         from .kinks import cones
 
-        for cone in cones(directions, len(self.J), close):
+        for cone in cones(self.directions, len(self.J), self.close):
             yield replace(self, cone=cone)
 
     def algebra(self, k: int) -> OnBall:
         """The algebra of networks, in k symbols."""
-        if self.cone is None:
+        if self.directions is None:
             return OnBall(k)
-        from .kinks import OnCone
+        from .kinks import OnCone, cone_of
 
-        return OnCone(k, self.cone)
+        return OnCone(k, cone_of(self))
+
+    def note_kinks(self, models: Models) -> None:
+        """Add to models what kinks have beyond them."""
+        if self.directions is not None:
+            from .kinks import Kinks, cone_of
+
+            models.more.append(Kinks.of(cone_of(self), models, self.case.c.P))
 
     @cached_property
     def states(self) -> list[Jet]:
@@ -169,19 +170,6 @@ class Ball:
         return [uncertain(lo, hi, self.units, j, self.count) for j, (lo, hi) in enumerate(cell)]
 
 
-def fits(ball: Ball) -> Failures:
-    """The jets take neither too much memory nor too much time."""
-    c, symbols = ball.case.c, len(ball.J) + (ball.motion is not None)
-    operations = (c.dynamics.size + c.policy.network.operations) * ball.order**2 * (1 + ball.count)
-    if operations * numbers_of(symbols) > _MOST_JETS:
-        yield "plant.dynamics", "the equations are too large for this rule"
-    called = [(call.network, call.network.reads) for call in c.dynamics.calls.values()]
-    for network, arguments in ((c.policy.network, 0), *called):
-        if is_too_large(network, symbols, arguments):
-            yield "networks", f"the network {network.name} is too large for this rule"
-    return 0
-
-
 def keeps_inputs(ball: Ball) -> Failures:
     """`inputs`: by form, or by the enclosure on the ball."""
     c = ball.case.c
@@ -200,23 +188,6 @@ def is_not_clipped(ball: Ball) -> Failures:
         if not limits[0] < low <= high < limits[1]:
             yield ball.at, f"{name} may be clipped: policy.clip"
     return 0
-
-
-def numbers_of(k: int) -> int:
-    """Numbers in the matrices and tensors of a jet."""
-    return k * k + len(triples(k)[0])
-
-
-def is_too_large(network: Network, k: int, arguments: int) -> bool:
-    """True if jets of a network in k symbols, of which so many arguments are units, take too much memory or time."""
-    products = 0
-    for rows, width, before in network.shapes:
-        if before + arguments:
-            columns = k + before + arguments
-            products += rows * columns * (width + numbers_of(k))
-            if columns * (rows + numbers_of(k)) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
-                return True
-    return False
 
 
 # ------------------------------------------------------------------------------------------------------------- networks

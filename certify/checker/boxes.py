@@ -19,7 +19,7 @@ from .expression import evaluate
 from .near import Above, Array, Form, Near, all_near, near, size, within
 from .network import prepare
 from .networks import Network
-from .taylor import Taylor, affine, combination, constant, pairs, upper_bound
+from .taylor import Taylor, affine, combination, constants, pairs, upper_bound
 
 LEAF = 255
 MAX_DEPTH = 4096
@@ -74,7 +74,7 @@ class Boxes(ABC):
     @property
     def networks(self) -> list[Network]:
         """The policy's, and that of each call in the equations."""
-        return [self.c.policy.network, *(call.network for call in self.c.dynamics.calls.values())]
+        return [self.c.policy.network, *self.c.dynamics.called]
 
     @abstractmethod
     def leaves(self) -> Iterator[Batch]:
@@ -121,13 +121,9 @@ class Boxes(ABC):
         """The uncertain quantities, each with its symbol."""
         return [self.number(pair, self.errors + self.m + j, batch) for j, pair in enumerate(self.c.ranges)]
 
-    def constant(self, batch: int) -> Callable[[Fraction], Taylor]:
-        """The function that gives a rational's model."""
-        return lambda q: constant(q, self.symbols, batch)
-
     def f(self, states: list[Taylor], held: list[Taylor]) -> list[Taylor]:
         """f of states, and of inputs and uncertain quantities."""
-        constant, variables = self.constant(len(held[0].c)), [*states, *held]
+        constant, variables = constants(held[0]), [*states, *held]
         if not self.c.dynamics.calls:
             return evaluate(self.c.dynamics, constant, variables)
         from .calls import entries

@@ -12,9 +12,10 @@ from typing import Any, TypeVar
 
 from flint import fmpq_mat
 
-from .document import Array, Certificate, Intervals, LocalBall, Partition
-from .exact import exactly, gershgorin_lower, inverse_diagonal
+from .document import Certificate, Intervals, LocalBall, Partition
+from .exact import exactly, inverse_diagonal
 from .network import Folded, fold
+from .schema import Array
 
 T = TypeVar("T")
 AT_CORNERS = 6  # uncertain quantities of which rule `local` decides every corner
@@ -75,11 +76,6 @@ class Case:
     def S_inverse(self) -> list[Fraction]:
         """The diagonal of S^-1."""
         return inverse_diagonal(self.S)
-
-    @cached_property
-    def least(self) -> Fraction:
-        """A lower bound of the least eigenvalue of S."""
-        return gershgorin_lower(self.S)
 
     @cached_property
     def net(self) -> Folded:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from . import words
 from .boxes import LEAF
-from .document import Certificate, Partition
-from .sections import MAX_RANK, Data, Outer, OuterTree, Ranks, Trusted
+from .document import Certificate
+from .sections import MAX_RANK, Data, Outer, Ranks, Trusted
 from .words import expression, interval, number
 
 if TYPE_CHECKING:
@@ -62,14 +62,16 @@ def claim(c: Certificate) -> list[str]:
     return [words.said(CLAIMS[c.claim].format(c=c, time=duration(c), when=when)), *lines]
 
 
-def besides(c: Certificate) -> list[str]:
-    """The target, the tube's start and the second function, line by line."""
+def stated(c: Certificate) -> list[str]:
+    """The plant, the policy, V, the target, the tube's start, the second function and the claim, line by line."""
     target = [] if c.target is None else [f"{expression(tree)} <= 0" for tree in c.target.trees]
     return [
+        *words.stated(c),
         *([f"target: {', '.join(target)}"] if target else []),
-        *([] if c.start is None else [f"S = {words.matrix(c.start)}"]),
-        *([] if c.centre is None else [f"c = {' '.join(map(repr, c.centre.tolist()))}"]),
+        *([] if c.tube is None else [f"S = {words.matrix(c.tube.start)}"]),
+        *([] if c.tube is None or c.tube.centre is None else [f"c = {words.matrix(c.tube.centre[None])}"]),
         *([] if c.outer is None else [f"N(x) = {expression(c.outer.function.trees[0])}"]),
+        *claim(c),
     ]
 
 
@@ -79,11 +81,10 @@ def answers(c: Certificate, tally: Tally) -> dict[str, Any]:
     if isinstance(evidence, Trusted):
         said = [": ".join(pair) for pair in evidence.queries]
         answer |= {"solver": evidence.solver, "version": evidence.version, "answers": said}
-    elif isinstance(evidence, OuterTree):
-        answer |= {"leaves": tally.rules["outer"], "margins": {"outer": tally.outer_margin}}
-    tree = evidence.outer if isinstance(evidence, Partition) else evidence
-    if c.outer is not None and isinstance(tree, OuterTree):
-        leaves = {"leaves": tree.tree.count(LEAF), "face_leaves": tally.rules["faces"]}
+    elif c.claim == "invariant":
+        answer |= {"leaves": tally.rules["outer"], "margins": {"outer": tally.margins["outer"]}}
+    if c.outer is not None:
+        leaves = {"leaves": c.outer.tree.count(LEAF), "face_leaves": tally.rules["faces"]}
         answer["outer"] = {"level": c.outer.level, **leaves}
     if c.ranks is not None:
         answer["ranks"] = {"leaves": len(c.ranks.steps), "steps": c.ranks.most, "of": sum(map(bool, c.ranks.steps))}
@@ -91,36 +92,39 @@ def answers(c: Certificate, tally: Tally) -> dict[str, Any]:
         stated = {"claim": c.then.claim, "levels": c.then.levels}
         of_rules = {"rules": tally.then.rules, "margins": tally.then.margins, "leaves": tally.then.rules["tree"]}
         answer["then"] = {"plant": c.then.name, **stated, **of_rules}
-    if c.start is not None:
-        centre, longest = None if c.centre is None else c.centre.tolist(), duration(c)
-        answer |= {"start": c.start.tolist(), "centre": centre, "time": longest if math.isfinite(longest) else None}
+    if c.tube is not None:
+        centre, longest = None if c.tube.centre is None else c.tube.centre.tolist(), duration(c)
+        answer |= {
+            "start": c.tube.start.tolist(),
+            "centre": centre,
+            "time": longest if math.isfinite(longest) else None,
+        }
     return answer
 
 
-def results(c: Certificate, answer: dict[str, Any]) -> tuple[str, str, list[str], list[str]]:
-    """Margins, verdict, the statements of a certificate that takes over, and the counts of its rules."""
-    verdict = answer["result"]
+def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
+    """The whole answer, line by line, with the statements of a certificate that takes over."""
+    result, then, counted = answer["result"], list[str](), list[str]()
     if c.claim == "reaches":
         rest = f"leaves {answer['ranks']['leaves']}"
     elif c.claim == "invariant":
         margin = answer["margins"]["outer"]
         least = "" if margin is None else f"; smallest bound of -N'F on a leaf on which N may be its level {margin:.3g}"
         rest = f"leaves {answer['outer']['leaves']}{least}"
-    elif verdict == "TRUSTED":
+    elif result == "TRUSTED":
         rest = f"not checked, the solver's word: {', '.join(answer['answers'])}"
-        verdict = f"TRUSTED {answer['solver']} {answer['version']}"
+        result = f"TRUSTED {answer['solver']} {answer['version']}"
     else:
         rest = words.margins(c, answer, "D" if c.step else "Vdot")
-    if c.then is None:
-        return rest, verdict, [], []
-    counts = ", ".join(f"{rule} {count}" for rule, count in answer["then"]["rules"].items())
-    counted = f"of the certificate that takes over: {counts}"
-    return rest, verdict, [*handed_over(c, c.then), *words.stated(c.then)], [counted]
+    if c.then is not None:
+        counts = ", ".join(f"{rule} {count}" for rule, count in answer["then"]["rules"].items())
+        then, counted = [*handed_over(c, c.then), *stated(c.then)], [f"of the certificate that takes over: {counts}"]
+    return [*stated(c), *then, *words.held(answer, counted), rest, words.verdict(c, result)]
 
 
 def duration(c: Certificate) -> float:
     """The tube's duration, rounded up; infinite if it exceeds all binary64 numbers."""
-    slabs = c.evidence.tube if isinstance(c.evidence, Partition) else ()
+    slabs = () if c.tube is None else c.tube.slabs
     try:
         return math.nextafter(math.fsum(slab.duration for slab in slabs), math.inf)
     except OverflowError:

@@ -13,7 +13,7 @@ from flint import fmpq, fmpq_mat
 
 from . import ball
 from .ball import Ball
-from .case import Case, Failures
+from .case import Case, Failures, given
 from .decrease import Models, are_finite, diagonal, rational, vectors
 from .exact import exactly, is_definite, root_above
 from .jets import unpacked
@@ -24,7 +24,6 @@ from .sections import Contraction
 from .stepping import lengths_of_forms
 
 if TYPE_CHECKING:
-    from .kinks import Cone
     from .rules import Tally
 
 
@@ -33,23 +32,19 @@ class Contracted(Ball):
     """The ball of the section `contraction`."""
 
     by: Contraction
+    close = True
 
-    @classmethod
-    def of(cls, case: Case, by: Contraction, cone: Cone | None = None) -> Contracted:
-        """The ball of a certificate, or a cone of it."""
-        if cone is None and by.directions is not None:
-            from .kinks import CLOSE
-
-            cone = CLOSE
-        return cls(case, by.J, "contraction", by, cone=cone)
+    @staticmethod
+    def of(case: Case) -> Contracted:
+        by = given(case.c.contraction)
+        return Contracted(case, by.J, "contraction", by, directions=by.directions)
 
 
 def fits(ball_: Contracted) -> Failures:
-    """The ball contains {V <= c0}, and its jets take neither too much memory nor too much time."""
-    yield from is_large_enough(ball_, "levels.floor", "c0", ball_.case.c.c0, ball_.by.directions)
+    """The ball contains {V <= c0}, and the weights are positive."""
+    yield from is_large_enough(ball_, "levels.floor", "c0", ball_.case.c.c0)
     if not np.all(ball_.by.weights > 0):
         yield "evidence.contraction.weights", "must be positive"
-    yield from ball.fits(ball_)
     return 0
 
 
@@ -57,15 +52,12 @@ def contracts(ball_: Contracted) -> Failures:
     """V(e + h g) - V(e), over h, is negative for any two points of the ball; e is their difference, g that of G, and h
     is 0 in continuous time, where this is 2 e'P g."""
     P, h, count = exactly(ball_.case.c.P), int(ball_.case.c.discrete), 0
-    parts = ball_.on_cones(ball_.by.directions, close=True)
-    for part, cell in ((part, cell) for part in parts for cell in ball_.case.cells):
+    for part, cell in ((part, cell) for part in ball_.on_cones() for cell in ball_.case.cells):
         G = part.change(cell)
         doubts = [g.lipschitz + g.slack for g in G]
         models = Models(ball_.J, G, rest=True) if are_finite(G) and all(np.isfinite(v.top) for v in doubts) else None
-        if models is not None and part.cone is not None:
-            from .kinks import Kinks
-
-            models.more.append(Kinks.of(part.cone, models, ball_.case.c.P))
+        if models is not None:
+            part.note_kinks(models)
         beyond = 0.0 if models is None or not h else _size_beyond(models, doubts, ball_.case.c.P)
         if models is None or not np.isfinite(beyond):
             yield ball_.at, "F has no finite model"
@@ -87,8 +79,7 @@ def contracts(ball_: Contracted) -> Failures:
 
 
 def examine(tally: Tally, case: Case) -> None:
-    if case.partition.contraction is not None:
-        tally.hold(OF_CONTRACTION, Contracted.of(case, case.partition.contraction))
+    tally.hold(OF_CONTRACTION, Contracted.of(case))
 
 
 OF_CONTRACTION = (("contraction", fits), ("contraction", ball.is_not_clipped), ("contraction", contracts))

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from .boxes import LEAF, is_whole
 from .case import Case, Failures, given
-from .document import Array, Intervals
+from .document import Intervals
 from .expression import evaluate
 from .flow import enclosed, later
 from .near import Above, Near, all_near, combined, near, size
+from .schema import Array
 from .sections import Data, Round
 from .taylor import Taylor, affine, constants, pairs
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from math import prod
+
+from .case import AT_CORNERS
 from .document import Certificate, Partition
-from .limits import LEAF, Net, Sizes, called
-from .sections import OuterTree, Trusted
+from .limits import LEAF, Net, Sizes
 
 
 def numbers(sizes: Sizes) -> int:
@@ -14,7 +17,7 @@ def numbers(sizes: Sizes) -> int:
 
 def work(sizes: Sizes) -> int:
     """Elementary operations."""
-    return of_ranks(sizes) + of_outer(sizes) + of_data(sizes) + of_tube(sizes)
+    return of_ranks(sizes) + of_outer(sizes) + of_data(sizes) + of_tube(sizes) + of_balls(sizes)
 
 
 def of_function(sizes: Sizes) -> int:
@@ -22,16 +25,16 @@ def of_function(sizes: Sizes) -> int:
     if sizes.c.outer is None:
         return 0
     tape, area = sizes.c.outer.function, (sizes.s + 1) ** 2
-    N, of_tape = Net(called(tape)), tape.size
+    N, of_tape = Net(tape.called), tape.size
     found = 4 * N.entries + sum(2 * rows * area for rows, *_ in N.steps) + 8 * of_tape * area
     return found + N.held_on_leaves(sizes.s + 1) + sizes.on_leaves(1, sizes.s)
 
 
 def of_following(sizes: Sizes) -> int:
     """Numbers for leaves that are followed by steps."""
-    if sizes.c.ranks is None or isinstance(sizes.evidence, Trusted | OuterTree):
+    if sizes.c.ranks is None:
         return 0
-    return 2**4 * len(sizes.c.ranks.tree) + sizes.on_leaves(sizes.evidence.order, sizes.s + sizes.n)
+    return 2**4 * len(sizes.c.ranks.tree) + sizes.on_leaves(sizes.c.ranks.order, sizes.s + sizes.n)
 
 
 def of_measured(sizes: Sizes) -> int:
@@ -46,10 +49,10 @@ def of_measured(sizes: Sizes) -> int:
 def of_ranks(sizes: Sizes) -> int:
     """Steps from leaves, and the leaves that their images meet."""
     ranks = sizes.c.ranks
-    if ranks is None or isinstance(sizes.evidence, Trusted | OuterTree):
+    if ranks is None:
         return 0
     leaves = len(ranks.steps)
-    of_all = sizes.of_leaves(leaves + sum(ranks.steps), sizes.evidence.order, sizes.s + sizes.n)
+    of_all = sizes.of_leaves(leaves + sum(ranks.steps), ranks.order, sizes.s + sizes.n)
     return 2**9 * len(ranks.tree) + 2**17 * leaves + of_all
 
 
@@ -78,20 +81,45 @@ def of_handover(sizes: Sizes, then: Certificate) -> int:
 
 
 def of_tube(sizes: Sizes) -> int:
-    if not isinstance(sizes.evidence, Partition):
+    tube = sizes.c.tube
+    if tube is None:
         return 0
     of_each = sizes.ball + sizes.equations + 3 * (sizes.inequality + sizes.decision(sizes.n))
-    tube, start = sizes.evidence.tube, sizes.c.start
-    nodes = [P for slab in tube for P in (slab.middle, slab.end)] + ([] if start is None else [start])
-    return len(tube) * of_each + sum(sizes.inverse(sizes.bits(P)) for P in nodes)
+    nodes = [tube.start, *(P for slab in tube.slabs for P in (slab.middle, slab.end))]
+    return len(tube.slabs) * of_each + sum(sizes.inverse(sizes.bits(P)) for P in nodes)
+
+
+def of_balls(sizes: Sizes) -> int:
+    """The rule `contraction`, and cones of both balls."""
+    evidence, close, found = sizes.evidence, sizes.c.contraction, 0
+    if not isinstance(evidence, Partition):
+        return 0
+    cells = prod(evidence.cells)
+    if evidence.local is not None:
+        times, corners = sizes.times(evidence, evidence.local.order), cells * 2 ** min(sizes.y, AT_CORNERS)
+        found += of_cones(sizes, evidence.local.directions, times, corners)
+    if close is not None:
+        corners = cells * 2**sizes.y
+        found += sizes.ball + cells * sizes.equations + corners * sizes.inequality + sizes.decision(sizes.n)
+        found += of_cones(sizes, close.directions, cells, corners)
+    return found
+
+
+def of_cones(sizes: Sizes, directions: Sequence[bytes] | None, times: int, corners: int) -> int:
+    """Models, for which the equations are evaluated so many times, and inequalities on cones."""
+    if directions is None:
+        return 0
+    leaves = max(1, sum(tree.count(LEAF) for tree in directions))
+    each = sizes.inequality + 2**8 * (sizes.y * sizes.n + sizes.net.units) * (sizes.d + 1) ** 2
+    return leaves * (sizes.ball + times * sizes.equations + corners * each) + 2**8 * sum(map(len, directions))
 
 
 def of_outer(sizes: Sizes) -> int:
-    evidence = sizes.evidence.outer if isinstance(sizes.evidence, Partition) else sizes.evidence
-    if sizes.c.outer is None or not isinstance(evidence, OuterTree):
+    evidence = sizes.c.outer
+    if evidence is None:
         return 0
-    tape = sizes.c.outer.function
-    N, of_tape = Net(called(tape)), tape.size
+    tape = evidence.function
+    N, of_tape = Net(tape.called), tape.size
     calls, values = 200 * N.reads, max(N.widest, 2 * of_tape)
     faces, leaves = sum(tree.count(LEAF) for tree in evidence.faces), evidence.tree.count(LEAF)
     found = N.folded + sizes.inverse(sizes.bits(evidence.T))

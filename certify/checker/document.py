@@ -3,32 +3,47 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from flint import fmpq
-from numpy.typing import NDArray
 
 from .errors import Rejected
 from .expression import Tape, parse
 from .networks import Network, hashed
 from .networks import read as read_networks
-from .schema import Value
+from .schema import Array, Binary64, Matrix, Value, section
 from .strict import load
 
 if TYPE_CHECKING:
-    from .sections import Contraction, Data, Outer, OuterTree, Ranked, Ranks, Slab, Trusted
+    from .sections import Contraction, Data, Outer, Ranks, Trusted, Tube
 
 MAX_STATES = 64
+MAX_ORDER = 8  # of a series in time
 MAX_CELLS, MAX_CUTS = 4096, 64  # of the box of uncertain quantities in all, and of one range
-CLAIMS = ("asymptotic", "practical", "nearby", "enlarged", "reached", "reaches", "invariant")
-PLAIN = ("asymptotic", "practical")
-WITHOUT_V = ("reaches", "invariant")
+PLAIN, WITH_TUBE, WITHOUT_V = ("asymptotic", "practical"), ("enlarged", "reached"), ("reaches", "invariant")
 PRACTICAL = ("practical", "nearby")
-Array = NDArray[np.float64]
+CLAIMS = {  # the keys of each claim, and those that may be missing
+    **dict.fromkeys((*PLAIN, "nearby"), ("rate sample outer", "ranks keep data")),
+    "enlarged": ("rate sample outer start", "keep"),
+    "reached": ("rate sample outer start centre", "keep"),
+    "reaches": ("sample target ranks", "keep"),
+    "invariant": ("outer", "keep"),
+}
+EVIDENCE = {  # the keys of each kind of evidence
+    "partition-tree": "T root tree order cells local contraction tube outer",
+    "trusted-solver": "solver version precision queries",
+    "ranks": "order ranks",
+    "outer": "outer",
+}
+EMPTY: dict[str, Any] = {
+    "contraction": None,
+    "tube": [],
+    "outer": None,
+}  # what evidence has where the claim has nothing
 Intervals = tuple[tuple[Fraction, Fraction], ...]
 
 
@@ -61,21 +76,45 @@ class Multipliers:
     weight: Array
 
 
+def _three(value: Value, sizes: Mapping[str, int]) -> Three:
+    rest, apart, joint = value.array(3, sizes["n"]).tolist()
+    return _rationals(rest), _rationals(apart), _rationals(joint)
+
+
+def _rationals(row: list[float]) -> tuple[fmpq, ...]:
+    return tuple(fmpq(*v.as_integer_ratio()) for v in row)
+
+
+def _trees(value: Value, sizes: Mapping[str, int]) -> tuple[bytes, ...]:
+    return value.listed(Value.octets, 2 * sizes["n"] if value.raw else 0)
+
+
+Three = tuple[tuple[fmpq, ...], tuple[fmpq, ...], tuple[fmpq, ...]]
+Rationals = Annotated[Three, _three]  # rest, apart and joint
+Order = Annotated[int, lambda value, sizes: value.integer(1, sizes["order"])]
+Directions = Annotated[tuple[bytes, ...] | None, _trees]
+
+
 @dataclass(frozen=True)
 class LocalBall:
     """The ball x = J d, ||d|| <= 1, and multipliers on it, the one of V - c0 among them; the order of the series in
     time there; with kinks, trees of directions."""
 
-    J: Array
-    multipliers: Multipliers
-    edge: float
-    order: int
-    directions: tuple[bytes, ...] | None = None
+    J: Matrix
+    multipliers: Rationals
+    weight: Matrix
+    edge: Binary64
+    order: Order
+    directions: Directions = None
+
+    @property
+    def by(self) -> Multipliers:
+        return Multipliers(*self.multipliers, self.weight)
 
 
 @dataclass(frozen=True)
 class Partition:
-    """Evidence that is replayed: a partition tree of the box |z| <= root, x = T z; the local ball; the tube's slabs."""
+    """Evidence that is replayed: a partition tree of the box |z| <= root, x = T z; the local ball."""
 
     T: Array
     root: Array
@@ -83,9 +122,6 @@ class Partition:
     order: int  # of the series in time on leaves
     cells: tuple[int, ...]  # number of parts of each uncertain quantity's range
     local: LocalBall | None
-    contraction: Contraction | None = None
-    tube: tuple[Slab, ...] = ()
-    outer: OuterTree | None = None
 
 
 @dataclass(frozen=True)
@@ -109,14 +145,14 @@ class Certificate:
     input_bounds: Intervals
     networks: tuple[Network, ...]
     policy: Policy
-    evidence: Partition | Trusted | Ranked | OuterTree
     sha256: str
+    evidence: Partition | Trusted | None = None  # None without V
     P: Array = field(default_factory=lambda: np.zeros((0, 0)))
     levels: Mapping[str, float] = field(default_factory=dict)
     rate: float = 0.0
     sample: tuple[Fraction, Fraction] | None = None  # the least and the largest period over which the input is held
-    start: Array | None = None  # P_0 of a claim with a tube
-    centre: Array | None = None  # c_0 of a claim whose tube follows a path
+    tube: Tube | None = None  # an ellipsoid from which trajectories lead into {V <= c2}
+    contraction: Contraction | None = None  # a ball on which they come closer
     outer: Outer | None = None  # whose set trajectories leave into {V <= c2} only; never, if there is no V
     ranks: Ranks | None = None  # of the leaves from which trajectories reach the target
     target: Tape | None = None  # whose outputs are at most 0 there; None if the target is {V <= c2}
@@ -157,57 +193,61 @@ def read(path: str) -> Certificate:
     return certificate(*load(path))
 
 
-def certificate(data: Any, sha256: str, at: str = "", kinds: tuple[str, ...] = CLAIMS) -> Certificate:
+def certificate(data: Any, sha256: str, at: str = "", kinds: Sequence[str] = tuple(CLAIMS)) -> Certificate:
     """A JSON value at a place of the file as a certificate, whose claim is of one of these kinds."""
-    whole = Value(data, at)
-    keys = f"schema claim networks plant policy lyapunov levels evidence provenance{whole.maybe('then')}"
-    schema, claim, functions, plant, policy, lyapunov, levels, evidence, provenance, *then = whole.keys(keys)
-    schema.choice("certify-certificate/9")
-    known = isinstance(claim.raw, dict) and claim.raw.get("kind") in kinds
-    claim.must(known, f"an object of kind {' or '.join(kinds)}")
-    kind = claim.raw["kind"]
-    whole.must(not then or kind == "practical", "without `then` under this claim")
-    networks = read_networks(functions)
-    stated = _plant(plant, networks)
-    n, m = len(stated["states"]), len(stated["inputs"])
-    stated["policy"] = _policy(policy, networks, n, m, kind in PRACTICAL)
-    stated["networks"], stated["sha256"] = tuple(networks.values()), sha256
-    provenance.must(isinstance(provenance.raw, dict), "an object")
+    keys = "schema claim networks plant policy lyapunov levels evidence provenance"
+    whole = Value(data, at).entries(keys, "then")
+    whole["schema"].choice("certify-certificate/9")
+    whole["provenance"].must(isinstance(whole["provenance"].raw, dict), "an object")
+    kind, networks = whole["claim"].kind(kinds), read_networks(whole["networks"])
+    plant = _plant(whole["plant"], networks)
+    n, m = len(plant["states"]), len(plant["inputs"])
+    policy = _policy(whole["policy"], networks, n, m, kind in PRACTICAL)
+    c = Certificate(kind, **plant, networks=tuple(networks.values()), policy=policy, sha256=sha256)
+    said, may_be = whole["claim"].entries(f"kind {CLAIMS[kind][0]}", CLAIMS[kind][1]), CLAIMS[kind][1].split()
     if kind in WITHOUT_V:
-        from . import sections
-
-        read_rest = sections.reaching if kind == "reaches" else sections.staying
-        return read_rest(stated, claim, lyapunov, levels, evidence)
-    c = _attracting(stated, claim, lyapunov, levels, evidence)
-    if then:
-        from . import sections
-
-        return replace(c, then=sections.taking_over(c, then[0]))
-    return c
-
-
-def _attracting(stated: dict[str, Any], claim: Value, lyapunov: Value, levels: Value, evidence: Value) -> Certificate:
-    """The rest of a certificate with V."""
-    n, kind, plain = len(stated["states"]), claim.raw["kind"], {"kind", "rate", "sample", "outer"}
-    more, besides = dict[str, Any](), dict[str, Value]()  # what only some claims have
-    if kind in PLAIN and {*claim.raw} <= plain and claim.raw.get("sample") is claim.raw.get("outer") is None:
-        _, rate, *_ = claim.keys("kind rate sample outer")
+        whole["lyapunov"].must(whole["lyapunov"].raw is None, "null under this claim")
+        whole["levels"].keys("")
     else:
-        from . import sections
+        c = replace(c, **_of_V(whole["lyapunov"], whole["levels"], said["rate"], c))
+    beyond = {*said} - {"kind", "rate"}
+    beyond -= {key for key in beyond if said[key].raw is None and key not in may_be}
+    by = {"reaches": "ranks", "invariant": "outer"}.get(kind, "partition-tree")
+    solved = kind in PLAIN and not (beyond or c.rate or c.discrete or c.uncertain)
+    by = whole["evidence"].kind((by, "trusted-solver") if solved else (by,))
+    both = ("ranks", "data") if by == "partition-tree" else ()
+    shown = whole["evidence"].entries(" ".join(["kind", EVIDENCE[by], *(key for key in both if key in beyond)]))
+    if by == "partition-tree":
+        c = replace(c, evidence=_partition(shown, c, MAX_ORDER if "sample" in beyond else 1))
+    others = by != "partition-tree" or any(shown[key].raw != none for key, none in EMPTY.items())
+    if kind in PLAIN and not (beyond or others or "then" in whole):
+        return c
+    from . import sections
 
-        rate, more, besides = sections.of_claim(claim, stated)
-    fall = rate.binary64()
-    rate.must(0 <= fall < math.inf, "0, or a rate where a claim may have one")
+    return sections.completed(c, said, shown, beyond, whole.get("then"))
+
+
+def _of_V(lyapunov: Value, levels: Value, rate: Value, c: Certificate) -> dict[str, Any]:
+    fall, n = rate.binary64(), len(c.states)
+    may_fall = 0 <= fall < math.inf and (fall == 0 or c.claim not in WITH_TUBE)
+    rate.must(may_fall, "0, or a rate where a claim may have one")
     form, P = lyapunov.keys("kind P")
     form.choice("quadratic")
-    edges = (*(("floor",) if kind in PRACTICAL else ()), "local", "roa")
-    numbers = {edge: level.binary64() for edge, level in zip(edges, levels.keys(" ".join(edges)), strict=True)}
-    by_tree = _evidence(evidence, stated, kind, {**more, **besides, "rate": fall})
-    if besides:
-        from . import sections
+    edges = levels.entries("floor local roa" if c.practical else "local roa")
+    return {"rate": fall, "P": P.array(n, n), "levels": {edge: level.binary64() for edge, level in edges.items()}}
 
-        more |= sections.beside(besides, evidence, stated, more["sample"])
-    return Certificate(kind, **stated, **more, evidence=by_tree, P=P.array(n, n), levels=numbers, rate=fall)
+
+def _partition(shown: Mapping[str, Value], c: Certificate, most: int) -> Partition:
+    """The evidence by a tree and a ball, whose orders are up to `most`."""
+    n, cells, local, ball = len(c.states), shown["cells"], shown["local"], None
+    cuts = cells.listed(lambda cut: cut.integer(1, MAX_CUTS), len(c.uncertain))
+    cells.must(math.prod(cuts) <= MAX_CELLS, f"{MAX_CELLS} parts in all")
+    if not (c.practical and local.raw is None):
+        ball = section(local, LocalBall, n=n, order=most)
+        edge = 0 <= ball.edge < math.inf and (ball.edge == 0 or c.practical)
+        Value(None, f"{local.at}.edge").must(edge, "0, or a multiplier under a practical claim")
+    of_tree = shown["T"].array(n, n), shown["root"].array(n), shown["tree"].octets(), shown["order"].integer(1, most)
+    return Partition(*of_tree, cuts, ball)
 
 
 def _plant(plant: Value, networks: Mapping[str, Network]) -> dict[str, Any]:
@@ -253,27 +293,6 @@ def _policy(value: Value, networks: Mapping[str, Network], n: int, m: int, pract
     return policy
 
 
-def _local(value: Value, n: int, claim: str, most: int) -> LocalBall | None:
-    if claim in PRACTICAL and value.raw is None:
-        return None
-    names = f"J multipliers weight edge order{value.maybe('directions')}"
-    J, multipliers, weight, edge, order, *directions = value.keys(names)
-    k = edge.binary64()
-    edge.must(0 <= k < math.inf and (k == 0 or claim in PRACTICAL), "0, or a multiplier under a practical claim")
-    trees = None
-    if directions:
-        from .sections import trees_of
-
-        trees = trees_of(directions, n)
-    return LocalBall(J.array(n, n), multipliers_of(multipliers, weight, n, n), k, order.integer(1, most), trees)
-
-
-def multipliers_of(value: Value, weight: Value, n: int, k: int) -> Multipliers:
-    rows = value.array(3, n)
-    rest, apart, joint = (tuple(fmpq(*v.as_integer_ratio()) for v in row) for row in rows.tolist())
-    return Multipliers(rest, apart, joint, weight.array(k, k))
-
-
 def _clip(value: Value, m: int) -> tuple[Array, Array] | None:
     if value.raw is None:
         return None
@@ -286,30 +305,3 @@ def check_hash(policy: Policy, stated: Any) -> None:
     """Rule `hash`."""
     if stated != policy.sha256():
         raise Rejected("hash", "policy.sha256", "does not match the network in the file")
-
-
-def _evidence(value: Value, stated: Mapping[str, Any], claim: str, more: Mapping[str, Any]) -> Partition | Trusted:
-    """The evidence of a claim that has more."""
-    n, k, most = len(stated["states"]), len(stated["uncertain"]), 1
-    if not isinstance(value.raw, dict) or value.raw.get("kind") != "partition-tree":
-        from . import sections
-
-        plain = claim in PLAIN and not (k or stated["discrete"] or any(v is not None and v != 0 for v in more.values()))
-        return sections.read_trusted(value, plain)
-    keys = "kind T root tree order cells local contraction tube outer"
-    if claim not in PLAIN or more.keys() != {"rate"}:
-        from . import sections
-
-        most, keys = sections.most_order(stated, more["sample"]), keys + sections.keys_of(more)
-    _, T, root, tree, order, cells, local, contraction, tube, beyond, *_ = value.keys(keys)
-    cuts = cells.listed(lambda cut: cut.integer(1, MAX_CUTS), k)
-    cells.must(math.prod(cuts) <= MAX_CELLS, f"{MAX_CELLS} parts in all")
-    ball, by_boxes = (
-        _local(local, n, claim, most),
-        (T.array(n, n), root.array(n), tree.octets(), order.integer(1, most)),
-    )
-    if contraction.raw is None and tube.raw == [] and beyond.raw is None and claim in PLAIN and not more.get("outer"):
-        return Partition(*by_boxes, cuts, ball)
-    from . import sections
-
-    return Partition(*by_boxes, cuts, ball, *sections.others(claim, n, k, contraction, tube, beyond, more.get("outer")))

@@ -48,9 +48,6 @@ class Call:
     first: int
 
 
-Calling = Callable[[Call, list[Any]], Sequence[Any]]  # the entries that a call uses, given the arguments
-
-
 @dataclass(frozen=True)
 class Tape:
     """`operations` in order of evaluation; `outputs` index the n components of f; `trees` are for people."""
@@ -73,6 +70,11 @@ class Tape:
         return found
 
     @property
+    def called(self) -> list[Network]:
+        """The network of each call."""
+        return [call.network for call in self.calls.values()]
+
+    @property
     def entries(self) -> int:
         """The number of entries of calls."""
         return sum(len(call.entries) for call in self.calls.values())
@@ -80,40 +82,31 @@ class Tape:
     @property
     def size(self) -> int:
         """The number of operations, with those in networks, for each call."""
-        return len(self.operations) + sum(call.network.operations for call in self.calls.values())
-
-
-def no_calls(call: Call, arguments: list[Any]) -> Sequence[Any]:
-    """The calling of expressions in which no network is called."""
-    raise TypeError("no network is called here")
+        return len(self.operations) + sum(network.operations for network in self.called)
 
 
 def evaluate(
-    tape: Tape, constant: Callable[[Fraction], Any], variables: Sequence[Any], calling: Calling = no_calls
+    tape: Tape, constant: Callable[[Fraction], Any], variables: Sequence[Any], calling: Any = None
 ) -> list[Any]:
-    """The outputs of `tape` at `variables` (states, inputs, uncertain quantities), in their arithmetic; a value is kept
-    no longer than it is needed."""
-    last = {i: k for k, operation in enumerate(tape.operations) for i in operation.operands}
-    last |= dict.fromkeys(tape.outputs, len(tape.operations))
-    values: dict[int, Any] = {}
+    """The outputs of `tape` at `variables` (states, inputs, uncertain quantities), in their arithmetic;
+    `calling` gives the entries that a call uses, of it and its arguments."""
+    values: list[Any] = []
     for k, operation in enumerate(tape.operations):
         given, detail = [values[i] for i in operation.operands], operation.detail
         match operation.name:
             case "const":
-                values[k] = constant(detail)
+                value = constant(detail)
             case "var":
-                values[k] = variables[detail]
+                value = variables[detail]
             case "call":
-                values[k] = dict(zip(tape.calls[k].entries, calling(tape.calls[k], given), strict=True))
+                value = dict(zip(tape.calls[k].entries, calling(tape.calls[k], given), strict=True))
             case "entry":
-                values[k] = given[0][detail]
+                value = given[0][detail]
             case "+" | "*" | "neg":
-                values[k] = _OPERATORS[operation.name](*given)
+                value = _OPERATORS[operation.name](*given)
             case name:
-                values[k] = given[0].function(name)
-        for i in set(operation.operands):
-            if last[i] == k:
-                del values[i]
+                value = given[0].function(name)
+        values.append(value)
     return [values[i] for i in tape.outputs]
 
 

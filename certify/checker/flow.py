@@ -30,7 +30,7 @@ from .near import Above, Array, Near, near, norm, size
 from .ranges import Swayed, between, uncertain
 from .ring import Motion, Moving, RingLeaves
 from .stepping import Stepping
-from .taylor import Taylor, affine, pairs
+from .taylor import Taylor, affine, constants, pairs
 
 Constant = Callable[[Fraction], Any]
 Way = tuple[Array, Array]  # the largest move of each state in a period: a number, and one times ||d||
@@ -252,7 +252,7 @@ def motion(
     h = boxes.number(period, boxes.symbols - 1, len(inputs[0].c))
     G = [of_mean(boxes, f) for f in boxes.f(during if boxes.order == 1 else states, [*inputs, *ranges])]
     if boxes.order > 1:
-        number = boxes.constant(len(inputs[0].c))
+        number = constants(inputs[0])
         rising = later(c.dynamics, number, states, during, loose, h, boxes.order, lambda v: v)
         G = [x + h * more for x, more in zip(G, rising, strict=True)]
     return Motion(G, during, loose, hull(states, F, boxes.widest, most))

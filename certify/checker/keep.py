@@ -13,12 +13,12 @@ from .expression import evaluate
 from .jets import Jet
 from .local import Local
 from .near import Array
-from .taylor import Taylor
+from .taylor import Taylor, constants
 
 
 def constraints(boxes: Boxes, states: list[Taylor], held: list[Taylor]) -> list[Taylor]:
     """Their models on boxes, of states, and of inputs and uncertain quantities."""
-    return evaluate(boxes.c.keep, boxes.constant(len(held[0].c)), [*states, *held]) if boxes.c.keep else []
+    return evaluate(boxes.c.keep, constants(held[0]), [*states, *held]) if boxes.c.keep else []
 
 
 def on_boxes(

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from flint import fmpq, fmpq_mat
 
-from .ball import OnBall, Rows
+from .ball import Ball, OnBall, Rows
 from .boxes import batches, is_whole
 from .case import Failures
 from .decrease import OF_ONE, Models, rational, vectors
@@ -27,7 +27,7 @@ from .jets import Jet, Units
 from .near import ZERO, Above, Array, Near, Tensor, Vector, at_least_0, near, norm, triples
 from .networks import Affine, Map, Step
 from .pairs import bound_of_pairs, in_binary64
-from .wiring import BallSteps, Clip, Concat, Observe, Product, Sum
+from .wiring import MEANINGS, BallSteps, Clip, Concat, Observe, Product, Sum
 
 _AT_ONCE = 4096  # leaves
 _COARSE, _FINE = np.arange(-4.0, 24.0), np.arange(-7.0, 8.0) / 8  # powers of 2 to choose a multiplier from
@@ -113,9 +113,6 @@ class OnCone(OnBall):
             return self.bent(step, v)
         return replace(super().map(step, v), at_0=v.at_0 & (FUNCTIONS[step.function].at_0 == 0))
 
-    def make(self, step: Step, vectors: Sequence[Rows]) -> Rows:
-        return super().make(step, vectors) if isinstance(step, Affine | Map) else ConeSteps(self).other(step, vectors)
-
     def bent(self, step: Step, v: Rows) -> Rows:
         """Entries that are known to first order."""
         value = self.jets(v)
@@ -134,11 +131,11 @@ class ConeSteps(BallSteps):
     def clip(self, step: Clip, v: Rows) -> Rows:
         return self.ball.bent(step, v)
 
-    def sum(self, step: Sum, vectors: Sequence[Rows]) -> Rows:
-        return replace(super().sum(step, vectors), at_0=np.all([v.at_0 for v in vectors], axis=0))
+    def sum(self, step: Sum, *vectors: Rows) -> Rows:
+        return replace(super().sum(step, *vectors), at_0=np.all([v.at_0 for v in vectors], axis=0))
 
-    def concat(self, step: Concat, vectors: Sequence[Rows]) -> Rows:
-        return replace(super().concat(step, vectors), at_0=np.concatenate([v.at_0 for v in vectors]))
+    def concat(self, step: Concat, *vectors: Rows) -> Rows:
+        return replace(super().concat(step, *vectors), at_0=np.concatenate([v.at_0 for v in vectors]))
 
     def product(self, step: Product, v: Rows, w: Rows) -> Rows:
         return replace(super().product(step, v, w), at_0=v.at_0 | w.at_0)
@@ -150,6 +147,9 @@ class ConeSteps(BallSteps):
         except Undecided:  # nothing is known to be 0
             return replace(found, at_0=np.zeros(step.size, dtype=bool))
         return replace(found, at_0=np.array([x.value == 0 for x in known]))
+
+
+MEANINGS[OnCone] = ConeSteps
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,9 @@ class Cone:
         return decay - _best(decay - rest, C) * C
 
 
-ALL, CLOSE = Cone(), Cone(close=True)
+def cone_of(ball: Ball) -> Cone:
+    """The cone that a ball's d are of."""
+    return ball.cone or Cone(close=ball.close)
 
 
 def are_whole(directions: Sequence[bytes], n: int, at: str) -> Failures:
@@ -256,10 +258,8 @@ def are_whole(directions: Sequence[bytes], n: int, at: str) -> Failures:
     return count
 
 
-def cones(directions: Sequence[bytes], n: int, close: bool = False) -> Iterator[Cone]:
+def cones(directions: Sequence[bytes], n: int, close: bool) -> Iterator[Cone]:
     """Yield cones that together have all d, (n,), after `are_whole`."""
-    if not directions:
-        yield CLOSE if close else ALL
     for k, tree in enumerate(directions):
         for _, lo, hi in batches(tree, *_face(k, n), _AT_ONCE):
             for a, b in zip(lo.T, hi.T, strict=True):

@@ -7,12 +7,13 @@ this checker and the reference generously: a unit is about a nanosecond here. Th
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from math import prod
 
 from .case import AT_CORNERS, Case, Failures
-from .document import Array, Certificate, Partition
-from .expression import Tape
+from .document import Certificate, Partition
 from .networks import Map, Network
+from .schema import Array
 
 MOST_NUMBERS = 2**25
 MOST_WORK, MOST_IN_PATIENCE = 3 * 2**37, 2**46  # ten minutes; many hours, if somebody says that there is time for it
@@ -98,28 +99,29 @@ class Sizes:
         self.t = 2 * self.d**2 + self.d * (self.d + 1) * (self.d + 2) // 6
         self.a = c.dynamics.size + c.policy.network.operations
         self.a += sum(tape.size for tape in (c.keep, c.target) if tape is not None)
-        self.net = Net(called(c.dynamics), [c.policy.network])
+        self.net = Net(c.dynamics.called, [c.policy.network])
 
     # ------------------------------------------------------------------------------------------------------ numbers
 
     def numbers(self) -> int:
         """Held at once."""
-        found = 4 * self.net.entries + self.of_features()[0]
+        found = 4 * self.net.entries + self.of_features[0]
         if not isinstance(self.evidence, Partition):
             return found
         order = max(self.evidence.order, self.evidence.local.order if self.evidence.local else 1)
         values = (4 * order if self.c.sample else 1) * self.a + 2 * self.n + 8
         if self.asked and not self.c.outer:
             found += self.on_leaves(order, self.s)
-        if self.evidence.local or self.evidence.contraction or self.evidence.tube:
+        if self.evidence.local or self.c.contraction or self.c.tube:
             found += values * (self.t + self.d * self.y + self.m + self.z) + self.d**4 // 4
             found += self.net.held_on_a_ball(self.d, self.t)
         return found
 
+    @cached_property
     def of_features(self) -> tuple[int, int]:
         """Numbers and operations of what only some certificates have."""
-        c = self.c
-        if not (c.outer or c.ranks or c.data or c.start is not None):
+        c, local = self.c, isinstance(self.evidence, Partition) and self.evidence.local
+        if not (c.outer or c.ranks or c.data or c.tube or c.contraction or (local and local.directions is not None)):
             return 0, 0
         from . import demands
 
@@ -138,15 +140,15 @@ class Sizes:
         found = 2**15 * self.a + self.net.folded
         found += 0 if self.c.without_V else self.inverse(self.bits(self.c.P))
         if not (self.c.practical or self.c.without_V):
-            found += 2**12 * self.net.entries + 2**19 * Net(called(self.c.dynamics)).entries
-        found += self.of_features()[1]
+            found += 2**12 * self.net.entries + 2**19 * Net(self.c.dynamics.called).entries
+        found += self.of_features[1]
         if not isinstance(self.evidence, Partition):
             return found
         seen = min(2 * self.bits(self.evidence.T) + self.bits(self.c.P) + 16, 2**16 // self.n)
         found += self.inverse(seen) + 2**8 * len(self.evidence.tree)
         if self.asked:
             found += self.of_leaves(self.evidence.tree.count(LEAF), self.evidence.order, self.s)
-        return found + self.of_balls()
+        return found + self.of_ball(self.evidence)
 
     @property
     def asked(self) -> bool:
@@ -206,37 +208,15 @@ class Sizes:
         rows = self.d + 1
         return 2**23 + 2**12 * rows**4 + 8 * self.d**5 + 4 * self.net.units * self.d**3 + self.decision(rows)
 
-    def of_balls(self) -> int:
-        evidence, found = self._partition, 0
-        cells = prod(evidence.cells)
-        if evidence.local:
-            times = cells + (self.evaluations(evidence.local.order) + 8 if self.c.sample else 0)
-            corners = cells * 2 ** min(self.y, AT_CORNERS)
-            each = self.inequality + 2**8 * self.y * self.n * (self.d + 1) ** 2
-            found += self.ball + times * self.equations + corners * each + self.decision(self.n)
-            found += self.of_cones(evidence.local.directions, times, corners)
-        if evidence.contraction:
-            corners = cells * 2**self.y
-            found += self.ball + cells * self.equations + corners * self.inequality + self.decision(self.n)
-            found += self.of_cones(evidence.contraction.directions, cells, corners)
+    def of_ball(self, evidence: Partition) -> int:
+        """The rule `local`."""
+        if evidence.local is None:
+            return 0
+        each = self.inequality + 2**8 * self.y * self.n * (self.d + 1) ** 2
+        times, corners = self.times(evidence, evidence.local.order), prod(evidence.cells) * 2 ** min(self.y, AT_CORNERS)
+        found: int = self.ball + times * self.equations + corners * each + self.decision(self.n)
         return found
 
-    def of_cones(self, directions: Sequence[bytes] | None, times: int, corners: int) -> int:
-        """Models, for which the equations are evaluated so many times, and inequalities on cones."""
-        if directions is None:
-            return 0
-        leaves = max(1, sum(tree.count(LEAF) for tree in directions))
-        each = self.inequality + 2**8 * (self.y * self.n + self.net.units) * (self.d + 1) ** 2
-        found = leaves * (self.ball + times * self.equations + corners * each)
-        return found + 2**8 * sum(map(len, directions))
-
-    @property
-    def _partition(self) -> Partition:
-        if not isinstance(self.evidence, Partition):
-            raise TypeError("a solver's word takes no work")
-        return self.evidence
-
-
-def called(tape: Tape) -> list[Network]:
-    """The networks that equations call, once for each call."""
-    return [call.network for call in tape.calls.values()]
+    def times(self, evidence: Partition, order: int) -> int:
+        """Evaluations of the equations on a ball, for all cells."""
+        return prod(evidence.cells) + (self.evaluations(order) + 8 if self.c.sample else 0)

@@ -7,26 +7,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
-from math import prod
-from typing import TYPE_CHECKING
 
 import numpy as np
 from flint import fmpq_mat
 
-from . import ball
 from .ball import Ball
-from .boxes import LEAF
-from .case import AT_CORNERS, Case, Failures
+from .case import Case, Failures
 from .decrease import Inequality, Level, Models, are_finite, are_usable, rational
 from .document import Intervals, Multipliers
 from .exact import contains_ball, exactly, fraction, is_definite
 from .jets import Jet
-
-if TYPE_CHECKING:
-    from .kinks import Cone
-
-_MOST_CORNERS = 2**16  # of all cells
-_MOST_WORK = 2**26  # corners times n^4, which is what an inequality takes
 
 
 @dataclass(frozen=True)
@@ -36,24 +26,15 @@ class Local(Ball):
     margins: list[float] = field(default_factory=list, kw_only=True)  # 1 - the largest share of the decay that the rest
     # takes at a corner, in floats for people
 
-    @classmethod
-    def of(cls, case: Case, cone: Cone | None = None) -> Local:
-        """The ball of a certificate, or a cone of it."""
-        kind: type[Local] = cls
+    @staticmethod
+    def of(case: Case) -> Local:
+        """The ball of a certificate."""
+        kind = Local
         if case.c.step:
             from .stepping import kind_of
 
             kind = kind_of(case)
-        if cone is None and case.local.directions is not None:
-            from .kinks import ALL
-
-            cone = ALL
-        return kind(case, case.local.J, "local ball", cone=cone)
-
-    @property
-    def margin(self) -> float:
-        """The least margin so far."""
-        return min(self.margins, default=float("nan"))
+        return kind(case, case.local.J, "local ball", directions=case.local.directions)
 
     @property
     def at_rest(self) -> bool:
@@ -79,7 +60,7 @@ class Local(Ball):
         """P, R, the multipliers and the level of the inequality."""
         P, by, c = exactly(self.case.c.P), self.case.local, self.case.c
         level = None if self.at_rest else Level(rational(c.c0), rational(by.edge))
-        return P, 2 * rational(c.rate) * P, by.multipliers, level
+        return P, 2 * rational(c.rate) * P, by.by, level
 
     def inequality(self, models: Models) -> Inequality:
         return Inequality(models, *self.terms)
@@ -92,10 +73,7 @@ class Local(Ball):
             if models is None:
                 yield None
                 return
-            if self.cone is not None:
-                from .kinks import Kinks
-
-                models.more.append(Kinks.of(self.cone, models, self.case.c.P))
+            self.note_kinks(models)
             for corner in models.corners(self.case.c.P):
                 decay, rest = self.inequality(corner).sides()
                 yield (decay if self.cone is None else self.cone.within(decay, rest)), rest
@@ -109,41 +87,32 @@ def _margin(decay: fmpq_mat, rest: fmpq_mat) -> float:
         return float("nan")
 
 
-def is_large_enough(
-    ball: Ball, place: str, name: str, level: float, directions: tuple[bytes, ...] | None, most: int = 64
-) -> Failures:
-    """The trees are trees; the ball contains {V <= level}, whose name and place are these; deciding an inequality at
-    each corner of each cell on each cone, of `most` of the numbers y, does not take too long."""
-    if directions:
+def is_large_enough(ball: Ball, place: str, name: str, level: float) -> Failures:
+    """The trees of directions are trees; the ball contains {V <= level}."""
+    if ball.directions:
         from .kinks import are_whole
 
-        where = "local" if most < 64 else "contraction"
-        yield from are_whole(directions, len(ball.J), f"evidence.{where}.directions")
+        yield from are_whole(ball.directions, len(ball.J), f"evidence.{ball.at.split()[0]}.directions")
     if not contains_ball(exactly(ball.J), exactly(ball.case.c.P), Fraction(level)):
         yield place, f"the ball must contain {{V <= {name}}}"
-    corners = prod(ball.case.partition.cells) * 2 ** min(ball.count, most)
-    corners *= max(1, sum(tree.count(LEAF) for tree in directions or ()))
-    if corners > _MOST_CORNERS or corners * len(ball.J) ** 4 > _MOST_WORK:
-        yield "evidence.cells", "there are too many cells for this rule"
     return 0
 
 
 def fits(local: Local) -> Failures:
-    """`local`: the ball contains {V <= c1}, and its jets take neither too much memory nor too much time."""
+    """`local`: the ball contains {V <= c1}, and multipliers may be used."""
     c = local.case.c
-    yield from is_large_enough(local, "levels.local", "c1", c.c1, local.case.local.directions, AT_CORNERS)
-    if not are_usable(local.case.local.multipliers):
+    yield from is_large_enough(local, "levels.local", "c1", c.c1)
+    if not are_usable(local.case.local.by):
         yield "evidence.local", "no multiplier may be negative, none of g 0 where some beta is"
     if c.step > 0 and Fraction(local.case.local.edge) * c.step > 1:
         yield "evidence.local.edge", "a step may lead out of {V <= c0}: the edge must be at most 1/h"
-    yield from ball.fits(local)
     return 0
 
 
 def decreases(local: Local) -> Failures:
     """`local`: D + 2 lambda V < 0 on the ball without its centre, or as far as V >= c0."""
     count = 0
-    for both in (both for part in local.on_cones(local.case.local.directions) for both in part.sides()):
+    for both in (both for part in local.on_cones() for both in part.sides()):
         if both is None:
             yield "levels.local", "F has no finite model on the local ball"
             return count

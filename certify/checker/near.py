@@ -289,13 +289,6 @@ class Form(Near):
         """The forms as numbers, whatever the symbols are."""
         return Near(self.value[0], size(self.value[1:]).sum() + self.error)
 
-    @property
-    def unmoved(self) -> Form:
-        """The coefficients of the symbols alone, and 0 for that of 1."""
-        value = self.value.copy()
-        value[0] = 0.0
-        return Form(value)
-
     def raised(self, b: Near) -> Form:
         """The sum with numbers, at the first coefficient."""
         value = self.value.copy()
@@ -379,7 +372,8 @@ class Cubic(Vector):
     of the whole tensor."""
 
     def length(self, x: Above) -> Above:
-        often = triples(order_of(len(x.v)))[-1].reshape(-1, *[1] * (np.ndim(x.v) - 1))
+        k = round((6 * len(x.v)) ** (1 / 3)) - 1  # of k (k + 1)(k + 2)/6 entries
+        often = triples(k)[-1].reshape(-1, *[1] * (np.ndim(x.v) - 1))
         found: Above = (x * x * often).sum(0).root
         return found
 
@@ -391,12 +385,6 @@ def triples(k: int) -> tuple[Array, Array, Array, Array]:
     kept = list(combinations_with_replacement(range(k), 3))
     h, i, j = np.array(kept).T
     return h, i, j, np.array([float(len(set(permutations(triple)))) for triple in kept])
-
-
-@cache
-def order_of(count: int) -> int:
-    """k for which there are so many triples."""
-    return next(k for k in range(1, count + 1) if k * (k + 1) * (k + 2) == 6 * count)
 
 
 def outer(x: Vector, y: Vector) -> Square:
@@ -550,7 +538,6 @@ def _sech2(x: arb) -> arb:
 
 
 ctx.prec = 128
-TURN = near_ball(2 * arb.pi())
 
 
 def split(y: Array, end: float) -> tuple[Any, Array]:

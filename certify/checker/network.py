@@ -7,7 +7,7 @@ At x = 0 the policy equals u_eq by its form, which the local rule uses; ball.py 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache, cached_property
 
@@ -225,16 +225,14 @@ class Folded:
 def fold(policy: Policy, u_eq: tuple[Fraction, ...]) -> Folded:
     """Fold the centring into a shift or the offset; rule `centring` has to hold."""
     origin = np.zeros(policy.network.reads) if policy.origin is None else policy.origin
-    squash, clip = policy.squash == "tanh", policy.clip
-    plain = Folded(policy.network, origin, None, squash, policy.scale, Near(policy.offset), clip)
+    squash = policy.squash == "tanh"
+    plain = Folded(policy.network, origin, None, squash, policy.scale, Near(policy.offset), policy.clip)
     if policy.centre == "none":
         return plain
     if policy.centre == "preactivation":
         beta = stacked([near_atanh(q) for q in reaches(policy, u_eq)])
-        shift = beta - Folded(policy.network, origin, None, False, policy.scale, Near(policy.offset)).at_origin
-        return Folded(policy.network, origin, shift, squash, policy.scale, Near(policy.offset), clip)
-    offset = all_near(u_eq) - plain.at_origin * Near(policy.scale)
-    return Folded(policy.network, origin, None, squash, policy.scale, offset, clip)
+        return replace(plain, shift=beta - replace(plain, squash=False).at_origin)
+    return replace(plain, offset=all_near(u_eq) - plain.at_origin * Near(policy.scale))
 
 
 def reaches(policy: Policy, u_eq: tuple[Fraction, ...]) -> list[Fraction]:

@@ -14,11 +14,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Generic, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from .expression import Call, load
-from .schema import Value
+from .schema import Array, Value
 
 MAX_NETWORKS, MAX_STEPS, MAX_WIDTH = 64, 256, 2**14
 KINDS = ("affine", "map", "clip", "sum", "concat", "product", "observe")  # all but two in wiring.py
@@ -26,7 +23,6 @@ FUNCTIONS = (
     *("sin", "cos", "tanh", "exp", "atan", "sqrt"),
     *("relu", "elu", "sigmoid", "silu", "gelu", "softplus", "mish", "softsign"),
 )
-Array = NDArray[np.float64]
 V = TypeVar("V")
 
 
@@ -48,37 +44,31 @@ class Step:
         return self.size
 
     @property
-    def operations(self) -> int:
-        """Operations of expressions."""
-        return 0
+    def kind(self) -> str:
+        """The word for it in the file, and the name of an algebra's method."""
+        return type(self).__name__.lower()
 
     @property
     def words(self) -> str:
         """The step but for its numbers, for the hash: FORMAT.md has it."""
-        return " ".join([type(self).__name__.lower(), *map(str, self.of)]) + "\0"
+        return " ".join([self.kind, *map(str, self.of)]) + "\0"
 
-    def said(self, of: list[str]) -> str:
+    def said(self, of: str) -> str:
         """The step for people, of vectors with these names."""
-        raise NotImplementedError
+        return f"{self.kind}({of}), {self.size} entries"
 
 
 @dataclass(frozen=True, eq=False)
 class Affine(Step):
     """`W h + b`."""
 
+    units = 0
     weight: Array
     bias: Array
 
     @property
     def arrays(self) -> tuple[Array, ...]:
         return self.weight, self.bias
-
-    @property
-    def units(self) -> int:
-        return 0
-
-    def said(self, of: list[str]) -> str:
-        return f"W {of[0]} + b, {self.size} entries"
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +81,8 @@ class Map(Step):
     def words(self) -> str:
         return f"{super().words[:-1]} {self.function}\0"
 
-    def said(self, of: list[str]) -> str:
-        return f"{self.function}({of[0]})"
+    def said(self, of: str) -> str:
+        return f"{self.function}({of})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,20 +98,19 @@ class Network:
         """The number of entries of its value."""
         return self.steps[-1].size
 
-    @cached_property
-    def widest(self) -> int:
-        """The most entries of a vector, the argument among them."""
-        return max(self.reads, *(step.size for step in self.steps))
+    @property
+    def sizes(self) -> list[int]:
+        """The numbers of entries of all vectors, the argument's first."""
+        return [self.reads, *(step.size for step in self.steps)]
 
     @property
-    def widths(self) -> list[int]:
-        """The sizes of the argument and of each affine step's vector."""
-        return [self.reads, *(step.size for step in self.steps if isinstance(step, Affine))]
+    def widest(self) -> int:
+        return max(self.sizes)
 
     @property
     def operations(self) -> int:
         """Operations of all expressions of `observe`."""
-        return sum(step.operations for step in self.steps)
+        return sum(len(step.tape.operations) for step in self.steps if hasattr(step, "tape"))
 
     @cached_property
     def shapes(self) -> list[tuple[int, int, int]]:
@@ -142,19 +131,13 @@ class Network:
     @property
     def kept(self) -> int:
         """The entries of vectors that a step reads which is not the next."""
-        sizes = [self.reads, *(step.size for step in self.steps)]
-        return sum(sizes[i] for i in {i for k, step in enumerate(self.steps) for i in step.of if i < k})
+        return sum(self.sizes[i] for i in {i for k, step in enumerate(self.steps) for i in step.of if i < k})
 
     @property
     def is_chain(self) -> bool:
         """True if it is affine and tanh in turn, affine first and last, each of the vector just before."""
-        return len(self.steps) % 2 == 1 and all(
-            step.of == (k,)
-            and (isinstance(step, Affine) if k % 2 == 0 else isinstance(step, Map))
-            # the only function of a chain is tanh
-            and getattr(step, "function", "tanh") == "tanh"
-            for k, step in enumerate(self.steps)
-        )
+        turns = [f"map {k} tanh\0" if k % 2 else f"affine {k}\0" for k in range(len(self.steps))]
+        return len(turns) % 2 == 1 and turns == [step.words for step in self.steps]
 
     @cached_property
     def readers(self) -> dict[int, list[int]]:
@@ -207,9 +190,7 @@ def _network(value: Value) -> Network:
 
 def _step(value: Value, sizes: Sequence[int]) -> Step:
     """A step after vectors of these sizes."""
-    known = isinstance(value.raw, dict) and value.raw.get("kind") in KINDS
-    value.must(known, f"an object of kind {' or '.join(KINDS)}")
-    kind = value.raw["kind"]
+    kind = value.kind(KINDS)
     if kind not in ("affine", "map"):
         from . import wiring
 
@@ -260,16 +241,14 @@ class Algebra(ABC, Generic[V]):
         return vectors[len(network.steps)]  # type: ignore[no-any-return]
 
     def make(self, step: Step, vectors: Sequence[V]) -> V:
-        """The vector that a step makes."""
-        match step:
-            case Affine():
-                return self.affine(step, vectors[0])
-            case Map():
-                return self.map(step, vectors[0])
-        from . import wiring
+        """The vector that a step makes, by the method of its kind: here, or in the class that wiring.py has for it."""
+        owner: Any = self
+        if not hasattr(self, step.kind):
+            from .wiring import MEANINGS
 
-        found: V = wiring.meaning(self).other(step, vectors)
-        return found
+            owner = MEANINGS[type(self)](self)
+        made: V = getattr(owner, step.kind)(step, *vectors)
+        return made
 
 
 class OnNumbers(Algebra[list[Any]]):

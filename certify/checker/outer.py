@@ -28,16 +28,14 @@ from .functions import FUNCTIONS
 from .near import Above, Array, Form, Near, near
 from .network import enclose_on_boxes, prepare
 from .networks import Affine, Algebra, Map
-from .sections import Outer, OuterTree
 from .taylor import Taylor, constant, constants, models, upper_bound
-from .wiring import Clip, Concat, Observe, Others, Product, Sum
+from .wiring import Clip, Concat, Observe, Product, Sum
 
 if TYPE_CHECKING:
     from .rules import Tally
 
 _MOST_BITS = 2**14  # of a number in a matrix all of whose inverse is wanted, times the matrix's size
 _BATCH_NUMBERS = 1_000_000  # in the largest array of a batch
-_MOST_NUMBERS, _MOST_VALUES = 2**22, 2**26  # of a box: in the models of a network, and of all of an expression's values
 
 
 @dataclass(frozen=True)
@@ -74,7 +72,7 @@ class Dual:
         return Dual(_through(W, self.value, b), None if self.rate is None else _through(W, self.rate))
 
 
-class InRows(Algebra[Dual], Others[Dual]):
+class InRows(Algebra[Dual]):
     """Networks of such models, each vector in rows (width, B)."""
 
     def affine(self, step: Affine, v: Dual) -> Dual:
@@ -87,10 +85,10 @@ class InRows(Algebra[Dual], Others[Dual]):
         """Nothing: N has to have a derivative."""
         return Dual(v.value.scaled(np.nan))
 
-    def sum(self, step: Sum, vectors: Sequence[Dual]) -> Dual:
+    def sum(self, step: Sum, *vectors: Dual) -> Dual:
         return reduce(add, vectors)
 
-    def concat(self, step: Concat, vectors: Sequence[Dual]) -> Dual:
+    def concat(self, step: Concat, *vectors: Dual) -> Dual:
         return _stacked([row for v in vectors for row in _rows(v)])
 
     def product(self, step: Product, v: Dual, w: Dual) -> Dual:
@@ -110,15 +108,9 @@ class Function:
     """N on boxes, and its derivative along F."""
 
     def __init__(self, tape: Tape) -> None:
-        self.tape, networks = tape, [call.network for call in tape.calls.values()]
+        self.tape, networks = tape, tape.called
         self.values = max(2 * tape.size, *(network.widest for network in networks), 0)
-        self.shapes = [shape for net in networks for shape in net.shapes]
         prepare(*networks)
-
-    def is_small(self, symbols: int) -> bool:
-        """True if the models in so many symbols take an acceptable amount of memory and time."""
-        numbers = sum(rows * (columns + symbols**2) for rows, columns, _ in self.shapes)
-        return numbers <= _MOST_NUMBERS and self.tape.size * symbols**2 <= _MOST_VALUES
 
     def along(self, states: Sequence[Taylor], F: Sequence[Taylor | None]) -> Dual:
         """N, and its derivative where F is given."""
@@ -157,20 +149,12 @@ class Function:
         return N
 
 
-def is_small(case: Case) -> Failures:
-    """`outer`: N is small enough."""
-    c = case.c
-    if not _function(case).is_small(len(c.states) + len(c.inputs) + len(c.uncertain) + c.dynamics.entries):
-        yield "claim.outer", "too many numbers or operations for so many symbols"
-    return 0
-
-
 def is_above_on_faces(case: Case) -> Failures:
     """`faces`: N > n2 on every leaf of every face of the domain."""
-    claim, evidence = of(case)
+    outer = given(case.c.outer)
     function, n, count = _function(case), len(case.c.states), 0
     widest = [(_below(lo), _above(hi)) for lo, hi in case.c.domain]
-    for k, tree in enumerate(evidence.faces):
+    for k, tree in enumerate(outer.faces):
         i, side = divmod(k, 2)
         where = f"face {k} "
         others = [j for j in range(n) if j != i]
@@ -180,7 +164,7 @@ def is_above_on_faces(case: Case) -> Failures:
         end = near(case.c.domain[i][side])
         lo, hi = np.array([(end.value, end.value) if j == i else pair for j, pair in enumerate(widest)]).T
         doubt = end.error * np.where(np.arange(n) == i, 1.0, 0.0)[:, None]
-        left_over, leaves = partial(_below_on_face, function, claim.level, doubt), tree.count(LEAF)
+        left_over, leaves = partial(_below_on_face, function, outer.level, doubt), tree.count(LEAF)
         for left in in_order(left_over, batches(tree, lo, hi, _batch(n * n * function.values)), leaves, case.jobs):
             if len(left):
                 yield f"{where}leaf {left[0]}", "N must be above its level"
@@ -206,15 +190,15 @@ def inverse(A: fmpq_mat) -> fmpq_mat | None:
 
 def contains_domain(case: Case) -> Failures:
     """`outer`: |z_i| <= sum_j |(T^-1)_ij| max |x_j| in rationals."""
-    _, evidence = of(case)
-    to_z = inverse(exactly(evidence.T))
+    outer = given(case.c.outer)
+    to_z = inverse(exactly(outer.T))
     if to_z is None:
         yield "evidence.outer.T", "T must be invertible"
         return 0
     far = [max(-lo, hi) for lo, hi in case.c.domain]
     sizes = fmpq_mat([[abs(v) for v in row] for row in to_z.tolist()])
     reach = sizes * fmpq_mat([[fmpq(x.numerator, x.denominator)] for x in far])
-    for i, b in enumerate(evidence.root.tolist()):
+    for i, b in enumerate(outer.root.tolist()):
         if not reach[i, 0] <= fmpq(*b.as_integer_ratio()):
             yield f"evidence.outer.root, axis {i}", "the root box must contain the domain"
     return len(far)
@@ -222,7 +206,7 @@ def contains_domain(case: Case) -> Failures:
 
 def is_partition(case: Case) -> Failures:
     """`outer`: the bytes are a partition of the root box."""
-    return (yield from is_whole(of(case)[1].tree, range(len(case.c.states))))
+    return (yield from is_whole(given(case.c.outer).tree, range(len(case.c.states))))
 
 
 def falls(leaves: Leaves) -> Failures:
@@ -251,10 +235,10 @@ class Beyond(Boxes):
     """The bounds that rule `outer` asks for, on boxes lo and hi (n, B) in the coordinates z of its tree."""
 
     def __init__(self, case: Case) -> None:
-        claim, evidence = of(case)
+        self.outer = given(case.c.outer)
         none = fmpq_mat(len(case.c.states), len(case.c.states))
-        super().__init__(case, evidence.T, none if case.c.without_V else case.seen_from(evidence.T))
-        self.function, self.level, self.evidence = _function(case), claim.level, evidence
+        super().__init__(case, self.outer.T, none if case.c.without_V else case.seen_from(self.outer.T))
+        self.function, self.level = _function(case), self.outer.level
         ends_of = [[near(end).ends[side] for side, end in enumerate(pair)] for pair in self.c.domain]
         self.least, self.largest = np.array(ends_of).T[:, :, None]  # at or beyond the domain's ends, (n, 1)
 
@@ -262,7 +246,7 @@ class Beyond(Boxes):
         """The tree's leaves in batches."""
         values = max(self.function.values, self.c.dynamics.size)
         size = _batch(max(self.symbols**2 * values, (self.symbols + 4) * self.width))
-        return batches(self.evidence.tree, -self.evidence.root, self.evidence.root, size)
+        return batches(self.outer.tree, -self.outer.root, self.outer.root, size)
 
     def examine(self, first: int, lo: Array, hi: Array) -> Leaves:
         """The leaves with these corners, numbered from `first`, on which N'F and the constraints must be negative where
@@ -306,18 +290,17 @@ class Beyond(Boxes):
 
 def examine(tally: Tally, case: Case) -> None:
     """The rules about a second function."""
-    for table in (OF_OUTER, ON_FACES, OF_OUTER_TREE):
+    for table in (ON_FACES, OF_OUTER_TREE):
         tally.hold(table, case)
     bounds = Beyond(case)
     if case.c.without_V:
         from . import invariant
 
         bounds = invariant.Staying(case)
-    tree = of(case)[1].tree
-    tally.outer_margin = tally.hold_on_leaves(ON_OUTER_LEAVES, bounds, tree, lambda leaves: leaves.bound)
+    tree = bounds.outer.tree
+    tally.margins["outer"] = tally.hold_on_leaves(ON_OUTER_LEAVES, bounds, tree, lambda leaves: leaves.bound)
 
 
-OF_OUTER = (("outer", is_small),)
 ON_FACES = (("faces", is_above_on_faces),)
 OF_OUTER_TREE = (("outer", contains_domain), ("outer", is_partition))
 ON_OUTER_LEAVES = (
@@ -327,14 +310,8 @@ ON_OUTER_LEAVES = (
 )
 
 
-def of(case: Case) -> tuple[Outer, OuterTree]:
-    """N and its evidence."""
-    evidence = case.c.evidence
-    return given(case.c.outer), evidence if isinstance(evidence, OuterTree) else given(case.partition.outer)
-
-
 def _function(case: Case) -> Function:
-    return Function(of(case)[0].function)
+    return Function(given(case.c.outer).function)
 
 
 def _batch(numbers: int) -> int:

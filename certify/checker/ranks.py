@@ -14,21 +14,22 @@ from operator import add
 from typing import TYPE_CHECKING
 
 import numpy as np
-from flint import fmpq_mat
+from flint import arb, fmpq_mat
 
 from .boxes import LEAF, Batch, batches, is_whole, middle
 from .case import Case, Failures, given
 from .expression import evaluate
-from .near import TURN, Above, Array, Form, Near, near, size, within
+from .near import Above, Array, Form, Near, near, near_ball, size, within
 from .network import enclose_on_boxes
 from .periodic import is_periodic
 from .ring import Moving
-from .sections import MAX_RANK, Ranked
+from .sections import MAX_RANK
 from .taylor import Taylor, affine, combination, constants, forms, upper_bound
 
 if TYPE_CHECKING:
     from .rules import Tally
 
+TURN = near_ball(2 * arb.pi())
 _MOST_NODES = 2**14  # of the tree that an image may meet
 Failing = tuple[str, str]  # a place, and what fails there
 
@@ -141,7 +142,7 @@ class Steps(Moving):
         identity = fmpq_mat([[int(i == j) for j in range(n)] for i in range(n)])
         super().__init__(case, np.eye(n), identity, lo < hi, n)
         self.widest, self.ranks = [np.inf] * n, given(case.c.ranks)
-        self.order = _order(case)
+        self.order = self.ranks.order
         self.rank, self.count = two_bytes(self.ranks.ranks), np.frombuffer(self.ranks.steps, np.uint8).astype(np.int64)
         self.straight = [i for i in range(n) if i not in self.ranks.angles]  # states that are no angles
 
@@ -238,12 +239,6 @@ class Steps(Moving):
         rows = [combination(*zip(row, states, strict=True)) for row in self.c.P.tolist()]
         V = [x * row for x, row in zip(states, rows, strict=True)]
         return [reduce(add, [*V, number(Fraction(-self.c.c2))])]
-
-
-def _order(case: Case) -> int:
-    """The order of the series in time."""
-    evidence = case.c.evidence
-    return evidence.order if isinstance(evidence, Ranked) else case.partition.order
 
 
 def moved(x: Array, turns: Array) -> tuple[Array, Array]:

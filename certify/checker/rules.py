@@ -22,7 +22,7 @@ from .boxes import in_order
 from .case import Case, Failures, only_where
 from .document import Certificate, Partition
 from .errors import Rejected
-from .exact import Exact, Exactly, policy_at_origin
+from .exact import Exact, Exactly, gershgorin_lower, policy_at_origin
 from .expression import evaluate
 from .functions import Undecided
 from .near import Array, self_test
@@ -72,7 +72,7 @@ def domain(case: Case) -> Failures:
 
 
 def coordinates(case: Case) -> Failures:
-    if not (case.S_inverse and case.least > 0):
+    if not (case.S_inverse and gershgorin_lower(case.S) > 0):
         yield "evidence.T", "T'PT must be positive definite and diagonally dominant"
     return 1
 
@@ -129,8 +129,8 @@ OTHERS: Sequence[tuple[str, Callable[[Certificate], object]]] = (  # modules wit
     ("handover", lambda c: c.then),
     ("data", lambda c: c.data),
     ("", lambda c: isinstance(c.evidence, Partition)),  # the rules about ball and tree
-    ("tube", lambda c: c.start is not None),
-    ("contraction", lambda c: isinstance(c.evidence, Partition) and c.evidence.contraction),
+    ("tube", lambda c: c.tube),
+    ("contraction", lambda c: c.contraction),
     ("outer", lambda c: c.outer),
     ("ranks", lambda c: c.ranks),
 )
@@ -145,18 +145,12 @@ RULES = (
 
 @dataclass
 class Tally:
-    """Each rule's count, and the margins, which are floats for people."""
+    """Each rule's count, and margins, which are floats for people: 1 - the remainder's largest part of the decay, and
+    the smallest bounds of -Vdot and -N'F on the leaves of which they are asked."""
 
     rules: Counter[str] = field(default_factory=lambda: Counter(dict.fromkeys(RULES, 0) | READ))
-    ring_margin: float | None = None  # smallest -Vdot bound over the ring's leaves
-    outer_margin: float | None = None  # smallest -N'F bound over the leaves of which it is asked
-    local_margin: float | None = None  # 1 - the remainder's largest part of the decay
+    margins: dict[str, float | None] = field(default_factory=lambda: dict.fromkeys(("local", "ring", "outer")))
     then: Tally | None = None  # of the certificate that takes over
-
-    @property
-    def margins(self) -> dict[str, float | None]:
-        """The margins of the rules, by name."""
-        return {"local": self.local_margin, "ring": self.ring_margin, "outer": self.outer_margin}
 
     def hold(self, table: Table[Subject], subject: Subject) -> None:
         """Raise `Rejected` at the first failure of the first rule that fails; count what the rules have looked at."""
@@ -220,9 +214,10 @@ def _examine(tally: Tally, case: Case) -> None:
     if case.covered:
         origin = local.Local.of(case)
         tally.hold(ON_THE_BALL, origin)
-        if np.isfinite(origin.margin):  # binary64 may not hold the sides of an inequality that rationals decide
-            tally.local_margin = origin.margin
+        least = min(origin.margins, default=np.nan)
+        if np.isfinite(least):  # binary64 may not hold the sides of an inequality that rationals decide
+            tally.margins["local"] = least
     tally.hold(OF_THE_TREE, case)
     if not case.covered or c.c1 != c.c2:
         bounds, tree = ring.Ring.of(case), case.partition.tree
-        tally.ring_margin = tally.hold_on_leaves(ON_LEAVES, bounds, tree, lambda leaves: leaves.bound[leaves.meet])
+        tally.margins["ring"] = tally.hold_on_leaves(ON_LEAVES, bounds, tree, lambda leaves: leaves.bound[leaves.meet])

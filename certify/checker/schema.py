@@ -7,10 +7,11 @@ from __future__ import annotations
 import base64
 import math
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields
 from fractions import Fraction
-from typing import Any, TypeVar
+from functools import cache
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,21 +32,24 @@ class Value:
         if not holds:
             strict.fail(self.at, f"must be {be}")
 
-    def keys(self, names: str) -> list[Value]:
-        """The entries of an object that has exactly these keys."""
+    def entries(self, names: str, maybe: str = "") -> dict[str, Value]:
+        """The entries of an object that has exactly these keys, or of others those that may be."""
         keys = names.split()
+        keys += [key for key in maybe.split() if isinstance(self.raw, dict) and key in self.raw]
         self.must(
             isinstance(self.raw, dict) and set(self.raw) == set(keys), f"an object with exactly the keys: {names}"
         )
-        return [self.entry(key) for key in keys]
+        return {key: Value(self.raw[key], f"{self.at}.{key}".lstrip(".")) for key in keys}
 
-    def entry(self, name: str) -> Value:
-        """The entry of an object at a key that it has."""
-        return Value(self.raw[name], f"{self.at}.{name}".lstrip("."))
+    def keys(self, names: str) -> list[Value]:
+        """The entries of an object that has exactly these keys."""
+        return list(self.entries(names).values())
 
-    def maybe(self, name: str) -> str:
-        """The name, after a space, if the object has such a key: for `keys`."""
-        return f" {name}" if isinstance(self.raw, dict) and name in self.raw else ""
+    def kind(self, kinds: Sequence[str]) -> str:
+        """The entry `kind` of an object, one of these words."""
+        known = isinstance(self.raw, dict) and self.raw.get("kind") in kinds
+        self.must(known, f"an object of kind {' or '.join(kinds)}")
+        return str(self.raw["kind"])
 
     def listed(self, read: Callable[[Value], T], least: int, most: int | None = None) -> tuple[T, ...]:
         """The entries of a list, each as `read` has it; `least` of them, or up to `most`."""
@@ -106,3 +110,34 @@ class Value:
         numbers = np.frombuffer(raw, dtype="<f8").astype(np.float64).reshape(shape)
         self.must(bool(np.all(np.isfinite(numbers))), "finite")
         return numbers
+
+
+# ------------------------------------------------------------------------------------------------------------ sections
+
+Array = NDArray[np.float64]
+Sizes = Mapping[str, int]
+
+
+def shaped(*axes: str | int) -> Callable[[Value, Sizes], Array]:
+    """The reader of an array whose axes are numbers, or names of sizes."""
+    return lambda value, sizes: value.array(*(sizes[axis] if isinstance(axis, str) else axis for axis in axes))
+
+
+Row = Annotated[Array, shaped("n")]
+Matrix = Annotated[Array, shaped("n", "n")]
+Binary64 = Annotated[float, lambda value, _: value.binary64()]
+Octets = Annotated[bytes, lambda value, _: value.octets()]
+
+
+def section(value: Value, kind: type[T], **sizes: int) -> T:
+    """An object as a dataclass whose fields are its keys; one with a default may be missing. Each is read as its
+    annotation says, with these sizes."""
+    readers: dict[str, Callable[[Value, Sizes], Any]] = _readers(kind)  # type: ignore[arg-type]
+    needed = [f.name for f in fields(kind) if f.default is MISSING]  # type: ignore[arg-type]
+    entries = value.entries(" ".join(needed), " ".join(readers.keys() - needed))
+    return kind(**{name: readers[name](entry, sizes) for name, entry in entries.items()})
+
+
+@cache
+def _readers(kind: type) -> dict[str, Callable[[Value, Sizes], Any]]:
+    return {name: hint.__metadata__[0] for name, hint in get_type_hints(kind, include_extras=True).items()}

@@ -7,12 +7,11 @@ meaning of these steps beside that of the others.
 from __future__ import annotations
 
 import json
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
-from typing import Any, Generic
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from .expression import Tape, evaluate, parse
 from .jets import Jet, constant
 from .near import ZERO, Above, Array, Form, Near, Uniform, Vector, norm, size
 from .network import Enclosed, OnBoxes
-from .networks import MAX_STEPS, MAX_WIDTH, Algebra, Step, V, vectors_of
+from .networks import MAX_STEPS, MAX_WIDTH, Step, vectors_of
 from .schema import Value
 from .taylor import constants, forms, models
 from .words import expression
@@ -42,17 +41,11 @@ class Clip(Step):
     def arrays(self) -> tuple[Array, ...]:
         return self.lo, self.hi
 
-    def said(self, of: list[str]) -> str:
-        return f"clip({of[0]}), {self.size} entries"
-
 
 class Sum(Step):
     """The sum of vectors, from left to right."""
 
     units = 0
-
-    def said(self, of: list[str]) -> str:
-        return " + ".join(of)
 
 
 class Concat(Step):
@@ -60,15 +53,9 @@ class Concat(Step):
 
     units = 0
 
-    def said(self, of: list[str]) -> str:
-        return f"({', '.join(of)}), {self.size} entries"
-
 
 class Product(Step):
     """The product of two vectors, entry by entry; one of a single entry multiplies every entry of the other."""
-
-    def said(self, of: list[str]) -> str:
-        return " * ".join(of)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,17 +66,13 @@ class Observe(Step):
     tape: Tape
 
     @property
-    def operations(self) -> int:
-        return len(self.tape.operations)
-
-    @property
     def words(self) -> str:
         trees = json.dumps(self.tape.trees, separators=(",", ":"))
         return super().words + "".join(f"{name}\0" for name in self.names) + f"{trees}\0"
 
-    def said(self, of: list[str]) -> str:
+    def said(self, of: str) -> str:
         made = ", ".join(expression(tree) for tree in self.tape.trees)
-        return f"({made}) of ({', '.join(self.names)}) = {of[0]}"
+        return f"({made}) of ({', '.join(self.names)}) = {of}"
 
 
 def read(value: Value, sizes: Sequence[int]) -> Step:
@@ -121,66 +104,13 @@ def read(value: Value, sizes: Sequence[int]) -> Step:
     return Observe(read, len(trees), named, parse(trees, named, expressions.at))
 
 
-class Others(ABC, Generic[V]):
-    """The meaning of each of these steps for vectors V."""
-
-    @abstractmethod
-    def clip(self, step: Clip, v: V) -> V:
-        """`min(max(v, lo), hi)`."""
-
-    @abstractmethod
-    def sum(self, step: Sum, vectors: Sequence[V]) -> V:
-        """The sum of vectors of equal length."""
-
-    @abstractmethod
-    def concat(self, step: Concat, vectors: Sequence[V]) -> V:
-        """Vectors one behind the other."""
-
-    @abstractmethod
-    def product(self, step: Product, v: V, w: V) -> V:
-        """The product of two vectors, of which one may have a single entry."""
-
-    @abstractmethod
-    def observe(self, step: Observe, v: V) -> V:
-        """Expressions of the entries."""
-
-    def other(self, step: Step, vectors: Sequence[V]) -> V:
-        """The vector that a step makes."""
-        match step:
-            case Clip():
-                return self.clip(step, vectors[0])
-            case Sum():
-                return self.sum(step, vectors)
-            case Concat():
-                return self.concat(step, vectors)
-            case Product():
-                return self.product(step, *vectors)
-            case Observe():
-                return self.observe(step, vectors[0])
-        raise TypeError(f"no kind of step: {type(step).__name__}")
-
-
-def meaning(algebra: Algebra[Any]) -> Others[Any]:
-    """The meaning of these steps in an algebra."""
-    match algebra:
-        case Others():
-            return algebra
-        case Exactly():
-            return ExactSteps()
-        case OnBoxes():
-            return BoxSteps(algebra)
-        case OnBall():
-            return BallSteps(algebra)
-    raise TypeError(f"no meaning of these steps in {type(algebra).__name__}")
-
-
-class NumberSteps(Others[list[Any]]):
+class NumberSteps:
     """Numbers that add and multiply, in lists."""
 
-    def sum(self, step: Sum, vectors: Sequence[list[Any]]) -> list[Any]:
+    def sum(self, step: Sum, *vectors: list[Any]) -> list[Any]:
         return [reduce(add, entries) for entries in zip(*vectors, strict=True)]
 
-    def concat(self, step: Concat, vectors: Sequence[list[Any]]) -> list[Any]:
+    def concat(self, step: Concat, *vectors: list[Any]) -> list[Any]:
         return [x for v in vectors for x in v]
 
     def product(self, step: Product, v: list[Any], w: list[Any]) -> list[Any]:
@@ -197,7 +127,7 @@ class ExactSteps(NumberSteps):
         return evaluate(step.tape, Exact, v)
 
 
-class BoxSteps(Others[Enclosed]):
+class BoxSteps:
     """Forms on boxes, with what each step adds to errors."""
 
     def __init__(self, boxes: OnBoxes) -> None:
@@ -207,7 +137,7 @@ class BoxSteps(Others[Enclosed]):
         h, slope, gap = clip_forms(v.plain, v.spread + v.error, step.lo, step.hi)
         return self.boxes.by_lines(v, h, slope, gap)
 
-    def sum(self, step: Sum, vectors: Sequence[Enclosed]) -> Enclosed:
+    def sum(self, step: Sum, *vectors: Enclosed) -> Enclosed:
         h, (first, *others) = vectors[0].h, vectors
         fresh, old, ball = first.fresh, first.old, first.ball
         for v in others:
@@ -215,7 +145,7 @@ class BoxSteps(Others[Enclosed]):
         self.boxes.added[-1] = h.error
         return Enclosed(Form(h.value), fresh + h.error, old, ball, self.k)
 
-    def concat(self, step: Concat, vectors: Sequence[Enclosed]) -> Enclosed:
+    def concat(self, step: Concat, *vectors: Enclosed) -> Enclosed:
         h = Form(np.concatenate([v.h.value for v in vectors], 1))
         fresh, old = (
             Above(np.concatenate([part.top + 0 * v.spread.v for part, v in zip(parts, vectors, strict=True)]))
@@ -230,7 +160,7 @@ class BoxSteps(Others[Enclosed]):
         """With v = c + V and w = e + W it is c e + c W + e V + V W: errors of v and w pass times e and c, exact
         numbers, and V W is between bounds."""
         c, e = v.h.value[0], w.h.value[0]
-        moved, other = v.h.unmoved, w.h.unmoved
+        moved, other = _unmoved(v.h), _unmoved(w.h)
         shift, gap = lines_around_product(moved, v.error, other, w.error, v.step == w.step)
         h = (w.plain * Near(c) + moved * Near(e)).raised(Near(shift))
         passed, added = v.error * size(e) + w.error * size(c), gap + h.error
@@ -266,6 +196,11 @@ class BoxSteps(Others[Enclosed]):
         return []  # expressions keep no way back
 
 
+def _unmoved(h: Form) -> Form:
+    """The coefficients of the symbols alone, and 0 for that of 1."""
+    return Form(np.concatenate([np.zeros_like(h.value[:1]), h.value[1:]]))
+
+
 def _length(v: Enclosed, factor: Array) -> Above:
     """Upper bound of the 2-norm of the errors of v times factors, of an error for all of them if v has one entry."""
     steep = norm(factor) if v.h.value.shape[1] == 1 else size(factor).max()
@@ -293,7 +228,7 @@ def clip_forms(v: Form, error: Above, least: Array, most: Array) -> tuple[Form, 
     return kept, np.where(inside, 1.0, slope), Above(np.where(inside, 0.0, gap.top))
 
 
-class BallSteps(Others[Rows]):
+class BallSteps:
     """Vectors on a ball, whose units stand in the algebra."""
 
     def __init__(self, ball: OnBall) -> None:
@@ -308,14 +243,14 @@ class BallSteps(Others[Rows]):
         y = Near(np.where(free, v.y.value, np.where(low, step.lo, step.hi)), v.y.error * slope)
         return Rows(y, self.ball.columns(v, value.units.count).times(Near(slope)))
 
-    def sum(self, step: Sum, vectors: Sequence[Rows]) -> Rows:
+    def sum(self, step: Sum, *vectors: Rows) -> Rows:
         units = self.ball.R.shape[2]
         y, X = vectors[0].y, self.ball.columns(vectors[0], units)
         for v in vectors[1:]:
             y, X = y + v.y, X + self.ball.columns(v, units)
         return Rows(y, X)
 
-    def concat(self, step: Concat, vectors: Sequence[Rows]) -> Rows:
+    def concat(self, step: Concat, *vectors: Rows) -> Rows:
         parts, error = [self.ball.columns(v, self.ball.R.shape[2]) for v in vectors], ZERO
         for X in parts:
             error = error + X.error * X.error
@@ -349,3 +284,6 @@ class BallSteps(Others[Rows]):
             for j in range(len(v.y.value))
         ]
         return self.ball.entered(evaluate(step.tape, lambda q: constant(q, u.units), entries))
+
+
+MEANINGS: dict[type, Callable[[Any], Any]] = {Exactly: lambda _: ExactSteps(), OnBoxes: BoxSteps, OnBall: BallSteps}

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any
 
-from .document import PLAIN, Array, Certificate, Partition, Policy
+from .document import PLAIN, Certificate, Partition, Policy
 from .networks import Network, hashed
+from .schema import Array
 
 CLAIMS = {
     "asymptotic": "the origin is asymptotically stable, and every trajectory of the closed loop that starts in "
@@ -49,22 +51,23 @@ def falls(c: Certificate, bound: str, latest: str) -> list[str]:
 
 def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
     """The plant, the policy, V, what is claimed of them, what held, and the verdict, line by line."""
-    then, counted = list[str](), list[str]()  # of a certificate that takes over
     if has_more(c):
         from . import clauses
 
-        rest, verdict, then, counted = clauses.results(c, answer)
-    else:
-        rest, verdict = margins(c, answer, "Vdot"), answer["result"]
-    return [
-        *stated(c),
-        *then,
-        "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items() if count),
-        *counted,
-        "modules that were used: " + ", ".join(answer["modules"]),
-        rest,
-        f"{verdict} {_levels(c)}sha256={c.sha256}",
-    ]
+        return clauses.report(c, answer)
+    return [*stated(c), *claim(c), *held(answer), margins(c, answer, "Vdot"), verdict(c, answer["result"])]
+
+
+def held(answer: dict[str, Any], counted: Sequence[str] = ()) -> list[str]:
+    """The rules and the modules that the answer rests on."""
+    rules = ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items() if count)
+    return [f"rules that held: {rules}", *counted, f"modules that were used: {', '.join(answer['modules'])}"]
+
+
+def verdict(c: Certificate, result: str) -> str:
+    inner = f"c0={c.c0!r} " if c.practical else ""
+    both = f"{inner}c1={c.c1!r} c2={c.c2!r} " if c.levels else ""
+    return f"{result} {both}{f'n2={c.outer.level!r} ' if c.outer else ''}sha256={c.sha256}"
 
 
 def margins(c: Certificate, answer: dict[str, Any], change: str) -> str:
@@ -81,7 +84,7 @@ def margins(c: Certificate, answer: dict[str, Any], change: str) -> str:
 
 
 def stated(c: Certificate) -> list[str]:
-    """The plant, the policy, V, and what is claimed of them, line by line."""
+    """The plant, the policy and V, line by line."""
     inputs = zip(c.inputs, c.input_bounds, c.u_eq, strict=True)
     after = "+" if c.discrete else "'"
     left = "x+" if c.discrete else "xdot"
@@ -100,25 +103,7 @@ def stated(c: Certificate) -> list[str]:
         f"sha256 {c.policy.sha256()}",
         *([] if c.policy.origin is None else [f"  its network reads ({matrix(c.policy.origin[None])}) + x"]),
         *([] if c.without_V else [f"V(x) = x'Px with P = {matrix(c.P)}"]),
-        *_besides(c),
-        *claim(c),
     ]
-
-
-def _besides(c: Certificate) -> list[str]:
-    """The other things that the claim is about."""
-    if not has_more(c):
-        return []
-    from . import clauses
-
-    return clauses.besides(c)
-
-
-def _levels(c: Certificate) -> str:
-    """The levels, each with a space after it."""
-    inner = f"c0={c.c0!r} " if c.practical else ""
-    both = f"{inner}c1={c.c1!r} c2={c.c2!r} " if c.levels else ""
-    return both if c.outer is None else f"{both}n2={c.outer.level!r} "
 
 
 def _network(network: Network) -> str:
@@ -126,8 +111,8 @@ def _network(network: Network) -> str:
     arrays = [array for step in network.steps for array in step.arrays]
     sha256 = hashed("certify-lyapunov/1\0", arrays, network.words())
     if network.is_chain:
-        return f"{'-'.join(map(str, network.widths))} tanh, sha256 {sha256}"
-    steps = (f"v{k} = {step.said([f'v{i}' for i in step.of])}" for k, step in enumerate(network.steps, 1))
+        return f"{'-'.join(map(str, [network.reads, *network.sizes[1::2]]))} tanh, sha256 {sha256}"
+    steps = (f"v{k} = {step.said(', '.join(f'v{i}' for i in step.of))}" for k, step in enumerate(network.steps, 1))
     return f"{'; '.join(steps)}; sha256 {sha256}"
 
 

@@ -17,10 +17,10 @@ from certify.analysis import acceptance as roa
 from certify.analysis.run import RoaOptions, certify_roa
 from certify.certificates import limits, read_certificate, run_checker
 from certify.certificates.verdict import Verdict
-from certify.checker import ball as checker_ball
 from certify.checker import document as checker_document
 from certify.checker import exact as checker_exact
 from certify.checker import expression as checker_expression
+from certify.checker import limits as checker_limits
 from certify.checker import networks as checker_networks
 from certify.errors import CertificateFormatError, InputError
 from certify.loop.expressions import Number, from_tree, symbols, tan, to_tree
@@ -254,9 +254,8 @@ def test_the_limits_are_the_checker_s() -> None:
         checker_expression.MAX_EXPONENT,
     )
     assert limits.MOST_MATRIX_BITS == checker_exact.MAX_MATRIX_BITS
-    assert limits.MOST_NUMBERS == checker_ball._MOST_JETS
-    assert producer_models._MOST_NUMBERS == checker_ball._MOST_NUMBERS
-    assert producer_models._MOST_PRODUCTS == checker_ball._MOST_PRODUCTS
+    assert producer_models._MOST_NUMBERS == checker_limits.MOST_NUMBERS == limits.MOST_NUMBERS // 2
+    assert producer_models._MOST_PRODUCTS <= checker_limits.MOST_WORK
     page = (Path(checker_document.__file__).parent / "FORMAT.md").read_text()
     assert f"at most {limits.MOST_DIGITS:,} digits" in page and f"at most {limits.MOST_NODES:,} nodes" in page
 

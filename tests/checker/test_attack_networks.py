@@ -25,7 +25,7 @@ from certify.checker.networks import Affine, Algebra, Map
 from certify.checker.ring import Ring
 from certify.checker.taylor import Taylor, constants
 from certify.checker.taylor import affine as form_of
-from certify.checker.wiring import Clip, Concat, Observe, Others, Product, Sum
+from certify.checker.wiring import Clip, Concat, Observe, Product, Sum
 from tests.checker.test_networks import a_jet, a_network, hash_of, odd_loop
 from tests.support.certificates import Document, encode
 from tests.support.earlier import newer
@@ -80,7 +80,7 @@ PHI: dict[str, Callable[[arb], arb]] = {
 }
 
 
-class Truths(Algebra[list[arb]], Others[list[arb]]):
+class Truths(Algebra[list[arb]]):
     """Networks in Arb."""
 
     def affine(self, step: Affine, v: list[arb]) -> list[arb]:
@@ -96,10 +96,10 @@ class Truths(Algebra[list[arb]], Others[list[arb]]):
         ends = zip(v, step.lo.tolist(), step.hi.tolist(), strict=True)
         return [x.max(arb(lo)).min(arb(hi)) for x, lo, hi in ends]
 
-    def sum(self, step: Sum, vectors: Sequence[list[arb]]) -> list[arb]:
+    def sum(self, step: Sum, *vectors: list[arb]) -> list[arb]:
         return [sum(entries, arb(0)) for entries in zip(*vectors, strict=True)]
 
-    def concat(self, step: Concat, vectors: Sequence[list[arb]]) -> list[arb]:
+    def concat(self, step: Concat, *vectors: list[arb]) -> list[arb]:
         return [x for v in vectors for x in v]
 
     def product(self, step: Product, v: list[arb], w: list[arb]) -> list[arb]:

@@ -48,10 +48,11 @@ def passes_the_checker(data: Document) -> bool:
     """The rule alone: a loop need not be one whose V falls."""
     with np.errstate(all="ignore"):
         case = Case(parse(data))
-        by = case.partition.contraction
-        assert by is not None
         try:
-            rules.Tally().hold(contraction.OF_CONTRACTION, contraction.Contracted.of(case, by))
+            rules.Tally().hold(
+                contraction.OF_CONTRACTION,
+                contraction.Contracted.of(case),
+            )
         except Rejected as no:
             assert no.rule == "contraction"
             return False

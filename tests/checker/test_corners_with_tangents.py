@@ -21,7 +21,7 @@ from certify.checker.ball import Ball
 from certify.checker.case import Case
 from certify.checker.functions import FUNCTIONS
 from certify.checker.jets import Units
-from certify.checker.kinks import ALL, OnCone
+from certify.checker.kinks import Cone, OnCone
 from certify.checker.near import Above, Near
 from certify.checker.networks import Affine, Map, Network, Step
 from certify.checker.ranges import Swayed, uncertain
@@ -96,7 +96,7 @@ def test_a_network_at_its_corners_lies_in_its_model(seed: int, relus: bool) -> N
         given = [replace(v, c=Near(np.float64(0.0))) for v in given]
     network = cornered(rng, 2, np.array([float(v.c.value) for v in given]), relus)
     with np.errstate(all="ignore"):
-        h = (OnCone(2, ALL) if relus else ball.OnBall(2)).value(network, given)
+        h = (OnCone(2, Cone()) if relus else ball.OnBall(2)).value(network, given)
         slack = h.slack.top + h.units.tilt(h.B.size).top * np.ones(2)
     M = h.remainder + np.tensordot(h.units.U, np.abs(h.B.value), 1)
     assert np.all(np.isfinite(M)) and np.all(np.isfinite(slack)) and np.all(np.isfinite(h.v0.size.top))

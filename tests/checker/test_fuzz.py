@@ -608,11 +608,11 @@ def counterexample(raw: bytes, path: Path) -> str | None:
 
 def _leaves_tube(c: document.Certificate, trees: list[Any], generator: random.Random) -> str | None:
     """A point of a slab's ellipsoids, around a path of their edges, in which e'P(t)e does not fall."""
-    if c.start is None or not isinstance(c.evidence, document.Partition):
+    if c.tube is None:
         return None
-    n, before = len(c.states), c.start
-    centre = [arb(0)] * n if c.centre is None else [arb(float(v)) for v in c.centre]
-    for k, slab in enumerate(c.evidence.tube):
+    n, before = len(c.states), c.tube.start
+    centre = [arb(0)] * n if c.tube.centre is None else [arb(float(v)) for v in c.tube.centre]
+    for k, slab in enumerate(c.tube.slabs):
         nodes = [[[arb(float(v)) for v in row] for row in P] for P in (before, slab.middle, slab.end)]
         h, before, begin = arb(slab.duration), slab.end, centre
         if slab.path is not None:

@@ -196,7 +196,7 @@ def test_honest_practical_certificates_are_accepted(name: str, tmp_path: Path) -
     path = Mutant(name, practical_base(name), frozenset()).write(tmp_path / "certificate.json")
     assert (verdict_on(path), faults(path), judge(read(path))) == ("ACCEPTED", {}, None)
     tally = rules.check(document.read(str(path)))
-    assert tally.rules["equilibrium"] == tally.rules["local"] == 0 and tally.local_margin is None
+    assert tally.rules["equilibrium"] == tally.rules["local"] == 0 and tally.margins["local"] is None
     assert tally.rules["tree"] >= tally.rules["ring"] > 0
     kind, levels = practical_base(name)["claim"]["kind"], practical_base(name)["levels"]
     asymptotic = edited(practical_base(name), "claim.kind", "asymptotic")

@@ -181,7 +181,11 @@ def certainly_within(kind: Any, found: Near, truth: list[list[Fraction]]) -> boo
         elif kind is Uniform:
             good = max(off) <= Fraction(float(error))
         else:
-            often = [1.0] * len(off) if kind is not Cubic else near.triples(near.order_of(len(off)))[-1].tolist()
+            often = (
+                [1.0] * len(off)
+                if kind is not Cubic
+                else near.triples(round((6 * len(off)) ** (1 / 3)) - 1)[-1].tolist()
+            )
             squares = sum((Fraction(w) * v * v for w, v in zip(often, off, strict=True)), Fraction(0))
             good = squares <= Fraction(float(error)) ** 2
         if not good:

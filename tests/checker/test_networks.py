@@ -28,7 +28,7 @@ from certify.checker.outer import Dual, InRows
 from certify.checker.smooth import add as add_smooth
 from certify.checker.taylor import Taylor, constants
 from certify.checker.taylor import affine as form_of
-from certify.checker.wiring import Clip, Concat, Observe, Others, Product, Sum
+from certify.checker.wiring import Clip, Concat, Observe, Product, Sum
 from tests.support.certificates import Document, decode, encode, grow, make
 from tests.support.earlier import newer
 from tests.support.marks import slow_after
@@ -71,7 +71,7 @@ def has_corners(net: Network) -> bool:
     return any(isinstance(step, Clip) or getattr(step, "function", "") in CORNERED for step in net.steps)
 
 
-class Numbers(Algebra[Array], Others[Array]):
+class Numbers(Algebra[Array]):
     """Plain numbers, (width, B)."""
 
     def affine(self, step: Affine, v: Array) -> Array:
@@ -83,10 +83,10 @@ class Numbers(Algebra[Array], Others[Array]):
     def clip(self, step: Clip, v: Array) -> Array:
         return np.clip(v, step.lo[:, None], step.hi[:, None])
 
-    def sum(self, step: Sum, vectors: Any) -> Array:
+    def sum(self, step: Sum, *vectors: Array) -> Array:
         return sum(vectors)
 
-    def concat(self, step: Concat, vectors: Any) -> Array:
+    def concat(self, step: Concat, *vectors: Array) -> Array:
         return np.concatenate(vectors)
 
     def product(self, step: Product, v: Array, w: Array) -> Array:

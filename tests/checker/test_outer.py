@@ -41,7 +41,7 @@ def test_the_originals_are_accepted_and_nothing_refutes_them(name: str) -> None:
     data = base(name)
     tally = rules.check(parse(data))
     assert tally.rules["faces"] >= 2 * len(data["plant"]["states"]) and tally.rules["outer"] > 0
-    assert tally.outer_margin is not None and tally.outer_margin > 0
+    assert tally.margins["outer"] is not None and tally.margins["outer"] > 0
     assert refutation(data) is None
 
 

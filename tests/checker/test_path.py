@@ -422,7 +422,7 @@ def growth(c: Certificate, directions: int, seed: int = 0) -> tuple[arb, arb]:
     """The largest dW/dt that is found where W = 1, and the largest |dW/dt|."""
     generator, rates = np.random.default_rng(seed), []
     n = len(c.states)
-    for slab, before in zip(c.evidence.tube, nodes_before(c), strict=True):
+    for slab, before in zip(c.tube.slabs, nodes_before(c), strict=True):
         points = generator.standard_normal((directions, n)) if n > 1 else np.array([[1.0], [-1.0]])
         for s in (Fraction(0), Fraction(1, 2), Fraction(1)):
             rates += [rate for rate, _ in rates_outwards(c, before, slab, s, points)]
@@ -476,7 +476,7 @@ def test_nothing_leaves_the_tube_where_the_true_field_is_asked(name: str) -> Non
     c = parse(HONEST[name]())
     generator, highest = np.random.default_rng(5), -math.inf
     with ctx.workprec(120):
-        for slab, before in zip(c.evidence.tube, nodes_before(c), strict=True):
+        for slab, before in zip(c.tube.slabs, nodes_before(c), strict=True):
             for s in (Fraction(0), Fraction(1), Fraction(int(generator.integers(1, 999)), 1000)):
                 directions = generator.standard_normal((6, len(c.states)))
                 for rate, x in rates_outwards(c, before, slab, s, directions):
@@ -499,11 +499,11 @@ def test_runs_stay_in_the_tube_and_arrive(name: str) -> None:
         return np.asarray(function(x, loop.policy(x)))
 
     generator = np.random.default_rng(6)
-    inverse, widest = np.linalg.inv(np.linalg.cholesky(c.start)).T, 0.0
+    inverse, widest = np.linalg.inv(np.linalg.cholesky(c.tube.start)).T, 0.0
     for _ in range(4):
         d = generator.standard_normal(n)
-        x = c.centre + inverse @ d / np.linalg.norm(d)
-        for slab, (P_0, c_0) in zip(c.evidence.tube, nodes_before(c), strict=True):
+        x = c.tube.centre + inverse @ d / np.linalg.norm(d)
+        for slab, (P_0, c_0) in zip(c.tube.slabs, nodes_before(c), strict=True):
             h = slab.duration / steps
             for k in range(steps):
                 k1 = field(x)
@@ -644,14 +644,14 @@ def assert_true(data: Document, directions: int) -> None:
     c = parse(data)
     generator = np.random.default_rng(8)
     with ctx.workprec(100):
-        for slab, before in zip(c.evidence.tube, nodes_before(c), strict=True):
+        for slab, before in zip(c.tube.slabs, nodes_before(c), strict=True):
             for s in (Fraction(0), Fraction(1, 2), Fraction(1)):
                 for rate, x in rates_outwards(
                     c, before, slab, s, generator.standard_normal((directions, len(c.states)))
                 ):
                     assert rate < 0
                     assert all(exact(lo) < v < exact(hi) for v, (lo, hi) in zip(x, c.domain, strict=True))
-        slab = c.evidence.tube[-1]
+        slab = c.tube.slabs[-1]
         edge = np.linalg.inv(np.linalg.cholesky(slab.end)).T @ generator.standard_normal((len(c.states), 99))
         edge /= np.sqrt(np.einsum("ik,ij,jk->k", edge, slab.end, edge))
         x = slab.path.centre[:, None] + edge

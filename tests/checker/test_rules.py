@@ -192,13 +192,17 @@ def test_honest_certificates_are_accepted(name: str) -> None:
     tally = rules.check(parse(data))
     assert tally.rules["tree"] == tree_of(data).count(LEAF)
     assert tally.rules["tube"] == len(data["evidence"]["tube"])
-    assert (tally.local_margin is None) if name.startswith(("practical", "nearby")) else 0 < tally.local_margin <= 1
+    assert (
+        (tally.margins["local"] is None)
+        if name.startswith(("practical", "nearby"))
+        else 0 < tally.margins["local"] <= 1
+    )
     if name == "scalar":  # bounded by form: no leaf is asked for its inputs
         assert tally.rules["inputs"] == 1
     if name in ("local only", *OUTER):
-        assert tally.rules["ring"] == 0 and tally.ring_margin is None
+        assert tally.rules["ring"] == 0 and tally.margins["ring"] is None
     else:
-        assert tally.rules["ring"] > 0 and tally.ring_margin is not None and tally.ring_margin > 0
+        assert tally.rules["ring"] > 0 and tally.margins["ring"] is not None and tally.margins["ring"] > 0
 
 
 def reordered(value: Any) -> Any:

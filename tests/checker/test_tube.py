@@ -495,10 +495,10 @@ def test_runs_of_the_pendulum_stay_in_its_tube() -> None:
         return np.array([x[1], -8 / 3 * x[1] + 80 / 3 * u_of(x) + 981 / 50 * np.sin(x[0])])
 
     angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
-    inverse = np.linalg.inv(np.linalg.cholesky(c.start)).T
+    inverse = np.linalg.inv(np.linalg.cholesky(c.tube.start)).T
     x = inverse @ np.array([np.cos(angle), np.sin(angle)])
-    node, W, steps = c.start, np.ones(64), 12
-    for piece in c.evidence.tube:
+    node, W, steps = c.tube.start, np.ones(64), 12
+    for piece in c.tube.slabs:
         h = piece.duration / steps
         for k in range(steps):
             k1 = field(x)

@@ -53,7 +53,7 @@ def test_models_and_sides_are_those_of_the_checker(name: str, tmp_path: Path) ->
     assert result.verdict is Verdict.PROVED and result.raw is not None
     c = parse(json.loads(result.raw))
     assert c.evidence.local is not None
-    J, by = c.evidence.local.J, c.evidence.local.multipliers
+    J, by = c.evidence.local.J, c.evidence.local.by
     mine = paths(case_of(system, network).loop).models(J)
     assert mine.finite and mine.admitted
     with np.errstate(all="ignore"):

@@ -16,7 +16,7 @@ TABLES = {
     "rules": ("STATED", "ON_THE_BALL", "OF_THE_TREE", "ON_LEAVES"),
     "tube": ("OF_THE_TUBE", "ON_SLABS"),
     "contraction": ("OF_CONTRACTION",),
-    "outer": ("OF_OUTER", "ON_FACES", "OF_OUTER_TREE", "ON_OUTER_LEAVES"),
+    "outer": ("ON_FACES", "OF_OUTER_TREE", "ON_OUTER_LEAVES"),
 }
 
 

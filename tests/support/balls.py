@@ -17,7 +17,9 @@ from flint import fmpq, fmpq_mat
 
 from certify.checker.ball import Ball
 from certify.checker.case import Case
+from certify.checker.document import LocalBall, Partition
 from certify.checker.errors import Rejected
+from certify.checker.limits import MOST_NUMBERS, Sizes
 from certify.checker.networks import Network
 from tests.support.certificates import ASYMPTOTIC, Document, decode, edited, encode, parse
 from tests.support.jets import seen
@@ -33,11 +35,23 @@ def with_ball(data: Document) -> Document:
     return edited(data, "evidence.local", local_ball(data))
 
 
-def sized(network: Network, operations: int, symbols: int) -> Any:
-    """A ball of which the sizes are known and nothing else: those that rule `fits` asks for."""
-    dynamics = SimpleNamespace(size=operations, calls={})
-    c = SimpleNamespace(dynamics=dynamics, policy=SimpleNamespace(network=network))
-    return SimpleNamespace(case=SimpleNamespace(c=c), J=np.eye(symbols), motion=None, order=1, count=0)
+def is_bearable_on_a_ball(network: Network, operations: int, n: int) -> bool:
+    """True if rule `limits` takes the numbers of a certificate of a ball alone, of which these sizes are known."""
+    none = dict.fromkeys(("sample", "keep", "target", "outer", "ranks", "data", "tube", "contraction"))
+    local = LocalBall(np.eye(n), ((), (), ()), np.eye(n), 0.0, 1)
+    c = SimpleNamespace(
+        **none,
+        claim="asymptotic",
+        states=range(n),
+        inputs=range(network.gives),
+        uncertain=(),
+        dynamics=SimpleNamespace(size=operations, entries=0, called=[]),
+        policy=SimpleNamespace(network=network),
+        evidence=Partition(np.eye(n), np.ones(n), b"", 1, (), local),
+        c1=1.0,
+        c2=1.0,
+    )
+    return Sizes(c).numbers() <= MOST_NUMBERS  # type: ignore[arg-type]
 
 
 def square(text: str) -> np.ndarray:

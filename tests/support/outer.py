@@ -260,7 +260,7 @@ def with_outer(
     data = with_faces(stated(data, function, T, root))
     with np.errstate(all="ignore"):
         beyond = Beyond(Case(parse(data)))
-        tree = halved(beyond.evidence.root, lambda *box: passes(beyond, *box), max_leaves, depth)
+        tree = halved(beyond.outer.root, lambda *box: passes(beyond, *box), max_leaves, depth)
     return edited(data, "evidence.outer.tree", packed(tree))
 
 

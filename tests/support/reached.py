@@ -129,6 +129,6 @@ def rates_outwards(
 
 def nodes_before(c: Certificate) -> list[tuple[Array, Array]]:
     """Matrix and centre of the node before each slab."""
-    slabs = c.evidence.tube  # type: ignore[union-attr]
+    slabs = c.tube.slabs  # type: ignore[union-attr]
     ends = [(slab.end, slab.path.centre) for slab in slabs if slab.path is not None]
-    return [(c.start, c.centre), *ends[:-1]]  # type: ignore[list-item]
+    return [(c.tube.start, c.tube.centre), *ends[:-1]]  # type: ignore[list-item, union-attr]
