@@ -1,5 +1,5 @@
 """The rule `contraction`: on a ball that holds {V <= c0} any two trajectories come closer, where q is constant, in the
-norm of P: at all times, or in discrete time with every step. So there is one equilibrium at most, to which those that
+norm of P: at all times, or with every step. So there is one equilibrium at most, to which those that
 stay in {V <= c0} converge."""
 
 from __future__ import annotations
@@ -41,7 +41,12 @@ class Contracted(Ball):
             from .kinks import CLOSE
 
             cone = CLOSE
-        return cls(case, by.J, "contraction", by, cone=cone)
+        kind: type[Contracted] = cls
+        if case.c.sample is not None:
+            from .held import HeldClose
+
+            kind = HeldClose
+        return kind(case, by.J, "contraction", by, cone=cone)
 
 
 def fits(ball_: Contracted) -> Failures:
@@ -55,18 +60,20 @@ def fits(ball_: Contracted) -> Failures:
 
 def contracts(ball_: Contracted) -> Failures:
     """V(e + h g) - V(e), over h, is negative for any two points of the ball; e is their difference, g that of G, and h
-    is 0 in continuous time, where this is 2 e'P g."""
-    P, h, count = exactly(ball_.case.c.P), int(ball_.case.c.discrete), 0
+    is 0 in continuous time, where this is 2 e'P g, and the longest period where inputs are held."""
+    P, step, count = exactly(ball_.case.c.P), ball_.case.c.step, 0
+    h = fmpq(step.numerator, step.denominator)
     parts = ball_.on_cones(ball_.by.directions, close=True)
     for part, cell in ((part, cell) for part in parts for cell in ball_.case.cells):
         G = part.change(cell)
         doubts = [g.lipschitz + g.slack for g in G]
-        models = Models(ball_.J, G, rest=True) if are_finite(G) and all(np.isfinite(v.top) for v in doubts) else None
+        finite = bool(G) and are_finite(G) and all(np.isfinite(v.top) for v in doubts)
+        models = Models(ball_.J, G, rest=True) if finite else None
         if models is not None and part.cone is not None:
             from .kinks import Kinks
 
             models.more.append(Kinks.of(part.cone, models, ball_.case.c.P))
-        beyond = 0.0 if models is None or not h else _size_beyond(models, doubts, ball_.case.c.P)
+        beyond = 0.0 if models is None or h == 0 else _size_beyond(models, doubts, ball_.case.c.P)
         if models is None or not np.isfinite(beyond):
             yield ball_.at, "F has no finite model"
             return count
@@ -76,10 +83,10 @@ def contracts(ball_: Contracted) -> Failures:
         for corner in models.corners():
             crossed = models.J.transpose() * P * corner.A
             form = crossed + crossed.transpose()
-            if h:
+            if h != 0:
                 most = sum((more.lengths(models, P)[1] for more in models.more), rational(beyond))
-                form += corner.A.transpose() * P * corner.A + diagonal([most**2] * b.ncols())
-                rest = _rest(models, P * (models.J + corner.A), sizes, ball_.by)
+                form += h * (corner.A.transpose() * P * corner.A + diagonal([most**2] * b.ncols()))
+                rest = _rest(models, P * (models.J + h * corner.A), sizes, ball_.by)
             count += 1
             if not is_definite(-form - rest):
                 yield ball_.at, "it is not shown that trajectories come closer"

@@ -312,4 +312,4 @@ def _evidence(value: Value, stated: Mapping[str, Any], claim: str, more: Mapping
         return Partition(*by_boxes, cuts, ball)
     from . import sections
 
-    return Partition(*by_boxes, cuts, ball, *sections.others(claim, n, k, contraction, tube, beyond, more.get("outer")))
+    return Partition(*by_boxes, cuts, ball, *sections.others(claim, n, k, most, contraction, tube, beyond, more))

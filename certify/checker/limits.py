@@ -107,7 +107,8 @@ class Sizes:
         found = 4 * self.net.entries + self.of_features()[0]
         if not isinstance(self.evidence, Partition):
             return found
-        order = max(self.evidence.order, self.evidence.local.order if self.evidence.local else 1)
+        balls = self.evidence.local, self.evidence.contraction
+        order = max(self.evidence.order, *(part.order if part else 1 for part in balls))
         values = (4 * order if self.c.sample else 1) * self.a + 2 * self.n + 8
         if self.asked and not self.c.outer:
             found += self.on_leaves(order, self.s)
@@ -210,16 +211,21 @@ class Sizes:
         evidence, found = self._partition, 0
         cells = prod(evidence.cells)
         if evidence.local:
-            times = cells + (self.evaluations(evidence.local.order) + 8 if self.c.sample else 0)
+            times = cells + self.of_series(evidence.local.order)
             corners = cells * 2 ** min(self.y, AT_CORNERS)
             each = self.inequality + 2**8 * self.y * self.n * (self.d + 1) ** 2
             found += self.ball + times * self.equations + corners * each + self.decision(self.n)
             found += self.of_cones(evidence.local.directions, times, corners)
         if evidence.contraction:
             corners = cells * 2**self.y
-            found += self.ball + cells * self.equations + corners * self.inequality + self.decision(self.n)
-            found += self.of_cones(evidence.contraction.directions, cells, corners)
+            times = cells + self.of_series(evidence.contraction.order)
+            found += self.ball + times * self.equations + corners * self.inequality + self.decision(self.n)
+            found += self.of_cones(evidence.contraction.directions, times, corners)
         return found
+
+    def of_series(self, order: int) -> int:
+        """Evaluations of the equations, beside those in cells, where inputs are held."""
+        return self.evaluations(order) + 8 if self.c.sample else 0
 
     def of_cones(self, directions: Sequence[bytes] | None, times: int, corners: int) -> int:
         """Models, for which the equations are evaluated so many times, and inequalities on cones."""

@@ -44,12 +44,13 @@ class Outer:
 @dataclass(frozen=True)
 class Contraction:
     """The ball x = J d, ||d|| <= 1, on which trajectories come closer, and on it the weights g of one bound, and the
-    weight of another; with kinks, trees of directions."""
+    weight of another; with kinks, trees of directions; where inputs are held, the order of the series in time."""
 
     J: Array
     weights: Array
     weight: Array
     directions: tuple[bytes, ...] | None = None
+    order: int = 1
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,6 @@ def of_claim(claim: Value, stated: dict[str, Any]) -> tuple[Value, dict[str, Any
     rate.must(fall == 0 or kind not in WITH_TUBE, "0, or a rate where a claim may have one")
     plain = periods is None and not discrete
     sample.must(plain or kind not in WITH_TUBE, "null, and the plant continuous, under this claim")
-    sample.must(periods is None or kind != "nearby", "null under this claim")
     sample.must(periods is None or not discrete, "null where time is discrete")
     outer = None
     if beyond.raw is not None:
@@ -135,22 +135,26 @@ def read_trusted(value: Value, may_be: bool) -> Trusted:
 
 
 def others(
-    claim: str, n: int, k: int, contraction: Value, tube: Value, beyond: Value, outer: Outer | None
+    claim: str, n: int, k: int, most: int, contraction: Value, tube: Value, beyond: Value, more: Mapping[str, Any]
 ) -> tuple[Contraction | None, tuple[Slab, ...], OuterTree | None]:
-    """The other parts of evidence for a claim, where k quantities are uncertain."""
+    """The other parts of evidence for a claim, where k quantities are uncertain and `most` is the largest order."""
+    outer = more.get("outer")
     tube.must(k == 0 or claim not in WITH_TUBE, "of another claim where quantities are uncertain")
     slabs = tube.listed(lambda slab: read_slab(slab, n, claim), *((1, MAX_SLABS) if claim in WITH_TUBE else (0,)))
-    close = _contraction(contraction, n, claim)
+    close = _contraction(contraction, n, claim, most if more.get("sample") else 0)
     beyond.must(outer is not None or beyond.raw is None, "null where the claim has none")
     return close, slabs, None if outer is None else read_outer_tree(beyond, n)
 
 
-def _contraction(value: Value, n: int, claim: str) -> Contraction | None:
+def _contraction(value: Value, n: int, claim: str, most: int) -> Contraction | None:
+    """With an order, `most` at most, where inputs are held; else that is 0."""
     if claim != "nearby":
         value.must(value.raw is None, "null under this claim")
         return None
-    J, weights, weight, *directions = value.keys(f"J weights weight{value.maybe('directions')}")
-    return Contraction(J.array(n, n), weights.array(n), weight.array(n, n), trees_of(directions, n))
+    ordered = " order" if most else ""
+    J, weights, weight, *others = value.keys(f"J weights weight{ordered}{value.maybe('directions')}")
+    order = others.pop(0).integer(1, most) if most else 1
+    return Contraction(J.array(n, n), weights.array(n), weight.array(n, n), trees_of(others, n), order)
 
 
 def trees_of(found: list[Value], n: int) -> tuple[bytes, ...] | None:
