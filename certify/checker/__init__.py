@@ -6,5 +6,6 @@ rules; docs/mathematics/ proves that the rules imply the claims. Reading order o
 case, exact; near, functions, jets, ball, pairs, decrease, local; networks, network, taylor, boxes, ring; then what
 proves nothing: strict, schema, expression, document, errors, limits, words. What only some need, by the chapters that
 FORMAT.md has it in: smooth, activations, elementary; wiring, calls; ranges; stepping, flow; tube; contraction, held;
-outer, invariant; periodic, ranks; kinks; keep; data; handover; and sections, clauses, demands, processes for several of them.
+outer, invariant; periodic, ranks; kinks; keep; data; handover; and sections, clauses, demands, processes for several
+of them.
 """
