@@ -76,15 +76,16 @@ TERMS: dict[str, tuple[Any, float]] = {  # g of x' = g(x) + 1/64 - t u, and the 
     "damped": (["*", "-1", "x"], 1.0),
     "square": (["*", "x", "x"], 0.125),
     "cube": (["**", "x", 3], 0.125),
-    "sin": (["sin", ["*", "2", "x"]], 0.5),
-    "exp": (["exp", "x"], 0.5),
-    "tanh": (["tanh", ["*", "-2", "x"]], 0.5),
-    "inverse": (["/", "1", ["+", "1", "x"]], 0.25),
-    "root": (["sqrt", ["+", "1", "x"]], 0.25),
-    "atan": (["atan", ["*", "2", "x"]], 0.5),
-    "corner": (["abs", ["+", "x", "3/2"]], 0.75),
+    "sin": (["sin", ["*", "2", "x"]], 0.0625),
+    "exp": (["exp", "x"], 0.0625),
+    "tanh": (["tanh", "x"], 0.0625),
+    "inverse": (["/", "1", ["+", "4", "x"]], 0.0625),
+    "root": (["sqrt", ["+", "1", "x"]], 0.0625),
+    "atan": (["atan", "x"], 0.0625),
+    "corner": (["abs", ["+", "x", "3/2"]], 0.0625),
 }
-SLOPES = {"inverse": 0.5, "exp": 0.8, "square": 0.8, "cube": 0.6, "root": 0.9}  # the least share that is found; else
+SHARE = {"nothing": 0.95, "line": 0.95, "damped": 0.95, "square": 0.8}  # the least that is found; of others less:
+# the way has a Lipschitz constant without directions, which grows with the radius
 
 
 def scalar(term: Any, t: float, radius: float, weight: float, **more: Any) -> Document:
@@ -114,7 +115,7 @@ def test_a_period_is_accepted_until_its_slope_is_minus_1(name: str, passes: Call
         last(lambda t, w=w: scalar(term, t, radius, w), start, 1.5 * high, passes)  # type: ignore[misc]
         for w in (2.0**-40, 0.05, 0.5)
     )
-    assert SLOPES.get(name, 0.95) * high <= found <= high * (1 + 2e-3), found / high
+    assert SHARE.get(name, 0.3) * high <= found <= high * (1 + 2e-3), found / high
 
 
 @pytest.mark.parametrize("passes", JUDGES)
