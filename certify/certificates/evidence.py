@@ -41,12 +41,14 @@ class LocalBall:
 @dataclass(frozen=True, slots=True)
 class Contraction:
     """Evidence that trajectories come closer: a ball x = J d, ||d|| <= 1, J (n, n), that contains {V <= c0}, and the
-    `weights` (n,) of one bound on it and the `weight` (n, n) of another; `directions` as a LocalBall has them."""
+    `weights` (n,) of one bound on it and the `weight` (n, n) of another; `directions` and `order` as a LocalBall has
+    them, but without an order where no input is held."""
 
     J: Array
     weights: Array
     weight: Array
     directions: tuple[bytes, ...] | None = None
+    order: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,12 +304,13 @@ def _ball(evidence: LocalBall | Slab) -> dict[str, str]:
 
 
 def _contraction(ball: Contraction) -> dict[str, Any]:
-    return {name: encode(getattr(ball, name)) for name in ("J", "weights", "weight")} | _directions(ball)
+    order = {} if ball.order is None else {"order": ball.order}
+    return {name: encode(getattr(ball, name)) for name in ("J", "weights", "weight")} | order | _directions(ball)
 
 
 def _read_contraction(data: Mapping[str, Any], n: int) -> Contraction:
     arrays = decode(data["J"], (n, n)), decode(data["weights"], (n,)), decode(data["weight"], (n, n))
-    return Contraction(*arrays, _read_directions(data))
+    return Contraction(*arrays, _read_directions(data), data.get("order"))
 
 
 def _directions(ball: LocalBall | Contraction) -> dict[str, Any]:

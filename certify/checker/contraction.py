@@ -1,6 +1,6 @@
 """The rule `contraction`: on a ball that holds {V <= c0} any two trajectories come closer, where q is constant, in the
-norm of P: at all times, or in discrete time with every step. So there is one equilibrium at most, to which those that
-stay in {V <= c0} converge."""
+norm of P: at all times, or with every step. So there is one equilibrium at most, to which those that stay in {V <= c0}
+converge."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from flint import fmpq, fmpq_mat
 
 from . import ball
 from .ball import Ball
-from .case import Case, Failures, given
+from .case import Case, Failures
 from .decrease import Models, are_finite, diagonal, rational, vectors
 from .exact import exactly, is_definite, root_above
 from .jets import unpacked
 from .local import is_large_enough
 from .near import Above, Array, Tensor, size
 from .pairs import bound_of_pairs, in_binary64
-from .sections import Contraction
+from .sections import Contraction, HeldContraction
 from .stepping import lengths_of_forms
 
 if TYPE_CHECKING:
@@ -31,13 +31,19 @@ if TYPE_CHECKING:
 class Contracted(Ball):
     """The ball of the section `contraction`."""
 
-    by: Contraction
+    by: Contraction | HeldContraction
     close = True
 
-    @staticmethod
-    def of(case: Case) -> Contracted:
-        by = given(case.c.contraction)
-        return Contracted(case, by.J, "contraction", by, directions=by.directions)
+    @classmethod
+    def of(cls, case: Case) -> Contracted:
+        kind, by = cls, case.c.contraction
+        if by is None:
+            raise TypeError("this rule is about what the certificate has not")
+        if case.c.sample is not None:
+            from .held import HeldClose
+
+            kind = HeldClose
+        return kind(case, by.J, "contraction", by, directions=by.directions)
 
 
 def fits(ball_: Contracted) -> Failures:
@@ -50,15 +56,17 @@ def fits(ball_: Contracted) -> Failures:
 
 def contracts(ball_: Contracted) -> Failures:
     """V(e + h g) - V(e), over h, is negative for any two points of the ball; e is their difference, g that of G, and h
-    is 0 in continuous time, where this is 2 e'P g."""
-    P, h, count = exactly(ball_.case.c.P), int(ball_.case.c.discrete), 0
+    is 0 in continuous time, where this is 2 e'P g, and the longest period where inputs are held."""
+    P, step, count = exactly(ball_.case.c.P), ball_.case.c.step, 0
+    h = fmpq(step.numerator, step.denominator)
     for part, cell in ((part, cell) for part in ball_.on_cones() for cell in ball_.case.cells):
         G = part.change(cell)
         doubts = [g.lipschitz + g.slack for g in G]
-        models = Models(ball_.J, G, rest=True) if are_finite(G) and all(np.isfinite(v.top) for v in doubts) else None
+        finite = bool(G) and are_finite(G) and all(np.isfinite(v.top) for v in doubts)
+        models = Models(ball_.J, G, rest=True) if finite else None
         if models is not None:
             part.note_kinks(models)
-        beyond = 0.0 if models is None or not h else _size_beyond(models, doubts, ball_.case.c.P)
+        beyond = 0.0 if models is None or h == 0 else _size_beyond(models, doubts, ball_.case.c.P)
         if models is None or not np.isfinite(beyond):
             yield ball_.at, "F has no finite model"
             return count
@@ -68,10 +76,10 @@ def contracts(ball_: Contracted) -> Failures:
         for corner in models.corners():
             crossed = models.J.transpose() * P * corner.A
             form = crossed + crossed.transpose()
-            if h:
+            if h != 0:
                 most = sum((more.lengths(models, P)[1] for more in models.more), rational(beyond))
-                form += corner.A.transpose() * P * corner.A + diagonal([most**2] * b.ncols())
-                rest = _rest(models, P * (models.J + corner.A), sizes, ball_.by)
+                form += h * (corner.A.transpose() * P * corner.A + diagonal([most**2] * b.ncols()))
+                rest = _rest(models, P * (models.J + h * corner.A), sizes, ball_.by)
             count += 1
             if not is_definite(-form - rest):
                 yield ball_.at, "it is not shown that trajectories come closer"
@@ -85,7 +93,7 @@ def examine(tally: Tally, case: Case) -> None:
 OF_CONTRACTION = (("contraction", fits), ("contraction", ball.is_not_clipped), ("contraction", contracts))
 
 
-def _rest(models: Models, b: fmpq_mat, doubts: Sequence[fmpq], by: Contraction) -> fmpq_mat:
+def _rest(models: Models, b: fmpq_mat, doubts: Sequence[fmpq], by: Contraction | HeldContraction) -> fmpq_mat:
     """A bound of twice the sum of b_i.e times what g_i has beyond a_i.e."""
     lengths = [root_above(sum((v * v for v in row), fmpq(0))) for row in b.tolist()]
     along = 2 * sum((length * doubt for length, doubt in zip(lengths, doubts, strict=True)), fmpq(0))

@@ -99,9 +99,9 @@ def of_balls(sizes: Sizes) -> int:
         times, corners = sizes.times(evidence, evidence.local.order), cells * 2 ** min(sizes.y, AT_CORNERS)
         found += of_cones(sizes, evidence.local.directions, times, corners)
     if close is not None:
-        corners = cells * 2**sizes.y
-        found += sizes.ball + cells * sizes.equations + corners * sizes.inequality + sizes.decision(sizes.n)
-        found += of_cones(sizes, close.directions, cells, corners)
+        times, corners = sizes.times(evidence, close.order), cells * 2**sizes.y
+        found += sizes.ball + times * sizes.equations + corners * sizes.inequality + sizes.decision(sizes.n)
+        found += of_cones(sizes, close.directions, times, corners)
     return found
 
 

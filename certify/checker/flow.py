@@ -154,11 +154,15 @@ class Held(Stepping):
         for _ in range(1 + _ATTEMPTS):
             F = self.f(self.during((far, along)), self.ranges)
             most = np.array([0.0 if self.at_rest else (f.v0.size * h).top for f in F])
-            steepest = np.array([(f.radius * h).top for f in F])
+            steepest = np.array([(self.steepness(f) * h).top for f in F])
             if np.all((most < far) | self.at_rest) and np.all(steepest < along):
                 return (far, along), F
             far, along = (0 * most if self.at_rest else 1.25 * most), 1.25 * steepest
         return None
+
+    def steepness(self, f: Jet) -> Above:
+        """A bound of how much f changes with d, over ||d||."""
+        return f.radius
 
     @property
     def way(self) -> Way | None:

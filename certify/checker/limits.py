@@ -108,7 +108,8 @@ class Sizes:
         found = 4 * self.net.entries + self.of_features[0]
         if not isinstance(self.evidence, Partition):
             return found
-        order = max(self.evidence.order, self.evidence.local.order if self.evidence.local else 1)
+        balls = self.evidence.local, self.c.contraction
+        order = max(self.evidence.order, *(part.order if part else 1 for part in balls))
         values = (4 * order if self.c.sample else 1) * self.a + 2 * self.n + 8
         if self.asked and not self.c.outer:
             found += self.on_leaves(order, self.s)

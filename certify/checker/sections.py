@@ -65,6 +65,22 @@ class Contraction:
     weight: Matrix
     directions: Directions = None
 
+    @property
+    def order(self) -> int:
+        """Of the series in time; there is none unless inputs are held."""
+        return 1
+
+
+@dataclass(frozen=True)
+class HeldContraction:
+    """The same where inputs are held, with the order of the series in time."""
+
+    J: Matrix
+    weights: Row
+    weight: Matrix
+    order: Order
+    directions: Directions = None
+
 
 @dataclass(frozen=True)
 class Trusted:
@@ -206,7 +222,7 @@ def completed(
     kind, n = c.claim, len(c.states)
     if "sample" in beyond:
         c = replace(c, sample=_periods(said["sample"]))
-        said["sample"].must(not c.discrete and kind not in (*WITH_TUBE, "nearby"), "null under this claim and time")
+        said["sample"].must(not c.discrete and kind not in WITH_TUBE, "null under this claim and time")
     most = MAX_ORDER if c.sample and not c.dynamics.calls else 1
     orders = [c.evidence, c.evidence.local] if isinstance(c.evidence, Partition) else []
     if any(part is not None and part.order > most for part in orders):
@@ -227,7 +243,8 @@ def completed(
     if "data" in said:
         c = replace(c, data=_data(said["data"], shown["data"], c))
     if kind == "nearby":
-        c = replace(c, contraction=section(shown["contraction"], Contraction, n=n))
+        kind_of: type[Contraction | HeldContraction] = HeldContraction if c.sample else Contraction
+        c = replace(c, contraction=section(shown["contraction"], kind_of, n=n, order=most))
     if kind in WITH_TUBE:
         c = replace(c, tube=_tube(said, shown["tube"], c))
     if "solver" in shown:

@@ -1,6 +1,6 @@
 """Rule `contraction`: in {V <= c0} any two trajectories approach each other, for constant uncertain quantities.
 
-In discrete time it is their next states that are nearer to each other than they are.
+In steps it is their next states that are nearer to each other than they are.
 
 So there is one equilibrium to which all of them go. For two points J d and J d' of a ball, with e = d - d' and m half
 of their sum, the components of F differ by a_i.e + 2 m'Q_i e, by K_i[d, d, e] + K_i[d, d', e] + K_i[d', d', e], each
@@ -8,9 +8,10 @@ within |T_i e|, and by what is beyond the third order, of which the models have 
 columns of J'P, the distance's derivative is a quadratic form in e, with one more for each entry of m, sum_j m_j e'N_j
 e, and as |m| <= 1 these are together below another: 2 e'w <= e'ge + w'(1/g)w.
 
-A step of discrete time changes a state by G = F - x, and the square of a distance by 2 e'J'P g + g'Pg, g being what two
-changes differ by, A e and a remainder. So b_i are the columns of (J + A)'P there, A'PA is part of the form, and the
-remainder's own square, in the norm of P, is bounded by that of its length.
+A step of length h changes a state by h G, and the square of a distance by h times 2 e'J'P g + h g'Pg, g being what two
+G differ by, A e and a remainder. So b_i are the columns of (J + h A)'P there, h A'PA is part of the form, and the
+remainder's own square, in the norm of P, is bounded by that of its length. In discrete time h is 1 and G = F - x. With
+held inputs the states of a period have Lipschitz constants too, and so has the last term of the series for G.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from .decrease import (
 from .document import Certificate
 from .evidence import Contraction
 from .fields import exact
-from .flow import Steps
+from .flow import steps_on
 from .kinks import ALL
 from .local import cells, cones
 from .loop import Field, Loop
@@ -54,12 +55,16 @@ def contraction(loop: Loop, evidence: Contraction, parts: Sequence[int]) -> None
     require(holds, RULE, "ball", "it does not contain {V <= c0}: J'PJ - c0 I is not positive definite")
     require(all(v > 0 for v in g), RULE, "ball", "a weight is not positive")
     known = loop.steady(J, RULE, "ball", None if sides[0] is None else ALL)
+    steps = steps_on(loop, known, evidence, "ball", rule=RULE)
     for side, cone in enumerate(sides):
         where = f" cone {side}" if evidence.directions else ""
-        steps = Steps(loop, known if cone in (None, ALL) else loop.on_cone(J, cone, RULE, f"ball{where}", steady=True))
+        here = steps
+        if cone not in (None, ALL):
+            known = loop.on_cone(J, cone, RULE, f"ball{where}", steady=True)
+            here = steps_on(loop, known, evidence, f"ball{where}", steps.within, RULE)
         for number, cell in enumerate(cells(c.plant.ranges, parts)):
             at = (f"cell {number}" if parts else "ball") + where
-            G = steps.change(cell, RULE, at)
+            G = here.change(cell, RULE, at)
             approaches = whatever_y(G, lambda change: contracts(c, J, list(map(arb, g)), evidence.weight, change))
             words = "trajectories do not certainly approach each other: its matrix is not definite"
             require(approaches, RULE, at, words)
@@ -79,10 +84,10 @@ def contracts(c: Certificate, J: fmpq_mat, g: Sequence[arb], weight: fmpq_mat, G
     form += form.transpose()
     wrong = [f.slack + lip_of(f) for f in G.components]
     along = ZERO
-    if c.plant.discrete:
-        of_A = A.transpose() * arb_mat(c.P)
-        form, b = form + of_A * A, b + of_A
-        along = longest_rest(c.P, G, wrong) ** 2
+    if c.step:
+        h, of_A = arb(c.step), A.transpose() * arb_mat(c.P)
+        form, b = form + h * (of_A * A), b + h * of_A
+        along = h * longest_rest(c.P, G, wrong) ** 2
     columns = [arb_mat(n, 1, column) for column in b.transpose().tolist()]
     turned, inverse = diagonal(g), [1 / v for v in g]
     for j in range(n):

@@ -223,7 +223,7 @@ def read_sections(value: Any, claims: tuple[str, ...]) -> Certificate:
     require(fixed, "format", "plant.uncertain", f"nothing may be uncertain with claim '{claim}'")
     continuous = not (claim in WITH_TUBE and plant.discrete)
     require(continuous, "format", "plant.time", f"time must be continuous with claim '{claim}'")
-    free = sample is None or not (claim in (*WITH_TUBE, "nearby") or plant.discrete)
+    free = sample is None or not (claim in WITH_TUBE or plant.discrete)
     require(free, "format", "claim.sample", f"null was expected with claim '{claim}', or in discrete time")
     start = square(said["start"], "claim.start", n) if "start" in said else None
     centre = column(said["centre"], "claim.centre", n) if "centre" in said else None
@@ -245,7 +245,15 @@ def read_sections(value: Any, claims: tuple[str, ...]) -> Certificate:
     longer = sample is not None and not plant.dynamics.calls  # a series goes through no network
     fitted = None if measured is None else Fitted(len(measured.parameters), measured.steps * n, plant.discrete)
     evidence = read_evidence(
-        data["evidence"], n, len(plant.uncertain), claim, longer, further, ranked=ranks is not None, fitted=fitted
+        data["evidence"],
+        n,
+        len(plant.uncertain),
+        claim,
+        longer,
+        further,
+        ranked=ranks is not None,
+        fitted=fitted,
+        held=sample is not None,
     )
     replayed = not isinstance(evidence, Trusted) or (simple and not further and keep is None)
     words = "a rate, a sample, discrete time, another set and constraints must be replayed"

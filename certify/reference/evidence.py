@@ -51,13 +51,15 @@ class Ball:
 class Contraction:
     """All x = J d with ||d|| <= 1, where any two trajectories approach each other.
 
-    The weights g and `weight` select one of many bounds; `directions` are those of a ball.
+    The weights g and `weight` select one of many bounds; `directions` are those of a ball, `order` is that of the
+    series in time.
     """
 
     J: fmpq_mat
     weights: array[float]
     weight: fmpq_mat
     directions: tuple[bytes, ...] | None = None
+    order: int = 1
 
 
 @dataclass(frozen=True)
@@ -177,10 +179,18 @@ class Fitted(NamedTuple):
 
 
 def read_evidence(
-    value: Any, n: int, k: int, claim: str, sampled: bool, further: bool, ranked: bool, fitted: Fitted | None
+    value: Any,
+    n: int,
+    k: int,
+    claim: str,
+    sampled: bool,
+    further: bool,
+    ranked: bool,
+    fitted: Fitted | None,
+    held: bool,
 ) -> Tree | Ranked | Covering | Trusted:
     """`sampled` says whether a series in time may have an order above 1, `further` whether the claim has an `outer`,
-    `ranked` whether it has `ranks`; `fitted` is there with `data`."""
+    `ranked` whether it has `ranks`, `held` whether inputs are; `fitted` is there with `data`."""
     if claim == REACHES:
         return read_ranked(value, n, sampled)
     if claim == INVARIANT:
@@ -203,7 +213,7 @@ def read_evidence(
     ball = None
     if claim not in WITH_FLOOR or evidence["local"] is not None:
         ball = read_local(evidence["local"], n, claim, sampled)
-    contraction = read_contraction(evidence["contraction"], n, claim)
+    contraction = read_contraction(evidence["contraction"], n, claim, held, sampled)
     tube = entries(evidence["tube"], "evidence.tube")
     least, most = (1, MAX_SLABS) if claim in WITH_TUBE else (0, 0)
     fits = least <= len(tube) <= most
@@ -288,15 +298,17 @@ def read_directions(value: dict[str, Any], at: str, n: int) -> tuple[bytes, ...]
     return tuple(decoded(tree, f"{at}.directions.{k}") for k, tree in enumerate(trees))
 
 
-def read_contraction(value: Any, n: int, claim: str) -> Contraction | None:
+def read_contraction(value: Any, n: int, claim: str, held: bool, sampled: bool) -> Contraction | None:
+    """With an order where inputs are held, which is 1 unless a series is `sampled`."""
     at = "evidence.contraction"
     if claim != "nearby":
         require(value is None, "format", at, f"null was expected with claim '{claim}'")
         return None
-    contraction = keys(value, at, "J", "weights", "weight", maybe=("directions",))
+    contraction = keys(value, at, "J", "weights", "weight", *(("order",) if held else ()), maybe=("directions",))
+    order = read_order(contraction["order"], f"{at}.order", sampled) if held else 1
     J, weight = (square(contraction[key], f"{at}.{key}", n) for key in ("J", "weight"))
     weights, directions = numbers(contraction["weights"], f"{at}.weights", n), read_directions(contraction, at, n)
-    return Contraction(J, weights, weight, directions)
+    return Contraction(J, weights, weight, directions, order)
 
 
 def read_cells(value: Any, at: str, k: int) -> tuple[int, ...]:

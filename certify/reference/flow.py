@@ -19,9 +19,10 @@ from typing import Any
 
 from flint import arb
 
+from . import lipschitz
 from .balls import SPREAD, ZERO
 from .document import Certificate, Interval
-from .evidence import Ball
+from .evidence import Ball, Contraction
 from .expressions import Called, Equations
 from .fields import exact
 from .loop import Field, Known, Loop
@@ -93,13 +94,20 @@ def settled(c: Certificate) -> Callable[[Model], Model]:
     return Model.at_rest if c.ends_at_origin else lambda v: v
 
 
-def steps_on(loop: Loop, known: Known, ball: Ball, at: str, within: Mapping[str, Model] | None = None) -> Steps:
+def steps_on(
+    loop: Loop,
+    known: Known,
+    ball: Ball | Contraction,
+    at: str,
+    within: Mapping[str, Model] | None = None,
+    rule: str = "flow",
+) -> Steps:
     """Rule `flow` on a ball; without a sample nothing is asked. On a cone the states `within` are those of the ball."""
     c = loop.c
     if c.sample is None:
         return Steps(loop, known)
     states = {name: known.names[name] for name in c.plant.states}
-    within = reached_on(loop, known, at) if within is None else within
+    within = reached_on(loop, known, at, rule) if within is None else within
     held = {name: known.names[name] for name in c.plant.inputs} | loop.anything(known)
     hi = arb(c.step)
     period = known.moving(c.sample, c.k, loop.symbols)
@@ -110,15 +118,15 @@ def steps_on(loop: Loop, known: Known, ball: Ball, at: str, within: Mapping[str,
     try:
         tail = later(c.plant.dynamics, states, within, held, known.constant, ball.order, settled(c), times_h)
     except Refused as no:
-        raise Refused("flow", at, no.detail) from None
+        raise Refused(rule, at, no.detail) from None
     return Steps(loop, known, ball.order, within, tail)
 
 
-def reached_on(loop: Loop, known: Known, at: str) -> dict[str, Model]:
+def reached_on(loop: Loop, known: Known, at: str, rule: str) -> dict[str, Model]:
     """The states of a whole period, each within kappa + kappa' ||d|| of where it was, or a refusal.
 
     For each d they have a model with these numbers: what a state moves by is a part that depends on d alone, and a part
-    that is a multiple of d / ||d||.
+    that is a multiple of d / ||d||. Where models have Lipschitz constants kappa' is one of what a state moves by.
     """
     c, hi = loop.c, arb(loop.c.step)
     states = [known.names[name] for name in c.plant.states]
@@ -127,25 +135,27 @@ def reached_on(loop: Loop, known: Known, at: str) -> dict[str, Model]:
     for _ in range(ATTEMPTS):
         moved = [beyond(x, k, t) for x, k, t in zip(states, far, turned, strict=True)]
         within = dict(zip(c.plant.states, moved, strict=True))
-        F = loop.field(replace(known, names={**known.names, **within}), uncertain, "flow", at).components
+        F = loop.field(replace(known, names={**known.names, **within}), uncertain, rule, at).components
         F = [settled(c)(f) for f in F]
-        most = [arb((hi * f.size).upper()) for f in F], [arb((hi * f.radius).upper()) for f in F]
+        most = [arb((hi * f.size).upper()) for f in F], [arb((hi * lipschitz.on_the_ball(f)).upper()) for f in F]
         rests = [c.ends_at_origin and v.is_zero() for v in most[0]]
         stays = all(rest or v < k for rest, v, k in zip(rests, most[0], far, strict=True))
         if stays and all(v < t for v, t in zip(most[1], turned, strict=True)):
-            ranges = [f.v + f.reach * SPREAD for f in F]
-            largest = (arb(exact(c.inner) * s).sqrt() for s in inverse_diagonal(c.P, "lyapunov"))
-            sizes = [x.slope.min(size) for x, size in zip(states, largest, strict=True)]
-            in_domain(c, [v * SPREAD for v in sizes], ranges, at)
+            if rule == "flow":
+                ranges = [f.v + f.reach * SPREAD for f in F]
+                largest = (arb(exact(c.inner) * s).sqrt() for s in inverse_diagonal(c.P, "lyapunov"))
+                sizes = [x.slope.min(size) for x, size in zip(states, largest, strict=True)]
+                in_domain(c, [v * SPREAD for v in sizes], ranges, at)
             return {name: beyond(x, k, t) for name, x, k, t in zip(c.plant.states, states, *most, strict=True)}
         far = [ZERO if rest else MORE * v + LEAST for rest, v in zip(rests, most[0], strict=True)]
         turned = [MORE * v + LEAST for v in most[1]]
-    raise Refused("flow", at, "no bound of how far the state goes within a period was found")
+    raise Refused(rule, at, "no bound of how far the state goes within a period was found")
 
 
 def beyond(x: Model, far: arb, turned: arb) -> Model:
     """x within far + turned ||d||."""
-    return replace(x, off=x.off + far, slack=x.slack + turned)
+    lip = None if x.lip is None else x.lip + turned
+    return replace(x, off=x.off + far, slack=x.slack + turned, lip=lip)
 
 
 def in_domain(c: Certificate, states: Sequence[arb], F: Sequence[arb], at: str, free: Collection[str] = ()) -> None:

@@ -178,14 +178,15 @@ def numbers(c: Certificate) -> int:
     count, square = 4 * z.nets.weights, (z.s + 1) ** 2
     if isinstance(evidence, Trusted):
         return count
-    ball = evidence.ball if isinstance(evidence, Tree) else None
-    order = max(1 if isinstance(evidence, Covering) else evidence.order, ball.order if ball else 1)
+    ball, near = (evidence.ball, evidence.contraction) if isinstance(evidence, Tree) else (None, None)
+    orders = (ball.order if ball else 1, near.order if near else 1)
+    order = max(1 if isinstance(evidence, Covering) else evidence.order, *orders)
     values = z.a * (1 if c.sample is None else 4 * order) + 2 * z.n + 8
     if not isinstance(evidence, Covering) and evidence.ranking is not None:
         count += 2**4 * len(evidence.ranking.tree) + held_on_leaves(with_errors(z), values)
     elif asked_of_leaves(c, evidence) or c.beyond is not None:
         count += held_on_leaves(z, values)
-    if isinstance(evidence, Tree) and (ball or evidence.contraction or evidence.tube):
+    if isinstance(evidence, Tree) and (ball or near or evidence.tube):
         count += values * (z.t + z.d * z.y + z.m + z.z) + z.d**4 // 4
         count += sum(4 * p * (z.d + g) for p, _, g in z.nets.shapes) + 3 * z.nets.units * z.t
     if c.data is not None and isinstance(evidence, Tree) and evidence.fit is not None:
@@ -313,15 +314,21 @@ def on_balls(c: Certificate, z: Sizes, evidence: Tree) -> int:
     cells, work = math.prod(evidence.cells), 0
     once = networks_on_a_ball(z) + deciding(z.n)
     if evidence.ball is not None:
-        times = cells + (0 if c.sample is None else evaluations(c, evidence.ball.order) + 8)
+        times = cells + beside_cells(c, evidence.ball.order)
         each = inequality(z) + 2**8 * z.y * z.n * (z.d + 1) ** 2
         corners = cells * 2 ** min(z.y, AT_CORNERS)
         work += times * equations_on_a_ball(z) + once + corners * each
         work += on_cones(z, evidence.ball.directions, times, corners)
     if evidence.contraction is not None:
-        work += cells * equations_on_a_ball(z) + once + cells * 2**z.y * inequality(z)
-        work += on_cones(z, evidence.contraction.directions, cells, cells * 2**z.y)
+        times = cells + beside_cells(c, evidence.contraction.order)
+        work += times * equations_on_a_ball(z) + once + cells * 2**z.y * inequality(z)
+        work += on_cones(z, evidence.contraction.directions, times, cells * 2**z.y)
     return work
+
+
+def beside_cells(c: Certificate, order: int) -> int:
+    """Evaluations of the equations for what is the same in all cells."""
+    return 0 if c.sample is None else evaluations(c, order) + 8
 
 
 def on_cones(z: Sizes, directions: Sequence[bytes] | None, times: int, corners: int) -> int:

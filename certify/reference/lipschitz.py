@@ -39,6 +39,11 @@ def of_product(v: Model, w: Model, wrong: arb) -> arb | None:
     return result + of_v.size * of_w.steep + of_w.size * of_v.steep + wrong
 
 
+def on_the_ball(v: Model) -> arb:
+    """A bound over ||d|| of what v adds to v(0); a Lipschitz constant of v, where it has a lip."""
+    return v.radius if v.lip is None else v.slope + beyond_linear(v, v.lip).steep
+
+
 def beyond_linear(v: Model, lip: arb) -> Beyond:
     """Bounds of the terms beyond v(0) + a.d; the Lipschitz constants of d'Qd and K[d] are 2 bend and 3 twist."""
     return Beyond(v.bend + v.twist + lip, 2 * v.bend + 3 * v.twist + lip)

@@ -115,7 +115,7 @@ def _with_claim(state: State) -> State:
     InputError : the claim `asymptotic` is asked for, and the loop does not rest at the origin.
     """
     options = state.options
-    converging = options.claim in ("auto", "nearby") and state.loop.system.sample is None
+    converging = options.claim in ("auto", "nearby")
     kind, why = _kind_of(state.loop, options)
     state = replace(state, converging=converging)
     if why is not None:

@@ -14,9 +14,9 @@ from certify.certificates import Contraction
 from certify.certificates.claims import Problem
 from certify.errors import InputError
 from certify.provers.ball.kinks import ALL, Cone, Directions, bound_of, has_kinks, is_left
-from certify.provers.ball.local import Array, ball_around
-from certify.provers.ball.models import Paths, paths
-from certify.provers.ball.steps import steps_of
+from certify.provers.ball.local import Array, ball_around, order_on
+from certify.provers.ball.models import Models, paths
+from certify.provers.ball.steps import Steps, steps_of
 
 _MOST_CONES = 1024  # of directions
 _LEAST = 1e-12  # share of the decay: a weight must not be 0
@@ -29,23 +29,16 @@ def contraction(problem: Problem, T: Array, floor: float) -> Contraction | None:
     ----------
     T : (n, n), with T'PT about the unit matrix: the ball is a multiple of x = T z.
     """
-    J = ball_around(problem, T, floor)
+    J, held = ball_around(problem, T, floor), problem.loop.system.sample is not None
     try:
         with np.errstate(all="ignore"):
-            known = paths(problem.loop)
-            models, directions = known.models(J), None
-            if not models.finite and (directions := _directions(problem, known, J)) is not None:
-                models = steps_of(known, False, 1).models_on(J[None], [()], np.zeros((1, len(J))), ALL)[0][0]
+            steps = steps_of(paths(problem.loop), False, order_on(problem))
+            models, directions = _models(steps, J), None
+            if not models.finite and (directions := _directions(problem, steps, J)) is not None:
+                models = _models(steps, J, ALL)
     except InputError:
         return None
-    A, b = models.A, problem.V.P @ J  # b_i is row i
-    if problem.loop.system.time == "discrete" and directions is None:
-        A = A - J  # of what a step adds
-    crossed = b.T @ A
-    decay = -(crossed + crossed.T)
-    if problem.loop.system.time == "discrete":
-        moved = problem.V.P @ A
-        decay, b = decay - A.T @ moved, b + moved
+    decay, b = _decay(problem, steps, J, models.A)
     if not (models.finite and np.linalg.eigvalsh(decay)[0] > 0):
         return None
     half = np.einsum("ia,ijb->jab", b, models.Q)
@@ -53,24 +46,34 @@ def contraction(problem: Problem, T: Array, floor: float) -> Contraction | None:
     weight = np.asarray(np.linalg.inv(decay), dtype=np.float64)
     spread = np.sum((N @ weight) * N, axis=(0, 2))
     g = np.sqrt(np.maximum(spread, 0.0) / np.diag(weight))
-    return Contraction(J, np.maximum(g, _LEAST * float(np.max(np.diag(decay)))), weight, directions)
+    g = np.maximum(g, _LEAST * float(np.max(np.diag(decay))))
+    return Contraction(J, g, weight, directions, steps.order if held else None)
 
 
-def _directions(problem: Problem, known: Paths, J: Array) -> tuple[bytes, ...] | None:
+def _models(steps: Steps, J: Array, cone: Cone | None = None) -> Models:
+    """Models of what a step adds, uncertain quantities in the middle of their ranges."""
+    cell = tuple(((lo + hi) / 2,) * 2 for lo, hi in steps.known.loop.system.ranges.values())
+    return steps.models_on(J[None], [cell], np.zeros((1, len(J))), cone)[0][0]
+
+
+def _decay(problem: Problem, steps: Steps, J: Array, A: Array) -> tuple[Array, Array]:
+    """The decay of a distance to first order, (n, n), and the b_i of the checker's rule, in rows."""
+    P, h = problem.V.P, steps.longest
+    crossed = (P @ J).T @ A
+    return -(crossed + crossed.T) - h * A.T @ P @ A, P @ (J + h * A)
+
+
+def _directions(problem: Problem, steps: Steps, J: Array) -> tuple[bytes, ...] | None:
     """Trees of directions on whose cones the loop contracts to first order, whatever the slopes of kinks are; None if
     there are no kinks, or too many cones."""
-    if not has_kinks(known.network) or problem.loop.system.ranges or problem.loop.system.sample is not None:
+    if not has_kinks(steps.known.network) or problem.loop.system.ranges:
         return None
-    steps, P = steps_of(known, False, 1), problem.V.P
 
     def contracts(cone: Cone) -> bool:
-        one = replace(cone, close=True)
-        models = steps.models_on(J[None], [()], np.zeros((1, len(J))), one)[0][0]
+        models = _models(steps, J, replace(cone, close=True))
         if not models.finite or models.kinks is None:
             return False
-        b = P @ J + steps.longest * P @ models.A
-        crossed = (P @ J).T @ models.A
-        decay = -(crossed + crossed.T) - steps.longest * models.A.T @ P @ models.A
+        decay, b = _decay(problem, steps, J, models.A)
         return is_left(decay - bound_of(models.kinks, models.shares.T @ b, np.eye(len(J))))
 
     found = Directions(len(J)) if contracts(ALL) else Directions(len(J)).refined(contracts, _MOST_CONES)

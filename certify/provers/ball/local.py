@@ -243,12 +243,12 @@ class Rule:
     @classmethod
     def at_rest(cls, problem: Problem, T: Array, known: Paths | None = None) -> Rule:
         """For a loop that rests at the origin; `known` are its paths, if they are there already."""
-        return cls._of(problem, T, steps_of(known or paths(problem.loop), True, _order(problem)))
+        return cls._of(problem, T, steps_of(known or paths(problem.loop), True, order_on(problem)))
 
     @classmethod
     def anywhere(cls, problem: Problem, T: Array, known: Paths | None = None) -> Rule:
         """For one that need not."""
-        return cls._of(problem, T, steps_of(known or paths(problem.loop, resting=False), False, _order(problem)))
+        return cls._of(problem, T, steps_of(known or paths(problem.loop, resting=False), False, order_on(problem)))
 
     @classmethod
     def _of(cls, problem: Problem, T: Array, steps: Steps) -> Rule:
@@ -396,7 +396,8 @@ class Rule:
         return corners_of(models, J, self.problem.V.P, self.R, self.steps.longest)
 
 
-def _order(problem: Problem) -> int:
+def order_on(problem: Problem) -> int:
+    """The order of the series in time on a ball; 1 where no input is held."""
     return 1 if problem.loop.system.sample is None else _ORDER
 
 
