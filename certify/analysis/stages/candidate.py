@@ -167,8 +167,7 @@ class _Choice:
         """Every candidate for a little effort, and more for the better ones."""
         state, race, loop = self.state, self.race, self.loop
         self.tools.tell("candidate")
-        with self.tools.timing("candidate"):
-            found = solutions(loop, state.options)
+        found = solutions(loop, state.options)  # a matter of milliseconds
         if state.kind == "practical" and state.options.engine != "dreal" and loop.system.n > FEW:
             with self.tools.timing("candidate"):
                 trials = solved(loop, found, state.options, self._granted())
@@ -199,7 +198,7 @@ class _Choice:
         if certain and self._is_thrifty(partial(economical_from, loop, certain, trials)):
             return
         begun = {id(c.trial) for c in race.contenders}
-        race.enter([one for one in [*trials, *([] if certain is None else [certain])] if id(one) not in begun])
+        race.enter([one for one in [*trials, *([certain] if certain else [])] if id(one) not in begun])
         self._improve()
         unproved = [c for c in race.open if c.trial.name == "optimised"]
         others = [c for c in race.contenders if c.trial.name != "optimised" and c.proved]
@@ -225,12 +224,12 @@ class _Choice:
 
     def _is_thrifty(self, make: Callable[[float, RoaOptions, Effort], Trial | None]) -> bool:
         """True if a candidate for the boxes that the effort left can bound and check is made, and entered alone."""
-        loop, left = self.loop, self.effort.left - OPTIMISING * self.tools.whole
-        if not (FEW < loop.system.n <= MANY and is_forecast(loop)) or self.state.options.engine == "dreal":
+        if not (FEW < self.loop.system.n <= MANY and is_forecast(self.loop)) or self.state.options.engine == "dreal":
             return False
-        boxes = left / (operations_of_box(loop) + operations_of_check(loop))
-        made = None if boxes < 1 else self._made(partial(make, boxes))
-        self.race.enter([] if made is None else [made])
+        each = operations_of_box(self.loop) + operations_of_check(self.loop)
+        boxes = (self.effort.left - OPTIMISING * self.tools.whole) / each
+        if made := self._made(partial(make, boxes)) if boxes >= 1 else None:
+            self.race.enter([made])
         return made is not None
 
     def _around_a_level(self, trials: list[Trial]) -> None:
