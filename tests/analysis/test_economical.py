@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from certify.analysis.candidates.economical import Forecast, economical_candidate, is_forecast
-from certify.analysis.candidates.trials import economical
+from certify.analysis.candidates.trials import economical, economical_from, trial
 from certify.analysis.options import RoaOptions
 from certify.effort import UNLIMITED, Effort
 from certify.loop.closed_loop import ClosedLoop
@@ -80,3 +80,13 @@ def test_no_forecast_is_made_of_loops_whose_boxes_it_does_not_know(curved: Close
     assert is_forecast(curved)
     assert not is_forecast(ClosedLoop(system.with_sample((Fraction(1, 50), Fraction(1, 50))), curved.network))
     assert not is_forecast(ClosedLoop(system.with_ranges({"m": (Fraction(45, 100), Fraction(5, 10))}), curved.network))
+
+
+def test_it_is_made_from_another_candidate_where_more_is_forecast_of_it_than_of_all_others(curved: ClosedLoop) -> None:
+    options, (P, other) = RoaOptions(), starts(curved)
+    certain, large = (trial(curved, one, name, options) for one, name in ((P, "robust"), (other, "large")))
+    assert economical_from(curved, certain, [large], 1e12, options, UNLIMITED) is None
+    found, forecast = economical_from(curved, certain, [large], 20, options, UNLIMITED), Forecast(curved)
+    assert found is not None and found.name == "economical"
+    most = max(volume(one.P, forecast.level(one.P, 20)) for one in (certain, large))
+    assert volume(found.P, forecast.level(found.P, 20)) > most

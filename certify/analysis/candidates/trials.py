@@ -42,6 +42,7 @@ _SMALLEST = 1e-120  # the least level: squares of states and products of bounds 
 _BLENDS = (0.05, 0.15, 0.3)
 MANY = 6  # states, beyond which there is next to nothing but the local set
 _BOXES_SUFFICE = 0.1  # share of a volume within reach
+_MORE = 10.0  # boxes to be economical for, relative to those there are, from where a ball shows much: as much or more
 OPTIMISING = 0.2  # share of the effort that the optimised candidate may take
 SAMPLING = 0.25  # further share of that for sampling what a candidate could give
 FOR_PEAK = 0.4  # share of the effort for a candidate that may be the only one
@@ -217,6 +218,22 @@ def economical(
         return None
     P = economical_candidate(loop, list(found.values()), boxes, effort)
     return trial(loop, P, "economical", options, effort)
+
+
+def economical_from(
+    loop: ClosedLoop, certain: Trial, others: Sequence[Trial], boxes: float, options: RoaOptions, effort: Effort
+) -> Trial | None:
+    """The candidate for these boxes from `certain` on, or None if they suffice for the largest of all these trials, or
+    more is forecast to be proved with one of them."""
+    forecast, given = Forecast(loop, effort, FEW_STATES), by_reach([certain, *others])
+    if forecast.boxes(given[0].P, given[0].task.target) <= boxes:
+        return None
+
+    def promised(one: Trial) -> float:
+        return min(one.volume, volume(one.P, forecast.level(one.P, boxes)))
+
+    found = trial(loop, economical_candidate(loop, [certain.P], _MORE * boxes, effort), "economical", options, effort)
+    return found if promised(found) > max(map(promised, given)) else None
 
 
 def share_of_robust(loop: ClosedLoop) -> float:

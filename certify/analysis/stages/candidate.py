@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -24,6 +24,7 @@ from certify.analysis.candidates.trials import (
     by_reach,
     corrected,
     economical,
+    economical_from,
     firm,
     named,
     optimised,
@@ -166,16 +167,14 @@ class _Choice:
         """Every candidate for a little effort, and more for the better ones."""
         state, race, loop = self.state, self.race, self.loop
         self.tools.tell("candidate")
-        with self.tools.timing("candidate"):
-            found = solutions(loop, state.options)
+        found = solutions(loop, state.options)  # a matter of milliseconds
         if state.kind == "practical" and state.options.engine != "dreal" and loop.system.n > FEW:
             with self.tools.timing("candidate"):
                 trials = solved(loop, found, state.options, self._granted())
             rests = loop.network.is_moved and not loop.system.ranges
             return (self._around_its_rest if rests else self._around_a_level)(trials)
-        thrifty = self._economical(found) if state.interruptible and state.options.engine != "dreal" else None
-        if thrifty is not None:
-            return race.enter([thrifty])
+        if state.interruptible and self._is_thrifty(partial(economical, loop, found)):
+            return None
         large = self._made(partial(optimised, loop)) if state.options.engine != "dreal" else None
         most = volume(ellipsoid_in(loop.system), 1.0)
         if state.interruptible and large is not None and race.is_settled_by(large, most):
@@ -196,8 +195,10 @@ class _Choice:
         if large is not None and loop.system.ranges and self._is_firm(large):
             return race.knock_out()
         certain = self._made(partial(robust, loop), share_of_robust(loop))
+        if certain and self._is_thrifty(partial(economical_from, loop, certain, trials)):
+            return
         begun = {id(c.trial) for c in race.contenders}
-        race.enter([one for one in [*trials, *([] if certain is None else [certain])] if id(one) not in begun])
+        race.enter([one for one in [*trials, *([certain] if certain else [])] if id(one) not in begun])
         self._improve()
         unproved = [c for c in race.open if c.trial.name == "optimised"]
         others = [c for c in race.contenders if c.trial.name != "optimised" and c.proved]
@@ -221,15 +222,15 @@ class _Choice:
         race.advance(entered, _SEARCH * self.effort.left, operations_of_box(self.loop))
         return entered.proved > _MOST * entered.trial.volume
 
-    def _economical(self, found: Mapping[str, Array]) -> Trial | None:
-        """The candidate for the boxes that the effort left can bound and check, if they limit what is proved with the
-        first of these solutions."""
-        loop, effort = self.loop, self.effort
-        if not (FEW < loop.system.n <= MANY and is_forecast(loop)):
-            return None
-        each = operations_of_box(loop) + operations_of_check(loop)
-        boxes = (effort.left - OPTIMISING * self.tools.whole) / each
-        return None if boxes < 1 else self._made(partial(economical, loop, found, boxes))
+    def _is_thrifty(self, make: Callable[[float, RoaOptions, Effort], Trial | None]) -> bool:
+        """True if a candidate for the boxes that the effort left can bound and check is made, and entered alone."""
+        if not (FEW < self.loop.system.n <= MANY and is_forecast(self.loop)) or self.state.options.engine == "dreal":
+            return False
+        each = operations_of_box(self.loop) + operations_of_check(self.loop)
+        boxes = (self.effort.left - OPTIMISING * self.tools.whole) / each
+        if made := self._made(partial(make, boxes)) if boxes >= 1 else None:
+            self.race.enter([made])
+        return made is not None
 
     def _around_a_level(self, trials: list[Trial]) -> None:
         """A practical claim in many states, where no tree of boxes can carry what a ball does not: the candidate made
