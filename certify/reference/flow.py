@@ -231,7 +231,7 @@ def highest(first: Taylor, second: Taylor, h: arb) -> arb:
 
 
 def lesser(a: arb, b: arb) -> arb:
-    """Of two bounds of a number one, the second if that is certainly the lesser."""
+    """One of two bounds of a number, the second if that is certainly the lesser."""
     return b if b < a else a
 
 

@@ -440,7 +440,7 @@ def test_the_domain_between_instants() -> None:
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("brakes", ["160", "q"])
 def test_a_state_that_turns_back_between_instants(side: int, brakes: str) -> None:
-    """From x <= 1/1000 at v <= 8/5 a brake of 160 turns x back after 10 ms, at 9/1000; x + hi f(xi) is beyond 33/1000."""
+    """From x <= 1/1000 at v <= 8/5 a brake of 160 turns x back after 10 ms, at 9/1000; x + hi f(xi) is beyond."""
     away = "v" if side > 0 else ["-", "v"]
     force = ["-", brakes] if side > 0 else brakes
     quantities = [("q", "160", "170")] if brakes == "q" else []
