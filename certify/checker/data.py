@@ -117,7 +117,7 @@ class Flows:
             during, _ = enclosed(lambda v: evaluate(self.c.dynamics, number, [*v, *held]), x, longest)
             G = evaluate(self.c.dynamics, number, [*(during if order == 1 else x), *held])
             if order > 1:
-                rising = later(self.c.dynamics, number, x, during, held, h, order, lambda v: v)
+                rising, _ = later(self.c.dynamics, number, x, during, held, h, order, lambda v: v)
                 G = [g + h * more for g, more in zip(G, rising, strict=True)]
             x = [v + h * g for v, g in zip(x, G, strict=True)]
         return x

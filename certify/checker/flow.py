@@ -30,7 +30,7 @@ from .near import Above, Array, Near, near, norm, size
 from .ranges import Swayed, between, uncertain
 from .ring import Motion, Moving, RingLeaves
 from .stepping import Stepping
-from .taylor import Taylor, affine, constants, pairs
+from .taylor import Taylor, affine, combination, constants, pairs, upper_bound
 
 Constant = Callable[[Fraction], Any]
 Way = tuple[Array, Array]  # the largest move of each state in a period: a number, and one times ||d||
@@ -100,9 +100,9 @@ def later(
     h: Any,
     order: int,
     rest: Callable[[Any], Any],
-) -> list[Any]:
-    """(G - x_1)/h, `order` being at least 2: `states` are those at the period's beginning, `during` where they may be
-    during it, `held` inputs and ranges of what is uncertain."""
+) -> tuple[list[Any], list[Any]]:
+    """(G - x_1)/h, `order` being at least 2, and x_2 at any time: `states` are those at the period's beginning,
+    `during` where they may be during it, `held` inputs and ranges of what is uncertain."""
     early = coefficients(dynamics, constant, states, held, order - 1, rest) if order > 2 else [[] for _ in states]
     late = coefficients(dynamics, constant, during, held, order, rest)
     found = []
@@ -111,7 +111,7 @@ def later(
         for x in reversed(known[1:]):
             rising = x + h * rising
         found.append(rising)
-    return found
+    return found, [last[1] for last in late]
 
 
 def enclosed(
@@ -200,7 +200,7 @@ class Held(Stepping):
             return []
         start, during = self.shared(self.states), self.shared(self.during(self.way))
         held, dynamics = [*self.inputs, *self.ranges], self.case.c.dynamics
-        return later(dynamics, self.constant, start, during, held, self.period, self.order, self.settled)
+        return later(dynamics, self.constant, start, during, held, self.period, self.order, self.settled)[0]
 
     def G(self, cell: Intervals) -> list[Jet] | None:
         """Within a period uncertain quantities may leave the cell: the cell counts only for their mean, in which D is
@@ -254,21 +254,36 @@ def motion(
     loose = [*inputs, *(affine(v.c, np.zeros_like(v.g), v.moved) for v in ranges)]  # by their ranges, without symbols
     during, F = enclosed(lambda x: boxes.f(x, loose), states, most)
     h = boxes.number(period, boxes.symbols - 1, len(inputs[0].c))
-    G = [of_mean(boxes, f) for f in boxes.f(during if boxes.order == 1 else states, [*inputs, *ranges])]
+    first = boxes.f(during if boxes.order == 1 else states, [*inputs, *ranges])
+    G, way = [of_mean(boxes, f) for f in first], Above(np.maximum(outwards(F), 0.0)) * most
     if boxes.order > 1:
         number = constants(inputs[0])
-        rising = later(c.dynamics, number, states, during, loose, h, boxes.order, lambda v: v)
+        rising, bent = later(c.dynamics, number, states, during, loose, h, boxes.order, lambda v: v)
         G = [x + h * more for x, more in zip(G, rising, strict=True)]
-    return Motion(G, during, loose, hull(states, F, boxes.widest, most))
+        way = way.least(highest(outwards(first), outwards(bent), most))
+    return Motion(G, during, loose, hull(states, way, boxes.widest))
 
 
-def hull(states: list[Taylor], F: list[Taylor], widest: list[float], longest: float) -> Array:
-    """Between what the states lie that start at |x_i| <= `widest` and move as fast as F for a period at most."""
+def outwards(models: list[Taylor]) -> Array:
+    """The upper ends of -v and of v, (2, n, B)."""
+    lo, hi = (np.array(end) for end in zip(*(v.range.ends for v in models), strict=True))
+    return np.array([-lo, hi])
+
+
+def highest(a: Array, b: Array, h: float) -> Above:
+    """The largest a t + b t^2 over 0 <= t <= h, for exact numbers. Half of h may underflow."""
+    half = np.full(a.size, h / 2)
+    t = affine(half, half[None], size(2 * half).ulps(1))
+    top = upper_bound(combination((a.ravel(), t), (b.ravel(), t * t)))
+    return Above(np.maximum(top, 0.0).reshape(a.shape))
+
+
+def hull(states: list[Taylor], way: Above, widest: list[float]) -> Array:
+    """Between what the states lie that start at |x_i| <= `widest` and move so far down and up, (2, n, B)."""
     found = []
-    for x, f, most in zip(states, F, widest, strict=True):
-        (lo, hi), (slowest, fastest) = x.range.ends, f.range.ends
-        down, up = (Above(np.maximum(v, 0.0)) * longest for v in (-slowest, fastest))
-        low, high = Near(np.maximum(lo, -most), down), Near(np.minimum(hi, most), up)
+    for i, (x, most) in enumerate(zip(states, widest, strict=True)):
+        lo, hi = x.range.ends
+        low, high = Near(np.maximum(lo, -most), way[0, i]), Near(np.minimum(hi, most), way[1, i])
         found.append((low.ends[0], high.ends[1]))
     return np.moveaxis(np.array(found), 1, 0)
 

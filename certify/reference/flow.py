@@ -32,6 +32,7 @@ from .refusal import Refused, require
 from .series import Constant, added, coefficients
 from .taylor import Taylor, constant
 
+Move = tuple[arb, arb]  # by how much a state falls, and rises, at most
 ATTEMPTS, MORE = 12, arb(1.25)  # more than the last hi |f| is tried, as long as that grows by more than this
 LEAST = arb(2) ** -200  # of what is tried: hi |f| < kappa is asked, also where f is 0
 
@@ -145,7 +146,7 @@ def reached_on(loop: Loop, known: Known, at: str, rule: str) -> dict[str, Model]
                 ranges = [f.v + f.reach * SPREAD for f in F]
                 largest = (arb(exact(c.inner) * s).sqrt() for s in inverse_diagonal(c.P, "lyapunov"))
                 sizes = [x.slope.min(size) for x, size in zip(states, largest, strict=True)]
-                in_domain(c, [v * SPREAD for v in sizes], ranges, at)
+                in_domain(c, [v * SPREAD for v in sizes], swept(c, ranges), at)
             return {name: beyond(x, k, t) for name, x, k, t in zip(c.plant.states, states, *most, strict=True)}
         far = [ZERO if rest else MORE * v + LEAST for rest, v in zip(rests, most[0], strict=True)]
         turned = [MORE * v + LEAST for v in most[1]]
@@ -158,17 +159,21 @@ def beyond(x: Model, far: arb, turned: arb) -> Model:
     return replace(x, off=x.off + far, slack=x.slack + turned, lip=lip)
 
 
-def in_domain(c: Certificate, states: Sequence[arb], F: Sequence[arb], at: str, free: Collection[str] = ()) -> None:
-    """x_i + t f_i lies strictly inside for 0 <= t <= hi, so that phi does: it is x_i and t times a mean of f_i.
-
-    States that are `free` are not asked.
+def swept(c: Certificate, F: Sequence[arb]) -> list[Move]:
+    """By how much the states fall and rise at most within a period, t times a mean of f_i.
 
     By their ends: the product of two balls also holds what would be the least t f_i if t could be negative.
     """
     period = arb(c.step)
-    for x, f, (lo, hi), name in zip(states, F, c.plant.domain, c.plant.states, strict=True):
-        down, up = (period * arb(f.lower())).min(ZERO), (period * arb(f.upper())).max(ZERO)
-        inside = arb(x.lower()) + down > arb(lo) and arb(x.upper()) + up < arb(hi)
+    return [((-period * arb(f.lower())).max(ZERO), (period * arb(f.upper())).max(ZERO)) for f in F]
+
+
+def in_domain(
+    c: Certificate, states: Sequence[arb], moves: Sequence[Move], at: str, free: Collection[str] = ()
+) -> None:
+    """The states less and plus their moves lie strictly inside; those that are `free` are not asked."""
+    for x, (down, up), (lo, hi), name in zip(states, moves, c.plant.domain, c.plant.states, strict=True):
+        inside = arb(x.lower()) - down > arb(lo) and arb(x.upper()) + up < arb(hi)
         require(inside or name in free, "flow", at, f"{name} is not certain to stay in the domain within a period")
 
 
@@ -194,14 +199,50 @@ class Moving:
     called: Called | None
 
 
-def reached_from(c: Certificate, leaf: Moving, at: str) -> dict[str, Taylor]:
-    """The states of a whole period, each within kappa of where it was and in the domain, or a refusal."""
+def reached_from(c: Certificate, leaf: Moving, order: int, at: str) -> dict[str, Taylor]:
+    """The states of a whole period, each within kappa of where it was and in the domain, or a refusal.
+
+    Of the two bounds of a move the one by x_1 and x_2 is asked for only where f alone does not do.
+    """
     within, F = moved_within(c, leaf, arb(c.step), at)
     states = [x.c + (x.first + x.r) * SPREAD for x in leaf.states.values()]
     if leaf.bounds is not None:
         states = [within_both(x, w) for x, w in zip(states, leaf.bounds, strict=True)]
-    in_domain(c, states, F, at, leaf.free)
+    moves = swept(c, F)
+    try:
+        in_domain(c, states, moves, at, leaf.free)
+    except Refused:
+        if order == 1:
+            raise
+        bent = [tuple(map(lesser, *each)) for each in zip(moves, turning(c, leaf, within, at), strict=True)]
+        in_domain(c, states, bent, at, leaf.free)
     return within
+
+
+def turning(c: Certificate, leaf: Moving, within: Mapping[str, Taylor], at: str) -> list[Move]:
+    """By how much the states fall and rise at most within a period as t x_1 + t^2 x_2, x_1 where they start and x_2
+    anywhere `within`: f(x, q) and, at every place of it, the next coefficient with other q."""
+    held, h = {**leaf.inputs, **leaf.anything}, arb(c.step)
+    try:
+        first = c.plant.dynamics.evaluate({**leaf.states, **held}, constant, leaf.called)
+        _, second = coefficients(c.plant.dynamics, within, held, constant, 2, lambda v: v)
+    except Refused as no:
+        raise Refused("flow", at, no.detail) from None
+    each = [(v, Taylor(ZERO) if w is None else w) for v, w in zip(first, second, strict=True)]
+    return [(highest(-v, -w, h), highest(v, w, h)) for v, w in each]
+
+
+def highest(first: Taylor, second: Taylor, h: arb) -> arb:
+    """A bound of the largest a t + b t^2 over 0 <= t <= h, a and b any numbers of the models: those at their ends."""
+    a, b = arb(first.bound().upper()), arb(second.bound().upper())
+    if a > 0 and b < 0 and not a >= -2 * h * b:
+        return a * a / (-4 * b)  # at t = -a / 2b, or farther on
+    return (h * (a + h * b)).max(ZERO)
+
+
+def lesser(a: arb, b: arb) -> arb:
+    """One of two bounds of a number, the second if that is certainly the lesser."""
+    return b if b < a else a
 
 
 def moved_within(c: Certificate, leaf: Moving, hi: arb, at: str) -> tuple[dict[str, Taylor], list[arb]]:

@@ -112,7 +112,7 @@ class Motion:
 
     def reached(self, at: Stage) -> dict[str, Taylor]:
         """Rule `flow`: the states of a whole period."""
-        return reached_from(self.c, self.numbers(at), at.place)
+        return reached_from(self.c, self.numbers(at), self.order, at.place)
 
     def mean(self, at: Stage, within: dict[str, Taylor]) -> list[Taylor]:
         """The mean of f over a period in which the states are `within`."""

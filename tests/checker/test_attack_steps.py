@@ -154,7 +154,7 @@ def test_nothing_is_accepted_beyond_the_truth(name: str) -> None:
 
 
 def in_steps_of_euler(dynamics: Any, constant: Any, states: Any, *rest: Any) -> Any:
-    return [constant(Fraction(0)) for _ in states]
+    return ([constant(Fraction(0)) for _ in states],) * 2
 
 
 def without_the_square(ball: Any, models: Any) -> Any:

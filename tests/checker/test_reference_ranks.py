@@ -12,6 +12,7 @@ import random
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -434,6 +435,29 @@ def test_the_domain_between_instants() -> None:
     assert verdict(document(rising, (0.5, 1.0), b"\xff", [1], [1])) == "flow"
     rising.domain = ("1/2", "9")
     assert verdict(document(rising, (0.5, 1.0), b"\xff", [1], [1])) == "flow"  # 1/2 is not inside
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("brakes", ["160", "q"])
+def test_a_state_that_turns_back_between_instants(side: int, brakes: str) -> None:
+    """From x <= 1/1000 at v <= 8/5 a brake of 160 turns x back after 10 ms, at 9/1000; x + hi f(xi) is beyond."""
+    away = "v" if side > 0 else ["-", "v"]
+    force = ["-", brakes] if side > 0 else brakes
+    quantities = [("q", "160", "170")] if brakes == "q" else []
+    loop = Loop([["*", "1", "v"], ["+", force, ["*", "0", "u"]]], [affine([[0.0, 0.0]])], [away], ("x", "v"),
+                ("1/50", "1/50"), 2, quantities)  # fmt: skip
+    near, fast = sorted([0.0, side / 1024]), sorted([side * 1.5, side * 1.6])
+    data = loop.document([near[0], fast[0]], [near[1], fast[1]], b"\xff", two_bytes([1]), bytes([1]))
+    exact = 1 / 1024 + 1.6**2 / 320
+
+    def ending(at: float) -> Document:
+        ends = [str(Fraction(-side)), str(Fraction(side * at))][::side]
+        return edited(data, "plant.domain", [ends, ["-9", "9"]])
+
+    for at, good in ((exact + 1e-9, True), (exact - 1e-9, False), (exact - 1e-6, False), (0.03, True)):
+        assert verdicts(ending(at)) == ((None, None) if good else ("flow", "flow")), at
+        assert set(verdicts(edited(ending(at), "evidence.order", 1))) == {"flow"}
+    assert verdicts(edited(ending(0.2), "evidence.order", 1)) == (None, None)  # v is within 5.6
 
 
 def test_constraints_between_instants_on_a_ball() -> None:

@@ -139,7 +139,7 @@ def test_images_hold_trajectories(loop: tuple[System, PolicyNetwork]) -> None:
     d = np.sign(generator.normal(size=(n, 200))) * generator.random((n, 200)) ** 0.2
     x, f = (centre + radius * d).T, system.function()
     for _ in range(12):
-        form, kept = course.step(form)
+        form, kept, _ = course.step(form)
         if system.sample is None:
             x = f(x, ClosedLoop(*loop).policy(x))
         else:

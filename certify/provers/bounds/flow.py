@@ -26,13 +26,13 @@ Values = Mapping[Symbol, Taylor]
 
 
 class Mean(NamedTuple):
-    """`G`: models of the mean of f over the period, a component each; `least` and `most` (n, B): bounds of f from its
-    beginning to the end of the longest; `exists` (B,): the solution does, and these hold for it; `during`: all values
-    at any time of the period, where it exists."""
+    """`G`: models of the mean of f over the period, a component each; `down` and `up` (n, B): by how much the states
+    fall and rise at most from its beginning to any time of the longest, at least 0; `exists` (B,): the solution does,
+    and these hold for it; `during`: all values at any time of the period, where it exists."""
 
     G: list[Taylor]
-    least: Array
-    most: Array
+    down: Array
+    up: Array
     exists: Mask
     during: Values
 
@@ -69,15 +69,20 @@ class Flow:
         else:
             inner = solution_series(self.dynamics, states, held, models, self.order - 1)
             rows = [[model, *row[1:], last[-1]] for model, row, last in zip(now, inner, along, strict=True)]
-        f = [row[0] for row in along]
-        reach = [model.radius() for model in f]
-        return Mean(
-            [self._sum([_mean(row[0], alike), *row[1:]]) for row in rows],
-            np.stack([model.c - r for model, r in zip(f, reach, strict=True)]),
-            np.stack([model.c + r for model, r in zip(f, reach, strict=True)]),
-            exists,
-            {**around, **held},
-        )
+        down, up = self._moved(now, along)
+        return Mean([self._sum([_mean(row[0], alike), *row[1:]]) for row in rows], down, up, exists, {**around, **held})
+
+    def _moved(self, now: Sequence[Taylor], along: Sequence[Sequence[Taylor]]) -> tuple[Array, Array]:
+        """By how much the states fall and rise at most: as fast as f along the solution or, where its order is at least
+        2, as fast as f at the beginning and then as x_2 along it says."""
+        first, second = (_ends([row[k] for row in along]) for k in (0, min(1, self.order - 1)))
+        fall, rise = (self.most * np.maximum(v, 0.0) for v in first)
+        if self.order == 1:
+            return fall, rise
+        start = _ends(now)
+        bent = (_highest(a, b, self.most) for a, b in zip(start, second, strict=True))
+        down, up = (np.minimum(a, b) for a, b in zip((fall, rise), bent, strict=True))
+        return down, up
 
     def _rate(self, values: Values, models: Models) -> list[Taylor]:
         known: dict[Expression, Taylor] = {}
@@ -124,6 +129,20 @@ class Flow:
 def _sizes(models: Sequence[Taylor]) -> Array:
     """Bounds of |v| (n, B)."""
     return np.stack([np.abs(model.c) + model.radius() for model in models]) * (1 + EPS)
+
+
+def _ends(models: Sequence[Taylor]) -> tuple[Array, Array]:
+    """Bounds of -v and of v, (n, B) each."""
+    c, reach = np.stack([model.c for model in models]), np.stack([model.radius() for model in models])
+    wider = EPS * (np.abs(c) + reach)
+    return reach - c + wider, reach + c + wider
+
+
+def _highest(a: Array, b: Array, h: float) -> Array:
+    """The largest of `a t + b t^2` over 0 <= t <= h, a little above."""
+    with np.errstate(all="ignore"):
+        peak = np.where((a > 0) & (b < 0) & (a < -2 * h * b), a * a / (-4 * b), h * (a + h * b))
+    return np.where(np.isnan(peak), np.inf, np.maximum(peak, 0.0)) * (1 + 8 * EPS)
 
 
 def _widened(model: Taylor, by: Array) -> Taylor:

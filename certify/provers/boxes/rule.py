@@ -36,7 +36,7 @@ from certify.provers.bounds import (
 )
 from certify.provers.bounds.arrays import Array, Mask, chosen, product
 from certify.provers.bounds.compiled import loops
-from certify.provers.bounds.flow import Values
+from certify.provers.bounds.flow import Mean, Values
 from certify.provers.bounds.loop import played
 from certify.provers.bounds.tape import Tape, recorded
 from certify.provers.bounds.taylor import EPS, TINY, ConstantsLast, V
@@ -199,7 +199,7 @@ class VdotBound:
         models = Models(here[0])
         mean = self.flow(states, inputs, quantities, self.system.n + self.system.m)
         moved = [self.flow.times_period(rate) for rate in mean.G]
-        kept = mean.exists & self._in_domain(here, mean.least, mean.most, outer)
+        kept = mean.exists & self._in_domain(here, mean, outer)
         return self._increment(here, mean.G, moved, models), kept, mean.during
 
     def _at_rates(self, values: Sequence[V], algebra: ConstantsLast[V]) -> V:
@@ -221,14 +221,13 @@ class VdotBound:
         terms = [row * rate for row, rate in zip(algebra.combined(factor * self.P, along), G, strict=True)]
         return algebra.total(None, terms)
 
-    def _in_domain(self, states: list[Taylor], least: Array, most: Array, outer: float) -> Mask:
+    def _in_domain(self, states: list[Taylor], mean: Mean, outer: float) -> Mask:
         """True (B,) if the solution from V <= outer stays inside the domain over the longest period."""
         centre = np.stack([model.c for model in states])
         reach = np.stack([model.radius() for model in states])
         wide = outer**0.5 * self.extent
-        longest = self.step * (1 + EPS)
-        down = np.maximum(centre - reach, -wide) + longest * np.minimum(least, 0.0)
-        up = np.minimum(centre + reach, wide) + longest * np.maximum(most, 0.0)
+        down = np.maximum(centre - reach, -wide) - mean.down
+        up = np.minimum(centre + reach, wide) + mean.up
         low, high = self.ends
         slack = _ENDS * (np.abs(low) + np.abs(high) + np.abs(centre) + reach)
         inside: Mask = ((down > low + slack) & (up < high - slack)).all(0)

@@ -36,6 +36,7 @@ class Images(NamedTuple):
     lo, hi : (K, n, B); NaN where there is none that is of use.
     there : (K, B), the image lies in the target.
     inside, meets : (B,), the box itself does; it may have states there.
+    loose : (B,), all that is asked for in the first step may hold in a part of the box, though not in all of it.
     taken : (B,), the steps that were followed.
     steep : (n, B), by how much each axis of the box widens its first image that reaches far, relative to the root.
     """
@@ -45,6 +46,7 @@ class Images(NamedTuple):
     there: Mask
     inside: Mask
     meets: Mask
+    loose: Mask
     taken: Array
     steep: Array
 
@@ -117,6 +119,7 @@ class Course:
             np.zeros((K, batch), dtype=bool),
             self.is_there(form),
             ~self.target.misses(form.x, form.e, self.angles),
+            np.zeros(batch, dtype=bool),
             np.zeros(batch),
             np.abs(slopes).sum(0) / self.root[:, None],
         )
@@ -125,9 +128,11 @@ class Course:
         for count in range(1, self.counts[-1] + 1):
             if not len(left):
                 break
-            form, kept = self.step(form)
+            form, kept, lost = self.step(form)
             found.taken[left] += 1
             below, above = form.box
+            if count == 1:
+                found.loose[left] = ~(kept | lost) & self.in_domain(above, below)  # the image meets the domain
             width = ((above - below) / self.root[:, None]).max(0)
             good = kept & (width < _WIDEST)
             if count in self.counts:
@@ -143,8 +148,9 @@ class Course:
             left, form = left[good], form.at(good)
         return found
 
-    def step(self, form: Form) -> tuple[Form, Mask]:
-        """The states after a step, and where (B,) all that is asked for on the way holds."""
+    def step(self, form: Form) -> tuple[Form, Mask, Mask]:
+        """The states after a step, where (B,) all that is asked for on the way holds, and where a constraint certainly
+        does not."""
         n, system = self.system.n, self.system
         x = np.concatenate([form.x, np.eye(n)[:, :, None] * form.e], 1)
         error = 4 * EPS * np.abs(x).sum(1) + TINY
@@ -166,13 +172,13 @@ class Course:
         else:
             mean = self.flow(states, inputs, quantities, 2 * n + system.m)
             after = [v + self.flow.times_period(rate) for v, rate in zip(here, mean.G, strict=True)]
-            most = self.flow.most
-            down, up = below + most * np.minimum(mean.least, 0.0), above + most * np.maximum(mean.most, 0.0)
-            kept = kept & mean.exists & self.in_domain(down, up)
+            kept = kept & mean.exists & self.in_domain(below - mean.down, above + mean.up)
             values = dict(mean.during)
+        lost = np.zeros_like(kept)
         for expression in self.keep:
-            kept = kept & (upper_bound(evaluate(expression, values, models, {}))[0] < 0)
-        return _form(after, n), kept & np.all([np.isfinite(v.c + v.radius()) for v in after], axis=0)
+            g = evaluate(expression, values, models, {})
+            kept, lost = kept & (upper_bound(g)[0] < 0), lost | (upper_bound(g.scaled(-1.0))[0] < 0)
+        return _form(after, n), kept & np.all([np.isfinite(v.c + v.radius()) for v in after], axis=0), lost
 
     def in_domain(self, below: Array, above: Array) -> Mask:
         """True on boxes (n, B) inside the domain, but for angles."""

@@ -32,7 +32,8 @@ class Search:
         K, n = len(course.counts), len(lo)
         self.rank, self.steps = np.full(1, UNPROVED), np.zeros(1, dtype=np.int64)
         self.lo, self.hi = np.full((K, n, 1), np.nan), np.full((K, n, 1), np.nan)
-        self.there, self.steep, self.meets = np.zeros((K, 1), dtype=bool), np.zeros((n, 1)), np.zeros(1, dtype=bool)
+        self.there, self.steep = np.zeros((K, 1), dtype=bool), np.zeros((n, 1))
+        self.meets, self.loose = np.zeros(1, dtype=bool), np.zeros(1, dtype=bool)
         self.boxes, self.pairs, self.shares = 0, 0, list[float]()
 
     def begin(self, most: float) -> Index:
@@ -77,17 +78,15 @@ class Search:
 
         self.rank, self.steps = longer(self.rank, UNPROVED), longer(self.steps, 0)
         self.lo, self.hi = longer(self.lo, np.nan), longer(self.hi, np.nan)
-        self.there, self.steep, self.meets = (
-            longer(self.there, False),
-            longer(self.steep, 0.0),
-            longer(self.meets, False),
-        )
+        self.there, self.steep = longer(self.there, False), longer(self.steep, 0.0)
+        self.meets, self.loose = longer(self.meets, False), longer(self.loose, False)
         return halves
 
     def take(self, nodes: Index, found: Images) -> None:
         """Take in the images of leaves."""
         self.lo[..., nodes], self.hi[..., nodes] = found.lo, found.hi
-        self.there[:, nodes], self.steep[:, nodes], self.meets[nodes] = found.there, found.steep, found.meets
+        self.there[:, nodes], self.steep[:, nodes] = found.there, found.steep
+        self.meets[nodes], self.loose[nodes] = found.meets, found.loose
         self.rank[nodes[found.inside]] = 0
         self.boxes += len(nodes)
 
@@ -119,7 +118,8 @@ class Search:
         some = np.logical_or.reduceat(self.rank[leaf] < UNPROVED, starts) if len(starts) else np.zeros(0, dtype=bool)
         (low, high), first = self.cover.root, k == 0
         sticks = first & ~inside & ((high > self.lo[k, :, node].T) & (low < self.hi[k, :, node].T)).all(0)
-        near: Index = np.unique(np.concatenate([owners[some], unknown[self.meets[unknown]], node[sticks]]))
+        apart = unknown[self.meets[unknown] | self.loose[unknown]]
+        near: Index = np.unique(np.concatenate([owners[some], apart, node[sticks]]))
         waiting: Index = near[self.rank[near] == UNPROVED]
         return waiting
 
