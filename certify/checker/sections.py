@@ -67,7 +67,7 @@ class Contraction:
 
     @property
     def order(self) -> int:
-        """Of the series in time; there is none unless inputs are held."""
+        """The order of the series in time; there is none unless inputs are held."""
         return 1
 
 
