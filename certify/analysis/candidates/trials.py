@@ -260,13 +260,18 @@ def _at_rest(loop: ClosedLoop, options: RoaOptions) -> ClosedLoop:
 
 
 def corrected(
-    loop: ClosedLoop, last: Trial, witnesses: Sequence[Witness], options: RoaOptions, effort: Effort
+    loop: ClosedLoop,
+    last: Trial,
+    witnesses: Sequence[Witness],
+    options: RoaOptions,
+    effort: Effort,
+    decays: tuple[float, ...] | None = None,
 ) -> Trial | None:
-    """An optimised candidate once more, with violations that its samples had missed; None if there is none larger, or
-    if that of the loop whose input follows at once is none over a period."""
+    """An optimised candidate once more, with violations that its samples had missed, or other margins than the usual
+    ones; None if there is none larger, or if that of the loop whose input follows at once is none over a period."""
     known = np.array([w.x for w in witnesses]) if witnesses else None
     try:
-        P = optimise_repeatedly(_at_rest(loop, options), last.P, _for_making(effort), known)
+        P = optimise_repeatedly(_at_rest(loop, options), last.P, _for_making(effort), known, decays)
     except (BackendError, InputError):
         return None
     return trial(loop, P, last.name, options, effort)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -45,6 +46,7 @@ from certify.effort import UNIT, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov import volume
+from certify.lyapunov.optimised import DECAYS, FURTHER
 from certify.provers.base import FEW, Attempt, Budget
 from certify.provers.boxes.rule import operations_of_box
 from certify.provers.falsify import Witness
@@ -245,6 +247,26 @@ class _Choice:
             sure, large = race.best.trial, self._made(partial(optimised, self.loop))
             if large is not None and not self._reaches(large):
                 self._between(large, sure)
+            elif large is not None and self.loop.system.ranges:
+                self._tighten(large)
+
+    def _tighten(self, sure: Trial) -> None:
+        """The optimised candidate once more, from where it is, with the least margin of which as much is proved as is
+        within reach: that of loops without ranges at first, then between one that is too small and one that is not."""
+        race, small, enough = self.race, DECAYS[-1], FURTHER[-1]
+        margin, nearby = small, self.state.converging and self._is_nearby(race.best)
+        while self.effort.left > _LEAST * self.tools.whole:
+            again = self._made(partial(corrected, self.loop, sure, [], decays=(margin,)))
+            entered = None if again is None else self._enter_alone(again)
+            if again is None or entered is None:
+                return
+            if self._has_reached(entered, nearby):
+                sure, enough = again, margin
+            else:
+                small = margin
+            if enough <= small:
+                return
+            margin = math.sqrt(small * enough)
 
     def _between(self, large: Trial, sure: Trial) -> None:
         """Blends of a large candidate and of one with which a set is proved: a search for the share of the latter with
@@ -272,8 +294,11 @@ class _Choice:
         not worth a heat. With `nearby` it is left out again where it is not shown that all converge to one equilibrium.
         """
         entered = self._enter_alone(trial)
-        if entered is None:
-            return True
+        return entered is None or self._has_reached(entered, nearby)
+
+    def _has_reached(self, entered: Contender, nearby: bool) -> bool:
+        """True if about all within its reach is proved, with `nearby` also that all converge to one equilibrium."""
+        trial = entered.trial
         if nearby and entered is self.race.best and not self._is_nearby(entered):
             self.race.contenders.remove(entered)
             self.tools.remarks.append(

@@ -156,14 +156,22 @@ def prove_band(
             floors[level] = max(found.floor, _NOTHING * limit)
         return floors[level]
 
-    top = _largest(lambda level: floor(level) < level, limit, effort, _NEAR)
-    if top is None:
-        return None
-    level, least = top * _LOWER, floor(top)
-    while not effort.over and floor(level) < min(level, (1 - _WORTH) * least):
-        level, least = level * _LOWER, floor(level)
-    c1 = _largest(lambda level: floor(level) <= above * least, top, effort, _LOWER)
-    return (floor(top), top) if c1 is None else (floor(c1), c1)
+    level = limit
+    while not floor(level) < level:
+        level *= _NEAR
+        if level <= 1e-30 * limit or level < _LEAST or effort.over:
+            return None
+    least = floor(level)
+    while not effort.over and floor(level * _LOWER) < min(level * _LOWER, (1 - _WORTH) * least):
+        level, least = level * _LOWER, floor(level * _LOWER)
+
+    def good(level: float) -> bool:
+        return floor(level) < level and floor(level) <= above * least
+
+    c1 = max(filter(good, floors))
+    higher = [level for level in floors if level > c1]
+    c1 = _closer(good, c1, min(higher), effort) if higher else c1
+    return floor(c1), c1
 
 
 def _around(rule: Rule, level: float, effort: Effort = UNLIMITED, floor: float = math.inf) -> tuple[Rule, _Around]:
@@ -221,10 +229,10 @@ class _Around:
     floor: float
     edge: float
     multipliers: Multipliers
-    rounds: int = _ROUNDS
+    rounds: int = 0
 
 
-_NOWHERE = _Around(math.inf, 0.0, NOT_SHOWN.multipliers, 0)
+_NOWHERE = _Around(math.inf, 0.0, NOT_SHOWN.multipliers)
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,14 +296,14 @@ class Rule:
             if corners is None:
                 return best
             V = J.T @ self.problem.V.P @ J
-            for _ in range(_ROUNDS):
+            for rounds in range(1, _ROUNDS + 1):
                 found = best_at([replace(c, decay=c.decay - edge * V) for c in corners], _AMPLE)
                 if not found.margin > _MARGIN:
-                    return replace(best, rounds=best.rounds if found is NOT_SHOWN else _ROUNDS)
+                    return replace(best, rounds=rounds - (found is NOT_SHOWN))
                 around = self._least(corners, V, found.multipliers)
                 if not around.floor < best.floor * (1 - _WORTH):
-                    return min(around, best, key=lambda one: one.floor)
-                best, edge = around, around.edge
+                    return replace(min(around, best, key=lambda one: one.floor), rounds=rounds)
+                best, edge = replace(around, rounds=rounds), around.edge
             return best
 
     def _least(self, corners: Sequence[Corner], V: Array, by: Multipliers) -> _Around:
@@ -312,7 +320,7 @@ class Rule:
             parts.append((values, (vectors.T @ linear) ** 2, start + _ROUNDING * float(np.trace(c.decay))))
         most, h = min(float(values[0]) for values, _, _ in parts), self.steps.longest
         if not most > 0:
-            return replace(_NOWHERE, rounds=_ROUNDS)
+            return _NOWHERE
         edges = most * np.append(np.geomspace(1e-4, 0.5, _EDGES), 1 - np.geomspace(0.5, 1e-4, _EDGES))
         edges = np.minimum(edges, (1 - _MARGIN) / h) if h else edges
         floors = [(s + np.sum(w / (v - edges[:, None]), axis=1)) / edges for v, w, s in parts]
