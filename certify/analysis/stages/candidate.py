@@ -62,6 +62,7 @@ _MOST = 0.5  # the same: where more is proved, others are not worth theirs
 _NEAR = 1e-3  # the same: where less is proved, its own correction is not
 _MISLED = 0.9  # share of its reach: a violation below it is one that the samples missed
 _REACHED = 0.9  # share of its target: a level above it leaves nothing to a candidate that is easier to prove
+_ALL = 0.99  # share of its target: a level above it is all that a candidate can give
 _APART = 1 / 16  # shares of a blend that are no farther apart are not told apart
 
 Array = NDArray[np.float64]
@@ -254,6 +255,8 @@ class _Choice:
         """The optimised candidate once more, from where it is, with the least margin of which as much is proved as is
         within reach: that of loops without ranges at first, then between one that is too small and one that is not."""
         race, small, enough = self.race, DECAYS[-1], FURTHER[-1]
+        if race.best.trial is not sure or (race.best.attempt.level or 0.0) < _ALL * sure.task.target:
+            return
         margin, nearby = small, self.state.converging and self._is_nearby(race.best)
         while self.effort.left > _LEAST * self.tools.whole:
             again = self._made(partial(corrected, self.loop, sure, [], decays=(margin,)))
@@ -327,6 +330,8 @@ class _Choice:
             certain = self._made(partial(robust, self.loop), share_of_robust(self.loop))
             if certain is not None:
                 self._enter_alone(certain, _AROUND_FIRST)
+            if large is not None and certain is not None and race.best.proved:
+                self._between(large, certain)
         for one in by_reach(trials):
             if race.contenders and race.best.proved:
                 break
