@@ -153,8 +153,8 @@ def _resumed(state: State, tools: Tools) -> State:
 
 
 @dataclass
-class _Choice:
-    """The choice among several candidates."""
+class _Trials:
+    """Candidates that are made and tried, within a run's effort."""
 
     state: State
     tools: Tools
@@ -165,6 +165,80 @@ class _Choice:
     @property
     def loop(self) -> ClosedLoop:
         return self.state.loop
+
+    def _made(self, make: Make, share: float = OPTIMISING) -> Trial | None:
+        """A trial that has its share of the effort to be made with, or None where none is left."""
+        if self.effort.over:
+            self.cut_short = True
+            return None
+        granted = self._granted(share)
+        with self.tools.timing("candidate"):
+            made = make(self.state.options, granted)
+        self.cut_short = granted.spent >= granted.granted / (1 + SAMPLING)
+        return made
+
+    def _granted(self, share: float = OPTIMISING) -> Effort:
+        return _granted(self.effort, self.tools.whole, share)
+
+    def _enter_alone(self, trial: Trial, share: float = _SEARCH) -> Contender | None:
+        """Enter a trial with a heat of this share of the effort that is left; None if its reach is not worth one."""
+        before = len(self.race.contenders)
+        self.race.enter([trial], share * self.effort.left)
+        return self.race.contenders[-1] if len(self.race.contenders) > before else None
+
+    def _is_left_for_more(self) -> bool:
+        return self.effort.left > _FOR_PROOF * self.tools.whole
+
+    def _reaches(self, trial: Trial, nearby: bool = False) -> bool:
+        """True if nothing easier to prove could gain more: about all within the trial's reach is proved, or that is
+        not worth a heat. With `nearby` it is left out again where it is not shown that all converge to one equilibrium.
+        """
+        entered = self._enter_alone(trial)
+        return entered is None or self._has_reached(entered, nearby)
+
+    def _has_reached(self, entered: Contender, nearby: bool) -> bool:
+        """True if about all within its reach is proved, with `nearby` also that all converge to one equilibrium."""
+        trial = entered.trial
+        if nearby and entered is self.race.best and not self._is_nearby(entered):
+            self.race.contenders.remove(entered)
+            self.tools.remarks.append(
+                f"with {trial.name} a set of volume {entered.proved:.6g} is proved as well, but not that all converge "
+                "to one equilibrium in it: the claim `practical` would have it"
+            )
+            return False
+        return (entered.attempt.level or 0.0) >= _REACHED * trial.task.target
+
+    def _is_nearby(self, contender: Contender) -> bool:
+        """True if all converge to one equilibrium in its set."""
+        with self.tools.timing("candidate"):
+            proof, path = contender.attempt.proof(), self.tools.out / "certificate.json"
+            return is_nearby(contender.trial.task.problem, proof, path)
+
+    def _improve(self) -> None:
+        """The optimised candidate again, from where it is, as long as its proofs reach as far as its samples do.
+
+        A proof that comes upon a violation far below its candidate's reach tells the next round of it.
+        """
+        race, witnesses = self.race, list[Witness]()
+        while self._is_left_for_more():
+            last = [c for c in race.contenders if c.trial.name == "optimised"][-1:]
+            if not last or not last[0].attempt.done:
+                return
+            found = last[0].attempt.proof().witness
+            misled = found is not None and found.level < _MISLED * last[0].trial.task.target
+            if found is not None and misled:
+                witnesses.append(found)
+            elif not self.cut_short:
+                return
+            again = self._made(partial(corrected, self.loop, last[0].trial, witnesses))
+            if again is None or (not misled and again.volume <= _WORTH * race.best.proved):
+                return
+            race.enter([again])
+
+
+@dataclass
+class _Choice(_Trials):
+    """The choice among several candidates."""
 
     def run(self) -> None:
         """Every candidate for a little effort, and more for the better ones."""
@@ -292,31 +366,6 @@ class _Choice:
             else:
                 high = share
 
-    def _reaches(self, trial: Trial, nearby: bool = False) -> bool:
-        """True if nothing easier to prove could gain more: about all within the trial's reach is proved, or that is
-        not worth a heat. With `nearby` it is left out again where it is not shown that all converge to one equilibrium.
-        """
-        entered = self._enter_alone(trial)
-        return entered is None or self._has_reached(entered, nearby)
-
-    def _has_reached(self, entered: Contender, nearby: bool) -> bool:
-        """True if about all within its reach is proved, with `nearby` also that all converge to one equilibrium."""
-        trial = entered.trial
-        if nearby and entered is self.race.best and not self._is_nearby(entered):
-            self.race.contenders.remove(entered)
-            self.tools.remarks.append(
-                f"with {trial.name} a set of volume {entered.proved:.6g} is proved as well, but not that all converge "
-                "to one equilibrium in it: the claim `practical` would have it"
-            )
-            return False
-        return (entered.attempt.level or 0.0) >= _REACHED * trial.task.target
-
-    def _is_nearby(self, contender: Contender) -> bool:
-        """True if all converge to one equilibrium in its set."""
-        with self.tools.timing("candidate"):
-            proof, path = contender.attempt.proof(), self.tools.out / "certificate.json"
-            return is_nearby(contender.trial.task.problem, proof, path)
-
     def _around_its_rest(self, trials: list[Trial]) -> None:
         """A practical claim in many states of a loop that rests where V is 0: a ball carries there as much as it does
         of a loop that rests exactly, and the largest candidates come first as they do there."""
@@ -336,47 +385,3 @@ class _Choice:
             if race.contenders and race.best.proved:
                 break
             self._enter_alone(one, _AROUND_FIRST)
-
-    def _improve(self) -> None:
-        """The optimised candidate again, from where it is, as long as its proofs reach as far as its samples do.
-
-        A proof that comes upon a violation far below its candidate's reach tells the next round of it.
-        """
-        race, witnesses = self.race, list[Witness]()
-        while self._is_left_for_more():
-            last = [c for c in race.contenders if c.trial.name == "optimised"][-1:]
-            if not last or not last[0].attempt.done:
-                return
-            found = last[0].attempt.proof().witness
-            misled = found is not None and found.level < _MISLED * last[0].trial.task.target
-            if found is not None and misled:
-                witnesses.append(found)
-            elif not self.cut_short:
-                return
-            again = self._made(partial(corrected, self.loop, last[0].trial, witnesses))
-            if again is None or (not misled and again.volume <= _WORTH * race.best.proved):
-                return
-            race.enter([again])
-
-    def _made(self, make: Make, share: float = OPTIMISING) -> Trial | None:
-        """A trial that has its share of the effort to be made with, or None where none is left."""
-        if self.effort.over:
-            self.cut_short = True
-            return None
-        granted = self._granted(share)
-        with self.tools.timing("candidate"):
-            made = make(self.state.options, granted)
-        self.cut_short = granted.spent >= granted.granted / (1 + SAMPLING)
-        return made
-
-    def _granted(self, share: float = OPTIMISING) -> Effort:
-        return _granted(self.effort, self.tools.whole, share)
-
-    def _enter_alone(self, trial: Trial, share: float = _SEARCH) -> Contender | None:
-        """Enter a trial with a heat of this share of the effort that is left; None if its reach is not worth one."""
-        before = len(self.race.contenders)
-        self.race.enter([trial], share * self.effort.left)
-        return self.race.contenders[-1] if len(self.race.contenders) > before else None
-
-    def _is_left_for_more(self) -> bool:
-        return self.effort.left > _FOR_PROOF * self.tools.whole
