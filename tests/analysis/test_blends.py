@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -45,6 +47,29 @@ def test_a_blend_does_not_win_by_a_weaker_claim(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(certify.analysis.stages.candidate, "is_nearby", asked)
     found = run(tmp_path)
     assert found.candidate == "peak" and "the claim `practical` would have it" in (found.notice or "")
+
+
+@pytest.mark.parametrize(("needed", "margins"), [(0.01, [0.02]), (0.03, [0.02, 0.0316, 0.0251, 0.0282]), (1.0, [])])
+def test_a_margin_is_lowered_as_far_as_all_within_reach_is_proved(needed: float, margins: list[float]) -> None:
+    """The least one first, then between one that is too small and one that is not; nothing where less is proved."""
+    asked = list[float]()
+
+    class Choice(certify.analysis.stages.candidate._Choice):
+        def _made(self, make: Any, share: float = 0.0) -> Any:
+            asked.extend(make.keywords["decays"])
+            return SimpleNamespace(name="optimised", task=SimpleNamespace(target=1.0))
+
+        def _enter_alone(self, trial: Any, share: float = 0.0) -> Any:
+            self.effort.spent += UNIT
+            level = 1.0 if asked[-1] >= needed else 0.5
+            return SimpleNamespace(trial=trial, attempt=SimpleNamespace(level=level))
+
+    sure: Any = SimpleNamespace(name="optimised", task=SimpleNamespace(target=1.0))
+    best = SimpleNamespace(trial=sure, attempt=SimpleNamespace(level=0.5 if needed > 0.1 else 1.0))
+    state: Any = SimpleNamespace(converging=False, loop=None)
+    tools: Any = SimpleNamespace(whole=4 * UNIT)
+    Choice(state, tools, Effort(4.0 * UNIT), cast(Any, SimpleNamespace(best=best)))._tighten(sure)
+    assert asked == pytest.approx(margins, abs=1e-4)
 
 
 @pytest.mark.parametrize(("n", "share"), [(3, 0.25), (4, 0.5)])
