@@ -102,7 +102,8 @@ class Clerk:
 
     Parameters
     ----------
-    left : operations that may still be spent on a leaf that was refused; after that only the level is lowered.
+    left : operations that may still be spent on leaves that were refused; without any the first of them is split
+        again, and then only the level is lowered.
     stage : times the stages `write` and `check`.
     tell : called before each check.
     show : called with the bytes of a certificate that the run ends with if they are accepted, before they are checked.
@@ -134,7 +135,7 @@ class Clerk:
             if answer["result"] == _wanted(certificate):
                 return Accepted(certificate, self.path, data, answer, mended)
             finer = None
-            if splits < _SPLITS and self.left() > 0:
+            if splits < _SPLITS and (splits == 0 or self.left() > 0):  # a lower level takes a check as well
                 finer = _finer(certificate, problem, answer)
             if finer is not None:
                 splits += 1
