@@ -175,7 +175,7 @@ def test_a_result_without_an_operating_point_needs_none() -> None:
         "reason": "time",
         "system": "p",
         "levels": {},
-        "policy": {"layers": [1, 1], "sha256": "0"},
+        "policy": {"layers": [1, 1], "words": "1-1", "sha256": "0"},
         "seconds": {},
         "checked": None,
     }
