@@ -251,7 +251,7 @@ class OnBall(Algebra[Rows]):
         y = stacked([v.v0 for v in jets])
         errors = stacked([Near(0.0, v.gradient.error) for v in jets]).error.norm()
         X = Vector(np.array([v.a.value for v in jets]), errors * np.ones(self.k))
-        if not any(np.any(part) for v in jets for part in (v.Q.value, v.K.value, v.remainder, v.B.value)):
+        if not any(np.any(part) for v in jets for part in (v.Q.value, v.K.value, v.remainder, v.B.value, v.lip.top)):
             return Rows(y, X)
         H, C = np.stack([v.Q.value for v in jets], -1), np.stack([v.K.value for v in jets], -1)
         R = np.stack([(Square(v.remainder) + v.shares).majorant for v in jets], -1)

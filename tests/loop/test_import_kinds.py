@@ -231,6 +231,10 @@ CENTRED: dict[str, tuple[Any, str]] = {
     "squashed": (lambda s, x: 2 * torch.tanh(s.net(x) - s.net(s.zero)), "preactivation"),
     "beside a gain": (lambda s, x: (s.gain(x) + (s.net(x) - s.net(s.zero))).clamp(-3, 3), "output"),
     "behind a gain": (lambda s, x: torch.tanh(s.gain(x) + s.net(x) - s.net(s.zero)), "preactivation"),
+    "kept at its range": (
+        lambda s, x: (torch.tanh(s.net(x / 4)) - torch.tanh(s.net(s.zero))).clamp(-1.0, 1.0),
+        "output",
+    ),
     "shares": (lambda s, x: torch.tanh(s.net(x / 4)) - torch.tanh(s.net(s.zero)), "output"),
 }
 UNCENTRED: dict[str, Any] = {
@@ -240,6 +244,8 @@ UNCENTRED: dict[str, Any] = {
     "another input": lambda s, x: s.net(x) - s.net(s.zero) + 0.25,
     "a shift within": lambda s, x: torch.tanh(s.net(x) - s.net(s.zero) + 0.25),
     "clips of each": lambda s, x: s.net(x).clamp(-0.1, 0.1) - s.net(s.zero).clamp(-0.1, 0.1),
+    "scaled clips of each": lambda s, x: 3 * s.net(x).clamp(-0.1, 0.1) - 3 * s.net(s.zero).clamp(-0.1, 0.1),
+    "scaled hardtanh": lambda s, x: s.tail(s.net(x)) - s.tail(s.net(s.zero)),
     "a clip within": lambda s, x: torch.tanh((s.net(x) - s.net(s.zero)).clamp(-0.1, 0.2)),
     "one side": lambda s, x: torch.relu(s.net(x) - s.net(s.zero)),
     "at the clip": lambda s, x: torch.clamp(s.net(x) - s.net(s.zero), 0, 1),
@@ -259,6 +265,7 @@ class Centred(Written):
         torch.manual_seed(8)
         self.net = nn.Sequential(nn.Linear(2, 6), nn.Tanh(), nn.Linear(6, 1))
         self.gain = nn.Linear(2, 1, bias=False)
+        self.tail = nn.Hardtanh(-0.2, 0.3)
         self.register_buffer("entries", torch.zeros(2))
         self.register_buffer("one", torch.tensor([[1.0, 0.0]]))
 
@@ -281,6 +288,21 @@ def test_a_file_may_centre_its_network_itself(kind: str, form: str, tmp_path: Pa
     assert found.policy.network.centre == centre
     assert ("net(o_eq)" in found.formula) == (centre != "none")
     agree(found.policy, module)
+
+
+def test_a_clip_at_the_range_of_tanh_acts_where_the_output_is_centred() -> None:
+    """tanh(net(x)) - tanh(net(0)) leaves [-1, 1], in the file's own program and where an option asks for it."""
+    module = Centred(lambda s, x: (torch.tanh(s.net(x)) - torch.tanh(s.net(s.zero))).clamp(-1.0, 1.0)).eval()
+    with torch.no_grad():
+        module.net[2].weight *= 20
+        module.net[2].bias += 0.7 - module.net(module.zero)[0]
+    found = import_module(module, PLANT, SAID).policy
+    assert found.network.centre == "output" and found.network.clip is not None
+    agree(found, module)
+    bare = Centred(lambda s, x: torch.tanh(s.net(x)).clamp(-1.0, 1.0)).eval()
+    assert import_module(bare, PLANT, SAID).policy.network.clip is None
+    assert import_module(bare, PLANT, replace(SAID, centre="output")).policy.network.clip is not None
+    assert import_module(bare, PLANT, replace(SAID, centre="preactivation")).policy.network.clip is None
 
 
 def test_the_point_at_which_a_file_centres_is_the_operating_point() -> None:

@@ -1,7 +1,8 @@
 """A network that a file's program centres itself, as in `clip(net(x) - net(x_eq) + u_eq)`.
 
 A file that subtracts the network's value at the operating point says by its form that pi(0) = u_eq. Its steps without
-the subtraction, centred by this program, are the same function in real arithmetic, and rest at the origin exactly.
+the subtraction, centred by this program, are the same function in real arithmetic, up to the rounding of u_eq, and rest
+at the origin exactly.
 """
 
 from __future__ import annotations
@@ -13,7 +14,17 @@ from typing import TypeGuard
 
 import numpy as np
 
-from certify.loop.policies.importers.steps import Affine, Branches, Clip, Diagonal, Step, Tanh, exactly, spread
+from certify.loop.policies.importers.steps import (
+    Activate,
+    Affine,
+    Branches,
+    Clip,
+    Diagonal,
+    Step,
+    Tanh,
+    exactly,
+    spread,
+)
 from certify.loop.policies.network import Centre
 
 Exact = Sequence[Fraction | None]
@@ -64,7 +75,7 @@ def _apart(
     if len(subtracted) < 3 or subtracted[-1] != _NEGATED:
         return None
     held, core = subtracted[0], subtracted[1:-1]
-    if not isinstance(held, Affine) or np.any(held.weight) or isinstance(core[-1], Clip):
+    if not isinstance(held, Affine) or np.any(held.weight) or _ends_clipped(core):
         return None
     end = len(net)
     while end > len(core) and _is_shift(net[end - 1]) and not _same(net[end - len(core) : end], core):
@@ -73,6 +84,12 @@ def _apart(
     if start < 0 or not _same(net[start:end], core):
         return None
     return net[:start], core, net[end:], exactly(held.bias)
+
+
+def _ends_clipped(core: Sequence[Step]) -> bool:
+    """True if a clip stands behind the last layer, which as the policy's own would act after the centring."""
+    last = max((k for k, step in enumerate(core) if isinstance(step, Affine | Activate | Branches)), default=-1)
+    return any(isinstance(step, Clip) for step in core[last + 1 :])
 
 
 def _layers(steps: tuple[Step, ...]) -> tuple[Step, ...]:

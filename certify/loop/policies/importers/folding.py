@@ -37,7 +37,7 @@ from certify.loop.policies.importers.steps import (
     nearest,
     spread,
 )
-from certify.loop.policies.network import Array, Squash
+from certify.loop.policies.network import Array, Centre, Squash
 
 Bounds = tuple[Fraction | None, Fraction | None]
 _BITS = (128, 512, 2048, 8192)
@@ -69,8 +69,8 @@ class Folded:
     inactive: tuple[Bounds, ...]
 
 
-def fold(steps: Sequence[Step], n: int, keep_clips: bool = False) -> Folded:
-    """Fold the steps from n observations to the action.
+def fold(steps: Sequence[Step], n: int, keep_clips: bool = False, centre: Centre = "none") -> Folded:
+    """Fold the steps from n observations to the action, which is centred so before its clip.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def fold(steps: Sequence[Step], n: int, keep_clips: bool = False) -> Folded:
     program = _Program(n)
     inactive = program.begin(body, n, keep_clips)
     network = Network(n, tuple(program.steps))
-    scale, offset, clip = _tail(tail, network.gives, squash)
+    scale, offset, clip = _tail(tail, network.gives, squash == "tanh" and centre != "output")
     return Folded(network, scale, offset, squash, clip, tuple(inactive))
 
 
@@ -370,7 +370,9 @@ def _end(value: flint.arb) -> Fraction:
     return Fraction(int(mantissa)) * Fraction(2) ** int(exponent)
 
 
-def _tail(steps: Sequence[Step], width: int, squash: Squash) -> tuple[Array, Array, tuple[Array, Array] | None]:
+def _tail(steps: Sequence[Step], width: int, ranged: bool) -> tuple[Array, Array, tuple[Array, Array] | None]:
+    """Scale, offset and clip; `ranged` says that the action lies in offset +- scale: behind a tanh, unless it is centred
+    after that."""
     scale, offset = [Fraction(1)] * width, [Fraction(0)] * width
     lows: list[Fraction | None] = [None] * width
     highs: list[Fraction | None] = [None] * width
@@ -389,7 +391,7 @@ def _tail(steps: Sequence[Step], width: int, squash: Squash) -> tuple[Array, Arr
                     highs[i] = _smaller(highs[i], hi)
             case _:
                 raise InputError("after the last layer there may be a tanh, a scale, an offset and a clip only.")
-    return _numbers(scale), _numbers(offset), _clip(scale, offset, lows, highs, squash)
+    return _numbers(scale), _numbers(offset), _clip(scale, offset, lows, highs, ranged)
 
 
 def _clip(
@@ -397,14 +399,14 @@ def _clip(
     offset: list[Fraction],
     lows: list[Fraction | None],
     highs: list[Fraction | None],
-    squash: Squash,
+    ranged: bool,
 ) -> tuple[Array, Array] | None:
     """The clip of the action, with the squash's own range where a side has none; None if none of it can act."""
     if all(v is None for v in (*lows, *highs)):
         return None
     acts = False
     for i in range(len(scale)):
-        if squash == "tanh":
+        if ranged:
             least, most = offset[i] - abs(scale[i]), offset[i] + abs(scale[i])
             lo, hi = lows[i], highs[i]
             acts = acts or (lo is not None and lo > least) or (hi is not None and hi < most)

@@ -161,9 +161,9 @@ def import_bytes(
     steps = (*before, *reading.steps, *after)
     u_eq = plant.exact_u_eq()
     steps, centre = _centred(steps, reading, reads, options, u_eq)
-    folded = fold(steps, n)
+    folded = fold(steps, n, centre=centre)
     if reads.index is None and reads.may_leave(folded.inactive):
-        folded = fold(steps, n, keep_clips=True)
+        folded = fold(steps, n, keep_clips=True, centre=centre)
     network, valid = _network(folded, reads, centre)
     if network.centre != "none":
         require_centred(network, u_eq)
@@ -180,7 +180,7 @@ def import_bytes(
     return Imported(
         policy=Policy(network, plant.name, _parameters(plant), {"imported": record}, reading.beta, valid),
         words=reading.words,
-        formula=_formula(normaliser, network, folded, reading, own != "none"),
+        formula=_formula(normaliser, network, folded, reading, own, u_eq),
         difference=difference,
         compared_with=reading.program,
         assumed=reading.assumed,
@@ -358,9 +358,15 @@ def _centrings(bare: PolicyNetwork, u_eq: tuple[Fraction, ...], x: Array, values
 
 
 def _formula(
-    normaliser: tuple[Step, ...], network: PolicyNetwork, folded: Folded, reading: Reading, centred: bool
+    normaliser: tuple[Step, ...],
+    network: PolicyNetwork,
+    folded: Folded,
+    reading: Reading,
+    centred: Centre,
+    u_eq: Sequence[Fraction],
 ) -> str:
-    """The file's policy in the plant's units."""
+    """The file's policy, which it centres itself so, in the plant's units."""
+    offset = [float(u) for u in u_eq] if centred == "output" else folded.offset
     observation = "o"
     if normaliser:
         divisor = "sqrt(var + epsilon)" if isinstance(normaliser[0], Normalise) else "(std + epsilon)"
@@ -368,12 +374,14 @@ def _formula(
     net = f"net({observation})"
     if reading.beta is not None:
         net = "net(x) - net(x_eq) + beta"
-    elif centred:
+    elif centred == "preactivation":
         net = f"{net} - net(o_eq)"
     inner = f"tanh({net})" if network.squash == "tanh" else net
-    factor = f"({inner})" if inner.endswith("net(o_eq)") else inner
+    if centred == "output":
+        inner += f" - {inner.replace(net, 'net(o_eq)')}"
+    factor = f"({inner})" if centred == "output" else inner
     scaled = inner if np.all(folded.scale == 1) else f"{_short(folded.scale)} * {factor}"
-    scaled = scaled if not np.any(folded.offset) else f"{scaled} + {_short(folded.offset)}"
+    scaled = scaled if not np.any(offset) else f"{scaled} + {_short(offset)}"
     if folded.clip is None:
         return f"u = {scaled}"
     return f"u = clip({scaled}, {_short(folded.clip[0])}, {_short(folded.clip[1])})"
