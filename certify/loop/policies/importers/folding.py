@@ -371,8 +371,8 @@ def _end(value: flint.arb) -> Fraction:
 
 
 def _tail(steps: Sequence[Step], width: int, ranged: bool) -> tuple[Array, Array, tuple[Array, Array] | None]:
-    """Scale, offset and clip; `ranged` says that the action lies in offset +- scale: behind a tanh, if it is not centred
-    after that."""
+    """Scale, offset and clip; `ranged` says that the action lies in offset +- scale, as it does behind a tanh unless it
+    is centred after that."""
     scale, offset = [Fraction(1)] * width, [Fraction(0)] * width
     lows: list[Fraction | None] = [None] * width
     highs: list[Fraction | None] = [None] * width
