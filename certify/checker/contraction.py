@@ -13,14 +13,14 @@ from flint import fmpq, fmpq_mat
 
 from . import ball
 from .ball import Ball
-from .case import Case, Failures
+from .case import Case, Failures, given
 from .decrease import Models, are_finite, diagonal, rational, vectors
 from .exact import exactly, is_definite, root_above
 from .jets import unpacked
 from .local import is_large_enough
 from .near import Above, Array, Tensor, size
 from .pairs import bound_of_pairs, in_binary64
-from .sections import Contraction, HeldContraction
+from .sections import Contraction
 from .stepping import lengths_of_forms
 
 if TYPE_CHECKING:
@@ -31,14 +31,12 @@ if TYPE_CHECKING:
 class Contracted(Ball):
     """The ball of the section `contraction`."""
 
-    by: Contraction | HeldContraction
+    by: Contraction
     close = True
 
     @classmethod
     def of(cls, case: Case) -> Contracted:
-        kind, by = cls, case.c.contraction
-        if by is None:
-            raise TypeError("this rule is about what the certificate has not")
+        kind, by = cls, given(case.c.contraction)
         if case.c.sample is not None:
             from .held import HeldClose
 
@@ -93,7 +91,7 @@ def examine(tally: Tally, case: Case) -> None:
 OF_CONTRACTION = (("contraction", fits), ("contraction", ball.is_not_clipped), ("contraction", contracts))
 
 
-def _rest(models: Models, b: fmpq_mat, doubts: Sequence[fmpq], by: Contraction | HeldContraction) -> fmpq_mat:
+def _rest(models: Models, b: fmpq_mat, doubts: Sequence[fmpq], by: Contraction) -> fmpq_mat:
     """A bound of twice the sum of b_i.e times what g_i has beyond a_i.e."""
     lengths = [root_above(sum((v * v for v in row), fmpq(0))) for row in b.tolist()]
     along = 2 * sum((length * doubt for length, doubt in zip(lengths, doubts, strict=True)), fmpq(0))

@@ -19,7 +19,7 @@ from .schema import Array, Binary64, Matrix, Value, section
 from .strict import load
 
 if TYPE_CHECKING:
-    from .sections import Contraction, Data, HeldContraction, Outer, Ranks, Trusted, Tube
+    from .sections import Contraction, Data, Outer, Ranks, Trusted, Tube
 
 MAX_STATES = 64
 MAX_ORDER = 8  # of a series in time
@@ -39,11 +39,7 @@ EVIDENCE = {  # the keys of each kind of evidence
     "ranks": "order ranks",
     "outer": "outer",
 }
-EMPTY: dict[str, Any] = {
-    "contraction": None,
-    "tube": [],
-    "outer": None,
-}  # what evidence has where the claim has nothing
+EMPTY: dict[str, Any] = {"contraction": None, "tube": [], "outer": None}  # of evidence where the claim has nothing
 Intervals = tuple[tuple[Fraction, Fraction], ...]
 
 
@@ -152,7 +148,7 @@ class Certificate:
     rate: float = 0.0
     sample: tuple[Fraction, Fraction] | None = None  # the least and the largest period over which the input is held
     tube: Tube | None = None  # an ellipsoid from which trajectories lead into {V <= c2}
-    contraction: Contraction | HeldContraction | None = None  # a ball on which they come closer
+    contraction: Contraction | None = None  # a ball on which they come closer
     outer: Outer | None = None  # whose set trajectories leave into {V <= c2} only; never, if there is no V
     ranks: Ranks | None = None  # of the leaves from which trajectories reach the target
     target: Tape | None = None  # whose outputs are at most 0 there; None if the target is {V <= c2}

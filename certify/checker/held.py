@@ -1,7 +1,8 @@
 """The ball of `contraction` where inputs are held: G of two states, which come closer with every period.
 
-Beside where a state is during a period it takes how fast that changes with the state at its beginning: phi - x has a
-Lipschitz constant over d, shown as the a-priori enclosure is. With it the last coefficient of the series has one.
+The rule needs two bounds for a period: where the state is, as rule `flow` has it, and how fast that changes with the
+state at the beginning. The second is a Lipschitz constant of phi - x over d, which the same iteration shows; with it
+the last coefficient of the series has one too.
 """
 
 from __future__ import annotations

@@ -58,28 +58,13 @@ class Outer(OuterTree):
 @dataclass(frozen=True)
 class Contraction:
     """The ball x = J d, ||d|| <= 1, on which trajectories come closer, and on it the weights g of one bound, and the
-    weight of another; with kinks, trees of directions."""
+    weight of another; with kinks, trees of directions; where inputs are held, the order of the series in time."""
 
     J: Matrix
     weights: Row
     weight: Matrix
     directions: Directions = None
-
-    @property
-    def order(self) -> int:
-        """The order of the series in time; there is none unless inputs are held."""
-        return 1
-
-
-@dataclass(frozen=True)
-class HeldContraction:
-    """The same where inputs are held, with the order of the series in time."""
-
-    J: Matrix
-    weights: Row
-    weight: Matrix
-    order: Order
-    directions: Directions = None
+    order: Order = 1
 
 
 @dataclass(frozen=True)
@@ -243,8 +228,12 @@ def completed(
     if "data" in said:
         c = replace(c, data=_data(said["data"], shown["data"], c))
     if kind == "nearby":
-        kind_of: type[Contraction | HeldContraction] = HeldContraction if c.sample else Contraction
-        c = replace(c, contraction=section(shown["contraction"], kind_of, n=n, order=most))
+        close = shown["contraction"]
+        c = replace(c, contraction=section(close, Contraction, n=n, order=most))
+        close.must(
+            ("order" in close.raw) is (c.sample is not None),
+            "an object with an order where inputs are held, and only there",
+        )
     if kind in WITH_TUBE:
         c = replace(c, tube=_tube(said, shown["tube"], c))
     if "solver" in shown:

@@ -208,6 +208,10 @@ class _Trials:
             return False
         return (entered.attempt.level or 0.0) >= _REACHED * trial.task.target
 
+    def _is_best_nearby(self) -> bool:
+        """True if convergence to one equilibrium is claimed, and shown of the best so far."""
+        return self.state.converging and self._is_nearby(self.race.best)
+
     def _is_nearby(self, contender: Contender) -> bool:
         """True if all converge to one equilibrium in its set."""
         with self.tools.timing("candidate"):
@@ -244,13 +248,14 @@ class _Choice(_Trials):
         """Every candidate for a little effort, and more for the better ones."""
         state, race, loop = self.state, self.race, self.loop
         self.tools.tell("candidate")
-        found = solutions(loop, state.options)  # a matter of milliseconds
+        with self.tools.timing("candidate"):
+            found = solutions(loop, state.options)
         if state.kind == "practical" and state.options.engine != "dreal" and loop.system.n > FEW:
             with self.tools.timing("candidate"):
                 trials = solved(loop, found, state.options, self._granted())
             rests = loop.network.is_moved and not loop.system.ranges
             return (self._around_its_rest if rests else self._around_a_level)(trials)
-        if state.interruptible and self._is_thrifty(partial(economical, loop, found)):
+        if state.interruptible and self._enters_thrifty(partial(economical, loop, found)):
             return None
         large = self._made(partial(optimised, loop)) if state.options.engine != "dreal" else None
         most = volume(ellipsoid_in(loop.system), 1.0)
@@ -272,7 +277,7 @@ class _Choice(_Trials):
         if large is not None and loop.system.ranges and self._is_firm(large):
             return race.knock_out()
         certain = self._made(partial(robust, loop), share_of_robust(loop))
-        if certain and self._is_thrifty(partial(economical_from, loop, certain, trials)):
+        if certain and self._enters_thrifty(partial(economical_from, loop, certain, trials)):
             return
         begun = {id(c.trial) for c in race.contenders}
         race.enter([one for one in [*trials, *([certain] if certain else [])] if id(one) not in begun])
@@ -299,13 +304,14 @@ class _Choice(_Trials):
         race.advance(entered, _SEARCH * self.effort.left, operations_of_box(self.loop))
         return entered.proved > _MOST * entered.trial.volume
 
-    def _is_thrifty(self, make: Callable[[float, RoaOptions, Effort], Trial | None]) -> bool:
-        """True if a candidate for the boxes that the effort left can bound and check is made, and entered alone."""
+    def _enters_thrifty(self, make: Callable[[float, RoaOptions, Effort], Trial | None]) -> bool:
+        """Enter a candidate for the boxes that the effort left can bound and check; False if none is made."""
         if not (FEW < self.loop.system.n <= MANY and is_forecast(self.loop)) or self.state.options.engine == "dreal":
             return False
         each = operations_of_box(self.loop) + operations_of_check(self.loop)
         boxes = (self.effort.left - OPTIMISING * self.tools.whole) / each
-        if made := self._made(partial(make, boxes)) if boxes >= 1 else None:
+        made = self._made(partial(make, boxes)) if boxes >= 1 else None
+        if made is not None:
             self.race.enter([made])
         return made is not None
 
@@ -331,7 +337,7 @@ class _Choice(_Trials):
         race, small, enough = self.race, DECAYS[-1], FURTHER[-1]
         if race.best.trial is not sure or (race.best.attempt.level or 0.0) < _ALL * sure.task.target:
             return
-        margin, nearby = small, self.state.converging and self._is_nearby(race.best)
+        margin, nearby = small, self._is_best_nearby()
         while self.effort.left > _LEAST * self.tools.whole:
             again = self._made(partial(corrected, self.loop, sure, [], decays=(margin,)))
             entered = None if again is None else self._enter_alone(again)
@@ -349,7 +355,7 @@ class _Choice(_Trials):
         """Blends of a large candidate and of one with which a set is proved: a search for the share of the latter with
         which most is proved, as if there were one maximum. A larger set of which less is claimed counts for nothing."""
         race, low, high = self.race, 0.0, 1.0
-        best, nearby = float(race.best.trial is not large), self.state.converging and self._is_nearby(race.best)
+        best, nearby = float(race.best.trial is not large), self._is_best_nearby()
         while high - low > _APART and self.effort.left > _LEAST * self.tools.whole:
             within = min(max(best, low), high)
             share = (low + within) / 2 if within - low >= high - within else (within + high) / 2
