@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
+from base64 import b64decode
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from certify.analysis.acceptance import _lowered
-from certify.certificates import Certificate, Contraction, OuterTree, PartitionTree, TrustedSolver
+from certify.analysis.acceptance import Clerk, _lowered
+from certify.certificates import Certificate, Contraction, LocalBall, OuterTree, PartitionTree, TrustedSolver
 from certify.certificates.claims import Asymptotic, Claim, Enlarged, Nearby, Outer, Practical, Problem, Reached
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import symbols
@@ -95,3 +100,24 @@ def test_a_solver_s_word_is_not_weakened() -> None:
     word = TrustedSolver("dReal", "4", 1e-3, ())
     certificate = Certificate(system, network, V, Asymptotic(4.0, 1.0), word)
     assert _lowered(certificate, ON_RING, Problem(ClosedLoop(system, network), V), 0) is None
+
+
+def test_a_refused_leaf_is_split_once_without_any_effort(tmp_path: Path) -> None:
+    """A lower level takes a check as well; only then the level is lowered, below the leaf."""
+    system, network = scalar_tanh()
+    problem, asked = Problem(ClosedLoop(system, network), V), list[tuple[int, float]]()
+    evidence = PartitionTree(ONE, np.array([2.5]), bytes([0, 255, 255]), local=LocalBall(ONE, np.ones((3, 1)), ONE))
+
+    def check(path: Path) -> dict[str, Any]:
+        data = path.read_bytes()
+        said = json.loads(data)
+        levels = {name: float.fromhex(level) for name, level in said["levels"].items()}
+        asked.append((len(b64decode(said["evidence"]["tree"])), levels["roa"]))
+        result = "ACCEPTED" if len(asked) == 3 else "REJECTED"
+        return {"certificate_sha256": sha256(data).hexdigest(), "levels": levels, "result": result, **ON_RING}
+
+    clerk = Clerk(tmp_path / "c.json", lambda: 0.0, lambda _: nullcontext(), lambda: None, lambda _: None, check)
+    found = clerk.accepted(Certificate(system, network, V, Asymptotic(4.0, 1.0), evidence), problem)
+    (first, level), (split, same), (_, lower) = asked
+    assert split > first and same == level == 4.0 and lower < 4.0 == level
+    assert found.certificate.roa == lower and "the level is" in (found.mended or "")

@@ -17,6 +17,7 @@ from certify.checker.jets import Units, constant, unpacked
 from certify.checker.near import Vector
 from certify.checker.networks import Affine, Map, Network
 from certify.checker.wiring import Clip
+from tests.checker.test_contraction_in_steps import JUDGES
 from tests.support.certificates import LEAF, Document, edited, encode, parse, verdict
 from tests.support.kinked import even, kinked, mirrored, pi
 from tests.support.marks import slow_after
@@ -356,12 +357,13 @@ def test_inputs_are_bounded_with_all_that_kinks_may_add(bound: str, found: str) 
 
 
 def nearby(gain: float, directions: Any, time: str = "continuous") -> Document:
-    """x' = u - x + 1/100 or x+ = u + 1/100 with u = gain relu(x), around the level 1/25."""
-    term = ["+", "u", "1/100", *([["-", "x0"]] if time == "continuous" else [])]
-    data = kinked([term], relu(gain), 1.0, 1.0, None, claim="nearby", levels=(0.04, 0.04), time=time)
+    """x' = u - x + 1/100 or x+ = u + 1/100, u = gain relu(x), which may be held over 1/10, around the level 1/25."""
+    term = ["+", "u", "1/100", *([["-", "x0"]] if time != "discrete" else [])]
+    more: dict[str, Any] = {"sample": ("1/10", "1/10")} if time == "held" else {"time": time}
+    data = kinked([term], relu(gain), 1.0, 1.0, None, claim="nearby", levels=(0.04, 0.04), **more)
     data["evidence"]["contraction"] = {
         "J": encode(0.2 * (1 + 1e-9)), "weights": encode([2.0**-40]), "weight": encode(2.0**-40),
-        "directions": directions,
+        "directions": directions, **({"order": 4} if time == "held" else {}),
     }  # fmt: skip
     data["evidence"]["local"] = None
     return grow_small(data)
@@ -378,7 +380,7 @@ def grow_small(data: Document) -> Document:
     return data
 
 
-@pytest.mark.parametrize("time", ["continuous", "discrete"])
+@pytest.mark.parametrize("time", ["continuous", "discrete", "held"])
 @pytest.mark.parametrize("directions", [[], even(1, 0)], ids=["one cone", "half lines"])
 def test_two_trajectories_come_closer_across_a_kink(time: str, directions: Any) -> None:
     assert verdict(nearby(0.7, directions, time)) == "ACCEPTED"
@@ -387,10 +389,25 @@ def test_two_trajectories_come_closer_across_a_kink(time: str, directions: Any) 
     assert verdict(without) == "contraction"
 
 
-@pytest.mark.parametrize(("time", "gain"), [("continuous", 1.01), ("discrete", 1.01), ("discrete", -1.01)])
+@pytest.mark.parametrize(
+    ("time", "gain"),
+    [("continuous", 1.01), ("discrete", 1.01), ("discrete", -1.01), ("held", 1.01), ("held", -20.5)],
+)
 @pytest.mark.parametrize("directions", [[], even(1, 0)], ids=["one cone", "half lines"])
 def test_trajectories_that_part_are_refused(time: str, gain: float, directions: Any) -> None:
     assert verdict(nearby(gain, directions, time)) in ("contraction", "ring")
+
+
+@pytest.mark.parametrize("passes", JUDGES)
+@pytest.mark.parametrize("directions", [[], even(1, 0)], ids=["one cone", "half lines"])
+def test_the_limits_of_the_gain_are_those_of_the_plant(passes: Callable[[Document], bool], directions: Any) -> None:
+    """A period multiplies x > 0 by e + (1 - e) gain, e = exp(-h), and x < 0 by e; a step of a map by gain, or 0."""
+    e = np.exp(-0.1)
+    for time, least in (("continuous", -np.inf), ("discrete", -1.0), ("held", -(1 + e) / (1 - e))):
+        for gain in (0.999, least + 0.02 if least > -np.inf else -30.0):
+            assert passes(nearby(gain, directions, time))
+        for gain in (1.001, *([least - 0.02] if least > -np.inf else [])):
+            assert not passes(nearby(gain, directions, time))
 
 
 def test_limits_count_the_cones() -> None:
