@@ -140,11 +140,7 @@ _PRACTICAL = CLAIMS["practical"]
 _BY_CONSTANTS = (
     "by models of the closed loop, with Lipschitz constants of what they leave out, on a ball that contains {V ≤ c₀}"
 )
-_CONTRACTION_IN_STEPS: Part = (
-    "Contraction",
-    "V(F(x) − F(y)) < V(x − y) for all x other than y with V(x) ≤ c₀ and V(y) ≤ c₀",
-    _BY_CONSTANTS,
-)
+_PAIRS = "for all x other than y with V(x) ≤ c₀ and V(y) ≤ c₀"
 CLAIMS = {
     **CLAIMS,
     "nearby": replace(
@@ -159,7 +155,7 @@ CLAIMS = {
             *_PRACTICAL.parts,
             (
                 "Contraction",
-                "2(x − y)′P(F(x) − F(y)) < 0 for all x other than y with V(x) ≤ c₀ and V(y) ≤ c₀",
+                f"2(x − y)′P(F(x) − F(y)) < 0 {_PAIRS}",
                 _BY_CONSTANTS,
             ),
         ),
@@ -377,7 +373,7 @@ def _in_steps(kind: str, parts: tuple[Part, ...], timing: TimingInWords) -> Iter
     """The parts, with those that a loop needs that is spoken of at its samples or steps."""
     after = "F(x)" if timing.discrete else "φ(h)"
     for part in parts:
-        yield _CONTRACTION_IN_STEPS if part[0] == "Contraction" and timing.discrete else part
+        yield _contraction_in_steps(part, timing) if part[0] == "Contraction" and not timing.is_plain else part
         if part[0] == "Domain" and timing.sample is not None:
             yield (
                 "Within a period",
@@ -387,6 +383,14 @@ def _in_steps(kind: str, parts: tuple[Part, ...], timing: TimingInWords) -> Iter
             )
         if part[0] == "Ring" and kind in PRACTICAL and not timing.is_plain:
             yield ("Inner set", f"V({after}) < c₀ for all x with V(x) ≤ c₀$every", "with the parts above")
+
+
+def _contraction_in_steps(part: Part, timing: TimingInWords) -> Part:
+    """The part about trajectories that come closer, with each step or over each period."""
+    if timing.discrete:
+        return part[0], f"V(F(x) − F(y)) < V(x − y) {_PAIRS}", part[2]
+    closer = f"V(φ(h, x) − φ(h, y)) < V(x − y) {_PAIRS}$every, φ(h, x) being φ(h) from x"
+    return part[0], f"{closer}; and φ(h, x) = x only where F(x) = 0", part[2]
 
 
 def _filled(text: Any, phrases: Mapping[str, str]) -> Any:

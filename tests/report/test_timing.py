@@ -266,8 +266,9 @@ def test_a_rate_alone_in_continuous_time() -> None:
 # A nearby equilibrium
 
 
-def nearby(*, push: bool, rate: float = 0.0) -> Certificate:
+def nearby(*, push: bool, rate: float = 0.0, timing: TimingInWords | None = None) -> Certificate:
     """A practical claim with one condition more."""
+    timing = timing or TimingInWords()
     ball = LocalBall(np.eye(2), np.ones((3, 2)), np.eye(2))
     evidence = PartitionTree(
         np.eye(2),
@@ -275,10 +276,10 @@ def nearby(*, push: bool, rate: float = 0.0) -> Certificate:
         bytes([255]),
         ball,
         cells=(1,) * push,
-        contraction=Contraction(np.eye(2), np.ones(2), np.eye(2)),
+        contraction=Contraction(np.eye(2), np.ones(2), np.eye(2), order=1 if timing.sample else None),
     )
     claim = Nearby(roa=2.0, local=0.5, floor=0.125, rate=rate)
-    return Certificate(integrator(TimingInWords(), push=push), gain("1", 2), Quadratic(np.eye(2)), claim, evidence)
+    return Certificate(integrator(timing, push=push), gain("1", 2), Quadratic(np.eye(2)), claim, evidence)
 
 
 def test_one_equilibrium_is_said_of_constants_alone() -> None:
@@ -301,6 +302,17 @@ def test_one_equilibrium_is_said_of_constants_alone() -> None:
         "enters {V <= 0.125} and stays there; where what is uncertain is constant in time, it converges to the one "
         "equilibrium in that set"
     ) in headline
+
+
+@pytest.mark.parametrize("timing", ["discrete", "exact", "range"])
+def test_trajectories_come_closer_with_steps(timing: str) -> None:
+    text, held = page(nearby(push=False, timing=TIMINGS[timing])).text, timing != "discrete"
+    (said,) = (part for part in text.split("Contraction. ")[1:] if part.startswith("V("))
+    condition = said.split("by models")[0]
+    closer = "V(φ(h, x) − φ(h, y)) < V(x − y)" if held else "V(F(x) − F(y)) < V(x − y)"
+    assert condition.startswith(f"{closer} for all x other than y with V(x) ≤ c₀ and V(y) ≤ c₀")
+    assert ("and φ(h, x) = x only where F(x) = 0" in condition) == held and "2(x − y)′P" not in text
+    assert ("every" in condition) == (timing == "range")
 
 
 # Times
