@@ -6,11 +6,10 @@ Whatever the checker refuses, the run ends with what it accepts: a refused leaf 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from certify.analysis.diagnosis import diagnose
 from certify.analysis.options import RoaOptions
@@ -31,9 +30,7 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.composition import composed
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
-
-if TYPE_CHECKING:
-    from certify.provers.execution import Runner
+from certify.provers.execution import runner_at
 
 __all__ = ["Report", "RoaOptions", "RoaResult", "certify_roa"]
 # Shares of the effort for candidates and ring, where more is to come:
@@ -87,7 +84,7 @@ def certify_roa(
     system, network = composed(system, network)
     begin = setting_of(ClosedLoop(system, network), options)
     aside = earlier_aside(out, tell or (lambda _: None), keep=options.resume)
-    with one_thread(), sole_writer(out), aside, _runner_for(options) as runner:
+    with one_thread(), sole_writer(out), aside, runner_at(options.cluster) as runner:
         can_keep, named = keep and options.engine == "bounds", options.P is not None or options.only is not None
         tools = Tools(
             out,
@@ -100,20 +97,6 @@ def certify_roa(
             load_seconds,
         )
         return _result(begin, tools)
-
-
-@contextmanager
-def _runner_for(options: RoaOptions) -> Iterator[Runner]:
-    """The place where boxes are bounded."""
-    if options.cluster is not None:
-        from certify.provers.execution.cluster import ClusterRunner, connect
-
-        with connect(options.cluster) as client:
-            yield ClusterRunner(client)
-        return
-    from certify.provers.execution import ThreadRunner
-
-    yield ThreadRunner()
 
 
 def _result(state: State, tools: Tools) -> RoaResult:

@@ -14,7 +14,7 @@ from certify.analysis.stages.state import Report, StageName, timed
 from certify.certificates import InvariantCertificate, ReachCertificate, parse_any
 from certify.certificates.drawn import nonlinearity_of
 from certify.certificates.verdict import Verdict
-from certify.errors import InputError, SoundnessError
+from certify.errors import BackendError, InputError, SoundnessError
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
 from certify.provers.base import Progress
@@ -104,10 +104,10 @@ class Tools:
         rests = [] if system.measurements is None else [AS_THEY_STAND]
         return "; ".join([*rests, *self.remarks]) or None
 
-    def clerk(self, path: Path, jobs: int | None, many: bool) -> Clerk:
+    def clerk(self, path: Path, jobs: int | None, many: bool, cluster: str | None = None) -> Clerk:
         """Somebody who writes certificates and has them checked; by several processes where leaves are `many`."""
         desk = Desk(jobs, many, self.remarks)
-        return Clerk(path, lambda: 0.0, self.timing, lambda: self.tell("check"), lambda _: None, desk.checked)
+        return Clerk(path, lambda: 0.0, self.timing, lambda: self.tell("check"), lambda _: None, desk.checked, cluster)
 
 
 def accepted(
@@ -120,6 +120,7 @@ def accepted(
     ------
     InputError : the checker takes none of this size.
     SoundnessError : the checker refuses what cannot be mended.
+    BackendError : the same, where a cluster had a part in it.
     """
     for _ in range(most):
         raw, answer = clerk.ask(certificate)
@@ -131,4 +132,9 @@ def accepted(
         certificate = other
     if answer.get("rule") == "limits":
         raise InputError(f"the checkers take no certificate of this size: {answer['detail']}. Try a smaller --effort.")
+    if clerk.cluster is not None:
+        raise BackendError(
+            f"the checker rejects what was proved with the workers of {clerk.cluster}, who may be at fault: {answer}. "
+            "Run without the cluster."
+        )
     raise SoundnessError(f"the checker rejects what the engine proved: {answer}.")

@@ -28,7 +28,7 @@ _CLAIM = "The claim"
 @takes(
     importing=import_options(_KIND),
     changes=changes_of_a_plant(*(name for name in declared(PlantChanges) if name != "data")),
-    typed=options_of_a_run("reach_from", "box", "resume", "effort", "time_limit", "jobs"),
+    typed=options_of_a_run("reach_from", "box", "resume", "effort", "time_limit", "jobs", "cluster"),
 )
 def reach(
     context: typer.Context,

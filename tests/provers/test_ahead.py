@@ -445,7 +445,7 @@ def certified(folder: Path, troupe: Troupe, monkeypatch: pytest.MonkeyPatch, **m
     class Told(PlayedRunner):
         remark = "told"
 
-    monkeypatch.setattr("certify.analysis.run._runner_for", lambda *_: nullcontext(Told(troupe)))
+    monkeypatch.setattr("certify.analysis.run.runner_at", lambda *_: nullcontext(Told(troupe)))
     resume = more.get("resume", False)
     options = RoaOptions(cluster=ADDRESS, **({} if resume else {"Q": (1.0, 1.0)}) | {"effort": 0.24} | more)
     return certify_roa(WIDE, pendulum_network(), folder, options)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from fractions import Fraction
 from pathlib import Path
 
@@ -15,17 +16,22 @@ from certify.analysis.reaching.runs import Run, is_refuted
 from certify.certificates import ReachCertificate, parse_any, run_checker
 from certify.certificates.located import Containment
 from certify.certificates.membership import proved_set
-from certify.errors import CertificateFormatError, InputError, OptionError
+from certify.errors import BackendError, CertificateFormatError, InputError, OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, Number, Symbol, symbols
 from certify.loop.plants import System, with_constraints
 from certify.loop.plants.system import Interval
 from certify.loop.policies import PolicyNetwork
+from certify.provers.execution import rows
+from certify.provers.ranks.search import COUNTS
+from tests.support.jobs import PlayedRunner, Troupe
 from tests.support.loops import box
 from tests.support.ranks import hanging, linear_plant
 
 HAIR = Fraction(1, 10**6)
 Box = tuple[Interval, ...]
+TARGET = ("x**2 + y**2 <= 1",)
+BEGIN = ((Fraction(3), Fraction(7, 2)), (Fraction(2), Fraction(21, 10)))
 
 
 def gain(n: int) -> PolicyNetwork:
@@ -81,8 +87,7 @@ def accepted_by_both(result: ReachResult) -> ReachCertificate:
 
 def test_a_box_of_a_linear_loop(tmp_path: Path) -> None:
     system, network = linear_plant()
-    begin = ((Fraction(3), Fraction(7, 2)), (Fraction(2), Fraction(21, 10)))
-    options = ReachOptions(target=("x**2 + y**2 <= 1",), begin=begin, effort=0.1)
+    begin, options = BEGIN, ReachOptions(target=TARGET, begin=BEGIN, effort=0.1)
     result = certify_reach(system, network, tmp_path, options)
     assert result.verdict == "PROVED" and result.runs is not None and result.runs.longest is not None
     assert result.steps is not None and result.runs.longest <= result.steps <= result.runs.longest + 4
@@ -93,6 +98,40 @@ def test_a_box_of_a_linear_loop(tmp_path: Path) -> None:
     assert proved.locate(at(30, 2)).answer is Containment.NOT_CONTAINED
     late = certify_reach(system, network, tmp_path, ReachOptions(target=options.target, begin=begin, within=1))
     assert late.verdict == "REFUTED" and "shown in Arb" in late.reason
+
+
+def of_a_cluster(out: Path, troupe: Troupe, monkeypatch: pytest.MonkeyPatch) -> ReachResult:
+    """A run for a linear loop whose cluster is the troupe."""
+    monkeypatch.setattr("certify.provers.execution.shared._WORTH", 0.0)
+    places = {"tcp://nowhere:1": nullcontext(PlayedRunner(troupe))}
+    monkeypatch.setattr("certify.analysis.reaching.run.runner_at", places.__getitem__)
+    return certify_reach(*linear_plant(), out, ReachOptions(target=TARGET, effort=0.1, cluster=next(iter(places))))
+
+
+def test_a_cluster_finds_the_same_certificate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    troupe, options = Troupe(seed=7), ReachOptions(target=TARGET, effort=0.1)
+    alone = certify_reach(*linear_plant(), tmp_path / "alone", options)
+    shared = of_a_cluster(tmp_path / "shared", troupe, monkeypatch)
+    assert alone.verdict == shared.verdict == "PROVED" and alone.raw == shared.raw and alone.raw is not None
+    assert alone.boxes == shared.boxes and troupe.answered > 3
+
+
+def test_a_cluster_that_lies_proves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each box is said to lie in the target: the checker refuses it, and the error names the cluster."""
+    vector, many = (2,), (len(COUNTS),)
+    images = [("lo", "f8", many + vector), ("hi", "f8", many + vector), ("there", "u1", many)]
+    row = np.dtype(
+        [*images, *((name, "u1") for name in ("inside", "meets", "loose")), ("taken", "f8"), ("steep", "f8", vector)]
+    )
+
+    def lie(job: bytes, answer: bytes) -> bytes:
+        told = np.frombuffer(rows.unsealed(job, answer), row).copy()
+        told["inside"] = 1
+        return rows.sealed(job, told.tobytes())
+
+    with pytest.raises(BackendError, match="workers of tcp://nowhere:1, who may be at fault"):
+        of_a_cluster(tmp_path, Troupe(play=lie), monkeypatch)
+    assert not (tmp_path / "certificate.json").exists()
 
 
 def test_all_that_is_reached_without_a_box(tmp_path: Path) -> None:

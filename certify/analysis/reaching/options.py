@@ -23,7 +23,7 @@ class ReachOptions:
     target : comparisons of the states' values by <= or >=, all of which hold in the region.
     begin : a box of states, in deviations, about which the verdict is; None for no box in particular.
     within : the most steps that it may take.
-    effort, time_limit, jobs : as of `certify roa`.
+    effort, time_limit, jobs, cluster : as of `certify roa`.
 
     Raises
     ------
@@ -36,6 +36,7 @@ class ReachOptions:
     effort: float = 1.0
     time_limit: float | None = None
     jobs: int | None = None
+    cluster: str | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.target) <= MOST_TARGETS:

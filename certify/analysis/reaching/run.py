@@ -44,7 +44,7 @@ from certify.loop.expressions import Expression
 from certify.loop.plants import System, kept_constraints
 from certify.loop.policies import PolicyNetwork
 from certify.provers.base import Progress
-from certify.provers.execution import ThreadRunner
+from certify.provers.execution import Runner, runner_at
 from certify.provers.ranks import (
     MOST_STEPS,
     Question,
@@ -91,6 +91,7 @@ def certify_reach(
     ------
     InputError : the closed loop or an option cannot be used, or `out` cannot be written or is another run's.
     SoundnessError : the checker rejects what was proved.
+    BackendError : the same with a cluster, or no scheduler answers.
     """
     from certify.provers.execution.threads import one_thread
 
@@ -162,11 +163,12 @@ def _proved(
     keep, root = tuple(kept_constraints(system).values()), root_box(loop)
     question = Question(loop, Region(target, system.states), keep, root)
     question = with_order(question, begins(options.begin or tuple(zip(*map(_exactly, root), strict=True)))[:_PROBES].T)
-    clerk = tools.clerk(path, options.jobs, True)
+    clerk = tools.clerk(path, options.jobs, True, options.cluster)
     _require_periodic(question, clerk)
-    with tools.timing("ranks"):
+    with tools.timing("ranks"), runner_at(options.cluster) as runner:
         soon = result.runs is not None and (result.runs.longest or MOST_STEPS) < MOST_STEPS
-        found = _searched(question, options, _DIRECT if soon else 0, effort.share(_FOR_SEARCH), tools)
+        direct = _DIRECT if soon else 0
+        found = _searched(question, options, direct, effort.share(_FOR_SEARCH), runner, tools)
     evidence = None if found is None else _within(found.evidence, options.within)
     if found is None or evidence is None:
         return replace(result, reason="no box of the domain is proved to lead into the region")
@@ -185,7 +187,9 @@ def _proved(
     return replace(result, verdict=Verdict.PROVED, reason="requested", steps=steps)
 
 
-def _searched(question: Question, options: ReachOptions, direct: int, effort: Effort, tools: Tools) -> RankProof | None:
+def _searched(
+    question: Question, options: ReachOptions, direct: int, effort: Effort, runner: Runner, tools: Tools
+) -> RankProof | None:
     """Leaves from which the region is reached: those that the box needs, or else all that the effort finds; `direct`
     boxes are looked at in the hope of one jump."""
 
@@ -197,7 +201,9 @@ def _searched(question: Question, options: ReachOptions, direct: int, effort: Ef
         lo, hi = (np.array([float(pair[k]) for pair in options.begin]) for k in (0, 1))
         most = UNPROVED - 1 if options.within is None else options.within
         wanted = Wanted(np.nextafter(lo, -np.inf), np.nextafter(hi, np.inf), most, direct)
-    return prove_ranks(question, effort, ThreadRunner(), report, wanted)
+    found = prove_ranks(question, effort, runner, report, wanted)
+    tools.remarks += [] if runner.remark is None else [runner.remark]
+    return found
 
 
 def _exactly(corner: Array) -> list[Fraction]:
