@@ -28,6 +28,7 @@ WIDER = Fraction(3, 2)
 """Factor of the side of the domain that is tried."""
 _WORTH = 1.1  # growth of the simulated region that is worth a word
 _NEAR = 1e-3  # of the largest level in the domain: a run that comes so low has converged
+_ENDED = ("effort", "boxes")  # limits of an outer set that more effort lifts
 _LOOK = 3 * UNIT  # operations for one look
 
 
@@ -117,14 +118,17 @@ def beyond_the_ellipsoid(result: RoaResult, options: RoaOptions, effort: Effort)
         return by_learning(result, options, other) if simulated.share < MOST else None
     if options.lyapunov_level is not None:
         return None
-    wider, said = _in_a_wider_domain(result, effort), _share_in_words(result)
+    said, outer = _share_in_words(result), result.outer
+    grows = not result.ranks.done if result.ranks is not None else outer is not None and outer.limit in _ENDED
+    more = Step((("--effort", f"{4 * options.effort:g}"),), f"{said}, and the set grows with the effort")
+    if grows and simulated.share < MOST:
+        return more
+    wider = _in_a_wider_domain(result, effort)
     if wider is not None:
         return wider
     if simulated.share >= NEARLY_ALL:
         return Step((), f"{said}, and hardly more converges in a wider domain: a larger set needs another policy")
-    if result.ranks is not None or (result.outer is not None and result.outer.limit in ("effort", "boxes")):
-        return Step((("--effort", f"{4 * options.effort:g}"),), f"{said}, and the set grows with the effort")
-    return None
+    return more if grows else None
 
 
 def by_learning(result: RoaResult, options: RoaOptions, candidate: str) -> Step | None:

@@ -24,12 +24,13 @@ from certify.certificates.claims import Asymptotic
 from certify.certificates.verdict import Stop
 from certify.effort import UNIT, Effort
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.plants import System
-from certify.loop.policies import load_policy
+from certify.loop.expressions import Number, symbols
+from certify.loop.plants import System, get_system
+from certify.loop.policies import PolicyNetwork, load_policy
 from certify.lyapunov import solve_lyapunov
 from certify.lyapunov.corners import Corners
 from certify.provers.base import Budget, Proof, Report
-from tests.support.loops import chain, scalar_tanh
+from tests.support.loops import box, chain, scalar_tanh
 
 SHIPPED = Path(__file__).parent.parent.parent / "examples" / "policies" / "pendulum.pt"
 
@@ -223,3 +224,50 @@ def test_the_candidate_of_a_large_margin_is_smaller_and_decays_at_every_corner(p
     for A in Corners(loop).rates:
         decay = -np.linalg.eigvals(np.linalg.solve(found.P, A.T @ found.P + found.P @ A)).real.max() / 2
         assert decay > 0.25 * slowest
+
+
+def crawling() -> tuple[System, PolicyNetwork]:
+    """x+ = x + x (x^2 - 1/25)(16/25 - x^2) / 2 + 1e-9: |x| falls below 1/5 and between 4/5 and 1, and rises between."""
+    (x,) = symbols("x")
+    (u,) = symbols("u")
+    squares = (x**2 - Number(Fraction(1, 25))) * (Number(Fraction(16, 25)) - x**2)
+    system = System(
+        name="crawling",
+        states=(x,),
+        inputs=(u,),
+        parameters={},
+        dynamics=(x + x * squares / 2 + u,),
+        u_eq=(Number(0),),
+        domain=box(1),
+        input_bounds=box(1),
+        time="discrete",
+    )
+    offset = np.array([1e-9])
+    return system, PolicyNetwork.of_layers((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), offset, "identity", "none")
+
+
+def test_a_band_that_ends_high_is_worth_what_lies_above_its_floor() -> None:
+    """Of a practical claim that is the length of what leaves a band, and not of the band's whole set."""
+    found = trial(ClosedLoop(*crawling()), np.eye(1), "given", RoaOptions(claim="practical"))
+    assert found.limited_by == "domain" and 0.35 < found.volume < 0.45  # 2 (1 - 4/5) and 2 / 5
+
+
+def test_a_practical_claim_goes_on_where_the_first_candidate_proves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The largest by its samples is one whose V rises almost everywhere; the next one is proved."""
+
+    def misleading(loop: ClosedLoop, options: RoaOptions, effort: Effort) -> Trial:
+        return replace(trial(loop, np.array([[1.0, -0.99], [-0.99, 1.0]]), "misleading", options, effort), volume=1e9)
+
+    monkeypatch.setattr(certify.analysis.stages.candidate, "optimised", misleading)
+    policy = load_policy(SHIPPED)
+    network = replace(policy.network, centre="none")
+    found = certify_roa(
+        get_system("pendulum").with_parameters(policy.parameters),
+        network,
+        tmp_path,
+        RoaOptions(claim="practical", candidate="ellipsoid", effort=0.1),
+    )
+    assert found.verdict == "PROVED" and found.candidate in ("lyapunov", "scaled", "lqr")
+    assert [row.proved_volume is None for row in found.tried] == [True, False]

@@ -60,7 +60,7 @@ class Trial:
     T : (n, n), the coordinates x = T z of its proof.
     limit : the domain's limit of V.
     limited_by : what its reach ends at.
-    volume : of the largest set within reach; sampled, not proved.
+    volume : of the largest set within reach, of a practical claim in few states less its floor's; sampled, not proved.
     notice : why it is not the candidate that was asked for.
     """
 
@@ -122,7 +122,8 @@ def trial(
     if kind == "practical":
         bands = survey(problem, T, level, effort=effort)
         reach = bands[0].above if bands else 0.0
-        return Trial(name, task, T, limit, "sampled" if reach < level else within, volume(P, reach), notice)
+        worth = max((volume(P, band.above) - volume(P, band.floor) for band in bands), default=0.0)
+        return Trial(name, task, T, limit, "sampled" if reach < level else within, worth, notice)
     witness = falsify(problem, T, level, _MANY_SAMPLES if _only_one(options) else _SAMPLES, 0, effort)
     below = level if witness is None or task.exactly else witness.level * (1 - _BELOW_WITNESS)
     task = Task(problem, kind, below, task.exactly, witness)

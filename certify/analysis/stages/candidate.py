@@ -267,7 +267,10 @@ class _Choice(_Trials):
                 trials = [*solved(loop, found, state.options, self._granted()), *trials]
         if state.interruptible:
             return self._among(trials, large)
-        race.enter(by_reach(trials)[:1])
+        for one in by_reach(trials):
+            race.enter([one])
+            if race.proved or self.effort.over:
+                break
         return self._improve() if loop.network.is_moved else None
 
     def _among(self, trials: list[Trial], large: Trial | None) -> None:

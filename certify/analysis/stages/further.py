@@ -23,6 +23,7 @@ from certify.provers.base import Budget, Progress
 
 Array = NDArray[np.float64]
 _FOR_SEARCH = 0.5  # share of the effort that is left, the rest being for the check
+_FOR_CELLS = 0.7  # the same for a search of boxes with ranks, of which only those with one are checked
 _FOR_RANKS = 0.35  # share of the whole effort, even if the search has left less
 _FOR_LEARNING = 0.4  # share of the effort that is left, the rest being for the proof and its check
 
@@ -188,7 +189,7 @@ class ByRanks:
             least, enough = _FOR_RANKS * tools.whole, 1.0 if self.enough is None else self.enough
             share = effort.part(max(least, effort.left - least), even_if_over=True)
             if self.enough is not None:
-                share = effort.share(_FOR_SEARCH)
+                share = effort.share(_FOR_CELLS)
             told = None if tools.progress is None else report
             target = Sublevel(problem.V, claim.roa)
             question = Question(problem.loop, target, claim.keep, root_box(problem.loop), evidence.order)
