@@ -16,9 +16,12 @@ import pytest
 
 from certify import PolicyNetwork, System, certify_roa, get_system
 from certify.analysis.acceptance import Clerk
+from certify.analysis.facts import SimulatedFacts, Step
+from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
 from certify.analysis.simulated import simulated_region
 from certify.analysis.stages import simulation
+from certify.analysis.suggested import beyond_the_ellipsoid
 from certify.certificates import Certificate
 from certify.certificates.verdict import Verdict
 from certify.effort import UNIT, Effort
@@ -248,3 +251,20 @@ def test_the_page_says_the_share_where_there_is_no_grid(by_default: RoaResult) -
     said = drawn_of(by_default.to_dict())
     assert said.startswith("about ") and "of what converges is proved" in said
     assert drawn_of(None) == drawn_of({"simulated": None}) == ""
+
+
+def test_more_effort_comes_before_a_wider_domain_where_little_is_proved(tmp_path: Path) -> None:
+    """As long as boxes with ranks still grow; where nothing is left for them to gain, a wider domain is looked at."""
+    result, options = proved(tmp_path, STEPS), RoaOptions(effort=0.4)
+    assert result.ranks is not None and result.simulated is not None
+
+    def step(done: bool, covered: int) -> Step | None:
+        assert result.ranks is not None
+        ranks, simulated = replace(result.ranks, done=done), SimulatedFacts(1000, 900, covered)
+        changed = replace(result, ranks=ranks, simulated=simulated)
+        return beyond_the_ellipsoid(changed, options, Effort(10 * UNIT))
+
+    first = step(False, 400)
+    assert first is not None and first.options == (("--effort", "1.6"),) and "grows with the effort" in first.why
+    for other in (step(True, 400), step(True, 850)):
+        assert other is None or "--effort" not in dict(other.options)
