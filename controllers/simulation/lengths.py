@@ -1,4 +1,4 @@
-"""How long runs are simulated, and when at their end they are measured."""
+"""Lengths of simulated runs, and of the window at their end in which they are measured."""
 
 from __future__ import annotations
 
