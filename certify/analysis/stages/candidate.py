@@ -269,7 +269,7 @@ class _Choice(_Trials):
             return self._among(trials, large)
         for one in by_reach(trials):
             race.enter([one])
-            if race.proved or self.effort.over:
+            if race.proved or self.effort.over or state.options.engine == "dreal":
                 break
         return self._improve() if loop.network.is_moved else None
 
