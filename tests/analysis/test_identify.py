@@ -434,12 +434,12 @@ def test_an_end_of_a_prior_that_no_measurement_moves_may_be_any_number(tmp_path:
 
 def test_measurements_that_narrow_nothing_end_with_what_to_do(tmp_path: Path) -> None:
     """With errors of 10 rad/s in the velocity nothing is known of its derivative: there are no ranges to be had."""
-    with pytest.raises(certify.InputError, match="narrow no prior, in .* parts of the priors: write the equations"):
+    with pytest.raises(certify.InputError, match=r"narrow no prior, in .* parts of the priors: write the equations"):
         identified(tmp_path, transitions()[:6], noise={"theta": "1e-3", "theta_dot": "10"})
 
 
 def test_inputs_in_another_unit_under_which_states_diverge_are_asked_about(tmp_path: Path) -> None:
-    """Of a car whose force is a thousand times too large the flow has no enclosure, and more measurements help little."""
+    """Of a car whose force is a thousand times too large the flow has no enclosure, and more rows help little."""
     car = """name = "car"
 states = ["v"]
 inputs = ["u"]
