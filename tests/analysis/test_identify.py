@@ -432,6 +432,37 @@ def test_an_end_of_a_prior_that_no_measurement_moves_may_be_any_number(tmp_path:
     assert low <= lo and hi <= high and high - low < Fraction("0.8000001")
 
 
+def test_measurements_that_narrow_nothing_end_with_what_to_do(tmp_path: Path) -> None:
+    """With errors of 10 rad/s in the velocity nothing is known of its derivative: there are no ranges to be had."""
+    with pytest.raises(certify.InputError, match=r"narrow no prior, in .* parts of the priors: write the equations"):
+        identified(tmp_path, transitions()[:6], noise={"theta": "1e-3", "theta_dot": "10"})
+
+
+def test_inputs_in_another_unit_under_which_states_diverge_are_asked_about(tmp_path: Path) -> None:
+    """Of a car whose force is a thousand times too large the flow has no enclosure, and more rows help little."""
+    car = """name = "car"
+states = ["v"]
+inputs = ["u"]
+[parameters]
+m = [800, 2000]
+c = [0.1, 1]
+[dynamics]
+v = "(u - c*v*abs(v))/m"
+[u_eq]
+u = 0
+[domain]
+v = [-35, 35]
+[input_bounds]
+u = [-4000, 4000]
+"""
+    rows = np.array([[20.0, u, 20.0 + u / 2400] for u in (-3000.0, -1000.0, 1500.0, 4000.0)])
+    rows[:, 1] *= 1000
+    (tmp_path / "car.toml").write_text(car)
+    data = write(tmp_path / "data.csv", rows, "v,u,v_next")
+    with pytest.raises(certify.InputError, match="look at the units of the measurements and at the period"):
+        certify.identify(data, tmp_path / "car.toml", noise="0.02", sample_time="0.5")
+
+
 def test_a_part_of_which_nothing_is_left_is_stated_beyond_its_ends(tmp_path: Path) -> None:
     """A certificate has binary64 numbers, and the ends of priors need not be such."""
     file = tmp_path / "plant.toml"

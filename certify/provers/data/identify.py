@@ -191,19 +191,17 @@ def _fitting(data: _Data, narrow: Box) -> Flows:
             errors = np.abs(rows.slopes[:, : system.n]).sum(1) + flows.noise[:, None]
             found.append((float(np.nanmedian((rows.slack + errors).sum(0))), flows))
     if not found:
-        raise InputError("the flow over most transitions has no enclosure, even for narrow priors: measure more often.")
+        raise InputError(
+            "the flow over most transitions has no enclosure, even for narrow priors: look at the units of the "
+            "measurements and at the period, or measure more often."
+        )
     least = min(slack for slack, _ in found)
     return next(flows for slack, flows in found if slack <= _WORSE * least)
 
 
 def _parts(data: _Data, flows: Flows, narrow: Box) -> tuple[bytes, list[_Box]]:
     """A partition of the priors into boxes that are narrow enough, or that their rounds make narrow enough, for rows
-    in which the box's width counts little beside the noise; as far as there may be so many.
-
-    Raises
-    ------
-    InputError : most transitions have no enclosure in any of them.
-    """
+    in which the box's width counts little beside the noise; as far as there may be so many."""
     tree, found, waiting, probes = bytearray(), list[_Box](), [dict(data.measurements.priors)], data.spread(_PROBES)
     middle = flows.rows(narrow, probes)
     base = middle.slack + np.abs(middle.slopes[:, : data.system.n]).sum(1) + flows.noise[:, None]
@@ -221,8 +219,6 @@ def _parts(data: _Data, flows: Flows, narrow: Box) -> tuple[bytes, list[_Box]]:
         axis = min(range(len(halves)), key=lambda k: (counts[k], -_relative(list(box.values())[k])))
         tree.append(axis)
         waiting += reversed(halves[axis])
-    if not any(part.rounds for part in found):
-        raise InputError("the measurements narrow no prior: narrow the priors, or measure more often.")
     return bytes(tree), found
 
 
@@ -255,6 +251,11 @@ def identify(system: System, measurements: Measurements) -> Identified:
         whole.jointly(data.windows())
     if whole.empty:
         raise Contradiction(tuple(sorted(data.against)))
+    if all(_width(pair) >= _width(measurements.priors[name]) for name, pair in whole.box.items()):
+        raise InputError(
+            f"the measurements narrow no prior, in {len(parts)} parts of the priors: write the equations linear in the "
+            "parameters, a quotient of two as one, narrow the priors, or measure more often."
+        )
     return _found(data, flows, tree, parts, whole)
 
 
@@ -284,8 +285,6 @@ def _found(data: _Data, flows: Flows, tree: bytes, parts: list[_Box], whole: _Bo
     for part in (*parts, whole):
         for chosen, weights, _ in part.rounds:
             used[chosen[np.any(weights != 0, axis=(0, 1, 2))]] = True
-    if not np.any(used):
-        raise InputError("the measurements narrow no prior.")
 
     def stored(part: _Box) -> tuple[Round, ...]:
         return tuple(Round(_corners(box), _stored(chosen, weights, used)) for chosen, weights, box in part.rounds)
