@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice
 
 from flint import arb_mat
 
-from .affine import batch
 from .balls import bounded_by_form, within_bounds
+from .batches import in_batches
 from .document import Certificate
 from .evidence import Covering
 from .function import Models
@@ -25,12 +24,11 @@ from .refusal import Refused, require
 from .taylor import Taylor, is_negative, kinks
 
 
-def invariant(c: Certificate, covering: Covering) -> int:
+def invariant(c: Certificate, covering: Covering, jobs: int) -> int:
     """Faces, T and the root, the whole tree, then its leaves; the number of these."""
     staying, bounded = Staying(c, covered(c, covering), covering), bounded_by_form(c)
-    size = batch(c.policy.network, c.n)
-    asked = (box for box in boxes(covering) if not staying.is_free(box))
-    while some := list(islice(asked, size)):
+
+    def check(some: list[Box]) -> None:
         enclosed = staying.enclose(some)
         for part in enclosed:
             good = bounded or within_bounds(c, part.ranges())
@@ -40,6 +38,8 @@ def invariant(c: Certificate, covering: Covering) -> int:
                 kept(staying.motion, part, None, staying.slack(part))
         for part in enclosed:
             require(staying.holds(part), RULE, part.place, "N is not certain to fall where it is at its level")
+
+    in_batches(c, c.n, (box for box in boxes(covering) if not staying.is_free(box)), check, jobs)
     return covering.tree.count(255)
 
 

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 
 from flint import arb, arb_mat, fmpq_mat
 
-from .affine import batch
 from .balls import ZERO, bounded_by_form, total, within_bounds
+from .batches import in_batches
 from .document import Certificate
 from .evidence import Covering, Tree
 from .keep import kept
@@ -214,17 +213,17 @@ class Leaves(Motion):
         return bool(self.diagonal_part(box.least()) - self.cross_part(box) >= self.inner)
 
 
-def check_leaves(leaves: Leaves, evidence: Tree) -> None:
+def check_leaves(leaves: Leaves, evidence: Tree, jobs: int) -> None:
     """Rules `inputs`, `flow`, `keep` and `ring`; in each batch of leaves they are taken in this order.
 
     An inside leaf has been covered by rule `local` where there is a ball. Without one nothing has: there the inputs are
     asked, and in continuous time that F has a finite model, but where time has steps that V stays below c0.
     """
     c, bounded = leaves.c, bounded_by_form(leaves.c)
-    size = batch(c.policy.network, c.n)
     covered = not leaves.alone
     asked = (box for box in boxes(evidence) if not (leaves.is_outside(box) or (covered and leaves.is_inside(box))))
-    while some := list(islice(asked, size)):
+
+    def check(some: list[Box]) -> None:
         enclosed = leaves.enclose(some)
         for leaf in enclosed:
             good = bounded or within_bounds(c, leaf.ranges())
@@ -239,3 +238,5 @@ def check_leaves(leaves: Leaves, evidence: Tree) -> None:
                 continue
             falls = leaves.decreases(leaf, within)
             require(falls, "ring", f"leaf {leaf.box.number}", "no bound of what V changes by is certainly negative")
+
+    in_batches(c, c.n, asked, check, jobs)

@@ -10,12 +10,11 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from fractions import Fraction
-from itertools import islice
 
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
-from .affine import batch
 from .balls import ZERO, bounded_by_form, total, within_bounds
+from .batches import in_batches
 from .document import Certificate
 from .evidence import Covering, Tree
 from .fields import exact
@@ -28,12 +27,12 @@ from .taylor import Taylor, is_negative
 RULE, FACES = "outer", "faces"
 
 
-def outer(c: Certificate, evidence: Tree) -> None:
+def outer(c: Certificate, evidence: Tree, jobs: int) -> None:
     """Faces in their order, then T and the root, then the whole tree, then its leaves."""
     covering = evidence.covering
     if covering is None:
         raise Refused("format", "evidence.outer", "the claim needs a tree over the domain")
-    check_leaves(c, covered(c, covering), covering)
+    check_leaves(c, covered(c, covering), covering, jobs)
 
 
 def covered(c: Certificate, covering: Covering) -> Models:
@@ -171,12 +170,11 @@ class Region(OverDomain):
         return [self.beyond(leaf), Taylor(self.models.level) + -N]
 
 
-def check_leaves(c: Certificate, models: Models, covering: Covering) -> None:
+def check_leaves(c: Certificate, models: Models, covering: Covering, jobs: int) -> None:
     """In each batch of leaves on which something is asked rule `inputs` comes first."""
     region, bounded = Region(c, models, covering), bounded_by_form(c)
-    size = batch(c.policy.network, c.n)
-    asked = (box for box in boxes(covering) if not region.is_free(box))
-    while some := list(islice(asked, size)):
+
+    def check(some: list[Box]) -> None:
         enclosed = region.leaves.enclose(some)
         for leaf in enclosed:
             good = bounded or within_bounds(c, leaf.ranges())
@@ -190,6 +188,8 @@ def check_leaves(c: Certificate, models: Models, covering: Covering) -> None:
             except Refused as no:
                 raise Refused(RULE, place(leaf), no.detail) from None
             require(falls, RULE, place(leaf), "no bound of what N changes by is certainly negative")
+
+    in_batches(c, c.n, (box for box in boxes(covering) if not region.is_free(box)), check, jobs)
 
 
 def place(leaf: Leaf) -> str:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import islice, product
+from itertools import product
 
 from flint import arb, arb_mat
 
-from .affine import Form, batch
+from .affine import Form
 from .balls import ZERO, bounded_by_form, total, within_bounds
+from .batches import in_batches
 from .document import Certificate, Ranks
 from .evidence import Ranked, Ranking, Tree
 from .keep import kept
@@ -28,7 +29,7 @@ Rows = list[list[arb]]  # for each state the constant, the coefficients of the l
 Range = tuple[float, float]
 
 
-def ranks(c: Certificate, evidence: Tree | Ranked) -> int:
+def ranks(c: Certificate, evidence: Tree | Ranked, jobs: int) -> int:
     """The tree with its ranks and steps first, then its leaves; their number."""
     ranking = evidence.ranking
     if c.ranks is None or ranking is None:
@@ -37,13 +38,15 @@ def ranks(c: Certificate, evidence: Tree | Ranked) -> int:
     walk = Walk(c, evidence.order)
     target = Target(c, c.ranks)
     asked = (box for box in cut(cover.lo, cover.hi, ranking.tree) if cover.ranks[box.number] != UNRANKED)
-    size = batch(c.policy.network, walk.d)
-    while some := list(islice(asked, size)):
+
+    def check(some: list[Box]) -> None:
         try:
             follow(some, cover, walk, target)
         except Refused:  # maybe of a leaf that is not the first
             for box in some:
                 follow([box], cover, walk, target)
+
+    in_batches(c, walk.d, asked, check, jobs)
     return len(cover.ranks)
 
 
