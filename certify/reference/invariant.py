@@ -20,7 +20,7 @@ from .keep import kept
 from .leaves import Box, boxes
 from .motion import Motion, Stage
 from .outer import RULE, OverDomain, covered
-from .refusal import Refused, require
+from .refusal import Refused, require, under
 from .taylor import Taylor, is_negative, kinks
 
 
@@ -86,12 +86,10 @@ class Staying(OverDomain):
         """True if F and N have finite models, and N is certainly below n2, or N'F or N'F + k (n2 - N) certainly
         negative: where N is n2, k may have any sign."""
         F = self.motion.F(part)
-        try:
+        with under(RULE, part.place):
             if self.models.is_below(part.own):
                 return True
             N, rate = self.models.moving([self.motion.affine(row) for row in part.x], F)
-        except Refused as no:
-            raise Refused(RULE, part.place, no.detail) from None
         slack = Taylor(self.models.level) + -N
         if not (N.is_finite() and rate.is_finite()):
             return False

@@ -18,7 +18,7 @@ from .expressions import Call
 from .flow import Moving, mean_on, reached_from
 from .function import net_at_0
 from .networks import Map
-from .refusal import Refused, require
+from .refusal import require, under
 from .taylor import Taylor, constant
 
 
@@ -103,10 +103,8 @@ class Motion:
         """Models of f(x, pi(x), q), all of them finite."""
         known = self.numbers(at)
         names = {**known.states, **known.inputs, **known.uncertain}
-        try:
+        with under(self.rule, at.place):
             result = self.c.plant.dynamics.evaluate(names, constant, self.called)
-        except Refused as no:
-            raise Refused(self.rule, at.place, no.detail) from None
         require(all(f.is_finite() for f in result), self.rule, at.place, "F has no finite model")
         return result
 

@@ -21,7 +21,7 @@ from .fields import exact
 from .function import Models
 from .keep import kept
 from .leaves import Box, Leaf, Leaves, boxes, cut, structure
-from .refusal import Refused, require
+from .refusal import Refused, require, under
 from .taylor import Taylor, is_negative
 
 RULE, FACES = "outer", "faces"
@@ -69,10 +69,8 @@ def face(c: Certificate, models: Models, k: int, tree: bytes) -> None:
         ]
         x[axis] = fixed
         place = f"{at} leaf {box.number}"
-        try:
+        with under(FACES, place):
             above = models.is_above(x)
-        except Refused as no:
-            raise Refused(FACES, place, no.detail) from None
         require(above, FACES, place, "N is not certain to be above its level")
 
 
@@ -183,10 +181,8 @@ def check_leaves(c: Certificate, models: Models, covering: Covering, jobs: int) 
             for leaf in enclosed:
                 kept(region.leaves, replace(leaf, place=place(leaf)), None, region.slacks(leaf))
         for leaf in enclosed:
-            try:
+            with under(RULE, place(leaf)):
                 falls = region.falls(leaf)
-            except Refused as no:
-                raise Refused(RULE, place(leaf), no.detail) from None
             require(falls, RULE, place(leaf), "no bound of what N changes by is certainly negative")
 
     in_batches(c, c.n, (box for box in boxes(covering) if not region.is_free(box)), check, jobs)

@@ -20,7 +20,7 @@ from .evidence import Ranked, Ranking, Tree
 from .keep import kept
 from .leaves import LEAF, Box, cut, structure
 from .motion import Motion, Stage
-from .refusal import Refused, require
+from .refusal import Refused, require, under
 from .taylor import Taylor, constant
 
 RULE, UNRANKED = "ranks", 65_535
@@ -217,10 +217,8 @@ class Target:
         if self.c.target is None:
             return [self.V_beyond(rows, at)]
         names = {name: Taylor(x, arb_mat([g])) for name, (x, *g) in zip(self.c.plant.states, rows, strict=True)}
-        try:
+        with under(RULE, at):
             values: list[Taylor] = self.c.target.evaluate(names, constant)
-        except Refused as no:
-            raise Refused(RULE, at, no.detail) from None
         require(all(v.is_finite() for v in values), RULE, at, "an expression of the target has no finite model")
         return values
 

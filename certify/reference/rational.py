@@ -16,7 +16,7 @@ from .evidence import Tree
 from .expressions import MAX_BITS, Call
 from .fields import exact
 from .networks import Affine, Clip, Concat, Map, Observe, Product, Sum, paired
-from .refusal import Refused, require
+from .refusal import require, under
 from .table import FUNCTIONS
 
 MAX_MATRIX_BITS = 2**16  # of a numerator over a common denominator, times rows: beyond it a decision takes minutes
@@ -211,10 +211,8 @@ def centring(c: Certificate) -> None:
             inside = bool(limits[0] < q) and bool(q < limits[1])
             require(inside, "centring", c.plant.inputs[j], "u_eq does not lie strictly inside the clip")
     if policy.centre == "none" and c.ends_at_origin:
-        try:
+        with under("centring", "policy"):
             values = [clipped_at_0(c, j, y) for j, y in enumerate(squashed_at_0(c))]
-        except Refused as no:
-            raise Refused("centring", "policy", no.detail) from None
         for name, value, q in zip(c.plant.inputs, values, c.plant.u_eq, strict=True):
             holds = value.value is not None and bool(value.value == q)
             require(holds, "centring", name, "raw(0) = u_eq does not hold by its form")
