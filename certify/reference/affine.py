@@ -12,7 +12,7 @@ from functools import cached_property
 
 from flint import arb, arb_mat
 
-from .balls import ONE, ZERO, norm, total
+from .balls import ONE, ZERO, lesser, norm, total
 from .expressions import Call
 from .lines import Line, clipped
 from .networks import Affine, Clip, Concat, Map, Observe, Product, Sum, paired
@@ -347,11 +347,6 @@ def scaled(ways: Rows, slopes: Rows) -> Rows:
 
 def by_leaf(rows: Rows) -> Rows:
     return [list(column) for column in zip(*rows, strict=True)]
-
-
-def lesser(a: arb, b: arb) -> arb:
-    """One of two bounds, the lesser if that is certain."""
-    return a if a < b else b
 
 
 def max_of(values: Sequence[arb]) -> arb:

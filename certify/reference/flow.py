@@ -20,7 +20,7 @@ from typing import Any
 from flint import arb
 
 from . import lipschitz
-from .balls import SPREAD, ZERO
+from .balls import SPREAD, ZERO, lesser
 from .document import Certificate, Interval
 from .evidence import Ball, Contraction
 from .expressions import Called, Equations
@@ -212,7 +212,7 @@ def reached_from(c: Certificate, leaf: Moving, order: int, at: str) -> dict[str,
     except Refused:
         if order == 1:
             raise
-        bent = [tuple(map(lesser, *each)) for each in zip(moves, turning(c, leaf, within, at), strict=True)]
+        bent = [tuple(map(lesser, *each)) for each in zip(turning(c, leaf, within, at), moves, strict=True)]
         in_domain(c, states, bent, at, leaf.free)
     return within
 
@@ -234,11 +234,6 @@ def highest(first: Taylor, second: Taylor, h: arb) -> arb:
     if a > 0 and b < 0 and not a >= -2 * h * b:
         return a * a / (-4 * b)  # at t = -a / 2b, or farther on
     return (h * (a + h * b)).max(ZERO)
-
-
-def lesser(a: arb, b: arb) -> arb:
-    """One of two bounds of a number, the second if that is certainly the lesser."""
-    return b if b < a else a
 
 
 def moved_within(c: Certificate, leaf: Moving, hi: arb, at: str) -> tuple[dict[str, Taylor], list[arb]]:

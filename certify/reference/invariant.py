@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 from flint import arb_mat
 
-from .balls import bounded_by_form, within_bounds
 from .batches import in_batches
 from .document import Certificate
 from .evidence import Covering
@@ -26,13 +25,12 @@ from .taylor import Taylor, is_negative, kinks
 
 def invariant(c: Certificate, covering: Covering, jobs: int) -> int:
     """Faces, T and the root, the whole tree, then its leaves; the number of these."""
-    staying, bounded = Staying(c, covered(c, covering), covering), bounded_by_form(c)
+    staying = Staying(c, covered(c, covering), covering)
 
     def check(some: list[Box]) -> None:
         enclosed = staying.enclose(some)
         for part in enclosed:
-            good = bounded or within_bounds(c, part.ranges())
-            require(good, "inputs", part.place, "an input is not certain to stay in its bounds")
+            staying.motion.keep_bounds(part)
         if c.keep is not None:
             for part in enclosed:
                 kept(staying.motion, part, None, staying.slack(part))

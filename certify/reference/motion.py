@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from flint import arb, arb_mat
 
 from .affine import Form, OnBoxes, called, clip
-from .balls import ZERO, beta, total
+from .balls import ZERO, beta, bounded_by_form, total, within_bounds
 from .document import Certificate
 from .expressions import Call
 from .flow import Moving, mean_on, reached_from
@@ -48,7 +48,7 @@ class Motion:
     def __init__(
         self, c: Certificate, d: int, order: int, bounds: Sequence[arb] | None = None, free: Collection[str] = ()
     ) -> None:
-        self.c, self.n, self.d = c, c.n, d
+        self.c, self.n, self.d, self.bounded = c, c.n, d, bounded_by_form(c)
         self.quantities = d + c.m
         self.calls = self.quantities + c.k
         self.symbols = self.calls + c.plant.dynamics.entries + c.varies
@@ -56,6 +56,11 @@ class Motion:
         self.shifts, self.offset = centred(c)
 
     # --------------------------------------------------------------------------------------------------- the policy
+
+    def keep_bounds(self, at: Stage) -> None:
+        """Rule `inputs`."""
+        good = self.bounded or within_bounds(self.c, at.ranges())
+        require(good, "inputs", at.place, "an input is not certain to stay in its bounds")
 
     def policy(self, x: arb_mat, count: int) -> list[list[Form]]:
         """For each input and each leaf, given x on the leaves; the network reads x from its origin."""

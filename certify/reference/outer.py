@@ -8,12 +8,11 @@ of the one set than into the other.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from fractions import Fraction
 
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
-from .balls import ZERO, bounded_by_form, total, within_bounds
+from .balls import ZERO, total
 from .batches import in_batches
 from .document import Certificate
 from .evidence import Covering, Tree
@@ -170,23 +169,18 @@ class Region(OverDomain):
 
 def check_leaves(c: Certificate, models: Models, covering: Covering, jobs: int) -> None:
     """In each batch of leaves on which something is asked rule `inputs` comes first."""
-    region, bounded = Region(c, models, covering), bounded_by_form(c)
+    region = Region(c, models, covering)
 
     def check(some: list[Box]) -> None:
-        enclosed = region.leaves.enclose(some)
+        enclosed = region.leaves.enclose(some, "outer leaf")
         for leaf in enclosed:
-            good = bounded or within_bounds(c, leaf.ranges())
-            require(good, "inputs", place(leaf), "an input is not certain to stay in its bounds")
+            region.leaves.keep_bounds(leaf)
         if c.keep is not None:
             for leaf in enclosed:
-                kept(region.leaves, replace(leaf, place=place(leaf)), None, region.slacks(leaf))
+                kept(region.leaves, leaf, None, region.slacks(leaf))
         for leaf in enclosed:
-            with under(RULE, place(leaf)):
+            with under(RULE, leaf.place):
                 falls = region.falls(leaf)
-            require(falls, RULE, place(leaf), "no bound of what N changes by is certainly negative")
+            require(falls, RULE, leaf.place, "no bound of what N changes by is certainly negative")
 
     in_batches(c, c.n, (box for box in boxes(covering) if not region.is_free(box)), check, jobs)
-
-
-def place(leaf: Leaf) -> str:
-    return f"outer leaf {leaf.box.number}"

@@ -13,7 +13,7 @@ from itertools import product
 from flint import arb, arb_mat
 
 from .affine import Form
-from .balls import ZERO, bounded_by_form, total, within_bounds
+from .balls import ZERO, total
 from .batches import in_batches
 from .document import Certificate, Ranks
 from .evidence import Ranked, Ranking, Tree
@@ -150,7 +150,7 @@ class Walk(Motion):
     def __init__(self, c: Certificate, order: int) -> None:
         angles = c.ranks.angles if c.ranks is not None else ()
         super().__init__(c, 2 * c.n, order, None, angles)
-        self.bounded, self.domain = bounded_by_form(c), [(arb(lo), arb(hi)) for lo, hi in c.plant.domain]
+        self.domain = [(arb(lo), arb(hi)) for lo, hi in c.plant.domain]
 
     def start(self, box: Box) -> Rows:
         """x = centre + radius d."""
@@ -170,8 +170,7 @@ class Walk(Motion):
         """The states after one step more, in which these are the inputs, or a refusal."""
         c = self.c
         here = Stage(at, rows, u)
-        good = self.bounded or within_bounds(c, here.ranges())
-        require(good, "inputs", at, "an input is not certain to stay in its bounds")
+        self.keep_bounds(here)
         within = None if c.sample is None else self.reached(here)
         if c.keep is not None:
             kept(self, here, within, [])
