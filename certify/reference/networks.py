@@ -141,7 +141,7 @@ class Algebra(Protocol):
 
 
 class OnLists:
-    """What is the same wherever a vector is a list of numbers with `+`, `*` and `function(name)`."""
+    """Steps that are the same wherever a vector is a list of numbers with `+`, `*` and `function(name)`."""
 
     def map(self, step: Map, v: list[Any]) -> list[Any]:
         return [x.function(step.function) for x in v]

@@ -21,7 +21,7 @@ def require(condition: bool, rule: str, at: str, detail: str) -> None:
 
 @contextmanager
 def under(rule: str, at: str) -> Iterator[None]:
-    """What is refused here is refused by this rule, at this place."""
+    """Take the refusals of others over: they become those of this rule, at this place."""
     try:
         yield
     except Refused as no:
