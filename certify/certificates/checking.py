@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any, Literal
 
-from certify.errors import BackendError, InputError
+from certify.errors import BackendError
 
 Program = Literal["checker", "reference"]
 _STATUS = {"ACCEPTED": 0, "REJECTED": 1, "TRUSTED": 3}
@@ -45,17 +45,14 @@ def ask(
     ----------
     path : the certificate.
     program : the checker or the reference.
-    jobs : number of processes that examine the leaves; the reference has only one.
+    jobs : number of processes that examine the leaves.
     patient : True to accept a file that needs hours, which its rule `limits` refuses otherwise.
     operations : the most that rule `limits` of the reference allows; None for its own limit.
 
     Raises
     ------
-    InputError : the reference is asked for more than one process.
     BackendError : it printed no JSON object, or its status is not the answer's.
     """
-    if program == "reference" and jobs != 1:
-        raise InputError("the reference must be asked for one process; leave out `jobs`.")
     options = [] if jobs == 1 else ["--jobs", str(jobs)]
     options += ["--patient"] if patient else []
     options += [] if operations is None else ["--operations", str(operations)]

@@ -1,4 +1,4 @@
-"""The command line: `python -I -m certify.reference FILE [--json] [--patient] [--operations N]`.
+"""The command line: `python -I -m certify.reference FILE [--json] [--jobs N] [--patient] [--operations N]`.
 
 The claim in words and the verdict. Exit status 0 accepted, 1 rejected, 2 usage or an unreadable file, 3 trusted,
 70 an error of this program.
@@ -23,7 +23,7 @@ from .limits import MAX_IN_PATIENCE
 from .rules import Verdict, judge
 
 STATUS = {"ACCEPTED": 0, "REJECTED": 1, "TRUSTED": 3}
-UNUSABLE, INTERNAL = 2, 70
+UNUSABLE, INTERNAL, MAX_JOBS = 2, 70, 256
 
 
 def read_once(path: str) -> bytes:
@@ -301,9 +301,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.json = "--json" in given
     parser.add_argument("file", metavar="FILE")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="examine the leaves in N processes")
     parser.add_argument("--patient", action="store_true", help="take files that may keep this program for hours")
     parser.add_argument("--operations", type=int, metavar="N", help="reject files that ask for more")
     options = parser.parse_args(given)
+    if not 1 <= options.jobs <= MAX_JOBS:
+        parser.error(f"argument --jobs: 1 to {MAX_JOBS} processes are allowed")
 
     def failed(message: str, status: int) -> int:
         if options.json:
@@ -318,7 +321,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (OSError, ValueError) as error:
         return failed(f"{options.file} cannot be read: {getattr(error, 'strerror', None) or error}", UNUSABLE)
     try:
-        verdict = judge(raw, MAX_IN_PATIENCE if options.patient else options.operations)
+        verdict = judge(raw, MAX_IN_PATIENCE if options.patient else options.operations, options.jobs)
     except Exception as error:  # whatever it is, it must not look like a verdict
         return failed(f"internal error of the reference: {type(error).__name__}: {error}", INTERNAL)
     seconds = time.perf_counter() - start

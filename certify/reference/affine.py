@@ -12,23 +12,16 @@ from functools import cached_property
 
 from flint import arb, arb_mat
 
-from .balls import ONE, ZERO, norm, total
+from .balls import ONE, ZERO, lesser, norm, total
 from .expressions import Call
 from .lines import Line, clipped
-from .networks import Affine, Clip, Concat, Map, Network, Observe, Product, Sum, paired
+from .networks import Affine, Clip, Concat, Map, Observe, Product, Sum, paired
 from .refusal import Refused
 from .table import FUNCTIONS
 from .taylor import Taylor, constant
 
 Form = tuple[arb, list[arb], arb]  # mid + slopes.d within an error
 Rows = list[list[arb]]  # for each entry of a vector a number for each leaf
-COLUMNS, WIDE = 48, 64  # of a product; networks from this width on take more of them at once without loss
-
-
-def batch(network: Network, symbols: int) -> int:
-    """The number of leaves that should meet the weights together."""
-    narrow = max(network.sizes) < WIDE
-    return max(1, (COLUMNS if narrow else 8 * COLUMNS) // (symbols + 1))
 
 
 class Forms:
@@ -354,11 +347,6 @@ def scaled(ways: Rows, slopes: Rows) -> Rows:
 
 def by_leaf(rows: Rows) -> Rows:
     return [list(column) for column in zip(*rows, strict=True)]
-
-
-def lesser(a: arb, b: arb) -> arb:
-    """One of two bounds, the lesser if that is certain."""
-    return a if a < b else b
 
 
 def max_of(values: Sequence[arb]) -> arb:

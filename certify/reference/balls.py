@@ -24,6 +24,11 @@ ZERO, ONE = arb(0), arb(1)
 SPREAD = arb(0, 1)  # every number from -1 to 1
 
 
+def lesser(a: arb, b: arb) -> arb:
+    """One of two bounds, the first if it is certainly the lesser."""
+    return a if a < b else b
+
+
 def total(terms: Iterable[arb]) -> arb:
     return sum(terms, ZERO)
 

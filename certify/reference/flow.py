@@ -20,7 +20,7 @@ from typing import Any
 from flint import arb
 
 from . import lipschitz
-from .balls import SPREAD, ZERO
+from .balls import SPREAD, ZERO, lesser
 from .document import Certificate, Interval
 from .evidence import Ball, Contraction
 from .expressions import Called, Equations
@@ -28,7 +28,7 @@ from .fields import exact
 from .loop import Field, Known, Loop
 from .model import Model
 from .rational import inverse_diagonal
-from .refusal import Refused, require
+from .refusal import Refused, require, under
 from .series import Constant, added, coefficients
 from .taylor import Taylor, constant
 
@@ -116,10 +116,8 @@ def steps_on(
     def times_h(v: Model) -> Model:
         return period * v if c.varies else v.scaled(hi)
 
-    try:
+    with under(rule, at):
         tail = later(c.plant.dynamics, states, within, held, known.constant, ball.order, settled(c), times_h)
-    except Refused as no:
-        raise Refused(rule, at, no.detail) from None
     return Steps(loop, known, ball.order, within, tail)
 
 
@@ -214,7 +212,7 @@ def reached_from(c: Certificate, leaf: Moving, order: int, at: str) -> dict[str,
     except Refused:
         if order == 1:
             raise
-        bent = [tuple(map(lesser, *each)) for each in zip(moves, turning(c, leaf, within, at), strict=True)]
+        bent = [tuple(map(lesser, *each)) for each in zip(turning(c, leaf, within, at), moves, strict=True)]
         in_domain(c, states, bent, at, leaf.free)
     return within
 
@@ -223,11 +221,9 @@ def turning(c: Certificate, leaf: Moving, within: Mapping[str, Taylor], at: str)
     """By how much the states fall and rise at most within a period as t x_1 + t^2 x_2, x_1 where they start and x_2
     anywhere `within`: f(x, q) and, at every place of it, the next coefficient with other q."""
     held, h = {**leaf.inputs, **leaf.anything}, arb(c.step)
-    try:
+    with under("flow", at):
         first = c.plant.dynamics.evaluate({**leaf.states, **held}, constant, leaf.called)
         _, second = coefficients(c.plant.dynamics, within, held, constant, 2, lambda v: v)
-    except Refused as no:
-        raise Refused("flow", at, no.detail) from None
     each = [(v, Taylor(ZERO) if w is None else w) for v, w in zip(first, second, strict=True)]
     return [(highest(-v, -w, h), highest(v, w, h)) for v, w in each]
 
@@ -240,20 +236,13 @@ def highest(first: Taylor, second: Taylor, h: arb) -> arb:
     return (h * (a + h * b)).max(ZERO)
 
 
-def lesser(a: arb, b: arb) -> arb:
-    """One of two bounds of a number, the second if that is certainly the lesser."""
-    return b if b < a else a
-
-
 def moved_within(c: Certificate, leaf: Moving, hi: arb, at: str) -> tuple[dict[str, Taylor], list[arb]]:
     """The states until hi, each within kappa of where it was, and enclosures of f at these, or a refusal."""
     names, far = c.plant.states, [ZERO] * c.n
     for _ in range(ATTEMPTS):
         moved = dict(zip(names, map(widened, leaf.states.values(), far), strict=True))
-        try:
+        with under("flow", at):
             F = c.plant.dynamics.evaluate({**moved, **leaf.inputs, **leaf.anything}, constant, leaf.called)
-        except Refused as no:
-            raise Refused("flow", at, no.detail) from None
         require(all(f.is_finite() for f in F), "flow", at, "F has no finite model within a period")
         ranges = [arb((-(-f).bound()).lower()).union(arb(f.bound().upper())) for f in F]
         most = [arb((hi * abs(v)).upper()) for v in ranges]
@@ -282,12 +271,10 @@ def mean_on(
     def times_h(v: Taylor) -> Taylor:
         return v.scaled(period.c) if period.g is None else period * v
 
-    try:
+    with under("flow", at):
         x_1 = c.plant.dynamics.evaluate({**start, **leaf.inputs, **leaf.uncertain}, constant, leaf.called)
         held = {**leaf.inputs, **leaf.anything}
         tail = later(c.plant.dynamics, leaf.states, within, held, constant, order, lambda v: v, times_h)
-    except Refused as no:
-        raise Refused("flow", at, no.detail) from None
     x_1 = [f.averaged(leaf.varying) for f in x_1]
     G = [f if t is None else f + t for f, t in zip(x_1, tail, strict=True)]
     require(all(g.is_finite() for g in G), "flow", at, "the series of F has no finite model")

@@ -17,7 +17,7 @@ from . import affine
 from .balls import SPREAD, ZERO
 from .document import Certificate, Function
 from .expressions import Call
-from .networks import Affine, Clip, Concat, Map, Network, Observe, Product, Sum, paired
+from .networks import Affine, Clip, Map, Network, Observe, OnLists, Product
 from .refusal import Refused
 from .series import Coefficient, Term, along
 from .taylor import Taylor, constant
@@ -25,7 +25,7 @@ from .taylor import Taylor, constant
 Vector = list[Taylor]
 
 
-class InRows:
+class InRows(OnLists):
     """Networks of models. `seen` has what `map`, `product` and `observe` steps have read, in their order."""
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class InRows:
 
     def map(self, step: Map, v: Vector) -> Vector:
         self.seen.append(v)
-        return [x.function(step.function) for x in v]
+        return super().map(step, v)
 
     def clip(self, step: Clip, v: Vector) -> Vector:
         """Numbers alone, for a clip has no model."""
@@ -44,22 +44,16 @@ class InRows:
             raise Refused("ring", "leaf", "a clip has no model")
         return [Taylor(whole(x).max(arb(lo)).min(arb(hi))) for x, lo, hi in zip(v, step.lo, step.hi, strict=True)]
 
-    def sum(self, step: Sum, *vectors: Vector) -> Vector:
-        return summed(vectors)
-
-    def concat(self, step: Concat, *vectors: Vector) -> Vector:
-        return [x for v in vectors for x in v]
-
     def product(self, step: Product, v: Vector, w: Vector) -> Vector:
         self.seen += [v, w]
-        return [x * y for x, y in paired(v, w)]
+        return super().product(step, v, w)
 
     def observe(self, step: Observe, v: Vector) -> Vector:
         self.seen.append(v)
         return step.expressions.evaluate(dict(zip(step.names, v, strict=True)), constant)
 
 
-class Rates:
+class Rates(OnLists):
     """The derivatives of the entries where those of a network's first vector are given, in the models of its values."""
 
     def __init__(self, seen: Sequence[Vector]) -> None:
@@ -74,17 +68,11 @@ class Rates:
     def clip(self, step: Clip, v: Vector) -> Vector:
         raise Refused("ring", "leaf", "a clip may have no derivative")
 
-    def sum(self, step: Sum, *vectors: Vector) -> Vector:
-        return summed(vectors)
-
-    def concat(self, step: Concat, *vectors: Vector) -> Vector:
-        return [x for v in vectors for x in v]
-
     def product(self, step: Product, v: Vector, w: Vector) -> Vector:
         """(x y)' = x y' + y x'."""
         x, y = next(self.seen), next(self.seen)
-        one, other = ([a * rate for a, rate in paired(*pair)] for pair in ((x, w), (y, v)))
-        return summed([one, other])
+        one, other = (super(Rates, self).product(step, *pair) for pair in ((x, w), (y, v)))
+        return [a + b for a, b in zip(one, other, strict=True)]
 
     def observe(self, step: Observe, v: Vector) -> Vector:
         values, rates = (dict(zip(step.names, each, strict=True)) for each in (next(self.seen), v))
@@ -93,13 +81,6 @@ class Rates:
 
 def number(v: Coefficient) -> Taylor:
     return Taylor(ZERO) if v is None else v
-
-
-def summed(vectors: Sequence[Vector]) -> Vector:
-    first, *others = vectors
-    for v in others:
-        first = [x + y for x, y in zip(first, v, strict=True)]
-    return first
 
 
 def net_at_0(c: Certificate) -> list[arb]:

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice
 
 from flint import arb_mat
 
-from .affine import batch
-from .balls import bounded_by_form, within_bounds
+from .batches import in_batches
 from .document import Certificate
 from .evidence import Covering
 from .function import Models
@@ -21,25 +19,25 @@ from .keep import kept
 from .leaves import Box, boxes
 from .motion import Motion, Stage
 from .outer import RULE, OverDomain, covered
-from .refusal import Refused, require
+from .refusal import Refused, require, under
 from .taylor import Taylor, is_negative, kinks
 
 
-def invariant(c: Certificate, covering: Covering) -> int:
+def invariant(c: Certificate, covering: Covering, jobs: int) -> int:
     """Faces, T and the root, the whole tree, then its leaves; the number of these."""
-    staying, bounded = Staying(c, covered(c, covering), covering), bounded_by_form(c)
-    size = batch(c.policy.network, c.n)
-    asked = (box for box in boxes(covering) if not staying.is_free(box))
-    while some := list(islice(asked, size)):
+    staying = Staying(c, covered(c, covering), covering)
+
+    def check(some: list[Box]) -> None:
         enclosed = staying.enclose(some)
         for part in enclosed:
-            good = bounded or within_bounds(c, part.ranges())
-            require(good, "inputs", part.place, "an input is not certain to stay in its bounds")
+            staying.motion.keep_bounds(part)
         if c.keep is not None:
             for part in enclosed:
                 kept(staying.motion, part, None, staying.slack(part))
         for part in enclosed:
             require(staying.holds(part), RULE, part.place, "N is not certain to fall where it is at its level")
+
+    in_batches(c, c.n, (box for box in boxes(covering) if not staying.is_free(box)), check, jobs)
     return covering.tree.count(255)
 
 
@@ -86,12 +84,10 @@ class Staying(OverDomain):
         """True if F and N have finite models, and N is certainly below n2, or N'F or N'F + k (n2 - N) certainly
         negative: where N is n2, k may have any sign."""
         F = self.motion.F(part)
-        try:
+        with under(RULE, part.place):
             if self.models.is_below(part.own):
                 return True
             N, rate = self.models.moving([self.motion.affine(row) for row in part.x], F)
-        except Refused as no:
-            raise Refused(RULE, part.place, no.detail) from None
         slack = Taylor(self.models.level) + -N
         if not (N.is_finite() and rate.is_finite()):
             return False

@@ -17,7 +17,7 @@ from .flow import Steps
 from .loop import Known, Loop
 from .model import Model
 from .motion import Motion, Stage
-from .refusal import Refused, require
+from .refusal import require, under
 from .taylor import Taylor, constant, is_negative
 
 RULE = "keep"
@@ -34,10 +34,8 @@ def kept(motion: Motion, at: Stage, within: Mapping[str, Taylor] | None, slacks:
     names = {**known.states, **known.inputs, **known.uncertain}
     if within is not None:
         names |= {**within, **known.anything}
-    try:
+    with under(RULE, at.place):
         values: list[Taylor] = expressions.evaluate(names, constant)
-    except Refused as no:
-        raise Refused(RULE, at.place, no.detail) from None
     for i, g in enumerate(values):
         holds = g.is_finite() and is_negative(g, slacks)
         require(holds, RULE, at.place, f"expression {i} is not certain to be negative")
@@ -62,10 +60,8 @@ def negative_on_ball(steps: Steps, names: Mapping[str, Any], at: str) -> None:
     expressions = steps.loop.c.keep
     if expressions is None:
         return
-    try:
+    with under(RULE, at):
         values: list[Model] = expressions.evaluate(names, steps.known.constant)
-    except Refused as no:
-        raise Refused(RULE, at, no.detail) from None
     for i, g in enumerate(values):
         holds = g.is_finite() and bool(g.v + g.reach < 0)
         require(holds, RULE, at, f"expression {i} is not certain to be negative")

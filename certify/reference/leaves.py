@@ -7,12 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 
 from flint import arb, arb_mat, fmpq_mat
 
-from .affine import batch
-from .balls import ZERO, bounded_by_form, total, within_bounds
+from .balls import ZERO, total
+from .batches import in_batches
 from .document import Certificate
 from .evidence import Covering, Tree
 from .keep import kept
@@ -122,7 +121,7 @@ class Leaves(Motion):
 
     # -------------------------------------------------------------------------------------------------- the box
 
-    def enclose(self, some: Sequence[Box]) -> list[Leaf]:
+    def enclose(self, some: Sequence[Box], kind: str = "leaf") -> list[Leaf]:
         """Each leaf with its models of x, 2 P x and the policy."""
         n, stride = self.n, self.n + 1
         centres = [[(arb(a) + arb(b)) / 2 for a, b in zip(box.lo, box.hi, strict=True)] for box in some]
@@ -137,7 +136,7 @@ class Leaves(Motion):
         states, gradients, at = x.tolist(), (self.PT2 * z).tolist(), range(0, stride * len(some), stride)
         return [
             Leaf(
-                f"leaf {box.number}",
+                f"{kind} {box.number}",
                 [row[k : k + stride] for row in states],
                 [row[b] for row in u],
                 box,
@@ -214,21 +213,19 @@ class Leaves(Motion):
         return bool(self.diagonal_part(box.least()) - self.cross_part(box) >= self.inner)
 
 
-def check_leaves(leaves: Leaves, evidence: Tree) -> None:
+def check_leaves(leaves: Leaves, evidence: Tree, jobs: int) -> None:
     """Rules `inputs`, `flow`, `keep` and `ring`; in each batch of leaves they are taken in this order.
 
     An inside leaf has been covered by rule `local` where there is a ball. Without one nothing has: there the inputs are
     asked, and in continuous time that F has a finite model, but where time has steps that V stays below c0.
     """
-    c, bounded = leaves.c, bounded_by_form(leaves.c)
-    size = batch(c.policy.network, c.n)
-    covered = not leaves.alone
+    c, covered = leaves.c, not leaves.alone
     asked = (box for box in boxes(evidence) if not (leaves.is_outside(box) or (covered and leaves.is_inside(box))))
-    while some := list(islice(asked, size)):
+
+    def check(some: list[Box]) -> None:
         enclosed = leaves.enclose(some)
         for leaf in enclosed:
-            good = bounded or within_bounds(c, leaf.ranges())
-            require(good, "inputs", f"leaf {leaf.box.number}", "an input is not certain to stay in its bounds")
+            leaves.keep_bounds(leaf)
         reached = [None if c.sample is None else leaves.reached(leaf) for leaf in enclosed]
         if c.keep is not None:
             for leaf, within in zip(enclosed, reached, strict=True):
@@ -238,4 +235,6 @@ def check_leaves(leaves: Leaves, evidence: Tree) -> None:
                 leaves.F(leaf)
                 continue
             falls = leaves.decreases(leaf, within)
-            require(falls, "ring", f"leaf {leaf.box.number}", "no bound of what V changes by is certainly negative")
+            require(falls, "ring", leaf.place, "no bound of what V changes by is certainly negative")
+
+    in_batches(c, c.n, asked, check, jobs)

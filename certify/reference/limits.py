@@ -181,10 +181,11 @@ def numbers(c: Certificate) -> int:
     ball, near = (evidence.ball, evidence.contraction) if isinstance(evidence, Tree) else (None, None)
     orders = (ball.order if ball else 1, near.order if near else 1)
     order = max(1 if isinstance(evidence, Covering) else evidence.order, *orders)
-    values = z.a * (1 if c.sample is None else 4 * order) + 2 * z.n + 8
+    values = values_held(c, z, order)
     if not isinstance(evidence, Covering) and evidence.ranking is not None:
-        count += 2**4 * len(evidence.ranking.tree) + held_on_leaves(with_errors(z), values)
-    elif asked_of_leaves(c, evidence) or c.beyond is not None:
+        count += 2**4 * len(evidence.ranking.tree)
+        count += held_on_leaves(with_errors(z), values_held(c, z, evidence.order))
+    if asked_of_leaves(c, evidence) or c.beyond is not None:
         count += held_on_leaves(z, values)
     if isinstance(evidence, Tree) and (ball or near or evidence.tube):
         count += values * (z.t + z.d * z.y + z.m + z.z) + z.d**4 // 4
@@ -200,6 +201,10 @@ def numbers(c: Certificate) -> int:
         count += 2**14 * (over.read + 8 * over.waiting * (z.s + 1))
         count += 8 * (len(N.steps) + observing(*called(N))) * square
     return count
+
+
+def values_held(c: Certificate, z: Sizes, order: int) -> int:
+    return z.a * (1 if c.sample is None else 4 * order) + 2 * z.n + 8
 
 
 def held_on_leaves(z: Sizes, values: int) -> int:

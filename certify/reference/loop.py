@@ -15,7 +15,7 @@ from .balls import ZERO, bounded_by_form, within_bounds
 from .document import Certificate, Interval
 from .kinks import Cone
 from .model import Model
-from .refusal import Refused, require
+from .refusal import require, under
 from .tangents import Calls, Policy, Units
 
 
@@ -110,10 +110,8 @@ class Loop:
         self, states: Sequence[Model], at_origin: bool, rule: str, at: str, cone: Cone | None = None
     ) -> tuple[list[Model], Units]:
         """The inputs before their clip, or a refusal where the policy has no model."""
-        try:
+        with under(rule, at):
             return self.policy.on(states, at_origin, cone)
-        except Refused as no:
-            raise Refused(rule, at, no.detail) from None
 
     def steady(self, J: fmpq_mat, rule: str, at: str, cone: Cone | None = None) -> Known:
         """The same around the origin, with Lipschitz constants; whether inputs keep their bounds is not asked."""
@@ -147,10 +145,8 @@ class Loop:
     def field(self, known: Known, uncertain: Mapping[str, Model], rule: str, at: str) -> Field:
         """Models of f, all of them finite."""
         calls = Calls(known.units, known.errors, known.rhos, known.cone)
-        try:
+        with under(rule, at):
             F = self.c.plant.dynamics.evaluate({**known.names, **uncertain}, known.constant, calls)
-        except Refused as no:
-            raise Refused(rule, at, no.detail) from None
         F = [f.among(calls.errors, calls.rhos) for f in F]
         finite = calls.units.is_finite() and all(f.is_finite() for f in F)
         require(finite, rule, at, "F has no finite model")

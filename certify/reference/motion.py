@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from flint import arb, arb_mat
 
 from .affine import Form, OnBoxes, called, clip
-from .balls import ZERO, beta, total
+from .balls import ZERO, beta, bounded_by_form, total, within_bounds
 from .document import Certificate
 from .expressions import Call
 from .flow import Moving, mean_on, reached_from
 from .function import net_at_0
 from .networks import Map
-from .refusal import Refused, require
+from .refusal import require, under
 from .taylor import Taylor, constant
 
 
@@ -48,7 +48,7 @@ class Motion:
     def __init__(
         self, c: Certificate, d: int, order: int, bounds: Sequence[arb] | None = None, free: Collection[str] = ()
     ) -> None:
-        self.c, self.n, self.d = c, c.n, d
+        self.c, self.n, self.d, self.bounded = c, c.n, d, bounded_by_form(c)
         self.quantities = d + c.m
         self.calls = self.quantities + c.k
         self.symbols = self.calls + c.plant.dynamics.entries + c.varies
@@ -56,6 +56,11 @@ class Motion:
         self.shifts, self.offset = centred(c)
 
     # --------------------------------------------------------------------------------------------------- the policy
+
+    def keep_bounds(self, at: Stage) -> None:
+        """Rule `inputs`."""
+        good = self.bounded or within_bounds(self.c, at.ranges())
+        require(good, "inputs", at.place, "an input is not certain to stay in its bounds")
 
     def policy(self, x: arb_mat, count: int) -> list[list[Form]]:
         """For each input and each leaf, given x on the leaves; the network reads x from its origin."""
@@ -103,10 +108,8 @@ class Motion:
         """Models of f(x, pi(x), q), all of them finite."""
         known = self.numbers(at)
         names = {**known.states, **known.inputs, **known.uncertain}
-        try:
+        with under(self.rule, at.place):
             result = self.c.plant.dynamics.evaluate(names, constant, self.called)
-        except Refused as no:
-            raise Refused(self.rule, at.place, no.detail) from None
         require(all(f.is_finite() for f in result), self.rule, at.place, "F has no finite model")
         return result
 

@@ -13,7 +13,8 @@ import struct
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import add
 from typing import Any, ClassVar, Protocol, TypeVar
 
 from flint import arb, arb_mat
@@ -137,6 +138,22 @@ class Algebra(Protocol):
     def concat(self, step: Concat, *vectors: Any) -> Any: ...
     def product(self, step: Product, v: Any, w: Any, /) -> Any: ...
     def observe(self, step: Observe, v: Any, /) -> Any: ...
+
+
+class OnLists:
+    """Steps that are the same wherever a vector is a list of numbers with `+`, `*` and `function(name)`."""
+
+    def map(self, step: Map, v: list[Any]) -> list[Any]:
+        return [x.function(step.function) for x in v]
+
+    def sum(self, step: Sum, *vectors: list[Any]) -> list[Any]:
+        return [reduce(add, each) for each in zip(*vectors, strict=True)]
+
+    def concat(self, step: Concat, *vectors: list[Any]) -> list[Any]:
+        return [x for v in vectors for x in v]
+
+    def product(self, step: Product, v: list[Any], w: list[Any]) -> list[Any]:
+        return [x * y for x, y in paired(v, w)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,32 +8,30 @@ of the one set than into the other.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from fractions import Fraction
-from itertools import islice
 
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
-from .affine import batch
-from .balls import ZERO, bounded_by_form, total, within_bounds
+from .balls import ZERO, total
+from .batches import in_batches
 from .document import Certificate
 from .evidence import Covering, Tree
 from .fields import exact
 from .function import Models
 from .keep import kept
 from .leaves import Box, Leaf, Leaves, boxes, cut, structure
-from .refusal import Refused, require
+from .refusal import Refused, require, under
 from .taylor import Taylor, is_negative
 
 RULE, FACES = "outer", "faces"
 
 
-def outer(c: Certificate, evidence: Tree) -> None:
+def outer(c: Certificate, evidence: Tree, jobs: int) -> None:
     """Faces in their order, then T and the root, then the whole tree, then its leaves."""
     covering = evidence.covering
     if covering is None:
         raise Refused("format", "evidence.outer", "the claim needs a tree over the domain")
-    check_leaves(c, covered(c, covering), covering)
+    check_leaves(c, covered(c, covering), covering, jobs)
 
 
 def covered(c: Certificate, covering: Covering) -> Models:
@@ -70,10 +68,8 @@ def face(c: Certificate, models: Models, k: int, tree: bytes) -> None:
         ]
         x[axis] = fixed
         place = f"{at} leaf {box.number}"
-        try:
+        with under(FACES, place):
             above = models.is_above(x)
-        except Refused as no:
-            raise Refused(FACES, place, no.detail) from None
         require(above, FACES, place, "N is not certain to be above its level")
 
 
@@ -171,26 +167,20 @@ class Region(OverDomain):
         return [self.beyond(leaf), Taylor(self.models.level) + -N]
 
 
-def check_leaves(c: Certificate, models: Models, covering: Covering) -> None:
+def check_leaves(c: Certificate, models: Models, covering: Covering, jobs: int) -> None:
     """In each batch of leaves on which something is asked rule `inputs` comes first."""
-    region, bounded = Region(c, models, covering), bounded_by_form(c)
-    size = batch(c.policy.network, c.n)
-    asked = (box for box in boxes(covering) if not region.is_free(box))
-    while some := list(islice(asked, size)):
-        enclosed = region.leaves.enclose(some)
+    region = Region(c, models, covering)
+
+    def check(some: list[Box]) -> None:
+        enclosed = region.leaves.enclose(some, "outer leaf")
         for leaf in enclosed:
-            good = bounded or within_bounds(c, leaf.ranges())
-            require(good, "inputs", place(leaf), "an input is not certain to stay in its bounds")
+            region.leaves.keep_bounds(leaf)
         if c.keep is not None:
             for leaf in enclosed:
-                kept(region.leaves, replace(leaf, place=place(leaf)), None, region.slacks(leaf))
+                kept(region.leaves, leaf, None, region.slacks(leaf))
         for leaf in enclosed:
-            try:
+            with under(RULE, leaf.place):
                 falls = region.falls(leaf)
-            except Refused as no:
-                raise Refused(RULE, place(leaf), no.detail) from None
-            require(falls, RULE, place(leaf), "no bound of what N changes by is certainly negative")
+            require(falls, RULE, leaf.place, "no bound of what N changes by is certainly negative")
 
-
-def place(leaf: Leaf) -> str:
-    return f"outer leaf {leaf.box.number}"
+    in_batches(c, c.n, (box for box in boxes(covering) if not region.is_free(box)), check, jobs)

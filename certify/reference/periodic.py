@@ -15,7 +15,7 @@ from flint import fmpq
 
 from .document import Certificate
 from .expressions import Call
-from .networks import Affine, Clip, Concat, Map, Observe, Product, Sum, paired
+from .networks import Affine, Clip, Observe, OnLists
 from .refusal import Refused, require
 
 RULE, PERIODIC = "angles", ("sin", "cos")
@@ -101,7 +101,7 @@ class Winding:
         return Winding((0,) * len(self.turns)) if name in PERIODIC else self.still(f"'{name}'")
 
 
-class Windings:
+class Windings(OnLists):
     """Networks of windings: vectors are lists of them."""
 
     def __init__(self, constant: Callable[[fmpq], Winding]) -> None:
@@ -115,20 +115,8 @@ class Windings:
             for i in range(step.size)
         ]
 
-    def map(self, step: Map, v: list[Winding]) -> list[Winding]:
-        return [x.function(step.function) for x in v]
-
     def clip(self, step: Clip, v: list[Winding]) -> list[Winding]:
         return [x.still("a clip") for x in v]
-
-    def sum(self, step: Sum, *vectors: list[Winding]) -> list[Winding]:
-        return [reduce(add, each) for each in zip(*vectors, strict=True)]
-
-    def concat(self, step: Concat, *vectors: list[Winding]) -> list[Winding]:
-        return [x for v in vectors for x in v]
-
-    def product(self, step: Product, v: list[Winding], w: list[Winding]) -> list[Winding]:
-        return [x * y for x, y in paired(v, w)]
 
     def observe(self, step: Observe, v: list[Winding]) -> list[Winding]:
         names = dict(zip(step.names, v, strict=True))

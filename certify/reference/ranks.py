@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import islice, product
+from itertools import product
 
 from flint import arb, arb_mat
 
-from .affine import Form, batch
-from .balls import ZERO, bounded_by_form, total, within_bounds
+from .affine import Form
+from .balls import ZERO, total
+from .batches import in_batches
 from .document import Certificate, Ranks
 from .evidence import Ranked, Ranking, Tree
 from .keep import kept
 from .leaves import LEAF, Box, cut, structure
 from .motion import Motion, Stage
-from .refusal import Refused, require
+from .refusal import Refused, require, under
 from .taylor import Taylor, constant
 
 RULE, UNRANKED = "ranks", 65_535
@@ -28,7 +29,7 @@ Rows = list[list[arb]]  # for each state the constant, the coefficients of the l
 Range = tuple[float, float]
 
 
-def ranks(c: Certificate, evidence: Tree | Ranked) -> int:
+def ranks(c: Certificate, evidence: Tree | Ranked, jobs: int) -> int:
     """The tree with its ranks and steps first, then its leaves; their number."""
     ranking = evidence.ranking
     if c.ranks is None or ranking is None:
@@ -37,13 +38,15 @@ def ranks(c: Certificate, evidence: Tree | Ranked) -> int:
     walk = Walk(c, evidence.order)
     target = Target(c, c.ranks)
     asked = (box for box in cut(cover.lo, cover.hi, ranking.tree) if cover.ranks[box.number] != UNRANKED)
-    size = batch(c.policy.network, walk.d)
-    while some := list(islice(asked, size)):
+
+    def check(some: list[Box]) -> None:
         try:
             follow(some, cover, walk, target)
         except Refused:  # maybe of a leaf that is not the first
             for box in some:
                 follow([box], cover, walk, target)
+
+    in_batches(c, walk.d, asked, check, jobs)
     return len(cover.ranks)
 
 
@@ -147,7 +150,7 @@ class Walk(Motion):
     def __init__(self, c: Certificate, order: int) -> None:
         angles = c.ranks.angles if c.ranks is not None else ()
         super().__init__(c, 2 * c.n, order, None, angles)
-        self.bounded, self.domain = bounded_by_form(c), [(arb(lo), arb(hi)) for lo, hi in c.plant.domain]
+        self.domain = [(arb(lo), arb(hi)) for lo, hi in c.plant.domain]
 
     def start(self, box: Box) -> Rows:
         """x = centre + radius d."""
@@ -167,8 +170,7 @@ class Walk(Motion):
         """The states after one step more, in which these are the inputs, or a refusal."""
         c = self.c
         here = Stage(at, rows, u)
-        good = self.bounded or within_bounds(c, here.ranges())
-        require(good, "inputs", at, "an input is not certain to stay in its bounds")
+        self.keep_bounds(here)
         within = None if c.sample is None else self.reached(here)
         if c.keep is not None:
             kept(self, here, within, [])
@@ -214,10 +216,8 @@ class Target:
         if self.c.target is None:
             return [self.V_beyond(rows, at)]
         names = {name: Taylor(x, arb_mat([g])) for name, (x, *g) in zip(self.c.plant.states, rows, strict=True)}
-        try:
+        with under(RULE, at):
             values: list[Taylor] = self.c.target.evaluate(names, constant)
-        except Refused as no:
-            raise Refused(RULE, at, no.detail) from None
         require(all(v.is_finite() for v in values), RULE, at, "an expression of the target has no finite model")
         return values
 

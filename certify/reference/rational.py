@@ -6,8 +6,6 @@ import math
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
-from operator import add
 
 from flint import fmpq, fmpq_mat
 
@@ -15,8 +13,8 @@ from .document import Certificate
 from .evidence import Tree
 from .expressions import MAX_BITS, Call
 from .fields import exact
-from .networks import Affine, Clip, Concat, Map, Observe, Product, Sum, paired
-from .refusal import Refused, require
+from .networks import Affine, Clip, Observe, OnLists
+from .refusal import require, under
 from .table import FUNCTIONS
 
 MAX_MATRIX_BITS = 2**16  # of a numerator over a common denominator, times rows: beyond it a decision takes minutes
@@ -149,26 +147,14 @@ class Exact:
 UNTOLD = Exact(None)
 
 
-class Exactly:
+class Exactly(OnLists):
     """Networks of exact numbers: vectors are lists of them."""
 
     def affine(self, step: Affine, v: list[Exact]) -> list[Exact]:
         return [weighted(step.row(i), b, v) for i, b in enumerate(step.bias)]
 
-    def map(self, step: Map, v: list[Exact]) -> list[Exact]:
-        return [x.function(step.function) for x in v]
-
     def clip(self, step: Clip, v: list[Exact]) -> list[Exact]:
         return [x.between(exact(lo), exact(hi)) for x, lo, hi in zip(v, step.lo, step.hi, strict=True)]
-
-    def sum(self, step: Sum, *vectors: list[Exact]) -> list[Exact]:
-        return [reduce(add, each) for each in zip(*vectors, strict=True)]
-
-    def concat(self, step: Concat, *vectors: list[Exact]) -> list[Exact]:
-        return [x for v in vectors for x in v]
-
-    def product(self, step: Product, v: list[Exact], w: list[Exact]) -> list[Exact]:
-        return [x * y for x, y in paired(v, w)]
 
     def observe(self, step: Observe, v: list[Exact]) -> list[Exact]:
         return step.expressions.evaluate(dict(zip(step.names, v, strict=True)), Exact)
@@ -211,10 +197,8 @@ def centring(c: Certificate) -> None:
             inside = bool(limits[0] < q) and bool(q < limits[1])
             require(inside, "centring", c.plant.inputs[j], "u_eq does not lie strictly inside the clip")
     if policy.centre == "none" and c.ends_at_origin:
-        try:
+        with under("centring", "policy"):
             values = [clipped_at_0(c, j, y) for j, y in enumerate(squashed_at_0(c))]
-        except Refused as no:
-            raise Refused("centring", "policy", no.detail) from None
         for name, value, q in zip(c.plant.inputs, values, c.plant.u_eq, strict=True):
             holds = value.value is not None and bool(value.value == q)
             require(holds, "centring", name, "raw(0) = u_eq does not hold by its form")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class Refused(Exception):
     """A rule that does not hold: its name, the place in the file or the region, and why."""
@@ -14,3 +17,12 @@ class Refused(Exception):
 def require(condition: bool, rule: str, at: str, detail: str) -> None:
     if not condition:
         raise Refused(rule, at, detail)
+
+
+@contextmanager
+def under(rule: str, at: str) -> Iterator[None]:
+    """Take the refusals of others over: they become those of this rule, at this place."""
+    try:
+        yield
+    except Refused as no:
+        raise Refused(rule, at, no.detail) from None

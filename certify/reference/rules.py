@@ -39,16 +39,19 @@ class Verdict:
     leaves: int | None = None
 
 
-def judge(raw: bytes, operations: int | None = None) -> Verdict:
-    """The verdict on a file that asks for no more operations; its hash is taken over the very bytes that are judged."""
+def judge(raw: bytes, operations: int | None = None, jobs: int = 1) -> Verdict:
+    """The verdict on a file that asks for no more operations; so many processes examine its leaves.
+
+    Its hash is taken over the very bytes that are judged.
+    """
     sha256, c, leaves = hashlib.sha256(raw).hexdigest(), None, None
     try:
         with ctx.workprec(PRECISION):
             c = read(raw)
             limits(c, operations)
-            leaves = check(c)
+            leaves = check(c, jobs)
             if c.then is not None:
-                check_after(c.then)
+                check_after(c.then, jobs)
     except Refused as no:
         return Verdict("REJECTED", sha256, no.rule, no.at, no.detail, c)
     if isinstance(c.evidence, Trusted):
@@ -57,23 +60,23 @@ def judge(raw: bytes, operations: int | None = None) -> Verdict:
     return Verdict("ACCEPTED", sha256, certificate=c, leaves=leaves)
 
 
-def check_after(c: Certificate) -> None:
+def check_after(c: Certificate, jobs: int) -> None:
     """Every rule for the certificate that takes over."""
     try:
-        check(c)
+        check(c, jobs)
     except Refused as no:
         raise Refused(no.rule, f"then.{no.at}", no.detail) from None
 
 
-def check(c: Certificate) -> int | None:
+def check(c: Certificate, jobs: int) -> int | None:
     """Every rule in its order; the number of leaves, or None where the evidence cannot be replayed."""
     if isinstance(c.evidence, Ranked):
         rational.centring(c)
-        return with_ranks(c, c.evidence)
+        return with_ranks(c, c.evidence, jobs)
     if isinstance(c.evidence, Covering):
         rational.centring(c)
         with ctx.workprec(ON_LEAVES):
-            return invariant(c, c.evidence)
+            return invariant(c, c.evidence, jobs)
     rational.levels(c)
     inverse = rational.inverse_diagonal(c.P, "lyapunov")
     if c.ends_at_origin:
@@ -97,7 +100,7 @@ def check(c: Certificate) -> int | None:
     leaves = structure(evidence.tree, range(c.n))
     if c.inner < c.outer or loop is None:  # no local ball stands in for the leaves
         with ctx.workprec(ON_LEAVES):
-            check_leaves(Leaves(c, evidence.T, S), evidence)
+            check_leaves(Leaves(c, evidence.T, S), evidence, jobs)
     if c.claim in WITH_TUBE:
         if loop is None or c.start is None:
             raise Refused("format", "claim.start", "the claim needs a start")
@@ -106,14 +109,14 @@ def check(c: Certificate) -> int | None:
         contraction(loop or Loop(c), evidence.contraction, evidence.cells)
     if c.beyond is not None:
         with ctx.workprec(ON_LEAVES):
-            outer(c, evidence)
+            outer(c, evidence, jobs)
     if evidence.ranking is not None:
-        with_ranks(c, evidence)
+        with_ranks(c, evidence, jobs)
     return leaves
 
 
-def with_ranks(c: Certificate, evidence: Tree | Ranked) -> int:
+def with_ranks(c: Certificate, evidence: Tree | Ranked, jobs: int) -> int:
     """Rules `angles` and `ranks`; the number of leaves that have a rank."""
     angles(c)
     with ctx.workprec(ON_LEAVES):
-        return ranks(c, evidence)
+        return ranks(c, evidence, jobs)

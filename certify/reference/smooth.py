@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 from flint import arb, arb_series, fmpq
 
-from .balls import ONE, SPREAD, ZERO
+from .balls import ONE, SPREAD, ZERO, lesser
 from .lines import Line, Turn, around, chord, limited
 from .rows import Four, Function
 
@@ -234,11 +234,6 @@ class Cornered(BySeries):
 def top(v: arb) -> arb:
     """The largest magnitude in a ball."""
     return arb(v.abs_upper())
-
-
-def lesser(a: arb, b: arb) -> arb:
-    """One of two bounds, the first if it is certainly the lesser."""
-    return a if a < b else b
 
 
 def narrower(a: arb, b: arb) -> arb:

@@ -17,7 +17,7 @@ from functools import cached_property
 
 from flint import arb, arb_mat, fmpq
 
-from .balls import ONE, ZERO, absolute, beta, columns_scaled, finite, total
+from .balls import ONE, ZERO, absolute, beta, columns_scaled, finite, identity, total
 from .document import Certificate
 from .expressions import Call
 from .function import net_at_0
@@ -126,7 +126,7 @@ class Tangent:
     @cached_property
     def ways(self) -> arb_mat:
         """All of L."""
-        return beside(self.L, unit_matrix(len(self.at_0))) if self.own else self.L
+        return beside(self.L, identity(len(self.at_0))) if self.own else self.L
 
     @cached_property
     def magnitudes(self) -> arb_mat:
@@ -179,7 +179,7 @@ class OnBall:
         self.roots += [list(v.a.entries()) for v in given]
 
         def make() -> Tangent:
-            G = beside(arb_mat(count, earlier), unit_matrix(count))
+            G = beside(arb_mat(count, earlier), identity(count))
             own = [[ONE if k == q else ZERO for q in at] for k in range(count)]
             L = beside(arb_mat(count, before), arb_mat(count, len(at), [v for row in own for v in row]))
             return Tangent([v.v for v in given], G, L)
@@ -438,10 +438,6 @@ def crossed(values: Sequence[tuple[arb, arb]], A: arb_mat, B: arb_mat) -> arb_ma
 
 def through(step: Affine, part: list[arb] | None) -> list[arb] | None:
     return None if part is None else list((step.magnitudes * arb_mat(len(part), 1, part)).entries())
-
-
-def unit_matrix(n: int) -> arb_mat:
-    return arb_mat([[ONE if i == j else ZERO for j in range(n)] for i in range(n)])
 
 
 def beside(A: arb_mat, B: arb_mat) -> arb_mat:

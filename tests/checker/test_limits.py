@@ -158,6 +158,14 @@ def test_a_file_that_asks_for_too_much_is_refused_at_once(name: str, program: st
     assert (status, answer["result"], answer["rule"], answer["at"]) == (1, "REJECTED", "limits", at)
 
 
+def with_ranks(data: Document) -> Document:
+    lo, hi = encode([-1.0, -1.0]), encode([1.0, 1.0])
+    octets = {"tree": b"\0\xff\xff", "ranks": b"\0\0\2\0", "steps": b"\0\2"}
+    found = {name: base64.b64encode(of).decode() for name, of in octets.items()}
+    data = edited(data, "claim.ranks", {"angles": [], "steps": 5})
+    return edited(data, "evidence.ranks", {"lo": lo, "hi": hi, **found})
+
+
 HONEST: dict[str, Callable[[], Document]] = {
     "leaves": lambda: loop(leaves=7, hidden=(5, 3), terms=2),
     "sampled": lambda: loop(leaves=3, sample=SAMPLE, order=3, k=1),
@@ -172,6 +180,10 @@ HONEST: dict[str, Callable[[], Document]] = {
     "reached": lambda: with_tube("reached"),
     "outer network": with_outer,
     "outer expression": lambda: with_outer("expression"),
+    "ranks": lambda: with_ranks(loop(leaves=3, time="discrete")),
+    "ranks beside a ball of another order": lambda: edited(
+        with_ranks(loop(leaves=3, sample=SAMPLE, order=2, levels=(0.25, 0.5, 1.0))), "evidence.local.order", 4
+    ),
 }  # fmt: skip
 
 

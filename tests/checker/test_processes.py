@@ -31,7 +31,7 @@ from certify.checker.__main__ import main
 from certify.checker.boxes import Batch, in_order
 from certify.checker.errors import Rejected
 from certify.checker.ring import Ring
-from certify.errors import BackendError, InputError
+from certify.errors import BackendError
 from tests.checker.test_rules import HONEST, honest, scalar_claim
 from tests.support import network_loops
 from tests.support.balls import with_ball
@@ -402,11 +402,6 @@ def test_the_checker_as_a_child_takes_jobs(jobs: int, tmp_path: Path) -> None:
     assert run_checker(write(honest("rotor"), tmp_path), jobs=jobs)["result"] == "ACCEPTED"
     answer = run_checker(write(with_tree(honest("linear"), b"\xff"), tmp_path), jobs=jobs)
     assert (answer["result"], answer["rule"], answer["at"]) == ("REJECTED", "ring", "leaf 0")
-
-
-def test_the_reference_has_one_process(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="one process"):
-        run_checker(write(honest("scalar"), tmp_path), "reference", jobs=2)
 
 
 @pytest.mark.parametrize(

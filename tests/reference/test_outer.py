@@ -527,7 +527,7 @@ CLAUSES: dict[str, tuple[str, Callable[..., Any], str, str]] = {
     "faces": ("face", lambda *_: None, "faces", "a level beyond all of them"),
     "the root box": ("covers_domain", lambda *_: None, "outer", "by one bit"),
     "the tree": ("structure", lambda *_: 0, "outer", "a tree cut short"),
-    "the inputs": ("within_bounds", lambda *_: True, "inputs", "with another N"),
+    "the inputs": ("Leaves.keep_bounds", lambda *_: None, "inputs", "with another N"),
 }
 
 
@@ -536,7 +536,7 @@ def test_with_a_clause_disabled_a_forgery_gets_through(monkeypatch: pytest.Monke
         forged = next(edit(honest(base)) for r, w, base, edit in FORGED if (r, w) == (rule, what))
         assert judge(forged) == rule
         with monkeypatch.context() as patch:
-            patch.setattr(outer, name, instead)
+            patch.setattr(f"certify.reference.outer.{name}", instead)
             assert judge(forged) is None, name
 
 
