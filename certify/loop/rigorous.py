@@ -49,7 +49,7 @@ class BallAlgebra(Algebra[flint.arb]):
 
     def function(self, name: str, value: flint.arb) -> flint.arb:
         if name == "sign":
-            return flint.arb(1) if value > 0 else flint.arb(-1) if value < 0 else flint.arb.nan()
+            return flint.arb(1) if value > 0 else flint.arb(-1) if value < 0 else flint.arb(0, 1)
         return abs(value) if name == "abs" else super().function(name, value)
 
     def extreme(self, name: str, a: flint.arb | Fraction, b: flint.arb | Fraction) -> flint.arb | Fraction:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from certify.errors import InputError
 from certify.loop.expressions import (
+    AT_CORNER,
     Expression,
     Number,
     Operation,
@@ -38,23 +39,24 @@ def linearise(system: System) -> tuple[Matrix, Matrix]:
 
     Raises
     ------
-    InputError : a derivative divides by 0 there, or takes the root of a number that is not positive; or a corner of
-        abs, min, max or clip lies there.
+    InputError : a derivative divides by 0 there, or takes the root of a number that is not positive; or it depends on
+        the slope of abs, min, max or clip at a corner. That of v*abs(v) at 0 is 0, whatever the slope of abs is.
     """
     at = dict.fromkeys(system.states, Fraction(0)) | dict(zip(system.inputs, system.exact_u_eq(), strict=True))
-    for term in _corners(system, at):
-        raise InputError(
-            f"the equations of {system.name} must be differentiable at the operating point; {term} has a corner there. "
-            "Move the operating point or the corner, or round it off, as sqrt(x**2 + 1e-6) does with abs(x), and "
-            "(x + sqrt(x**2 + 1e-6))/2 with max(x, 0)."
-        )
     try:
         A, B = (
             tuple(tuple(_constant(differentiate(e, s), at) for s in by) for e in system.exact_dynamics())
             for by in (system.states, system.inputs)
         )
     except InputError as error:
-        raise InputError(f"the equations of {system.name} have no derivative at the origin: {error}.") from error
+        if str(error) != AT_CORNER:
+            raise InputError(f"the equations of {system.name} have no derivative at the origin: {error}.") from error
+        raise InputError(
+            f"the equations of {system.name} must be differentiable at the operating point; "
+            f"{next(_corners(system, at))} has a corner there. Move the operating point or the corner, multiply it by "
+            "what is 0 there, as in x*abs(x), or round it off, as sqrt(x**2 + 1e-6) does with abs(x), and "
+            "(x + sqrt(x**2 + 1e-6))/2 with max(x, 0)."
+        ) from error
     return A, B
 
 
@@ -82,6 +84,8 @@ def in_floats(matrix: Matrix) -> NDArray[np.float64]:
 
 def _constant(slope: Expression, at: dict[Symbol, Fraction]) -> Expression:
     value = value_if_rational(slope, at)
+    if value == AT_CORNER:
+        raise InputError(AT_CORNER)
     return substitute(slope, {s: Number(q) for s, q in at.items()}) if isinstance(value, str) else Number(value)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import Expression, Symbol, evaluate, solution_series
+from certify.loop.expressions import Expression, Symbol, cornered, evaluate, solution_series
 from certify.loop.plants.system import Interval
 from certify.provers.ball.kinks import Cone
 from certify.provers.ball.models import Driven, Models, Paths, Spread, of_all, tilts_of_all
@@ -52,8 +52,8 @@ class Steps:
 
     @property
     def is_plain(self) -> bool:
-        """True if G is F and nothing is uncertain."""
-        return not self.longest and not self.known.loop.system.ranges
+        """True if G is F, nothing is uncertain, and nothing has a corner, where gradients are."""
+        return not self.longest and not self.known.loop.system.ranges and not any(cornered(*self.dynamics))
 
     def models(self, J: Array, cells: Sequence[Cell], reach: Array) -> list[Models]:
         """The models of G on the ball x = J d for each cell; no state of interest there exceeds `reach`, (n,)."""
