@@ -5,7 +5,7 @@ The rank is exact if A and B are rational: a rank computed in floats depends on 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -42,7 +42,7 @@ def linearise(system: System) -> tuple[Matrix, Matrix]:
     InputError : a derivative divides by 0 there, or takes the root of a number that is not positive; or it depends on
         the slope of abs, min, max or clip at a corner. That of v*abs(v) at 0 is 0, whatever the slope of abs is.
     """
-    at = dict.fromkeys(system.states, Fraction(0)) | dict(zip(system.inputs, system.exact_u_eq(), strict=True))
+    at = _at_rest(system)
     try:
         A, B = (
             tuple(tuple(_constant(differentiate(e, s), at) for s in by) for e in system.exact_dynamics())
@@ -53,21 +53,29 @@ def linearise(system: System) -> tuple[Matrix, Matrix]:
             raise InputError(f"the equations of {system.name} have no derivative at the origin: {error}.") from error
         raise InputError(
             f"the equations of {system.name} must be differentiable at the operating point; "
-            f"{next(_corners(system, at))} has a corner there. Move the operating point or the corner, multiply it by "
+            f"{corners_at_rest(system)[0]} has a corner there. Move the operating point or the corner, multiply it by "
             "what is 0 there, as in x*abs(x), or round it off, as sqrt(x**2 + 1e-6) does with abs(x), and "
             "(x + sqrt(x**2 + 1e-6))/2 with max(x, 0)."
         ) from error
     return A, B
 
 
-def _corners(system: System, at: Mapping[Symbol, Fraction]) -> Iterator[Expression]:
-    """The terms with a corner at that point, as they were written."""
+def corners_at_rest(system: System) -> list[Expression]:
+    """The terms of the nominal plant with a corner at x = 0 and u_eq, as they were written."""
     values = {Symbol(name): q for name, q in system.parameters.items()}
-    values |= dict.fromkeys(system.disturbances, Fraction(0)) | dict(at)
-    for term in cornered(*system.dynamics):
-        inner = nodes(in_absolute_values(term))
-        if any(isinstance(v, Operation) and v.operator == "abs" and _is_zero(v.operands[0], values) for v in inner):
-            yield term
+    values |= dict.fromkeys(system.disturbances, Fraction(0)) | _at_rest(system)
+    return [
+        term
+        for term in cornered(*system.dynamics)
+        if any(
+            isinstance(v, Operation) and v.operator == "abs" and _is_zero(v.operands[0], values)
+            for v in nodes(in_absolute_values(term))
+        )
+    ]
+
+
+def _at_rest(system: System) -> dict[Symbol, Fraction]:
+    return dict.fromkeys(system.states, Fraction(0)) | dict(zip(system.inputs, system.exact_u_eq(), strict=True))
 
 
 def _is_zero(expression: Expression, values: Mapping[Symbol, Fraction]) -> bool:
