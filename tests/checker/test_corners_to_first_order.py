@@ -238,6 +238,14 @@ def test_contraction_ends_where_the_slope_of_drag_does(time: str) -> None:
         assert not contracts(closer(tree, None, r, time, 1e-9))
 
 
+def test_contraction_ends_where_the_slope_of_a_square_does() -> None:
+    """4 |x^2| is within 4 r^2 of 0, and twice as steep."""
+    tree = of("4", ["abs", ["*", "x", "x"]])
+    assert contracts(closer(tree, None, 0.03, "continuous", 1e-9)) == {"checker", "reference"}
+    for r in (0.12500001, 0.15, 0.2):
+        assert not contracts(closer(tree, None, r, "continuous", 1e-9))
+
+
 @pytest.mark.parametrize("name", FALSE)
 def test_pairs_that_part_at_a_corner_are_refused(name: str) -> None:
     for r in (1e-6, 0.01):
