@@ -10,7 +10,7 @@ gradient are the same for all d. E and U_j are matrices that know the directions
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 from itertools import permutations
@@ -18,7 +18,7 @@ from itertools import permutations
 import numpy as np
 
 from .functions import FUNCTIONS, Expansion
-from .near import ZERO, Above, Array, Cubic, Near, Square, Vector, mixed, near, norm, outer, symmetric, triples
+from .near import ZERO, Above, Array, Cubic, Near, Square, Vector, lower, mixed, near, norm, outer, symmetric, triples
 
 
 def unpacked(K: Array, k: int) -> Array:
@@ -213,12 +213,21 @@ class Jet:
 
     def function(self, name: str) -> Jet:
         """phi(v) for a function phi of the table."""
+        if name == "abs" and not np.all(lower(self.v0) > 0):
+            return self.magnitude()
         phi = FUNCTIONS[name].expansion(self.v0, self.radius)
         f0, f1, _, _ = phi.f
         H, C, R = self.beyond_tangent(phi)
         E = times(self.E, f1.size) + R
         lip = f1.size * self.lip + self.lip_beyond_tangent(phi)
         return Jet(f0, self.a * f1, self.Q * f1 + H, self.K * f1 + C, E, self.B * f1, self.units, lip)
+
+    def magnitude(self) -> Jet:
+        """|v| where v(0) may be 0, to first order: it is within radius ||d|| of |v(0)|, as if it had some gradient of
+        that length at each d, and as steep as v."""
+        c, nothing = self.c, constant(Fraction(0), self.units)
+        a = nothing.a.wider(self.radius)
+        return replace(nothing, c=Near(np.abs(c.value), c.error), a=a, lip=self.gradient.size + self.beyond[1])
 
     def beyond_tangent(self, phi: Expansion) -> tuple[Square, Cubic, Square]:
         """(H, C, R): phi(v) less its tangent at v(0) is d'H d + C[d] within d'R d.

@@ -18,7 +18,7 @@ from .decrease import OF_ONE, Models, rational
 from .exact import exactly, fraction, root_above
 from .functions import FUNCTIONS
 from .jets import Jet, Units, aligned, constant
-from .near import ZERO, Above, Array, Near, Vector, near
+from .near import ZERO, Above, Array, Near, Vector, lower, near
 
 _SHORT = 6  # bits of a number that is chosen here
 
@@ -98,6 +98,8 @@ class Swayed(Jet):
         phi'(c) + phi''(c) delta within sup|phi'''|/2 delta^2, the suprema over all that v(0) may be; NaN where phi'
         has no derivative among these.
         """
+        if name == "abs" and not np.all(lower(self.v0) > 0):
+            return self.magnitude()
         f0, f1, half, _ = FUNCTIONS[name].expansion(Near(self.c.value), ZERO).f
         _, bent, twisted = (f.size for f in FUNCTIONS[name].expansion(self.v0, ZERO).derivative.stored)
         off, twice = self.v0.error, half * 2
@@ -107,6 +109,11 @@ class Swayed(Jet):
         a = (self.a * moved).wider(by_y * (self.a.error + self.tilt))
         v = replaced(super().function(name), c, a)
         return Swayed.of(v, self.c_y * f1, self.a_y * moved + _each(self.c_y * twice, self.a))
+
+    def magnitude(self) -> Swayed:
+        """|v(0)| is within as much of |c| as v(0) of c."""
+        v = super().magnitude()
+        return in_y(replaced(v, v.c.wider(self.v0.error), v.a), len(self.c_y.value))
 
 
 def replaced(v: Jet, c: Near, a: Vector) -> Jet:

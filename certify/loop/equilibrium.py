@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 _STEPS, _HALVINGS = 100, 30  # of Newton's method, and of a step that does not reduce ||F||
 _REFINEMENTS = 8  # in Arb, each by some ten digits
 _RADIUS = 1e-20  # of the box of the test, in the states' units
+_LEAP = 1e-9  # of a derivative between states so near to each other
 _DIGITS = 12
 _BITS = 40  # of a point from which a loop is looked at
 _WHILE = 100.0  # of a trajectory, in the plant's unit of time
@@ -110,6 +111,8 @@ def _enclosed(loop: ClosedLoop, start: Array) -> Rest | None:
             return None
         u, _ = policy_on(loop, box)
         _, J = field_on(loop, box)
+        if any(v.rad() > _LEAP for v in J.entries()):  # slopes of a corner at the equilibrium
+            return None
         eigenvalues, stable = _spectrum(J, loop.system.time)
     return Rest(_decimals(box), _decimals(u), eigenvalues, stable)
 

@@ -41,6 +41,8 @@ Balls = list[flint.arb]
 class BallAlgebra(Algebra[flint.arb]):
     """Expressions in Arb balls."""
 
+    at_corner = flint.arb.nan()  # the sign of what may be 0
+
     def constant(self, q: Fraction) -> flint.arb:
         return ball(q)
 
@@ -49,12 +51,18 @@ class BallAlgebra(Algebra[flint.arb]):
 
     def function(self, name: str, value: flint.arb) -> flint.arb:
         if name == "sign":
-            return flint.arb(1) if value > 0 else flint.arb(-1) if value < 0 else flint.arb.nan()
+            return flint.arb(1) if value > 0 else flint.arb(-1) if value < 0 else self.at_corner
         return abs(value) if name == "abs" else super().function(name, value)
 
     def extreme(self, name: str, a: flint.arb | Fraction, b: flint.arb | Fraction) -> flint.arb | Fraction:
         v, w = (ball(q) if isinstance(q, Fraction) else q for q in (a, b))
         return v.max(w) if name == "max" else v.min(w)
+
+
+class MeanSlopes(BallAlgebra):
+    """Derivatives by which a value moves between two states: at a corner any slope between those beside it."""
+
+    at_corner = flint.arb(0, 1)
 
 
 @contextmanager
@@ -270,9 +278,7 @@ def field_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
     known: dict[Expression, flint.arb] = {}
     F = [evaluate(e, values, BallAlgebra(), known) for e in loop.dynamics]
     A, B = (
-        flint.arb_mat(
-            [[evaluate(differentiate(e, s), values, BallAlgebra(), known) for s in by] for e in loop.dynamics]
-        )
+        flint.arb_mat([[evaluate(differentiate(e, s), values, MeanSlopes(), known) for s in by] for e in loop.dynamics])
         for by in (system.states, system.inputs)
     )
     return F, A + B * gain
@@ -285,7 +291,9 @@ def gain_at_origin(loop: ClosedLoop) -> flint.arb_mat:
 
 def plant_at_origin(loop: ClosedLoop) -> tuple[flint.arb_mat, flint.arb_mat]:
     """A (n, n) and B (n, m) of the plant at the origin and u_eq."""
-    A, B = (flint.arb_mat([[evaluate_arb(e, {}) for e in row] for row in M]) for M in loop.plant_jacobians())
+    A, B = (
+        flint.arb_mat([[evaluate(e, {}, MeanSlopes(), {}) for e in row] for row in M]) for M in loop.plant_jacobians()
+    )
     return A, B
 
 

@@ -66,6 +66,8 @@ class Beyond:
 
 def function_of(v: Model, name: str) -> Model:
     """The model of phi of v."""
+    if name == "abs" and not (abs(v.v) > v.doubt):
+        return magnitude(v)
     phi = expansion(v, name)
     beyond, (off, slack) = beyond_tangent(v, phi), unsure(v, phi)
     value, p, half, _ = phi.at
@@ -74,6 +76,14 @@ def function_of(v: Model, name: str) -> Model:
     lip = None if v.lip is None or beyond.lip is None else abs(p) * v.lip + beyond.lip
     Q, K, E = p * v.Q + beyond.H, p * v.K + beyond.C, abs(p) * v.E + beyond.R
     return replace(v, v=value, a=p * v.a, Q=Q, K=K, E=E, B=B, dv=dv, da=da, lip=lip, off=off, slack=slack)
+
+
+def magnitude(v: Model) -> Model:
+    """|v| where v may vanish at the centre: it differs from its value there by no more than v does from its own, which
+    a gradient does that is another one at each d. Where Lipschitz constants are asked for, the gradient is 0."""
+    lip = None if v.lip is None else v.slope + beyond_linear(v, v.lip).steep
+    nothing = v.scaled(ZERO)
+    return replace(nothing, v=abs(v.v), off=v.doubt, slack=v.radius, lip=lip)
 
 
 def unsure(v: Model, phi: Expansion) -> tuple[arb, arb]:

@@ -41,7 +41,7 @@ from certify.loop.expressions import (
 )
 from certify.loop.plants import linearise, load_system
 from certify.loop.plants.equations import parse_expression
-from certify.loop.rigorous import evaluate_arb
+from certify.loop.rigorous import MeanSlopes, evaluate_arb
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.symbolic import Symbolic
 from certify.report.mathml import typeset
@@ -103,12 +103,13 @@ def test_derivatives_are_slopes_where_no_corner_is_near(seed: int) -> None:
 
 
 def test_a_derivative_at_a_corner() -> None:
-    """From the right in floats, nothing in rationals and balls."""
+    """From the right in floats, nothing in rationals and balls, but all slopes where means are meant."""
     slope = differentiate(abs(X), X)
     assert numerical([slope], [X])(np.array([-1.0, 0.0, 2.0]))[0].tolist() == [-1.0, 1.0, 1.0]
-    with pytest.raises(InputError, match="corner"):
+    with pytest.raises(InputError, match="the slope of abs at 0 has no exact value"):
         evaluate_exactly(slope, {X: Fraction(0)})
     assert evaluate_arb(slope, {X: flint.arb(0, 1e-30)}).is_nan()
+    assert evaluate(slope, {X: flint.arb(0, 1e-30)}, MeanSlopes(), {}).contains(flint.arb(0, 1))
     assert evaluate_arb(slope, {X: flint.arb(-1, 0.5)}) == -1
 
 
@@ -186,11 +187,13 @@ def test_pythons_min_and_numpys_clip_are_corrected() -> None:
 @pytest.mark.parametrize(
     ("equation", "term"),
     [
-        ("u - x*abs(x)", "abs(x)"),
+        ("u - abs(x)", "abs(x)"),
+        ("u - (1 + x)*max(x, 0)", "max(x, 0)"),
+        ("u - abs(x)*sqrt(2)*exp(x + 1)", "abs(x)"),
+        ("u + exp(x + 1)*x - abs(x + abs(x))", "abs(x)"),
         ("clip(u, 0, 1) - x", "clip(u, 0, 1)"),
         ("u - max(x, 2*x)", "max(x, 2*x)"),
-        ("u - x + 0*min(1 - x, 1 + x, 3)", "min(1 - x, 1 + x, 3)"),
-        ("u - x*abs(w)", "abs(w)"),
+        ("u - x + 2*min(1 - x, 1 + x, 3)", "min(1 - x, 1 + x, 3)"),
     ],
 )
 def test_a_corner_at_the_operating_point_is_named(equation: str, term: str) -> None:
@@ -198,6 +201,24 @@ def test_a_corner_at_the_operating_point_is_named(equation: str, term: str) -> N
     with pytest.raises(InputError) as refused:
         linearise(found)
     assert f"must be differentiable at the operating point; {term} has a corner there" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("equation", "slope"),
+    [
+        ("u - 3*x - x*abs(x)", -3),
+        ("u - x + max(x, 0)*x", -1),
+        ("u + 2*x + abs(x)**3", 2),
+        ("u - abs(x)*sin(x)*cos(x)", 0),
+        ("u - x + abs(x*abs(x))", -1),
+        ("u - x + 0*min(1 - x, 1 + x, 3)", -1),
+        ("u - x*abs(w)", 0),
+        ("clip(x, -1, 1)*min(x, 2*x) + u - x", -1),
+    ],
+)
+def test_a_corner_times_0_has_a_derivative(equation: str, slope: int) -> None:
+    A, B = linearise(plant("x", equation, ranges={"w": (Fraction(-1), Fraction(1))}))
+    assert (str(A[0][0]), str(B[0][0])) == (str(slope), "1")
 
 
 def test_a_corner_elsewhere_does_not_count() -> None:

@@ -117,13 +117,11 @@ def test_models_on_balls_hold_the_values_or_are_none(seed: int, size: float) -> 
     plain = evaluate(e, jets(Jets(1, 2, np.zeros((0, 3))), centre, a), Jets(1, 2, np.zeros((0, 3))))
     ranged = RangedJets(1, 2, 0, np.zeros((0, 3)))
     with_ranges = evaluate(e, jets(ranged, centre, a), ranged)
-    assert np.isfinite(plain.c) == np.isfinite(with_ranges.c)
-    if not np.isfinite(plain.c):
-        return
+    assert np.isfinite(with_ranges.c) or not np.isfinite(plain.c)  # abs is known to first order where it may be 0
     d = rng.standard_normal((2, 400))
     d *= rng.random(400) ** 0.5 / np.linalg.norm(d, axis=0)
     true = value(e, {s: centre[i] + a[i] @ d for i, s in enumerate((X, Y))})
-    for jet in (plain, with_ranges):
+    for jet in (jet for jet in (plain, with_ranges) if np.isfinite(jet.c)):
         assert np.all(np.abs(true - shown(jet, d)) <= left(jet, d) + 1e-12 * (1 + np.abs(true)))
 
 
@@ -300,4 +298,25 @@ def test_a_false_claim_is_never_proved(name: str, time: str, tmp_path: Path) -> 
 def test_a_true_claim_beside_it_is_proved(time: str, tmp_path: Path) -> None:
     system = timed("u - x + 9*max(x - 4, 0) - max(x - 1, 0)", 3.0, time)
     result = certify_roa(system, regulator(0.5), tmp_path, RoaOptions(level=0.99 * 9, P=np.eye(1)))
+    assert result.verdict is Verdict.PROVED
+
+
+DRAG = "0*u + (x*abs(x) - x)/8"  # turns at |x| = 1
+
+
+@pytest.mark.parametrize("time", TIMES)
+def test_drag_of_the_wrong_sign_is_proved_up_to_where_it_turns(time: str, tmp_path: Path) -> None:
+    system, options = timed(DRAG, 2.0, time), RoaOptions(level=1 - 1e-3, P=np.eye(1))
+    assert certify_roa(system, regulator(0.5), tmp_path, options).verdict is Verdict.PROVED
+    for level in (1 + 1e-9, 1.5):
+        beyond = certify_roa(system, regulator(0.5), tmp_path, RoaOptions(level=level, P=np.eye(1)))
+        assert beyond.verdict is not Verdict.PROVED
+
+
+@pytest.mark.parametrize("claim", ["asymptotic", "practical", "nearby"])
+def test_drag_at_rest_is_proved_with_ranges(claim: str, tmp_path: Path) -> None:
+    """The corner moves with w in the last two, so that the loop does not rest at the origin."""
+    moved = "abs(v)" if claim == "asymptotic" else "abs(v - w)"
+    system = plant("v p", f"3*u - p - (1 + w)*v*{moved}", "v", **W)
+    result = certify_roa(system, regulator(1.0, 1.73), tmp_path, RoaOptions(effort=0.1, claim=claim))
     assert result.verdict is Verdict.PROVED

@@ -8,7 +8,7 @@ from certify.loop.expressions.from_sympy import from_sympy
 from certify.loop.expressions.gathering import constant_of, gathered
 from certify.loop.expressions.nested import Tree, from_tree, to_tree
 from certify.loop.expressions.numerical import numerical
-from certify.loop.expressions.rational import evaluate_exactly, value_if_rational
+from certify.loop.expressions.rational import AT_CORNER, evaluate_exactly, value_if_rational
 from certify.loop.expressions.series import PowerSeries, Series, solution_series
 from certify.loop.expressions.tree import (
     CORNERS,
@@ -42,6 +42,7 @@ from certify.loop.expressions.tree import (
 )
 
 __all__ = [
+    "AT_CORNER",
     "CORNERS",
     "FUNCTIONS",
     "GRAMMAR",

@@ -2,7 +2,7 @@
 
 A derivative has a value wherever the expression has one and is differentiable. Nothing is cancelled, so that its bounds
 are bounds of a Jacobian. That of abs(v) is `sign(v)` times that of v, an operator which no equation has: in floats 1 at
-v = 0, and elsewhere no number where the sign is not certain.
+v = 0, and elsewhere no number where the sign is not certain, or [-1, 1] where slopes between two states are meant.
 """
 
 from __future__ import annotations

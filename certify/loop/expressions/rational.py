@@ -12,6 +12,7 @@ from certify.loop.expressions.evaluate import Algebra, evaluate
 from certify.loop.expressions.gathering import MOST_BITS
 from certify.loop.expressions.tree import Expression, Symbol
 
+AT_CORNER = "the slope of abs at 0"
 _AT_ZERO: Mapping[str, int] = {"sin": 0, "cos": 1, "tan": 0, "tanh": 0, "exp": 1, "atan": 0}
 
 
@@ -36,7 +37,7 @@ class _Rational(Algebra[_Number]):
 
     def total(self, constant: Fraction | None, terms: Sequence[_Number]) -> _Number:
         result = constant or Fraction(0)
-        for term in terms:
+        for term in sorted(terms, key=_is_slope, reverse=True):
             if isinstance(term, _Unnamed):
                 return term
             result = _small(result + term)
@@ -47,7 +48,7 @@ class _Rational(Algebra[_Number]):
         if Fraction(0) in factors:
             return Fraction(0)
         result = Fraction(1)
-        for factor in factors:
+        for factor in sorted(factors, key=_is_slope, reverse=True):
             if isinstance(factor, _Unnamed):
                 return factor
             result = _small(result * factor)
@@ -64,9 +65,7 @@ class _Rational(Algebra[_Number]):
         if name == "abs":
             return abs(value)
         if name == "sign":
-            if value == 0:
-                raise InputError("it has a corner")
-            return Fraction(1 if value > 0 else -1)
+            return Fraction(1 if value > 0 else -1) if value != 0 else _Unnamed(AT_CORNER)
         if name == "sqrt":
             if value <= 0:
                 raise InputError(
@@ -84,8 +83,7 @@ def value_if_rational(
 
     Raises
     ------
-    InputError : it divides by 0, takes the root of a number that is not positive, is a derivative at a corner, or a
-        number grows too long.
+    InputError : it divides by 0, takes the root of a number that is not positive, or a number grows too long.
     """
     numbers: dict[Symbol, _Number] = {**values, **{s: _Unnamed(f"{s}, which is uncertain,") for s in unknown}}
     value = evaluate(expression, numbers, _Rational())
@@ -107,6 +105,11 @@ def evaluate_exactly(
     if isinstance(value, str):
         raise InputError(f"{value} has no exact value")
     return value
+
+
+def _is_slope(value: _Number) -> bool:
+    """True of a slope at a corner, which names a sum or product rather than other numbers without a value do."""
+    return isinstance(value, _Unnamed) and value.words == AT_CORNER
 
 
 def _small(q: Fraction) -> Fraction:

@@ -11,7 +11,7 @@ from certify.loop.plants.deviations import (
     with_origin,
 )
 from certify.loop.plants.floating_point import mean_rate
-from certify.loop.plants.linear import Controllability, Matrix, controllability, in_floats, linearise
+from certify.loop.plants.linear import Controllability, Matrix, controllability, corners_at_rest, in_floats, linearise
 from certify.loop.plants.measurements import Measurements, Run
 from certify.loop.plants.operating_point import require_equilibrium, residuals, rests_where
 from certify.loop.plants.registry import available_systems, chosen_system, get_system, shipped_system
@@ -31,6 +31,7 @@ __all__ = [
     "constraints_of_values",
     "controllability",
     "corners",
+    "corners_at_rest",
     "domain_of_values",
     "dynamics_of_values",
     "exact",

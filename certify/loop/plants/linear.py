@@ -5,7 +5,7 @@ The rank is exact if A and B are rational: a rank computed in floats depends on 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from certify.errors import InputError
 from certify.loop.expressions import (
+    AT_CORNER,
     Expression,
     Number,
     Operation,
@@ -38,34 +39,43 @@ def linearise(system: System) -> tuple[Matrix, Matrix]:
 
     Raises
     ------
-    InputError : a derivative divides by 0 there, or takes the root of a number that is not positive; or a corner of
-        abs, min, max or clip lies there.
+    InputError : a derivative divides by 0 there, or takes the root of a number that is not positive; or it depends on
+        the slope of abs, min, max or clip at a corner. That of v*abs(v) at 0 is 0, whatever the slope of abs is.
     """
-    at = dict.fromkeys(system.states, Fraction(0)) | dict(zip(system.inputs, system.exact_u_eq(), strict=True))
-    for term in _corners(system, at):
-        raise InputError(
-            f"the equations of {system.name} must be differentiable at the operating point; {term} has a corner there. "
-            "Move the operating point or the corner, or round it off, as sqrt(x**2 + 1e-6) does with abs(x), and "
-            "(x + sqrt(x**2 + 1e-6))/2 with max(x, 0)."
-        )
+    at = _at_rest(system)
     try:
         A, B = (
             tuple(tuple(_constant(differentiate(e, s), at) for s in by) for e in system.exact_dynamics())
             for by in (system.states, system.inputs)
         )
     except InputError as error:
-        raise InputError(f"the equations of {system.name} have no derivative at the origin: {error}.") from error
+        if str(error) != AT_CORNER:
+            raise InputError(f"the equations of {system.name} have no derivative at the origin: {error}.") from error
+        raise InputError(
+            f"the equations of {system.name} must be differentiable at the operating point; "
+            f"{corners_at_rest(system)[0]} has a corner there. Move the operating point or the corner, multiply it by "
+            "what is 0 there, as in x*abs(x), or round it off, as sqrt(x**2 + 1e-6) does with abs(x), and "
+            "(x + sqrt(x**2 + 1e-6))/2 with max(x, 0)."
+        ) from error
     return A, B
 
 
-def _corners(system: System, at: Mapping[Symbol, Fraction]) -> Iterator[Expression]:
-    """The terms with a corner at that point, as they were written."""
+def corners_at_rest(system: System) -> list[Expression]:
+    """The terms of the nominal plant with a corner at x = 0 and u_eq, as they were written."""
     values = {Symbol(name): q for name, q in system.parameters.items()}
-    values |= dict.fromkeys(system.disturbances, Fraction(0)) | dict(at)
-    for term in cornered(*system.dynamics):
-        inner = nodes(in_absolute_values(term))
-        if any(isinstance(v, Operation) and v.operator == "abs" and _is_zero(v.operands[0], values) for v in inner):
-            yield term
+    values |= dict.fromkeys(system.disturbances, Fraction(0)) | _at_rest(system)
+    return [
+        term
+        for term in cornered(*system.dynamics)
+        if any(
+            isinstance(v, Operation) and v.operator == "abs" and _is_zero(v.operands[0], values)
+            for v in nodes(in_absolute_values(term))
+        )
+    ]
+
+
+def _at_rest(system: System) -> dict[Symbol, Fraction]:
+    return dict.fromkeys(system.states, Fraction(0)) | dict(zip(system.inputs, system.exact_u_eq(), strict=True))
 
 
 def _is_zero(expression: Expression, values: Mapping[Symbol, Fraction]) -> bool:
@@ -82,6 +92,8 @@ def in_floats(matrix: Matrix) -> NDArray[np.float64]:
 
 def _constant(slope: Expression, at: dict[Symbol, Fraction]) -> Expression:
     value = value_if_rational(slope, at)
+    if value == AT_CORNER:
+        raise InputError(AT_CORNER)
     return substitute(slope, {s: Number(q) for s, q in at.items()}) if isinstance(value, str) else Number(value)
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from certify.certificates import LocalBall
 from certify.certificates.claims import Problem
 from certify.effort import UNLIMITED, Effort
+from certify.loop.plants import corners_at_rest
 from certify.lyapunov import domain_limit, extents
 from certify.provers.ball.cells import cut, cuts_for
 from certify.provers.ball.decrease import (
@@ -406,7 +407,8 @@ class Rule:
 
 def order_on(problem: Problem) -> int:
     """The order of the series in time on a ball; 1 where no input is held."""
-    return 1 if problem.loop.system.sample is None else _ORDER
+    system = problem.loop.system
+    return 1 if system.sample is None or corners_at_rest(system) else _ORDER
 
 
 def _largest(good: Callable[[float], bool], limit: float, effort: Effort, fall: float = _FAR) -> float | None:

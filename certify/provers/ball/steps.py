@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import Expression, Symbol, evaluate, solution_series
+from certify.loop.expressions import Expression, Symbol, cornered, evaluate, solution_series
 from certify.loop.plants.system import Interval
 from certify.provers.ball.kinks import Cone
 from certify.provers.ball.models import Driven, Models, Paths, Spread, of_all, tilts_of_all
@@ -36,7 +36,7 @@ class Steps:
     ----------
     known : the loop at the origin.
     at_rest : the loop rests there for certain, so that the models start from 0 exactly.
-    order : r, of the series where inputs are held, at least 2 there.
+    order : r, of the series where inputs are held; with 1 G is f at states of the period.
     dynamics : f in states, inputs and uncertain quantities.
     """
 
@@ -52,8 +52,8 @@ class Steps:
 
     @property
     def is_plain(self) -> bool:
-        """True if G is F and nothing is uncertain."""
-        return not self.longest and not self.known.loop.system.ranges
+        """True if G is F, nothing is uncertain, and nothing has a corner, where gradients are."""
+        return not self.longest and not self.known.loop.system.ranges and not any(cornered(*self.dynamics))
 
     def models(self, J: Array, cells: Sequence[Cell], reach: Array) -> list[Models]:
         """The models of G on the ball x = J d for each cell; no state of interest there exceeds `reach`, (n,)."""
@@ -94,7 +94,8 @@ class Steps:
 
     def _in_cell(self, walk: _Walk, driven: Sequence[Driven], later: _Later | None) -> list[Models]:
         """On each ball."""
-        system, G, stays = self.known.loop.system, [walk.still(v) for v in walk.rates()], np.ones(len(driven), bool)
+        system, stays = self.known.loop.system, np.ones(len(driven), bool)
+        G = [walk.still(v) for v in walk.rates(None if later is None or self.order > 1 else later.near)]
         if later is not None:
             G, stays = [v + more for v, more in zip(G, later.terms, strict=True)], later.stays
         if system.time == "discrete":
@@ -177,10 +178,12 @@ class _Walk:
 
 @dataclass(frozen=True, slots=True)
 class _Later:
-    """`h x_2 + ... + h^(r-1) x_r` for every h of the sample, and on which balls the states stay in the domain, (N,)."""
+    """`h x_2 + ... + h^(r-1) x_r` for every h of the sample, on which balls the states stay in the domain, (N,), and
+    how far from x they may be."""
 
     terms: list[RangedJet]
     stays: NDArray[np.bool_]
+    near: tuple[Array, Array] | None = None
 
 
 def _later(walk: _Walk, order: int, sample: Interval, reach: Array) -> _Later:
@@ -192,6 +195,8 @@ def _later(walk: _Walk, order: int, sample: Interval, reach: Array) -> _Later:
     near, rate = moved
     low, high = np.array([[float(end) for end in pair] for pair in walk.loop.system.domain]).T
     stays = np.all((low < -reach - hi * rate.T) & (reach + hi * rate.T < high), axis=1)
+    if order == 1:
+        return _Later([x.scaled(0.0) for x in walk.states()], stays, near)
     last = [row[-1] for row in walk.series(order, near)]
     early = walk.series(order - 1) if order > 2 else [[]] * len(last)
     h = walk.algebra.quantity(*sample, len(walk.cell) if walk.varies else None)
@@ -201,7 +206,7 @@ def _later(walk: _Walk, order: int, sample: Interval, reach: Array) -> _Later:
         for v in reversed(own[1:]):
             value = walk.still(v) + h * value
         terms.append(h * value)
-    return _Later(terms, stays)
+    return _Later(terms, stays, near)
 
 
 def _within_a_period(walk: _Walk, hi: float) -> tuple[tuple[Array, Array], Array] | None:
