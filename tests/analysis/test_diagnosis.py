@@ -126,9 +126,7 @@ def test_an_unstable_loop_needs_another_policy(
 
 
 @pytest.mark.parametrize("claim", ["asymptotic", "practical"])
-def test_a_period_that_is_too_long_is_to_be_shorter(
-    tmp_path: Path, claim: Literal["asymptotic", "practical"]
-) -> None:
+def test_a_period_that_is_too_long_is_to_be_shorter(tmp_path: Path, claim: Literal["asymptotic", "practical"]) -> None:
     """x' = u with u = -x held over 5 s: a step multiplies by 1 - h, which is -1/4 at a quarter and -3/2 at a half."""
     system, network = chain(1, [-1.0])
     held = system.with_sample((Fraction(5), Fraction(5)))
