@@ -295,12 +295,12 @@ def blend(
 
 
 def below_violations(trial: Trial, effort: Effort) -> Trial | None:
-    """The candidate up to the lowest violation that sampling finds but for those next to the equilibrium, of which V's
-    own place is a rounding; None where there is no such level."""
+    """The candidate up to a level of the lowest violation that sampling finds but for those next to the equilibrium, of
+    which V's own place is a rounding; None where there is no such level."""
     lowest = survey(trial.task.problem, trial.T, trial.task.target, effort=effort)[-1:]
     if not lowest or lowest[0].below > _NEXT_TO * lowest[0].top:
         return None
-    task = replace(trial.task, target=lowest[0].top)
+    task = replace(trial.task, target=lowest[0].above)
     return replace(trial, task=task, limited_by="sampled", volume=volume(trial.P, task.target))
 
 
