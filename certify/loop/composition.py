@@ -41,8 +41,9 @@ def composed(system: System, policy: PolicyNetwork) -> tuple[System, PolicyNetwo
     if not system.calls:
         return system, policy
     if system.sample is not None:
+        called = ", ".join({call.name: 1 for call in system.calls})
         raise InputError(
-            f"the equations of {system.name} call {', '.join({call.name: 1 for call in system.calls})}, whose results move "
+            f"the equations of {system.name} call {called}, whose results move "
             "within a period, and with --sample-time they would be held as inputs are. Leave --sample-time out, or "
             'write the equations of a whole step, with time = "discrete".'
         )

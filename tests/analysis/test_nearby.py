@@ -17,6 +17,7 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
 from certify.provers.ball.local import Rule, prove_band
+from tests.support.loops import chain
 
 
 def bumpy(half_width: int = 1, ends: float = 1.0) -> tuple[System, PolicyNetwork]:
@@ -89,3 +90,11 @@ def test_a_look_at_a_step_is_no_dearer_than_a_step() -> None:
     plant, law = bumpy()
     rule = Rule.anywhere(Problem(ClosedLoop(plant, law), Quadratic(np.eye(1))), np.eye(1))
     assert rule.operations_of_models == 3 * rule.steps.known.operations
+
+
+def test_a_loop_that_rests_exactly_in_floats_has_an_enclosure_of_a_period(tmp_path: Path) -> None:
+    """Nothing moves the equilibrium, so that the bound of how far it moves within a period starts from 0."""
+    plant, law = chain(2, [-1.0, -2.0])
+    held = plant.with_sample((Fraction(1, 20), Fraction(1, 20)))
+    result = certify_roa(held, law, tmp_path, RoaOptions(candidate="lyapunov", claim="nearby"))
+    assert (result.verdict, result.claim) == (Verdict.PROVED, "nearby")
