@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from certify.errors import OptionError
-from controllers.commands.shared import Json, PlantName, emit, errors, preset_options
+from controllers.commands.shared import Json, PlantName, emit, errors, preset_options, span
 
 if TYPE_CHECKING:
-    from certify.loop.plants import System
     from controllers.comparison.runs import RunProgress
 
 Without = Annotated[
@@ -81,7 +80,7 @@ def compare(
         options = CompareOptions(
             methods=methods,
             seeds=seeds,
-            **_span(duration, system),
+            **span(duration, system),
             states=states,
             to_floor=steps is None and not ablations,
             budget=budget,
@@ -96,13 +95,6 @@ def compare(
         if not as_json:
             typer.echo(_table(result["rows"]))
         emit(result if as_json else result["files"], as_json)
-
-
-def _span(duration: float | None, system: System) -> dict[str, Any]:
-    """The options for a duration in the plant's unit of time."""
-    if duration is None:
-        return {}
-    return {"duration": duration} if system.time == "continuous" else {"duration_steps": int(duration)}
 
 
 @contextmanager

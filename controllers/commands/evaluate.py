@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from controllers.commands.shared import ChosenPlant, Json, PolicyFile, beside_a_gain, emit, errors
+from controllers.commands.shared import ChosenPlant, Json, PolicyFile, beside_a_gain, emit, errors, span
 
 if TYPE_CHECKING:
     from controllers.evaluation.evaluation import Evaluation
@@ -21,6 +21,9 @@ def evaluate(
     policy: PolicyFile,
     states: Annotated[int, typer.Option(help="Number of initial states.")] = 1000,
     seed: Annotated[int, typer.Option(help="Seed of the initial states.")] = 0,
+    duration: Annotated[
+        float | None, typer.Option(help="Seconds simulated, or steps in discrete time; default: 60 s or 3000 steps.")
+    ] = None,
     system: ChosenPlant = None,
     certificate: Annotated[
         Path | None, typer.Option(help="A certificate of this policy: counts the states in its proved set.")
@@ -33,10 +36,10 @@ def evaluate(
         from certify.loop.policies import load_policy
         from controllers.evaluation.evaluation import evaluate as judge
         from controllers.evaluation.settling import EvaluationOptions
-        from controllers.plants.choice import chosen_plant
+        from controllers.plants.choice import chosen_plant, plant_of
 
-        options = EvaluationOptions(states=states, seed=seed)
         stored, chosen = load_policy(policy), None if system is None else chosen_plant(system)
+        options = EvaluationOptions(states=states, seed=seed, **span(duration, plant_of(stored, chosen)[0]))
         proved = None if certificate is None else proved_set(certificate)
         result = judge(stored, options, chosen, proved)
         emit(result.as_json() if as_json else _table(result, options), as_json)

@@ -15,6 +15,7 @@ from certify.errors import CertifyError, OptionError
 from controllers.options import TrainingOptions, overridden, preset
 
 if TYPE_CHECKING:
+    from certify.loop.plants import System
     from certify.loop.policies.nonlinearity import Nonlinearity
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
@@ -84,3 +85,10 @@ def beside_a_gain(found: Nonlinearity) -> str:
         f"{100 * share:.2g} %" for share in (found.rms, found.largest, found.bend, found.saturated)
     )
     return f"{rms} from it on the box of initial states, rms, {largest} at most; bend {bend}, saturated at {saturated}"
+
+
+def span(duration: float | None, system: System) -> dict[str, Any]:
+    """The options for a duration of simulated runs, in the plant's unit of time."""
+    if duration is None:
+        return {}
+    return {"duration": duration} if system.time == "continuous" else {"duration_steps": int(duration)}

@@ -18,46 +18,34 @@ from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
 from controllers.options import Plant
 from controllers.simulation.closed_loop import Loop, held_loop
+from controllers.simulation.lengths import Lengths
 from controllers.simulation.trajectories import initial_states, mean_action
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EvaluationOptions:
-    """The simulations that judge a policy.
+class EvaluationOptions(Lengths):
+    """The simulations that judge a policy; a run has settled if it stays small in the window.
 
     Parameters
     ----------
     states : number of initial states, uniform in the plant's box.
     seed : of the initial states.
-    duration, window : seconds simulated, and the last seconds in which the state must stay small.
-    duration_steps, window_steps : the same of a plant in discrete time, in steps.
     tolerance : bound on ||x|| in the window.
     resolution : step of the continuous simulation, as a multiple of 1 / (fastest eigenvalue's modulus).
     """
 
     states: int = 1000
     seed: int = 0
-    duration: float = 60.0
-    window: float = 1.0
-    duration_steps: int = 3000
-    window_steps: int = 50
     tolerance: float = 1e-6
     resolution: float = 0.2
 
     def __post_init__(self) -> None:
-        for name in ("states", "duration", "window", "duration_steps", "window_steps", "tolerance", "resolution"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise OptionError(f"`{name}` must be positive and finite; found {getattr(self, name)}.")
-        if self.seed < 0 or self.window > self.duration or self.window_steps > self.duration_steps:
-            raise OptionError("`seed` must be at least 0, and `window` at most `duration`, in seconds and in steps.")
-
-    def span(self, system: System) -> tuple[float, float]:
-        """Duration and window in the plant's unit of time: seconds, or steps."""
-        if system.time == "discrete":
-            return self.duration_steps, self.window_steps
-        return self.duration, self.window
+        Lengths.__post_init__(self)
+        self.require_positive("states", "tolerance", "resolution")
+        if self.seed < 0:
+            raise OptionError(f"`seed` must be at least 0; found {self.seed}.")
 
 
 MONITORING = EvaluationOptions(states=100, duration=20.0, duration_steps=1000, tolerance=1e-3)

@@ -44,4 +44,4 @@ def _least_squares(regressors: Array, targets: Array, name: str) -> Array:
             f"the transitions do not determine {name}: they span {rank} of {regressors.shape[1]} directions. "
             "Collect more of them, or from a larger ball."
         )
-    return np.asarray(solution.T)
+    return np.ascontiguousarray(solution.T)  # as a checkpoint gives it back: products depend on the order in memory

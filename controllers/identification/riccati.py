@@ -25,4 +25,4 @@ def riccati_gain(A: Array, B: Array, Q: Array, R: Array) -> Array:
         raise InputError(f"the discrete Riccati equation has no stabilising solution: {error}.") from error
     if not np.all(np.abs(eigenvalues) < 1):
         raise InputError(f"the LQR loop must be stable; its eigenvalues are {eigenvalues}.")
-    return np.asarray(K, dtype=np.float64)
+    return np.ascontiguousarray(K, dtype=np.float64)

@@ -212,7 +212,7 @@ def test_settling_is_counted_in_steps(henon):
     )
     assert long.settled == 20 and short.settled == 0  # 0.9^295 = 3e-14, 0.9^55 = 3e-3
     assert 1e-6 < short.largest < 1
-    with pytest.raises(InputError, match="in seconds and in steps"):
+    with pytest.raises(InputError, match="`duration_steps` must be at least the window, 5 steps"):
         EvaluationOptions(duration_steps=4, window_steps=5)
 
 

@@ -151,7 +151,7 @@ def test_resuming_from_nothing_or_from_rubbish_is_refused(tmp_path):
 
 
 def test_evaluate_prints_one_json_object_that_says_nothing_of_a_proof_without_a_certificate():
-    result = runner.invoke(app, ["evaluate", str(SHIPPED), "--states", "3", "--json"])
+    result = runner.invoke(app, ["evaluate", str(SHIPPED), "--states", "3", "--duration", "12", "--json"])
     assert result.exit_code == 0, result.stderr
     figures = json.loads(result.stdout)
     assert figures["proved"] is None
@@ -161,9 +161,12 @@ def test_evaluate_prints_one_json_object_that_says_nothing_of_a_proof_without_a_
 
 
 def test_evaluate_prints_text_that_says_nothing_of_a_proof_without_a_certificate():
-    result = runner.invoke(app, ["evaluate", str(SHIPPED), "--states", "2"])
+    """A run of a second has not settled; the window of the last second is all of it."""
+    result = runner.invoke(app, ["evaluate", str(SHIPPED), "--states", "2", "--duration", "1"])
     assert result.exit_code == 0, result.stderr
-    assert "2 of 2 settled" in result.stdout and "proved" not in result.stdout
+    assert "0 of 2 settled" in result.stdout and "proved" not in result.stdout
+    shorter = runner.invoke(app, ["evaluate", str(SHIPPED), "--duration", "0.5"])
+    assert shorter.exit_code == 2 and "--duration must be at least the window, 1 s" in shorter.stderr
 
 
 @pytest.mark.parametrize("content", [None, b"rubbish"])

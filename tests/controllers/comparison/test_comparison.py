@@ -264,7 +264,7 @@ def test_the_command_prints_the_table_or_one_json_object(finished, tmp_path, mon
     [
         (["spaceship"], "spaceship"),
         (["pendulum", "--seeds", "0"], "--seeds must be positive"),
-        (["pendulum", "--duration", "0.5"], "`window` at most --duration"),
+        (["pendulum", "--duration", "0.5"], "--duration must be at least the window, 1 s"),
         (["pendulum", "--duration", "nan"], "--duration"),
         (["pendulum", "--without", "ours"], "--without must be one of sac, sb3-ppo, sb3-sac"),
         (["pendulum", "--jobs", "0"], "--jobs must be at least 1"),

@@ -144,7 +144,7 @@ def test_the_command_writes_the_same_bytes_twice_and_says_how_far_it_is(tmp_path
     assert said["sha256"] == policy.network.sha256() and said["layers"] == [2, 12, 1] and said["activation"] == "relu"
     assert said["nearest_corner"] == nearest_corner(policy.network, PENDULUM)
     assert said["distilled"]["states"] == said["source"]["states"] == 5
-    judged = runner.invoke(app, ["evaluate", str(outs[0]), "--states", "2"])
+    judged = runner.invoke(app, ["evaluate", str(outs[0]), "--states", "2", "--duration", "1"])
     assert judged.exit_code == 0 and "nearest corner" in judged.stdout
     table = runner.invoke(app, ["distil", str(source), *short, "--out", str(outs[0])])
     for words in ("difference", "error of J(0)", "runs of the source", "2-12-1 relu, centre preactivation"):

@@ -156,6 +156,19 @@ def test_each_round_adds_to_the_transitions_that_are_fitted_or_replaces_them():
     assert errors["all"] < errors["latest"]
 
 
+def test_matrices_lie_in_memory_as_a_checkpoint_gives_them_back():
+    """Products depend on it in their last bits, and with them a resumed run."""
+    x, v = _transitions(40)
+    after = x @ A.T + v @ B.T
+    found = (
+        fit_A(x, after),
+        fit_A(x, after, "quadratic"),
+        fit_B(x, v, after, A),
+        riccati_gain(A, B, np.eye(2), np.eye(2)),
+    )
+    assert all(matrix.flags.c_contiguous for matrix in found)
+
+
 @pytest.mark.parametrize("which", ["all", "latest"])
 @pytest.mark.parametrize("seen", [0, 2, 4, 5, 7, 9, 12])
 def test_a_learner_goes_on_from_its_state(which, seen):

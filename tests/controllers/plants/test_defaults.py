@@ -151,7 +151,9 @@ def test_a_plant_of_ones_own_is_trained_evaluated_and_certified(tmp_path, monkey
 
     alone = runner.invoke(app, ["evaluate", str(out), "--states", "3", "--json"])
     assert alone.exit_code == 2 and "--system" in json.loads(alone.stdout)["error"]
-    judged = runner.invoke(app, ["evaluate", str(out), "--system", str(path), "--states", "3", "--json"])
+    judged = runner.invoke(
+        app, ["evaluate", str(out), "--system", str(path), "--states", "3", "--duration", "1", "--json"]
+    )
     assert judged.exit_code == 0, judged.stderr
     assert json.loads(judged.stdout)["held"]["states"] == 3
 

@@ -80,7 +80,7 @@ def test_a_new_plant_is_one_file_on_either_side(plant_file, tmp_path):
     trained = runner.invoke(app, ["train", "leak", "--out", str(out), "--json"])
     assert trained.exit_code == 0, trained.stderr
     assert load_policy(out).system == "leak" and json.loads(trained.stdout)["steps"] == 260
-    judged = runner.invoke(app, ["evaluate", str(out), "--states", "3", "--json"])
+    judged = runner.invoke(app, ["evaluate", str(out), "--states", "3", "--duration", "1", "--json"])
     assert judged.exit_code == 0, judged.stderr
     assert json.loads(judged.stdout)["held"]["states"] == 3
     arguments = ["--runs", tmp_path / "runs", "--out", tmp_path / "out", "--seeds", 1, "--states", 2, "--duration", 1]

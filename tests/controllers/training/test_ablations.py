@@ -114,10 +114,10 @@ def test_the_command_trains_and_evaluates_an_ablation(tmp_path):
     assert trained.exit_code == 0, trained.stderr
     result = json.loads(trained.stdout)
     assert result["K"] is None and result["distance"] is None
-    text = runner.invoke(app, ["evaluate", str(out), "--states", "2"])
+    text = runner.invoke(app, ["evaluate", str(out), "--states", "2", "--duration", "1"])
     assert text.exit_code == 0, text.stderr
     assert "nan" not in text.stdout
     rows = dict(line.split("  ", 1) for line in text.stdout.splitlines())
     assert rows["||J+K||/||K||"].strip() == "-"
-    evaluated = runner.invoke(app, ["evaluate", str(out), "--states", "2", "--json"])
+    evaluated = runner.invoke(app, ["evaluate", str(out), "--states", "2", "--duration", "1", "--json"])
     assert json.loads(evaluated.stdout)["gain"] == {"distance": None, "relative": None}

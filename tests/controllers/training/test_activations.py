@@ -168,7 +168,7 @@ def test_a_policy_is_trained_and_evaluated(tmp_path, name):
     assert resumed.exit_code == 0 and again.read_bytes() == out.read_bytes()
     other = runner.invoke(app, ["train", "pendulum", *SHORT, "--checkpoint-dir", str(folder), "--resume", "--out", "x"])
     assert other.exit_code == 2 and f"--activation was {name}" in other.stderr
-    judged = runner.invoke(app, ["evaluate", str(out), "--states", "2", "--json"])
+    judged = runner.invoke(app, ["evaluate", str(out), "--states", "2", "--duration", "1", "--json"])
     assert judged.exit_code == 0, judged.stderr
     found = json.loads(judged.stdout)["nearest_corner"]
     assert found is None if name == "silu" else found == policy.training["nearest_corner"] > 0.0999

@@ -119,7 +119,9 @@ def test_the_command_shows_and_writes_them_and_a_resumed_run_writes_the_same(tmp
     figures = ["step", "distance", "offset", "curvature", "settled", "cost", "A_error", "B_error", "K_error"]
     assert list(rows[0]) == figures
     identified = [float(rows[-1][name]) for name in figures[-3:]]
-    judged = CliRunner().invoke(app, ["evaluate", str(tmp_path / "whole.pt"), "--states", "1", "--json"])
+    judged = CliRunner().invoke(
+        app, ["evaluate", str(tmp_path / "whole.pt"), "--states", "1", "--duration", "1", "--json"]
+    )
     assert list(json.loads(judged.stdout)["identification"].values()) == identified and 0 < max(identified) < 0.01
     assert f"settled {float(rows[-1]['settled']):.0%}" in result.stderr
     assert json.loads(result.stdout)["distance"] == float(rows[-1]["distance"])

@@ -28,10 +28,10 @@ SHIPPED = POLICIES / "pendulum.pt"
 
 
 # Long enough for a gain, a refresh of it, gradient steps and an annealed end; short enough for a test.
-SHORT = {"steps": 600, "warm_up": 100, "n_A": 60, "n_B": 60, "refresh": 300, "batch": 32, "critic": (16, 16)}
+SHORT = {"steps": 420, "warm_up": 100, "n_A": 60, "n_B": 60, "refresh": 200, "batch": 32, "critic": (16, 16)}
 CASES: dict[str, tuple[str, dict[str, object]]] = {
     "pendulum": ("pendulum", SHORT),
-    "cartpole": ("cartpole", {**SHORT, "steps": 700, "actor": (16, 16)}),
+    "cartpole": ("cartpole", {**SHORT, "steps": 500, "actor": (16, 16)}),
     "identified before": ("pendulum", {**SHORT, "steps": 400, "identification": "before"}),
 }
 
