@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import certify.provers.ball.local
 from certify import RoaOptions, System, Verdict, certify_roa, symbols
 from certify.certificates.claims import Problem
 from certify.effort import Effort
@@ -78,7 +77,6 @@ def test_a_level_without_kinks_is_kept_where_the_effort_ends_with_them(monkeypat
     def dear(self: Rule, level: float, effort: Effort) -> None:
         effort.charge(effort.left)
 
-    monkeypatch.setattr(certify.provers.ball.local, "_FAR_BELOW", 1.0)
     monkeypatch.setattr(Rule, "with_kinks", dear)
     found: Any = prove_band(problem, np.eye(1), 1.0, effort=effort)
     assert found is not None and found[0] < found[1] < 0.011  # the first kink is at 0.1

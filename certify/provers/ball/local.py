@@ -150,7 +150,7 @@ def prove_band(
     if rule.cuts is None:
         return None
     found = _band(lambda level: _alone(rule, level, effort)[1].floor, limit, effort, above)
-    if not has_kinks(rule.steps.known.network) or (found is not None and found[1] >= _FAR_BELOW * limit):
+    if not has_kinks(rule.steps.known.network) or (found is not None and found[1] >= _NEAR * limit):
         return found
     part, least = (effort, 0.0) if found is None else (effort.share(_FOR_KINKS), found[1])
     return _band(lambda level: _around(rule, level, part)[1].floor, limit, part, above, least) or found
