@@ -29,7 +29,7 @@ from certify.loop.activations import activation
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, require_equilibrium
 from certify.loop.policies import PolicyNetwork
-from certify.lyapunov import domain_limit, extents, increment_matrix, volume
+from certify.lyapunov import domain_limit, extents, increment_matrix, slowest_decay, volume
 from certify.provers.ball.models import paths
 from certify.provers.base import FEW, Proof
 from certify.provers.tube.tube import find_tube
@@ -48,6 +48,7 @@ _TELLING = 1000  # boxes: a limit below it is what ended the search, and says no
 _SAME, _BELOW = 1e-6, 0.99  # relative: rates that are as good as equal; a rate that is safely below another
 _FEW = 3  # states, for which a function beyond the ellipsoid is suggested
 _ALL = 0.995  # share of the box that has ranks: more effort gains little
+_HALVINGS = 6  # of a period that is too long, before the policy is to blame
 _ENDED = (Stop.EFFORT, Stop.BOXES, Stop.LOCAL)
 
 
@@ -339,6 +340,8 @@ def _has_tube(result: RoaResult, effort: Effort) -> bool:
 def _correction(result: RoaResult, options: RoaOptions, plant: System) -> Step | None:
     """Correct the policy, the plant or the level, where no other option helps; None where one may."""
     if result.stop is Stop.UNSTABLE:
+        if (sooner := _shorter_period(result)) is not None:
+            return sooner
         other = "another policy, which stabilises the plant"
         if result.verdict is Verdict.REFUTED:
             return Step((), f"{other}: no V can prove the claim for this one")
@@ -353,6 +356,20 @@ def _correction(result: RoaResult, options: RoaOptions, plant: System) -> Step |
             require_equilibrium(plant, rounded=True)
         except InputError as error:
             return Step((), str(error))
+    return None
+
+
+def _shorter_period(result: RoaResult) -> Step | None:
+    """The first half, quarter, ... of the period for which an input that is held leaves the linearisation stable."""
+    system = result.system
+    if system.sample is None:
+        return None
+    for halvings in range(1, _HALVINGS + 1):
+        period = system.sample[1] / 2**halvings
+        loop = ClosedLoop(system.with_sample((period, period)), result.network)
+        if slowest_decay(loop.mean_rate(), loop.step) > 0:
+            why = f"with the input held for {float(period):g} s the linearisation is stable"
+            return Step((("--sample-time", f"{float(period):g}"),), why)
     return None
 
 

@@ -36,7 +36,8 @@ _HELP = {
     "centre": "Make pi(0) = u_eq: output or preactivation; nothing is centred unless this asks for it.",
     "observes": "Whether the network reads absolute states or their deviation from the operating point.",
     "ignore": "Tensor that is no part of the policy, * and ? as in names of files; repeatable.",
-    "output": "Output that is the action, where there are several: for ONNX its name, else its place, 0 for the first.",
+    "output": "Output that is the action, where there are several: for ONNX its name, else its place, 0 for the first; "
+    "for a state_dict mean, if the last layer gives the mean of the actions and then their spread.",
 }
 
 

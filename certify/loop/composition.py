@@ -35,10 +35,18 @@ def composed(system: System, policy: PolicyNetwork) -> tuple[System, PolicyNetwo
 
     Raises
     ------
-    InputError : the policy has another number of states or inputs than the plant.
+    InputError : the policy has another number of states or inputs than the plant, or inputs are held, and the results
+        of calls, which would become inputs, are not.
     """
     if not system.calls:
         return system, policy
+    if system.sample is not None:
+        called = ", ".join({call.name: 1 for call in system.calls})
+        raise InputError(
+            f"the equations of {system.name} call {called}, whose results move "
+            "within a period, and with --sample-time they would be held as inputs are. Leave --sample-time out, or "
+            'write the equations of a whole step, with time = "discrete".'
+        )
     if (policy.n, policy.m) != (system.n, system.m):
         raise InputError(
             f"the policy must read the {system.n} states and command the {system.m} inputs of {system.name}; it reads "

@@ -16,7 +16,7 @@ from certify.analysis.facts import Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
 from certify.analysis.run import certify_roa
-from certify.certificates.verdict import Verdict
+from certify.certificates.verdict import Stop, Verdict
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, get_system
 from certify.loop.policies import load_policy
@@ -123,6 +123,16 @@ def test_an_unstable_loop_needs_another_policy(
     result = certify_roa(system, network, tmp_path, RoaOptions(claim=claim))
     assert result.diagnosis is not None and result.diagnosis.next.options == ()
     assert result.diagnosis.next.why.startswith("another policy") and said in result.diagnosis.next.why
+
+
+@pytest.mark.parametrize("claim", ["asymptotic", "practical"])
+def test_a_period_that_is_too_long_is_to_be_shorter(tmp_path: Path, claim: Literal["asymptotic", "practical"]) -> None:
+    """x' = u with u = -x held over 5 s: a step multiplies by 1 - h, which is -1/4 at a quarter and -3/2 at a half."""
+    system, network = chain(1, [-1.0])
+    held = system.with_sample((Fraction(5), Fraction(5)))
+    result = certify_roa(held, network, tmp_path, RoaOptions(claim=claim))
+    assert result.stop is Stop.UNSTABLE and result.diagnosis is not None
+    assert result.diagnosis.next.options == (("--sample-time", "1.25"),)
 
 
 @pytest.mark.filterwarnings("error")

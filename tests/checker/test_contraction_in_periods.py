@@ -25,7 +25,9 @@ from tests.checker.test_contraction_in_steps import INSIDE, JUDGES, exactly, las
 from tests.support.balls import around, square
 from tests.support.certificates import Document, dump, edited, encode, grow, make, parse, verdict
 from tests.support.claim_oracle import Loop as Plant
+from tests.support.earlier import newer
 from tests.support.marks import slow_after
+from tests.support.network_loops import affine, mapped
 from tests.support.reference import judge
 from tests.support.uncertain import corners, drawn, held
 
@@ -116,6 +118,31 @@ def test_a_period_is_accepted_until_its_slope_is_minus_1(name: str, passes: Call
         for w in (2.0**-40, 0.05, 0.5)
     )
     assert SHARE.get(name, 0.3) * high <= found <= high * (1 + 2e-3), found / high
+
+
+def calling(t: float, radius: float, weight: float) -> Document:
+    """x' = 1/2 tanh(2 x + 1/8) + 1/64 - t u, of which a network that moves within the period says the first term."""
+    data = newer(scalar(["*", "0", "x"], t, radius, weight, order=1))
+    steps = [affine(0, [[2.0]], [0.125]), mapped(1, "tanh"), affine(2, [[0.5]])]
+    data["networks"].append({"name": "g", "reads": 1, "steps": steps})
+    data["plant"]["dynamics"] = [["+", ["network", "g", 0, "x"], "1/64", ["*", exactly(-t), "u"]]]
+    return data
+
+
+@pytest.mark.parametrize("passes", JUDGES)
+def test_a_network_that_the_equations_call_moves_within_a_period(passes: Callable[[Document], bool]) -> None:
+    """It is about as good as the same function written out, and no gain beyond the truth is accepted."""
+    radius, written = 0.0625, ["*", "1/2", ["tanh", ["+", "1/8", ["*", "2", "x"]]]]
+    low, high = 6.0, 40.0
+    assert parts(low, written, radius, 0.1) < 1 < parts(high, written, radius, 0.1)
+    while high > low * 1.00005:
+        middle = (low + high) / 2
+        low, high = (middle, high) if parts(middle, written, radius, 0.1) < 1 else (low, middle)
+    weight = 2.0**-10
+    found = last(lambda t: calling(t, radius, weight), 3.0, 1.5 * high, passes)
+    plain = last(lambda t: scalar(written, t, radius, weight, order=1), 3.0, 1.5 * high, passes)
+    assert 0.3 * high < 0.9 * plain <= found <= high, (found, plain, high)
+    assert not passes(calling(0.9, radius, weight)), "the slope of g is about 1"
 
 
 @pytest.mark.parametrize("passes", JUDGES)

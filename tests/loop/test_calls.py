@@ -169,3 +169,12 @@ u = [-3, 3]
         assert (result.verdict is Verdict.PROVED) == (wanted is Verdict.PROVED)
         if wanted is Verdict.PROVED:
             assert result.claim == "asymptotic" and [s.name for s in result.system.inputs] == ["u", "filter_0"]
+
+
+def test_results_are_not_held_with_the_inputs(tmp_path: Path) -> None:
+    """A larger plant would hold them: the claim would be about another loop."""
+    held = plant(tmp_path).with_sample((Fraction(1, 50), Fraction(1, 50)))
+    with pytest.raises(InputError, match=r"call observer, pair, whose results move within a period"):
+        composed(held, law())
+    with pytest.raises(InputError, match=r"Leave `sample_time` out"):
+        certify_roa(tmp_path / "plant.toml", law(), tmp_path / "out", sample_time="0.02")

@@ -423,3 +423,51 @@ class FromThird(nn.Module):  # type: ignore[misc]
 def test_a_part_without_an_end_is_read(tmp_path: Path) -> None:
     module = FromThird().eval()
     agree(import_policy(saved(module, "script", tmp_path / "p.pt"), PLANT, SAID).policy, module)
+
+
+def brax(path: Path, outputs: int = 2) -> Any:
+    """Parameters as Brax has them, flattened with numpy: kernels (in, out) of hidden_0, hidden_1; mean, then spread."""
+    module = nn.Sequential(nn.Linear(2, 6), nn.SiLU(), nn.Linear(6, outputs))
+    named = {f"policy/params/hidden_{k}": module[2 * k] for k in range(2)}
+    arrays = {f"{name}/kernel": layer.weight.detach().numpy().T for name, layer in named.items()}
+    np.savez(path, **arrays, **{f"{name}/bias": layer.bias.detach().numpy() for name, layer in named.items()})
+    return module
+
+
+BRAX = replace(SAID, squash="tanh", activation="silu", prefix="policy.params.hidden_0,policy.params.hidden_1")
+
+
+def test_the_mean_of_what_gives_the_spread_as_well(tmp_path: Path) -> None:
+    torch.manual_seed(7)
+    module, path = brax(tmp_path / "p.npz"), tmp_path / "p.npz"
+    found = import_policy(path, PLANT, replace(BRAX, output="mean"))
+    assert "first 1 are the mean" in found.assumed
+    agree(found.policy, module, lambda y: torch.tanh(y[:, :1]))
+    with pytest.raises(InputError, match=r"it gives 2\. .* --output mean"):
+        import_policy(path, PLANT, BRAX)
+    torch.save(module.state_dict(), tmp_path / "p.pt")  # found by its sizes
+    found = import_policy(tmp_path / "p.pt", PLANT, replace(BRAX, output="mean", prefix=None))
+    agree(found.policy, module.float(), lambda y: torch.tanh(y[:, :1]))
+    for outputs in (1, 3, 4):
+        brax(path, outputs)
+        with pytest.raises(InputError, match=f"2 numbers for 1 inputs; it gives {outputs}"):
+            import_policy(path, PLANT, replace(BRAX, output="mean"))
+    brax(path, 1)
+    with pytest.raises(InputError, match="--output must be left out"):
+        import_policy(path, PLANT, replace(BRAX, output="0"))
+
+
+@pytest.mark.parametrize("prefix", [None, "first,last"])
+@pytest.mark.parametrize(
+    "norm",
+    [nn.utils.weight_norm, nn.utils.parametrizations.weight_norm, nn.utils.parametrizations.spectral_norm],
+)
+@pytest.mark.filterwarnings("ignore:.*weight_norm.* is deprecated:FutureWarning")
+def test_a_file_of_computed_weights_names_what_writes_them_out(tmp_path: Path, norm: Any, prefix: str | None) -> None:
+    """Where no layer has a plain weight none is found, and the reason is told."""
+    module = nn.ModuleDict(
+        {name: norm(nn.Linear(2, 1) if name == "last" else nn.Linear(2, 2)) for name in ("first", "last")}
+    )
+    torch.save(module.eval().state_dict(), tmp_path / "p.pt")
+    with pytest.raises(InputError, match=r"belongs to is computed\. Write the weights out before you save it"):
+        import_policy(tmp_path / "p.pt", PLANT, replace(LAYERS, prefix=prefix))

@@ -15,7 +15,8 @@ from certify.provers.boxes.search import empty_ring
 def is_nearby(problem: Problem, proof: Proof, path: Path) -> bool:
     """True if the checker accepts that trajectories converge to one equilibrium in {V <= c0}.
 
-    Only the checker bounds what bends F there. It is asked about {V <= c1} alone, for which no leaf has to be bounded.
+    Only the checker bounds what bends F there. It is asked about {V <= c1} alone, for which no leaf has to be bounded;
+    about all where leaves carry the floor.
 
     Parameters
     ----------
@@ -27,16 +28,17 @@ def is_nearby(problem: Problem, proof: Proof, path: Path) -> bool:
     BackendError : the checker process failed.
     """
     claim, evidence = proof.claim, proof.evidence
-    if claim is None or claim.floor is None or not isinstance(evidence, PartitionTree) or evidence.local is None:
+    if claim is None or claim.floor is None or not isinstance(evidence, PartitionTree):
         return False
-    closer = contraction(problem, evidence.T, claim.floor)
-    inner = replace(claim, roa=claim.local).converging()
+    closer, asked = contraction(problem, evidence.T, claim.floor), evidence
+    if evidence.local is not None:
+        claim, ring = replace(claim, roa=claim.local), empty_ring(problem, evidence.T, claim.local)
+        asked = replace(evidence, root=ring.root, tree=ring.tree)
+    inner = claim.converging()
     if closer is None or inner is None:
         return False
-    ring = empty_ring(problem, evidence.T, claim.local)
-    asked = replace(evidence, root=ring.root, tree=ring.tree, contraction=closer)
     loop = problem.loop
-    certificate = Certificate(loop.system, loop.network, problem.V, inner, asked)
+    certificate = Certificate(loop.system, loop.network, problem.V, inner, replace(asked, contraction=closer))
     file = write_beside(path, certificate.to_json().encode(), ".unchecked.json")
     try:
         return bool(run_checker(file)["result"] == "ACCEPTED")

@@ -38,6 +38,7 @@ Array = NDArray[np.float64]
 Ended = Literal["domain", "sampled"]
 _BELOW = 1e-9  # relative distance from a limit that is itself out of reach (the domain's open condition)
 _BELOW_WITNESS = 1e-3
+_NEXT_TO = 1e-6  # share of a level: violations below it are next to the equilibrium
 _SMALLEST = 1e-120  # the least level: squares of states and products of bounds must not underflow
 _BLENDS = (0.05, 0.15, 0.3)
 MANY = 6  # states, beyond which there is next to nothing but the local set
@@ -292,6 +293,16 @@ def blend(
     """The candidate that has this share of the one that is easier to prove."""
     P = (1 - share) * large.unit + share * provable.unit
     return trial(loop, (P + P.T) / 2, f"{large.name} with {share:.0%} of {provable.name}", options, effort)
+
+
+def below_violations(trial: Trial, effort: Effort) -> Trial | None:
+    """The candidate up to a level of the lowest violation that sampling finds but for those next to the equilibrium, of
+    which V's own place is a rounding; None where there is no such level."""
+    lowest = survey(trial.task.problem, trial.T, trial.task.target, effort=effort)[-1:]
+    if not lowest or lowest[0].below > _NEXT_TO * lowest[0].top:
+        return None
+    task = replace(trial.task, target=lowest[0].above)
+    return replace(trial, task=task, limited_by="sampled", volume=volume(trial.P, task.target))
 
 
 def by_reach(trials: Sequence[Trial]) -> list[Trial]:

@@ -20,6 +20,7 @@ from certify.analysis.candidates.trials import (
     OPTIMISING,
     SAMPLING,
     Trial,
+    below_violations,
     blend,
     blends,
     by_reach,
@@ -55,6 +56,8 @@ _HEAT = 0.04  # share of the effort for a candidate's first heat
 _SEARCH = 0.6  # share of the effort that is left for a search that cannot be interrupted
 _AROUND_FIRST = 0.3  # the same in many states, for the first of several, of which the later ones are to be the larger
 _GRACE, _LEAST = 1.0 * UNIT, 0.05  # operations, or of the whole, for a local level where nothing is proved yet
+_FOR_BALL = 0.2  # of the whole, for a set from a ball around the equilibrium, even if no effort is left
+_LITTLE = 0.01  # share of the domain's ellipsoid: a smaller set counts for less than a claim of convergence
 _FOR_PROOF = 0.4  # share of the whole in which no further candidate is optimised
 _WORTH = 1.05  # growth of a volume that another candidate must promise
 _SMALL = 0.1  # share of the volume within a candidate's reach: if less is proved, another one is worth its effort
@@ -201,12 +204,17 @@ class _Trials:
         trial = entered.trial
         if nearby and entered is self.race.best and not self._is_nearby(entered):
             self.race.contenders.remove(entered)
-            self.tools.remarks.append(
-                f"with {trial.name} a set of volume {entered.proved:.6g} is proved as well, but not that all converge "
-                "to one equilibrium in it: the claim `practical` would have it"
-            )
+            self._leave_out(entered)
             return False
         return (entered.attempt.level or 0.0) >= _REACHED * trial.task.target
+
+    def _leave_out(self, contender: Contender) -> None:
+        """Say that a set is larger than the one that is claimed, and that less is known of it."""
+        if contender.proved:
+            self.tools.remarks.append(
+                f"with {contender.trial.name} a set of volume {contender.proved:.6g} is proved as well, but not that "
+                "all converge to one equilibrium in it: the claim `practical` would have it"
+            )
 
     def _is_best_nearby(self) -> bool:
         """True if convergence to one equilibrium is claimed, and shown of the best so far."""
@@ -271,7 +279,26 @@ class _Choice(_Trials):
             race.enter([one])
             if race.proved or self.effort.over or state.options.engine == "dreal":
                 break
-        return self._improve() if loop.network.is_moved else None
+        if loop.network.is_moved:
+            self._improve()
+        little = race.best.proved < _LITTLE * volume(ellipsoid_in(loop.system), 1.0)
+        if (state.insists or (state.converging and little)) and race.best.proved and not self._is_best_nearby():
+            self._closer(trials)
+        return None
+
+    def _closer(self, trials: list[Trial]) -> None:
+        """A set that is shown to converge to one equilibrium instead of the largest one, which is not: with the V of
+        which samples fall from the equilibrium on up to the largest level, from a ball around it."""
+        race = self.race
+        with self.tools.timing("candidate"):
+            within = [one for trial in trials if (one := below_violations(trial, self.effort)) is not None]
+        for one in by_reach(within)[:1]:
+            least = self.effort.part(_FOR_BALL * self.tools.whole, even_if_over=True)
+            entered = Contender(one, race.begin(one, True))
+            entered.advance(Budget(least, race.boxes), race.report)
+            if entered.proved and self._is_nearby(entered):
+                self._leave_out(race.best)
+                race.contenders[:] = [entered]
 
     def _among(self, trials: list[Trial], large: Trial | None) -> None:
         """The best of these, of `robust`, and of what lies between the two that are largest and best proved; or `firm`

@@ -117,7 +117,7 @@ def _with_claim(state: State) -> State:
     options = state.options
     converging = options.claim in ("auto", "nearby")
     kind, why = _kind_of(state.loop, options)
-    state = replace(state, converging=converging)
+    state = replace(state, converging=converging, insists=options.claim == "nearby")
     if why is not None:
         or_nearby = ", or a nearby equilibrium" if converging else ""
         state = state.noting(f"practical stability is claimed{or_nearby}, because {why}")

@@ -43,6 +43,7 @@ class State:
     options : of the run, with the claim that is aimed at.
     result : as far as it is known.
     converging : convergence to one nearby equilibrium is to be shown as well.
+    insists : the same, and a smaller set of which it is shown is better than a larger one.
     centre : the state that a tube has to start around, in deviations; None if none was named.
     notes : remarks for a person, in order; none is ever taken away.
     race, proof : the candidates, and what the prover says of the best.
@@ -60,6 +61,7 @@ class State:
     options: RoaOptions
     result: RoaResult
     converging: bool = False
+    insists: bool = False
     centre: tuple[Fraction, ...] | None = None
     notes: tuple[str, ...] = ()
     race: Race | None = None

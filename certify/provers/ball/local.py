@@ -52,6 +52,7 @@ _ROUNDING = 1e-12  # share of the decay: the checker's numbers are in doubt by i
 _MOST_CONES = 4096  # of directions
 _FAR_BELOW = 1e-3  # share of its limit below which a level is tried to be raised by kinks
 _WORTH_KINKS, _DOWN = 4.0, 0.1  # from a level without kinks to the first with them, and on; down to one that is good
+_FOR_KINKS = 0.5  # share of the effort for a higher level with kinks, where one is found without
 _TINY, _LOWEST = 1e-10, 1e-6  # shares of the largest level: where directions are chosen, and the lowest that is tried
 _SHARED = 0.1  # share of a rule's operations that one of many cones takes
 _ABOVE = 1 + 1e-3  # factor of the least floor that is shown
@@ -149,18 +150,28 @@ def prove_band(
     rule = Rule.anywhere(problem, T, known)
     if rule.cuts is None:
         return None
+    found = _band(lambda level: _alone(rule, level, effort)[1].floor, limit, effort, above)
+    if not has_kinks(rule.steps.known.network) or (found is not None and found[1] >= _NEAR * limit):
+        return found
+    part, least = (effort, 0.0) if found is None else (effort.share(_FOR_KINKS), found[1])
+    return _band(lambda level: _around(rule, level, part)[1].floor, limit, part, above, least) or found
+
+
+def _band(
+    floor_on: Callable[[float], float], limit: float, effort: Effort, above: float, lowest: float = 0.0
+) -> tuple[float, float] | None:
+    """The same by the least floor on the ball of a level; None also where no level from `lowest` on has a lower one."""
     floors: dict[float, float] = {}
 
     def floor(level: float) -> float:
         if level not in floors:
-            found = _around(rule, level, effort)[1]
-            floors[level] = max(found.floor, _NOTHING * limit)
+            floors[level] = max(floor_on(level), _NOTHING * limit)
         return floors[level]
 
     level = limit
     while not floor(level) < level:
         level *= _NEAR
-        if level <= 1e-30 * limit or level < _LEAST or effort.over:
+        if level <= max(1e-30 * limit, lowest) or level < _LEAST or effort.over:
             return None
     least = floor(level)
     while not effort.over and floor(level * _LOWER) < min(level * _LOWER, (1 - _WORTH) * least):
@@ -177,17 +188,18 @@ def prove_band(
 
 def _around(rule: Rule, level: float, effort: Effort = UNLIMITED, floor: float = math.inf) -> tuple[Rule, _Around]:
     """The rule, with kinks where it shows no floor up to that without, and the least floor on the ball of a level."""
-
-    def around(one: Rule) -> tuple[Rule, _Around]:
-        found = one.around(level)
-        effort.charge(max(found.rounds * one.operations, one.operations_of_models))
-        return one, found
-
-    found = around(rule)
+    found = _alone(rule, level, effort)
     if found[1].floor < level and found[1].floor <= floor:
         return found
     kinked = rule.with_kinks(level, effort)
-    return found if kinked is None else around(kinked)
+    return found if kinked is None else _alone(kinked, level, effort)
+
+
+def _alone(rule: Rule, level: float, effort: Effort) -> tuple[Rule, _Around]:
+    """The rule as it is."""
+    found = rule.around(level)
+    effort.charge(max(found.rounds * rule.operations, rule.operations_of_models))
+    return rule, found
 
 
 def local_margin(problem: Problem, T: Array, level: float, known: Paths) -> float:
@@ -280,7 +292,8 @@ class Rule:
     @property
     def operations_of_models(self) -> float:
         """The operations of the models alone."""
-        cells = max(1, len(self.cells)) * (1 if self.steps.is_plain else 3) + (20 if self.problem.loop.step else 0)
+        cells = max(1, len(self.cells)) * (1 if self.steps.is_plain else 3)
+        cells += 0 if self.problem.loop.system.sample is None else 20  # the series, and where the state is meanwhile
         return cells * self.steps.known.operations
 
     def shown(self, level: float, enough: float = math.inf) -> Shown:

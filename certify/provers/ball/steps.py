@@ -25,6 +25,7 @@ from certify.provers.ball.ranged import RangedJet, RangedJets
 Array = NDArray[np.float64]
 Cell = tuple[Interval, ...]
 _WIDER = 1 + 1e-9  # share of how far a constraint moves on a ball, for the checker's rounding
+_LEAST = 1e-300  # such a bound, above rates that are exactly 0 in floats, which a loop at its rest may have
 _ATTEMPTS, _FURTHER = 4, 1.25  # at how far the states move in a period, each from the rates of the last
 
 
@@ -224,5 +225,6 @@ def _within_a_period(walk: _Walk, hi: float) -> tuple[tuple[Array, Array], Array
         found = np.all((at_rest | (hi * first < far)) & (hi * steep < along), axis=0)
         if np.all(found):
             return (far, along), first + steep
-        far, along = np.where(found, far, _FURTHER * hi * first), np.where(found, along, _FURTHER * hi * steep)
+        further = np.maximum(_FURTHER * hi * first, _LEAST)
+        far, along = np.where(found, far, further), np.where(found, along, _FURTHER * hi * steep)
     return None

@@ -58,7 +58,8 @@ class ImportOptions:
     observes : `absolute` if the network reads the states' values, `deviation` if deviations from the operating point.
     ignore : names of tensors that are no part of the policy, with `*` and `?` as in names of files.
     output : which output of a program is the action, where it has several: a name for ONNX, for TorchScript and modules
-        the place, counted from 0.
+        the place, counted from 0. Of a state_dict: `mean`, if its last layer gives the mean of the actions and then
+        their spread.
 
     Raises
     ------

@@ -30,6 +30,9 @@ from certify.loop.policies.importers.steps import Affine, Clip, Step, Tanh, line
 from certify.loop.policies.importers.unread import unread
 
 _KEY = re.compile(r"(?:(?P<prefix>.*)\.)?(?P<number>[0-9]{1,4})\.(?P<rest>.*)", re.DOTALL)
+MEAN = "mean"
+"""The `--output` of a network whose last layer gives the mean of the actions and behind it their spread."""
+_COMPUTED = re.compile(r"(^|\.)(weight_(g|v|orig)|parametrizations\.weight\.original[01]?)$")
 _PARTS = ("controller.x_equilibrium", "controller.layers.0.weight", "controller.b")
 _OTHERS = ("critic", "value", "vf", "v_net", "q_net", "qf", "q1", "q2", "lyapunov", "target")
 _ENDS: dict[Output, tuple[Step, ...]] = {
@@ -109,9 +112,9 @@ def read_state_dict(
     if options.prefix is not None and "," in options.prefix:
         tensors, prefix = _numbered(tensors, options.prefix.split(",")), _LISTED
     else:
-        prefix = options.prefix if options.prefix is not None else _only(tensors, n, m)
+        prefix = options.prefix if options.prefix is not None else _only(tensors, n, _given(m, options))
     norms = {} if options.norm is None else _norms(tensors, prefix, options)
-    layers = _layers(tensors, prefix, list(norms))
+    layers = _mean_of(_layers(tensors, prefix, list(norms)), m, options)
     if (layers[0].weight.shape[1], layers[-1].weight.shape[0]) != (n, m):
         raise InputError(
             f"the policy must read {n} states and command {m} inputs; {prefix} is {widths(layers)}. "
@@ -126,6 +129,8 @@ def read_state_dict(
         known |= dict.fromkeys(_own(tensors, beside), "the Lyapunov network that is imported beside it")
     activation, placed = options.activation or "tanh", dict(norms.values())
     assumed = f"{activation} between the layers is what --activation says, {squash} behind them what --squash says"
+    if options.output == MEAN:
+        assumed += f", of whose {2 * m} numbers the first {m} are the mean, as --output says"
     if options.norm is not None:
         epsilon = float(options.norm_epsilon or _EPSILON)
         assumed += f", layer normalisation {options.norm[6:]} the activation, with epsilon {epsilon}, what --norm says"
@@ -193,6 +198,35 @@ def read_lyapunov(tensors: Mapping[str, Numbers], prefix: str | None, options: I
     )
 
 
+def _given(m: int, options: ImportOptions) -> int:
+    """The numbers that the last layer gives for m actions."""
+    return 2 * m if options.output == MEAN else m
+
+
+def _mean_of(layers: Layers, m: int, options: ImportOptions) -> Layers:
+    """The layers up to the mean of the actions, where the last one gives their spread behind it.
+
+    Raises
+    ------
+    InputError : `--output` says so, and the last layer does not give two numbers for each input; or the contrary.
+    """
+    last = layers[-1]
+    given = len(last.bias)
+    if options.output == MEAN:
+        if given != 2 * m:
+            raise InputError(
+                f"--output mean takes the first half of what the last layer gives, {2 * m} numbers for {m} inputs; it "
+                f"gives {given}."
+            )
+        return [*layers[:-1], Affine(last.weight[:m], last.bias[:m])]
+    if given == 2 * m:
+        raise InputError(
+            f"the last layer must give {m} numbers, one for each input; it gives {given}. If these are the mean of the "
+            "actions and then their spread, as Brax has them, say so with --output mean."
+        )
+    return layers
+
+
 def _numbered(tensors: Mapping[str, Numbers], names: Sequence[str]) -> dict[str, Numbers]:
     """The tensors with the layers of these names, in their order, numbered under one prefix.
 
@@ -204,7 +238,7 @@ def _numbered(tensors: Mapping[str, Numbers], names: Sequence[str]) -> dict[str,
     if wrong or len(set(names)) != len(names):
         raise InputError(
             f"--prefix with commas must name each layer once, in their order; found {','.join(names)}. "
-            f"Layers are {', '.join(_weights(tensors)) or 'none'}."
+            f"Layers are {', '.join(_weights(tensors)) or 'none'}.{_without_norm(tensors)}"
         )
     parts = {f"{name}.{part}": f"{_LISTED}.{k}.{part}" for k, name in enumerate(names) for part in ("weight", "bias")}
     return {parts.get(name, name): tensor for name, tensor in tensors.items()}
@@ -247,8 +281,15 @@ def _only(tensors: Mapping[str, Numbers], n: int, m: int) -> str:
     raise InputError(
         f"a file must hold one policy from {n} states to {m} inputs; it holds {len(fitting)}. "
         f"Name its keys up to their numbers with --prefix, and its states with --states. Found {listed}. "
-        "If the policy is more than layers one behind the other, export it as TorchScript or ONNX."
+        f"If the policy is more than layers one behind the other, export it as TorchScript or ONNX."
+        f"{_without_norm(tensors)}"
     )
+
+
+def _without_norm(tensors: Mapping[str, Numbers]) -> str:
+    """The next step for a file in which weights are computed from other tensors; empty if none is."""
+    found = next(filter(_COMPUTED.search, tensors), None)
+    return "" if found is None else f" The weight that {found} belongs to is computed. {WITHOUT_WEIGHT_NORM}"
 
 
 def _norms(tensors: Mapping[str, Numbers], prefix: str, options: ImportOptions) -> dict[int, tuple[int, LayerNorm]]:

@@ -1,0 +1,98 @@
+"""The set that is claimed where the largest one is not shown to converge to one equilibrium."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from certify import RoaOptions, System, Verdict, certify_roa, symbols
+from certify.certificates.claims import Problem
+from certify.effort import Effort
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.policies import PolicyNetwork
+from certify.lyapunov.function import Quadratic
+from certify.provers.ball.local import Rule, prove_band
+from tests.support.loops import chain
+
+
+def bumpy(half_width: int = 1, ends: float = 1.0) -> tuple[System, PolicyNetwork]:
+    """x+ = u, with u of slope 1/2, but -2 from 0.1 to 0.3, and 2.5 beyond `ends`; not at rest at 0.
+
+    |u| is less than |x| next to the rest, at about 1/1000, but not from 1/4 to 7/20.
+    """
+    x, u = symbols("x u")
+    bound = Fraction(4 * half_width)
+    plant = System(
+        name="bumpy",
+        states=(x,),
+        inputs=(u,),
+        parameters={},
+        dynamics=(u,),
+        u_eq=(0,),
+        domain=((Fraction(-half_width), Fraction(half_width)),),
+        input_bounds=((-bound, bound),),
+        time="discrete",
+    )
+    bends, growth = np.array([-9.0, 0.1, 0.3, ends]), 2.0 * (ends < half_width)
+    last = np.array([[0.5, -2.5, 2.5, growth]])
+    law = PolicyNetwork.of_layers(
+        weights=(np.ones((4, 1)), last),
+        biases=(-bends, np.array([-4.5 + 5e-4])),
+        scale=[1.0],
+        offset=[0.0],
+        squash="identity",
+        centre="none",
+        activation="relu",
+    )
+    return plant, law
+
+
+def test_the_set_that_converges_is_claimed_where_that_is_asked_for(tmp_path: Path) -> None:
+    plant, law = bumpy()
+    large = certify_roa(plant, law, tmp_path / "auto", RoaOptions(candidate="ellipsoid"))
+    assert (large.verdict, large.claim) == (Verdict.PROVED, "practical")
+    assert large.volume is not None and large.volume > 1.8
+    close = certify_roa(plant, law, tmp_path / "nearby", RoaOptions(candidate="ellipsoid", claim="nearby"))
+    assert (close.verdict, close.claim) == (Verdict.PROVED, "nearby")
+    assert close.volume is not None and 0.15 < close.volume < 0.5
+    assert close.notice is not None and "not that all converge to one equilibrium" in close.notice
+
+
+def test_next_to_nothing_of_the_domain_counts_for_less_than_convergence(tmp_path: Path) -> None:
+    plant, law = bumpy(400)
+    result = certify_roa(plant, law, tmp_path, RoaOptions(candidate="ellipsoid"))
+    assert (result.verdict, result.claim) == (Verdict.PROVED, "nearby")
+    assert result.volume is not None and 0.15 < result.volume < 0.5
+
+
+def test_a_level_without_kinks_is_kept_where_the_effort_ends_with_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant, law = bumpy()
+    problem = Problem(ClosedLoop(plant, law), Quadratic(np.eye(1)))
+    effort = Effort(1e9)
+
+    def dear(self: Rule, level: float, effort: Effort) -> None:
+        effort.charge(effort.left)
+
+    monkeypatch.setattr(Rule, "with_kinks", dear)
+    found: Any = prove_band(problem, np.eye(1), 1.0, effort=effort)
+    assert found is not None and found[0] < found[1] < 0.011  # the first kink is at 0.1
+    assert 0 < effort.left < 6e8  # half of it was for kinks
+
+
+def test_a_look_at_a_step_is_no_dearer_than_a_step() -> None:
+    """Only an input that is held needs a series."""
+    plant, law = bumpy()
+    rule = Rule.anywhere(Problem(ClosedLoop(plant, law), Quadratic(np.eye(1))), np.eye(1))
+    assert rule.operations_of_models == 3 * rule.steps.known.operations
+
+
+def test_a_loop_that_rests_exactly_in_floats_has_an_enclosure_of_a_period(tmp_path: Path) -> None:
+    """Nothing moves the equilibrium, so that the bound of how far it moves within a period starts from 0."""
+    plant, law = chain(2, [-1.0, -2.0])
+    held = plant.with_sample((Fraction(1, 20), Fraction(1, 20)))
+    result = certify_roa(held, law, tmp_path, RoaOptions(candidate="lyapunov", claim="nearby"))
+    assert (result.verdict, result.claim) == (Verdict.PROVED, "nearby")
