@@ -102,7 +102,7 @@ def test_without_a_kink_nothing_changes() -> None:
 RUNS: dict[str, tuple[Any, PolicyNetwork, dict[str, Any]]] = {
     "three states": (plant("x y z", "y", "z", "u", half=2, bound=9), sides(1.0, 3.0, 3.0, share=0.8), {}),
     "a rest beside a kink": (
-        plant("x y", "y", "u+0.01", half=2, bound=9), sides(1.0, 1.5, share=0.6), {"claim": "nearby"},
+        plant("x y", "y", "u+0.001", half=2, bound=9), sides(1.0, 1.5, share=0.6), {"claim": "nearby"},
     ),
     "discrete": (
         plant("x y", "x+y/10", "y+u/10", half=2, bound=9, time="discrete"), sides(1.0, 1.5, share=0.7), {},
