@@ -429,6 +429,35 @@ def jit(path: Path, x: np.ndarray) -> np.ndarray:
     return result
 
 
+def before(self: Any, x: tuple[torch.Tensor]) -> tuple[torch.Tensor]:
+    return (2.0 * x[0],)
+
+
+def behind(self: Any, x: tuple[torch.Tensor], u: torch.Tensor) -> torch.Tensor:
+    return 3.0 * u + 1.0
+
+
+def hooked(module: torch.nn.Module, inner: torch.nn.Module, which: str) -> torch.nn.Module:
+    if which == "before":
+        inner.register_forward_pre_hook(before)
+    else:
+        inner.register_forward_hook(behind)
+    return module
+
+
+@pytest.mark.parametrize("which", ["before", "behind"])
+def test_torchscript_with_a_hook_is_refused_unless_its_code_calls_it(which: str, tmp_path: Path) -> None:
+    """torch calls the hooks of the whole module, which no code of the archive does."""
+    torch.manual_seed(4)
+    module = Relu()
+    path = scripted(hooked(module, module.a, which), "script", tmp_path / "inner.pt")
+    assert gap(import_policy(path, plant(), SAID), jit(path, X)) < 5e-6
+    module = Relu()
+    path = scripted(hooked(module, module, which), "script", tmp_path / "whole.pt")
+    with pytest.raises(InputError, match="has a forward hook: write it into forward"):
+        import_policy(path, plant(), SAID)
+
+
 @pytest.mark.parametrize("how", ["trace", "script", "freeze"])
 @pytest.mark.parametrize("make", [mlp, Scaled, Relu, Constant])
 def test_torchscript(make: Any, how: str, tmp_path: Path) -> None:

@@ -43,6 +43,7 @@ _IN_PLACE = (
     *("relu", "elu", "leaky_relu", "selu", "celu", "silu", "mish", "tanh", "sigmoid"),
     *("hardtanh", "hardswish", "hardsigmoid", "relu6", "clamp"),
 )
+_HOOKS = ("__forward_pre_hooks__", "__forward_hooks__")
 _RESERVED = ("torch", "__torch__", "ops", "CONSTANTS", "getattr")
 _COMPARED: dict[str, Callable[[Any, Any], bool]] = {
     **{
@@ -191,7 +192,11 @@ def _forward(program: _Program, module: Any, given: list[Any], depth: int, metho
     if "torch.nn.utils.parametrize" in str(module.function):
         raise InputError(f"a weight of {what} is computed by {module.function.name}. {WITHOUT_WEIGHT_NORM}")
     definition = program.classes.get(module.function)
-    methods = [] if definition is None else [n for n in definition.body if isinstance(n, ast.FunctionDef)]
+    body = [] if definition is None else definition.body
+    methods = [node for node in body if isinstance(node, ast.FunctionDef)]
+    if depth == 0 and any(isinstance(n, ast.Name) and n.id in _HOOKS for part in body for n in ast.walk(part)):
+        # of a module inside another one the code that calls it has them
+        raise InputError(f"{module.function} in {what} has a forward hook: write it into forward before you save it.")
     forward = [node for node in methods if node.name == method]
     if len(forward) != 1:
         raise InputError(f"{module.function} in {what} must have one {method}.")
