@@ -458,6 +458,25 @@ def test_torchscript_with_a_hook_is_refused_unless_its_code_calls_it(which: str,
         import_policy(path, plant(), SAID)
 
 
+class Sized(Relu):
+    def NumToTensor(self, count: int) -> int:  # noqa: N802
+        return 3 * count
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.b(torch.tanh(self.a(x))) * self.NumToTensor(x.size(1))
+
+
+def test_torchscript_with_names_of_its_own_is_what_torch_makes_of_it(tmp_path: Path) -> None:
+    """A method is called like an operation of torch, and a function of the archive like a module's forward."""
+    torch.manual_seed(4)
+    path = scripted(Sized(), "script", tmp_path / "sized.pt")
+    assert gap(import_policy(path, plant(), SAID), jit(path, X)) < 5e-6
+    path = scripted(Relu(), "script", tmp_path / "policy.pt")
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("policy/code/b.py", "def forward(h: Tensor) -> Tensor:\n  return torch.slice(h, 1, 0, 1)\n")
+    assert gap(import_policy(path, plant(), SAID), jit(path, X)) < 5e-6
+
+
 @pytest.mark.parametrize("how", ["trace", "script", "freeze"])
 @pytest.mark.parametrize("make", [mlp, Scaled, Relu, Constant])
 def test_torchscript(make: Any, how: str, tmp_path: Path) -> None:

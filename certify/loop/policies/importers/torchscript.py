@@ -267,7 +267,11 @@ def _evaluate(program: _Program, node: ast.expr, values: dict[str, Any], depth: 
             return [_evaluate(program, part, values, depth) for part in parts]
         case ast.Tuple(elts=parts):
             return tuple(_evaluate(program, part, values, depth) for part in parts)
-        case ast.Call(func=ast.Name(id="int") | ast.Attribute(attr="NumToTensor"), args=[inner], keywords=[]):
+        case ast.Call(
+            func=ast.Name(id="int") | ast.Attribute(value=ast.Attribute(value=ast.Name(id="ops")), attr="NumToTensor"),
+            args=[inner],
+            keywords=[],
+        ):
             size = _evaluate(program, inner, values, depth)
             if isinstance(size, Batch) or type(size) is int:
                 return size
@@ -312,7 +316,9 @@ def _function(program: _Program, node: ast.expr, values: dict[str, Any]) -> ast.
     while isinstance(node, ast.Attribute):
         names.append(node.attr)
         node = node.value
-    return program.functions.get(".".join([node.id, *names[::-1]])) if isinstance(node, ast.Name) else None
+    if not isinstance(node, ast.Name) or node.id != "__torch__":  # others are values and their attributes
+        return None
+    return program.functions.get(".".join([node.id, *names[::-1]]))
 
 
 def _is_call(method: str) -> bool:
