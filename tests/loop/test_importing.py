@@ -459,7 +459,7 @@ def test_torchscript_with_a_hook_is_refused_unless_its_code_calls_it(which: str,
 
 
 class Sized(Relu):
-    def NumToTensor(self, count: int) -> int:  # noqa: N802
+    def NumToTensor(self, count: int) -> int:
         return 3 * count
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -539,6 +539,22 @@ def rewritten(path: Path, old: str, new: str) -> Path:
         for name, raw in members.items():
             archive.writestr(name, raw.replace(old.encode(), new.encode()) if name.endswith(".py") else raw)
     return path
+
+
+@pytest.mark.parametrize("name", ["p/CODE", "q/code"])
+def test_torchscript_of_which_torch_reads_another_member_is_refused(name: str, tmp_path: Path) -> None:
+    """torch looks members up whatever their case, in the folder of the first one."""
+    torch.manual_seed(4)
+    path = scripted(Relu(), "script", tmp_path / "p.pt")
+    with zipfile.ZipFile(path) as archive:
+        members = {each: archive.read(each) for each in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+        for each in [each for each in members if each.startswith("p/code/")]:
+            archive.writestr(each.replace("p/code", name), members[each].replace(b"torch.tanh", b"torch.relu"))
+        for each, raw in members.items():
+            archive.writestr(each, raw)
+    with pytest.raises(InputError, match="differ in more than capital letters"):
+        import_policy(path, plant(), SAID)
 
 
 def test_a_function_is_what_its_archive_says(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import io
 import pickle
 import zipfile
 from collections import OrderedDict
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -58,6 +59,8 @@ class TorchFile:
         if len(set(roots)) != 1:
             raise InputError(f"{what} must hold one data.pkl, as torch.save writes it; found {len(set(roots))}.")
         self.root = roots[0]
+        if isinstance(self.archive, Archive):
+            _require_torchs_names(self.archive.names, self.root, what)
         self.order = "<"
         if f"{self.root}byteorder" in self.archive:
             word = self.archive.read(f"{self.root}byteorder")
@@ -155,6 +158,13 @@ def is_tensor(node: Any) -> bool:
     if not isinstance(node, Call) or not isinstance(node.function, Name) or node.function.module != "torch._utils":
         return False
     return node.function.name in ("_rebuild_tensor_v2", "_rebuild_tensor_v3", "_rebuild_parameter")
+
+
+def _require_torchs_names(names: Sequence[str], root: str, what: str) -> None:
+    """Refuse an archive of which torch would read other members: it takes the folder of the first one, and capitals for
+    small letters."""
+    if not names[0].startswith(root) or len({name.lower() for name in names}) != len(names):
+        raise InputError(f"{what} must have {root}, with names that differ in more than capital letters, as torch has.")
 
 
 def _depth(name: str) -> int:
