@@ -557,6 +557,30 @@ def test_torchscript_of_which_torch_reads_another_member_is_refused(name: str, t
         import_policy(path, plant(), SAID)
 
 
+class Shares(Relu):
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("whole", torch.tensor([7]))
+        self.register_buffer("parts", torch.tensor([2]))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.b(torch.tanh(self.a(x))) * torch.div(self.whole, self.parts)
+
+
+def test_torchscript_of_an_old_format_divides_no_integers(tmp_path: Path) -> None:
+    """There torch rounds the quotient of integers towards 0."""
+    torch.manual_seed(4)
+    path = scripted(Shares(), "script", tmp_path / "p.pt")
+    assert gap(import_policy(path, plant(), SAID), jit(path, X)) < 5e-6
+    with zipfile.ZipFile(path) as archive:
+        members = {each: archive.read(each) for each in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+        for each, raw in members.items():
+            archive.writestr(each, b"3\n" if each == "p/version" else raw)
+    with pytest.raises(InputError, match="of torch before"):
+        import_policy(path, plant(), SAID)
+
+
 def test_a_function_is_what_its_archive_says(tmp_path: Path) -> None:
     torch.manual_seed(4)
     module = torch.nn.Sequential(torch.nn.Linear(2, 6), torch.nn.ReLU(), torch.nn.Linear(6, 1))

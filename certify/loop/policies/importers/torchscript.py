@@ -393,11 +393,21 @@ def _operation(program: _Program, name: str, given: list[Any], node: ast.Call) -
         # alpha is written out even where it is 1, and then changes nothing
         elif said is not None and (word.arg != "alpha" or said != 1):
             raise InputError(f"{at} has {word.arg}, which is not read.")
+    if name == "div" and not any(depends(v) for v in given) and _is_old(program.file):
+        raise InputError(
+            f"{at} is of constants alone, in a format of torch before 1.6. Save it with a newer one."
+        )
     made = operation(name, given, approximate, program.observations, at)
     if name in PARTS:
         parts = made if isinstance(made, list) else [made]
         program.shared.extend(v for v in (given[0], *parts) if isinstance(v, Value))
     return made
+
+
+def _is_old(file: TorchFile) -> bool:
+    """True for a format in which the quotient of integers is rounded."""
+    said = file.archive.read(f"{file.root}version").strip() if file.holds("version") else b""
+    return not said.isdigit() or int(said) < 4
 
 
 def _held(program: _Program, value: Any) -> Any:
