@@ -282,7 +282,9 @@ class _Choice(_Trials):
         if loop.network.is_moved:
             self._improve()
         little = race.best.proved < _LITTLE * volume(ellipsoid_in(loop.system), 1.0)
-        if (state.insists or (state.converging and little)) and race.best.proved and not self._is_best_nearby():
+        ranks = loop.system.in_steps and (state.options.ranks or (state.options.goes_on and loop.system.n <= FEW))
+        wanted = state.insists or (state.converging and little and not ranks)  # which reach a large set from far more
+        if wanted and race.best.proved and not self._is_best_nearby():
             self._closer(trials)
         return None
 

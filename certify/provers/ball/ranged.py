@@ -231,7 +231,7 @@ def _sqrt(v: RangedJet) -> RangedJet:
 
 
 def _abs(v: RangedJet) -> RangedJet:
-    """Where v(0) may be 0, to first order: as if |v| had some gradient of at most v's radius."""
+    """|v| where v(0) may be 0, to first order: as if it had some gradient of at most v's radius."""
     if _is_certain(v) or np.all(abs(v.c) > CERTAIN * v.away):
         return v.scaled(math.copysign(1.0, v.c)) if _is_certain(v) else _nowhere(v)
     nothing = v.scaled(0.0)
