@@ -394,9 +394,7 @@ def _operation(program: _Program, name: str, given: list[Any], node: ast.Call) -
         elif said is not None and (word.arg != "alpha" or said != 1):
             raise InputError(f"{at} has {word.arg}, which is not read.")
     if name == "div" and not any(depends(v) for v in given) and _is_old(program.file):
-        raise InputError(
-            f"{at} is of constants alone, in a format of torch before 1.6. Save it with a newer one."
-        )
+        raise InputError(f"{at} is of constants alone, in a format of torch before 1.6. Save it with a newer one.")
     made = operation(name, given, approximate, program.observations, at)
     if name in PARTS:
         parts = made if isinstance(made, list) else [made]
