@@ -484,15 +484,27 @@ def test_a_kink_off_the_middle_limits_a_ball(name: str, program: Callable[[bytes
 
 
 @PROGRAMS
-@pytest.mark.parametrize("function", ["relu", "abs"])
-def test_a_kink_in_the_middle_has_no_model(function: str, program: Callable[[bytes], str | None]) -> None:
+def test_a_relu_with_its_kink_in_the_middle_has_no_model(program: Callable[[bytes], str | None]) -> None:
     """Also where it would do no harm, or its factor is 0, or the argument only touches 0."""
-    phi = ["abs", "x"] if function == "abs" else F
-    f = None if function == "abs" else net("f", mapped(0, function))
-    for tree in (["-", ["*", "2", phi], "x"], ["-", ["/", phi, "-2"], "x"], ["-", ["*", "0", phi], "x"]):
+    f = net("f", mapped(0, "relu"))
+    for tree in (["-", ["*", "2", F], "x"], ["-", ["/", F, "-2"], "x"], ["-", ["*", "0", F], "x"]):
         assert program(on_a_ball(tree, 0.5, f)) == "local"
-    touching = ["abs", ["*", "x", "x"]] if function == "abs" else call("f", ["*", "x", "x"])
-    assert program(on_a_ball(["-", touching, "x"], 0.5, f)) == "local"
+    assert program(on_a_ball(["-", call("f", ["*", "x", "x"]), "x"], 0.5, f)) == "local"
+
+
+@PROGRAMS
+@pytest.mark.parametrize(
+    ("tree", "falls"),
+    [
+        (["-", ["*", "2", ["abs", "x"]], "x"], False),  # x' = x for x > 0
+        (["-", ["/", ["abs", "x"], "-2"], "x"], True),
+        (["-", ["*", "0", ["abs", "x"]], "x"], True),
+        (["-", ["abs", ["*", "x", "x"]], "x"], True),  # up to x = 1
+        (["-", ["*", "2", ["abs", ["*", "x", "x"]]], "x"], False),  # up to x = 1/2, and the ball reaches further
+    ],
+)
+def test_abs_with_its_corner_in_the_middle(tree: Any, falls: bool, program: Callable[[bytes], str | None]) -> None:
+    assert program(on_a_ball(tree, 0.5)) == (None if falls else "local")
 
 
 # ------------------------------------------------------------------------------------------- contraction, N of outer

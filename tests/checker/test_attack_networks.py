@@ -316,14 +316,25 @@ def test_a_level_beyond_the_basin_is_refused(name: str) -> None:
     "tree",
     [
         ["-", ["*", "3", ["abs", "x"]], "x"],  # false: x' = 2 x for x > 0
-        ["-", ["/", ["abs", "x"], "2"], "x"],  # true, but no model has a derivative there
+        ["-", ["*", "1001/1000", ["abs", "x"]], "x"],  # false: x' = x/1000 for x > 0
         ["-", call("f", ["*", "2", "x"]), call("f", "x")],  # false: a symbol for both would cancel
-        ["-", ["*", "1000", ["max", ["-", "x"], "0"]], "x"],
-        ["-", ["*", "4", ["abs", ["*", "x", "x"]]], "x"],  # x x touches the corner
+        ["-", ["*", "1000", ["max", "x", "0"]], "x"],  # false: x' = 999 x for x > 0
+        ["-", ["*", "4", ["abs", ["*", "x", "x"]]], "x"],  # false from x = 1/4 on: x x touches the corner
     ],
 )
 def test_kinks_at_rest_and_calls_that_differ_show_nothing(tree: Any) -> None:
     assert verdict(loop(tree, net("f", TANH))) == "local"
+
+
+@pytest.mark.parametrize(
+    "tree",
+    [
+        ["-", ["/", ["abs", "x"], "2"], "x"],  # x' = -x/2 for x > 0, -3 x/2 else
+        ["-", ["*", "1000", ["max", ["-", "x"], "0"]], "x"],  # x' = -1001 x for x < 0
+    ],
+)
+def test_a_corner_at_rest_is_as_steep_as_its_argument(tree: Any) -> None:
+    assert verdict(loop(tree, net("f", TANH))) == "ACCEPTED"
 
 
 @pytest.mark.parametrize("clipped", [False, True])

@@ -222,10 +222,10 @@ def of_loops(name: str, form: str) -> Iterator[Forgery]:
             ("a root beyond 0", ["sqrt", ["-", "x", "1"]]),
             ("a root of 0", ["sqrt", ["*", "x", "x"]]),
             ("a division by 0", ["/", "1", "x"]),
-            ("a corner in the middle", ["abs", "x"]),
             ("a wild one", ["*", "x", "x", ["exp", ["*", "60", "x"]]]),
         ):
             yield "inputs", what, hashed(edited(data, f"{STEPS}.0.expressions.0", tree))
+        yield "local", "a corner in the middle", hashed(edited(data, f"{STEPS}.0.expressions.0", ["abs", "x"]))
         yield "local", "what is seen turned round", hashed(
             edited(data, f"{STEPS}.0.expressions", lambda old: [["-", tree] for tree in old]))  # fmt: skip
     moved = array(data, last, "bias", lambda a: a + 2.0**-9)
