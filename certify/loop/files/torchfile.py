@@ -164,7 +164,10 @@ def _require_torchs_names(names: Sequence[str], root: str, what: str) -> None:
     """Refuse an archive of which torch would read other members: it takes the folder of the first one, and capitals for
     small letters."""
     if not names[0].startswith(root) or len({name.lower() for name in names}) != len(names):
-        raise InputError(f"{what} must have {root}, with names that differ in more than capital letters, as torch has.")
+        raise InputError(
+            f"{what} must begin with its folder {root}, and no two of its members may differ in capital letters alone: "
+            "torch would read other ones."
+        )
 
 
 def _depth(name: str) -> int:
