@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 _FOR_SEARCH = 0.5  # share of the effort that is left, the rest being for the check
 _FOR_CELLS = 0.7  # the same for a search of boxes with ranks, of which only those with one are checked
 _FOR_RANKS = 0.35  # share of the whole effort, even if the search has left less
-_FOR_LEARNING = 0.4  # share of the effort that is left, the rest being for the proof and its check
+_FOR_LEARNING = 0.6  # share of the effort that is left, the rest being for the proof and its check
 
 
 @dataclass(frozen=True)
