@@ -414,6 +414,19 @@ def base() -> str:
     return json.dumps(newer(still))
 
 
+def sampled(c: Any, J: Any, rng: np.random.Generator, count: int) -> Iterator[tuple[arb, int, arb, Any]]:
+    """For q at the ends, the middle and within the range: its place, and of each equation its number, its value at
+    d = 0, and its changes at so many d."""
+    lo, hi = c.ranges[0]
+    for y in (Fraction(1), Fraction(-1), Fraction(0), Fraction(float(rng.uniform(-1, 1)))):
+        q, share = (lo + hi) / 2 + (hi - lo) / 2 * y, arb(fmpq(y.numerator, y.denominator))
+        of_q = arb(fmpq(q.numerator, q.denominator))
+        start, points = changes(c, [ZERO, ZERO], of_q), directions(rng, count)
+        there = [changes(c, [linear(row, d) for row in J], of_q) for d in points]
+        for j in range(2):
+            yield share, j, start[j], [(d, found[j] - start[j]) for d, found in zip(points, there, strict=True)]
+
+
 def on_a_ball(
     tree: Any, r: float, f: Document | None = None, claim: Any = None, policy: Any = None, **plant: Any
 ) -> bytes:
