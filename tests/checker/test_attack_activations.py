@@ -4,7 +4,7 @@ false because of a kink near the origin alone, and small files that ask for too 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache
