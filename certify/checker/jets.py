@@ -213,7 +213,7 @@ class Jet:
 
     def function(self, name: str) -> Jet:
         """phi(v) for a function phi of the table."""
-        if name == "abs" and not np.all(lower(self.v0) > 0):
+        if name == "abs" and self.may_vanish:
             return self.magnitude()
         phi = FUNCTIONS[name].expansion(self.v0, self.radius)
         f0, f1, _, _ = phi.f
@@ -221,6 +221,11 @@ class Jet:
         E = times(self.E, f1.size) + R
         lip = f1.size * self.lip + self.lip_beyond_tangent(phi)
         return Jet(f0, self.a * f1, self.Q * f1 + H, self.K * f1 + C, E, self.B * f1, self.units, lip)
+
+    @property
+    def may_vanish(self) -> bool:
+        """True if v(0) may be 0."""
+        return not np.all(lower(self.v0) > 0)
 
     def magnitude(self) -> Jet:
         """|v| where v(0) may be 0, to first order: it is within radius ||d|| of |v(0)|, as if it had some gradient of

@@ -18,7 +18,7 @@ from .decrease import OF_ONE, Models, rational
 from .exact import exactly, fraction, root_above
 from .functions import FUNCTIONS
 from .jets import Jet, Units, aligned, constant
-from .near import ZERO, Above, Array, Near, Vector, lower, near
+from .near import ZERO, Above, Array, Near, Vector, near
 
 _SHORT = 6  # bits of a number that is chosen here
 
@@ -98,7 +98,7 @@ class Swayed(Jet):
         phi'(c) + phi''(c) delta within sup|phi'''|/2 delta^2, the suprema over all that v(0) may be; NaN where phi'
         has no derivative among these.
         """
-        if name == "abs" and not np.all(lower(self.v0) > 0):
+        if name == "abs" and self.may_vanish:
             return self.magnitude()
         f0, f1, half, _ = FUNCTIONS[name].expansion(Near(self.c.value), ZERO).f
         _, bent, twisted = (f.size for f in FUNCTIONS[name].expansion(self.v0, ZERO).derivative.stored)

@@ -38,8 +38,9 @@ def evaluate(
         from controllers.evaluation.settling import EvaluationOptions
         from controllers.plants.choice import chosen_plant, plant_of
 
-        stored, chosen = load_policy(policy), None if system is None else chosen_plant(system)
-        options = EvaluationOptions(states=states, seed=seed, **span(duration, plant_of(stored, chosen)[0]))
+        stored = load_policy(policy)
+        chosen = plant_of(stored, None if system is None else chosen_plant(system))
+        options = EvaluationOptions(states=states, seed=seed, **span(duration, chosen[0]))
         proved = None if certificate is None else proved_set(certificate)
         result = judge(stored, options, chosen, proved)
         emit(result.as_json() if as_json else _table(result, options), as_json)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -91,4 +92,6 @@ def span(duration: float | None, system: System) -> dict[str, Any]:
     """The options for a duration of simulated runs, in the plant's unit of time."""
     if duration is None:
         return {}
-    return {"duration": duration} if system.time == "continuous" else {"duration_steps": int(duration)}
+    if system.time == "continuous" or not math.isfinite(duration):  # which is refused as a duration
+        return {"duration": duration}
+    return {"duration_steps": int(duration)}

@@ -201,6 +201,9 @@ def test_a_stable_policy_settles_and_its_times_are_steps(henon, tmp_path):
     assert "below 1: stable" in shown.stdout and "continuous" not in shown.stdout
     data = json.loads(runner.invoke(app, [*command, "--json"]).stdout)
     assert data["time"] == "discrete" and data["continuous"] is None and data["held"]["step"] == 1
+    for wrong in ("nan", "inf"):
+        refused = runner.invoke(app, [*command, "--duration", wrong])
+        assert refused.exit_code == 2 and f"--duration must be positive and finite; found {wrong}" in refused.stderr
 
 
 def test_settling_is_counted_in_steps(henon):

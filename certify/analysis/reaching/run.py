@@ -202,7 +202,8 @@ def _searched(
         most = UNPROVED - 1 if options.within is None else options.within
         wanted = Wanted(np.nextafter(lo, -np.inf), np.nextafter(hi, np.inf), most, direct)
     found = prove_ranks(question, effort, runner, report, wanted)
-    tools.remarks += [] if runner.remark is None else [runner.remark]
+    if runner.remark is not None:
+        tools.remarks.append(runner.remark)
     return found
 
 

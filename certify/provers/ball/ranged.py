@@ -232,10 +232,11 @@ def _sqrt(v: RangedJet) -> RangedJet:
 
 def _abs(v: RangedJet) -> RangedJet:
     """|v| where v(0) may be 0, to first order: as if it had some gradient of at most v's radius."""
-    if _is_certain(v) or np.all(abs(v.c) > CERTAIN * v.away):
-        return v.scaled(math.copysign(1.0, v.c)) if _is_certain(v) else _nowhere(v)
-    nothing = v.scaled(0.0)
-    return replace(nothing, c=abs(v.c), error=v.away, slack=v.radius)
+    if _is_certain(v):
+        return v.scaled(math.copysign(1.0, v.c))
+    if np.all(abs(v.c) > CERTAIN * v.away):
+        return _nowhere(v)
+    return replace(v.scaled(0.0), c=abs(v.c), error=v.away, slack=v.radius)
 
 
 def _sign(v: RangedJet) -> RangedJet:

@@ -281,7 +281,7 @@ def _only(tensors: Mapping[str, Numbers], n: int, m: int) -> str:
     raise InputError(
         f"a file must hold one policy from {n} states to {m} inputs; it holds {len(fitting)}. "
         f"Name its keys up to their numbers with --prefix, and its states with --states. Found {listed}. "
-        f"If the policy is more than layers one behind the other, export it as TorchScript or ONNX."
+        "If the policy is more than layers one behind the other, export it as TorchScript or ONNX."
         f"{_without_norm(tensors)}"
     )
 
