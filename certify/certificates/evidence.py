@@ -119,10 +119,11 @@ class RankTree:
     ranks : (N,), of each leaf in the tree's order: from it the target, {V <= c2} or a region, is reached after so many
         steps at the latest, 0 within it, 65,535 where nothing is said.
     steps : (N,), of each leaf: after so many steps its image lies in leaves of lower ranks, or in the target.
+    frame : N, (n, n), in whose coordinates N x errors of images are bounded; None: in those of the states.
 
     Raises
     ------
-    InputError : corners, ranks and steps do not have shapes of one tree.
+    InputError : corners, ranks, steps and frame do not have shapes of one tree.
     """
 
     lo: Array
@@ -130,9 +131,12 @@ class RankTree:
     tree: bytes
     ranks: NDArray[np.uint16]
     steps: NDArray[np.uint8]
+    frame: Array | None = None
 
     def __post_init__(self) -> None:
         found = self.tree.count(LEAF)
+        if self.frame is not None and self.frame.shape != (len(self.lo), len(self.lo)):
+            raise InputError(f"a frame must have the shape (n, n), n = {len(self.lo)}; found {self.frame.shape}.")
         if self.lo.shape != self.hi.shape or self.lo.ndim != 1 or {len(self.ranks), len(self.steps)} != {found}:
             raise InputError(
                 f"a tree of ranks must have two corners of one length, and a rank and steps for each of its {found} "
@@ -289,14 +293,17 @@ def _read_outer_tree(data: Mapping[str, Any], n: int) -> OuterTree:
 def _rank_tree(evidence: RankTree) -> dict[str, str]:
     numbers = {"ranks": evidence.ranks.astype("<u2").tobytes(), "steps": evidence.steps.astype("u1").tobytes()}
     parts = {"tree": evidence.tree, **numbers}
-    corners = {"lo": encode(evidence.lo), "hi": encode(evidence.hi)}
+    frame = {} if evidence.frame is None else {"frame": encode(evidence.frame)}
+    corners = {"lo": encode(evidence.lo), "hi": encode(evidence.hi)} | frame
     return corners | {name: base64.b64encode(part).decode("ascii") for name, part in parts.items()}
 
 
 def _read_rank_tree(data: Mapping[str, str], n: int) -> RankTree:
     tree, ranks, steps = (base64.b64decode(data[name]) for name in ("tree", "ranks", "steps"))
     corners = decode(data["lo"], (n,)), decode(data["hi"], (n,))
-    return RankTree(*corners, tree, np.frombuffer(ranks, "<u2").astype(np.uint16), np.frombuffer(steps, np.uint8))
+    frame = decode(data["frame"], (n, n)) if "frame" in data else None
+    of_leaves = np.frombuffer(ranks, "<u2").astype(np.uint16), np.frombuffer(steps, np.uint8)
+    return RankTree(*corners, tree, *of_leaves, frame)
 
 
 def _ball(evidence: LocalBall | Slab) -> dict[str, str]:

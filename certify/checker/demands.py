@@ -53,7 +53,8 @@ def of_ranks(sizes: Sizes) -> int:
         return 0
     leaves = len(ranks.steps)
     of_all = sizes.of_leaves(leaves + sum(ranks.steps), ranks.order, sizes.s + sizes.n)
-    return 2**9 * len(ranks.tree) + 2**17 * leaves + of_all
+    of_frame = 0 if ranks.frame is None else sizes.inverse(sizes.bits(ranks.frame))
+    return 2**9 * len(ranks.tree) + 2**17 * leaves + of_frame + of_all
 
 
 def of_data(sizes: Sizes) -> int:

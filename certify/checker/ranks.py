@@ -1,7 +1,7 @@
 """The rules for ranks: from each leaf of a finite rank a few steps lead to the target, or to leaves of lower ranks.
 
-A leaf is followed step by step: its image is affine in the symbols of the leaf, within an error for each state, which
-is a symbol of its own in the next step. `Cover` decides which leaves the last image meets.
+A leaf is followed step by step: its image is affine in the symbols of the leaf and of n errors. Errors are bounded in
+coordinates N x, and are symbols of their own in the next step. `Cover` decides which leaves the last image meets.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ from flint import arb, fmpq_mat
 
 from .boxes import LEAF, Batch, batches, is_whole, middle
 from .case import Case, Failures, given
+from .exact import exactly, fraction
 from .expression import evaluate
-from .near import Above, Array, Form, Near, near, near_ball, size, within
+from .near import Above, Array, Form, Near, all_near, near, near_ball, within
 from .network import enclose_on_boxes
 from .periodic import is_periodic
 from .ring import Moving
 from .sections import MAX_RANK
-from .taylor import Taylor, affine, combination, constants, forms, upper_bound
+from .taylor import Taylor, affine, combination, constants, upper_bound
 
 if TYPE_CHECKING:
     from .rules import Tally
@@ -143,6 +144,9 @@ class Steps(Moving):
         super().__init__(case, np.eye(n), identity, lo < hi, n)
         self.widest, self.ranks = [np.inf] * n, given(case.c.ranks)
         self.order = self.ranks.order
+        self.frame = np.eye(n) if self.ranks.frame is None else self.ranks.frame
+        inverse = exactly(self.frame).inv()
+        self.back = all_near(fraction(v) for v in inverse.transpose().entries())
         self.rank, self.count = two_bytes(self.ranks.ranks), np.frombuffer(self.ranks.steps, np.uint8).astype(np.int64)
         self.straight = [i for i in range(n) if i not in self.ranks.angles]  # states that are no angles
 
@@ -159,7 +163,8 @@ class Steps(Moving):
         """The leaves with these corners, numbered from `first`, and all steps from them."""
         course, numbers = Course(), first + np.arange(lo.shape[1])
         centre, radius = middle(lo, hi)
-        x = Form(np.concatenate([centre[None], np.eye(self.n)[:, :, None] * radius]), Above(np.zeros_like(centre)))
+        slopes = np.eye(self.n)[:, :, None] * radius
+        x = Form(np.concatenate([centre[None], slopes, np.zeros_like(slopes)]), Above(np.zeros_like(centre)))
         rank, count = self.rank[numbers], self.count[numbers]
         there = np.flatnonzero(rank == 0)
         course.note("ranks", self.is_in_target(x[:, there]), numbers[there], "the leaf must lie in the target")
@@ -175,14 +180,13 @@ class Steps(Moving):
         return course
 
     def step(self, x: Form, numbers: Array, course: Course) -> Form:
-        """The images of forms (n + 1, n, B) after a step, and what the rules say of it."""
-        n, c = self.n, self.c
-        whole = Form(np.concatenate([x.value, np.eye(n)[:, :, None] * x.error.top]))
-        u = enclose_on_boxes(self.net, whole)
+        """The images of forms (2 n + 1, n, B) after a step, and what the rules say of it."""
+        c = self.c
+        u = enclose_on_boxes(self.net, x)
         if not self.case.bounded:
             hold = [within(bounds, u.range[j]) for j, bounds in enumerate(c.input_bounds)]
             course.note("inputs", np.all(hold, axis=0), numbers, "an input may leave its bounds")
-        states, inputs = self.models(whole, u)
+        states, inputs = self.models(x, u)
         motion = self.motion(states, inputs)
         if c.sample:
             hold = self.in_domain(*motion.ends)
@@ -190,11 +194,20 @@ class Steps(Moving):
         if c.keep is not None:
             hold = self.kept(motion.states, motion.held, ())
             course.note("keep", np.all(hold, axis=0), numbers, "a constraint may be violated")
-        hold = self.in_domain(*whole.range.ends)
+        hold = self.in_domain(*x.range.ends)
         course.note("ranks", hold, numbers, "the state may leave the domain")
-        later = forms(self.after(states, motion.G))
+        later = self.form(self.after(states, motion.G))
         course.note("ranks", np.all(np.isfinite(later.size.top), axis=0), numbers, "F may be undefined")
-        return Form(later.value[: n + 1], later.error + size(later.value[n + 1 :]).sum())
+        return later
+
+    def form(self, models: list[Taylor]) -> Form:
+        """Models in the symbols of the leaf, and in those of errors that have all else."""
+        n, batch = self.n, models[0].c.shape[-1]
+        first = np.stack([np.concatenate([v.c[None], v.g[:n]]) for v in models], 1)
+        others = Near(np.stack([v.p[n:] for v in models]).reshape(n, -1)).through(self.frame).size.shaped(n, -1, batch)
+        bound = others.sum(1) + Above(np.stack([v.r.top + 0 * v.c for v in models])).through(self.frame)
+        errors = Near(bound.top[:, None]) * Near(self.back.value.reshape(n, n, 1), self.back.error.shaped(n, n, 1))
+        return Form(np.concatenate([first, errors.value]), errors.error.sum(0))
 
     def after(self, states: list[Taylor], G: list[Taylor]) -> list[Taylor]:
         """x + h G."""
@@ -226,8 +239,7 @@ class Steps(Moving):
             for i in self.ranks.angles:
                 turned = Near(value[0, i]) + TURN * Near(-np.rint(value[0, i] / TURN.value))
                 value[0, i], error = turned.value, error + Above(np.eye(self.n)[i][:, None] * turned.error.top)
-        g = np.concatenate([value[1:], np.eye(self.n)[:, :, None] * error.top])
-        states = [affine(value[0, i], g[:, i]) for i in range(self.n)]
+        states = [affine(value[0, i], value[1:, i], error[i]) for i in range(self.n)]
         hold: Array = np.all([upper_bound(v) <= 0 for v in self.beyond(states)], axis=0)
         return hold
 
@@ -259,6 +271,8 @@ def is_stated(case: Case) -> Failures:
         least = Fraction(TURN.ends[1]) if i in ranks.angles else Fraction(0)
         if not Fraction(hi) - Fraction(lo) > least:
             yield f"evidence.ranks, axis {i}", "lo must be below hi, in an angle by more than 2 pi"
+    if ranks.frame is not None and exactly(ranks.frame).det() == 0:
+        yield "evidence.ranks.frame", "it must have an inverse"
     leaves = yield from is_whole(ranks.tree, range(n), "ranks, ")
     if (len(ranks.ranks), len(ranks.steps)) != (2 * leaves, leaves):
         yield "evidence.ranks", f"there must be two bytes of ranks and one of steps for each of {leaves} leaves"

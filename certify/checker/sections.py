@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Annotated
 
@@ -123,13 +123,15 @@ class Tube:
 
 @dataclass(frozen=True)
 class RankTree:
-    """A partition tree of the box lo <= x <= hi, and of each leaf its rank and the number of its steps."""
+    """A partition tree of the box lo <= x <= hi, and of each leaf its rank and the number of its steps. `frame` is N of
+    the coordinates N x in which errors are bounded, None for the identity."""
 
     lo: Row
     hi: Row
     tree: Octets
     ranks: Octets
     steps: Octets
+    frame: Annotated[Array | None, shaped("n", "n")] = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)

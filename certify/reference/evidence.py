@@ -98,10 +98,12 @@ class Covering:
 
 @dataclass(frozen=True)
 class Ranking:
-    """A tree over the box from `lo` to `hi`, whose leaves have two bytes of `ranks` each and one of `steps`."""
+    """A tree over the box from `lo` to `hi`, whose leaves have two bytes of `ranks` each and one of `steps`; errors of
+    images are bounded after the matrix `frame`."""
 
     lo: array[float]
     hi: array[float]
+    frame: fmpq_mat | None
     tree: bytes
     ranks: bytes
     steps: bytes
@@ -236,9 +238,10 @@ def read_ranked(value: Any, n: int, sampled: bool) -> Ranked:
 
 def read_ranking(value: Any, n: int) -> Ranking:
     at = "evidence.ranks"
-    ranking = keys(value, at, "lo", "hi", "tree", "ranks", "steps")
+    ranking = keys(value, at, "lo", "hi", "tree", "ranks", "steps", maybe=("frame",))
     lo, hi = (numbers(ranking[end], f"{at}.{end}", n) for end in ("lo", "hi"))
-    return Ranking(lo, hi, *(decoded(ranking[key], f"{at}.{key}") for key in ("tree", "ranks", "steps")))
+    frame = square(ranking["frame"], f"{at}.frame", n) if "frame" in ranking else None
+    return Ranking(lo, hi, frame, *(decoded(ranking[key], f"{at}.{key}") for key in ("tree", "ranks", "steps")))
 
 
 def read_fit(value: Any, fitted: Fitted) -> Fit:

@@ -253,6 +253,7 @@ def in_ranks(c: Certificate, z: Sizes, evidence: Tree | Ranked) -> int:
         return 0
     leaves, steps, wider = ranking.tree.count(LEAF), sum(ranking.steps), with_errors(z)
     work = 2**9 * len(ranking.tree) + 2**17 * leaves
+    work += 0 if ranking.frame is None else inverting(z.n, bits(ranking.frame))
     work += models_on_leaves(c, wider, steps + leaves, evidence.order)
     return work + on_leaves(c, wider, steps + leaves, evidence.order)
 

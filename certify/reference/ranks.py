@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from itertools import product
 
-from flint import arb, arb_mat
+from flint import arb, arb_mat, fmpq_mat
 
 from .affine import Form
 from .balls import ZERO, total
@@ -35,7 +35,7 @@ def ranks(c: Certificate, evidence: Tree | Ranked, jobs: int) -> int:
     if c.ranks is None or ranking is None:
         raise Refused("format", "evidence.ranks", "the claim needs boxes with ranks")
     cover = Cover(c, c.ranks, ranking)
-    walk = Walk(c, evidence.order)
+    walk = Walk(c, evidence.order, ranking.frame)
     target = Target(c, c.ranks)
     asked = (box for box in cut(cover.lo, cover.hi, ranking.tree) if cover.ranks[box.number] != UNRANKED)
 
@@ -143,14 +143,19 @@ class Cover:
 
 
 class Walk(Motion):
-    """Steps of boxes: of the states' symbols the first n are the leaf's, the others those of errors."""
+    """Steps of boxes: of the states' symbols the first n are the leaf's, the others those of errors, which are what is
+    beyond the leaf's symbols after the matrix `frame`."""
 
     rule = RULE
 
-    def __init__(self, c: Certificate, order: int) -> None:
+    def __init__(self, c: Certificate, order: int, frame: fmpq_mat | None) -> None:
         angles = c.ranks.angles if c.ranks is not None else ()
         super().__init__(c, 2 * c.n, order, None, angles)
         self.domain = [(arb(lo), arb(hi)) for lo, hi in c.plant.domain]
+        one = fmpq_mat([[int(i == k) for k in range(c.n)] for i in range(c.n)])
+        exact = one if frame is None else frame
+        require(exact.det() != 0, RULE, "frame", "the matrix has no inverse")
+        self.frame, self.back = (arb_mat(M).tolist() for M in (exact, exact.inv()))
 
     def start(self, box: Box) -> Rows:
         """x = centre + radius d."""
@@ -180,7 +185,7 @@ class Walk(Motion):
             a, b = ends(row)
             inside = name in self.free or bool(a > lo and b < hi)
             require(inside, RULE, at, f"{name} is not certain to be inside of the domain before a step")
-        return [self.settled(i, v, at) for i, v in enumerate(self.after(here, within))]
+        return self.settled(self.after(here, within), at)
 
     def after(self, here: Stage, within: dict[str, Taylor] | None) -> list[Taylor]:
         """Models of the next state: F in discrete time, else x + h G."""
@@ -190,14 +195,21 @@ class Walk(Motion):
         moved = [h * g if self.c.varies else g.scaled(h.c) for g in G]
         return [self.affine(row) + g for row, g in zip(here.x, moved, strict=True)]
 
-    def settled(self, i: int, v: Taylor, at: str) -> list[arb]:
-        """State i as a row of numbers: what is not affine in the symbols of the leaf is its error, and so are the radii
+    def settled(self, models: list[Taylor], at: str) -> Rows:
+        """The states as rows of numbers: what is not affine in the leaf's symbols is an error, and so are the radii
         of the balls, which would grow many times over with each step."""
-        require(v.is_finite(), RULE, at, "the next state has no finite model")
-        slopes = v.slopes(self.symbols)
-        first = [v.c, *slopes[: self.n]]
-        error = arb((total(map(abs, slopes[self.n :])) + v.second + v.r + total(arb(b.rad()) for b in first)).upper())
-        return [*(b.mid() for b in first), *(error if k == i else ZERO for k in range(self.n))]
+        require(all(v.is_finite() for v in models), RULE, at, "the next state has no finite model")
+        first = [[v.c, *v.slopes(self.symbols)[: self.n]] for v in models]
+        loose = [total(arb(b.rad()) for b in row) for row in first]
+        errors = list[arb]()
+        for turned in self.frame:
+            v = Taylor(ZERO)
+            for k, model in zip(turned, models, strict=True):
+                v += model.scaled(k)
+            rounded = total(abs(k) * r for k, r in zip(turned, loose, strict=True))
+            errors.append(arb((total(map(abs, v.slopes(self.symbols)[self.n :])) + v.second + v.r + rounded).upper()))
+        rest = [[k * e for k, e in zip(row, errors, strict=True)] for row in self.back]
+        return [[*(b.mid() for b in row), *errs] for row, errs in zip(first, rest, strict=True)]
 
 
 class Target:

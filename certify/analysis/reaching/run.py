@@ -53,12 +53,13 @@ from certify.provers.ranks import (
     Wanted,
     prove_ranks,
     root_box,
+    with_frame,
     with_order,
     without_leaf,
 )
 
 Array = NDArray[np.float64]
-_PROBES = 30  # states at which the order of the series in time is chosen
+_PROBES = 30  # states at which the order of the series in time is chosen, and the frame of errors
 _RUNS = 1e10  # operations for simulated runs, a few seconds, which no effort is charged with
 _FOR_SEARCH = 0.7  # share of the effort, the rest being for the check
 _DIRECT = 4000  # boxes that are looked at first where runs need few steps
@@ -162,7 +163,8 @@ def _proved(
     options, system = result.options, loop.system
     keep, root = tuple(kept_constraints(system).values()), root_box(loop)
     question = Question(loop, Region(target, system.states), keep, root)
-    question = with_order(question, begins(options.begin or tuple(zip(*map(_exactly, root), strict=True)))[:_PROBES].T)
+    probes = begins(options.begin or tuple(zip(*map(_exactly, root), strict=True)))[:_PROBES].T
+    question = with_frame(with_order(question, probes), probes)
     clerk = tools.clerk(path, options.jobs, True, options.cluster)
     _require_periodic(question, clerk)
     with tools.timing("ranks"), runner_at(options.cluster) as runner:

@@ -26,6 +26,7 @@ _FOR_SEARCH = 0.5  # share of the effort that is left, the rest being for the ch
 _FOR_CELLS = 0.7  # the same for a search of boxes with ranks, of which only those with one are checked
 _FOR_RANKS = 0.35  # share of the whole effort, even if the search has left less
 _FOR_LEARNING = 0.6  # share of the effort that is left, the rest being for the proof and its check
+_PROBES = 30  # states at which a frame of errors is chosen
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,7 @@ class ByRanks:
 
     def extend(self, state: State, effort: Effort) -> State:
         """Add the boxes; a note says why there are none."""
-        from certify.provers.ranks import Question, Sublevel, prove_ranks, root_box
+        from certify.provers.ranks import Question, Sublevel, prove_ranks, root_box, with_frame
 
         tools, (claim, evidence), trial = self.tools, state.proved, state.contest.best.trial
         problem = trial.task.problem
@@ -192,7 +193,10 @@ class ByRanks:
                 share = effort.share(_FOR_CELLS)
             told = None if tools.progress is None else report
             target = Sublevel(problem.V, claim.roa)
-            question = Question(problem.loop, target, claim.keep, root_box(problem.loop), evidence.order)
+            root = lo, hi = root_box(problem.loop)
+            probes = np.random.default_rng(0).uniform(lo, hi, (_PROBES, len(lo))).T
+            question = Question(problem.loop, target, claim.keep, root, evidence.order)
+            question = with_frame(question, probes)
             found = prove_ranks(question, share, tools.runner, told, enough=enough)
         if found is None:
             return state.noting("no box of the domain beyond the set is proved to lead into it")

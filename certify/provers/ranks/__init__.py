@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from certify.provers.ranks.mend import without_leaf
-from certify.provers.ranks.prove import Question, RankProof, prove_ranks, root_box, turning, with_order
+from certify.provers.ranks.prove import Question, RankProof, prove_ranks, root_box, turning, with_frame, with_order
 from certify.provers.ranks.targets import Region, Sublevel
 from certify.provers.ranks.wanted import MOST_STEPS, Wanted
 
@@ -17,6 +17,7 @@ __all__ = [
     "prove_ranks",
     "root_box",
     "turning",
+    "with_frame",
     "with_order",
     "without_leaf",
 ]

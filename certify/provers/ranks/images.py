@@ -1,8 +1,10 @@
-"""Images of boxes after several steps of a loop: affine in the coordinates of the box, with an error for each state.
+"""Images of boxes after several steps of a loop: affine in the coordinates of the box, with n errors.
 
-The error of a state is a symbol of its own in the next step, so that the policy's answer to it cancels it there, as it
-does in truth; after the step all that is not of first order in the box's coordinates is an error again. FORMAT.md has
-the same in its chapter on ranks; boxes here are wider by more than rounding makes of them.
+An error is a symbol of its own in the next step, so that the policy's answer to it cancels it there, as it does in
+truth; after the step all that is not of first order in the box's coordinates is an error again. Errors are those of
+N x for a matrix N, the frame: where its rows are left eigenvectors of the step's map, errors shrink as fast as states
+do, while those of single states may grow by a factor with each step (the wrapping effect; Moore 1966, Lohner 1987).
+FORMAT.md has the same in its chapter on ranks; boxes here are wider by more than rounding makes of them.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from certify.provers.ranks.targets import Target
 _WIDER = 1e-7  # share of a box's width, beyond all that two programs' rounding may differ by
 _ENDS = 1e-9  # relative distance kept from ends of the domain
 _WIDEST = 0.15  # share of the root box beyond which an image is of no use
+_MORE_THAN_ROUNDING = 1e-13  # relative, of sums whose terms may cancel
 _MORE = 1.5  # operations of a step of a box, relative to those of a box's bound, whose symbols are fewer
 
 
@@ -53,19 +56,19 @@ class Images(NamedTuple):
 
 @dataclass(frozen=True)
 class Form:
-    """States `x[:, 0] + x[:, 1:] d` within e: (n, n + 1, B) and (n, B)."""
+    """States `x[:, 0] + x[:, 1:] d`, the symbols d being n of a box, and n of errors from the second step on:
+    (n, 2 n + 1, B)."""
 
     x: Array
-    e: Array
 
     def at(self, index: Index | Mask) -> Form:
         """Some of the boxes."""
-        return Form(self.x[..., index], self.e[..., index])
+        return Form(self.x[..., index])
 
     @property
     def box(self) -> tuple[Array, Array]:
         """Their corners, (n, B) each, a little farther out."""
-        reach = np.abs(self.x[:, 1:]).sum(1) + self.e
+        reach = np.abs(self.x[:, 1:]).sum(1)
         reach = reach * (1 + _WIDER) + 4 * EPS * np.abs(self.x[:, 0])
         return self.x[:, 0] - reach, self.x[:, 0] + reach
 
@@ -80,6 +83,8 @@ class Course:
     keep : expressions that have to stay negative.
     root : the widths of the root box, (n,).
     counts : the numbers of steps after which images are wanted, ascending.
+    order : of the series in time, where inputs are held.
+    frame : N, (n, n), in whose coordinates N x errors are bounded; None: in those of the states.
     """
 
     piece = 512
@@ -93,9 +98,12 @@ class Course:
         root: Array,
         counts: Sequence[int],
         order: int = 2,
+        frame: Array | None = None,
     ) -> None:
         self.system, self.target, self.keep = loop.system, target, tuple(keep)
-        self.angles, self.root, self.counts = tuple(angles), root, tuple(counts)
+        self.angles, self.root, self.counts, self.frame = tuple(angles), root, tuple(counts), frame
+        self.into = np.eye(self.system.n) if frame is None else frame
+        self.back = np.linalg.inv(self.into)
         self.straight = [i for i in range(self.system.n) if i not in self.angles]
         self.policy = policy_enclosure(loop, 2 * self.system.n)
         self.dynamics = self.system.uncertain_dynamics()
@@ -112,13 +120,13 @@ class Course:
         centre = 0.5 * lo + 0.5 * hi
         radius = np.maximum(hi - centre, centre - lo) * (1 + EPS)
         slopes = np.eye(n)[:, :, None] * radius
-        form = Form(np.concatenate([centre[:, None], slopes], 1), np.zeros_like(centre))
+        form = Form(np.concatenate([centre[:, None], slopes, np.zeros_like(slopes)], 1))
         found = Images(
             np.full((K, n, batch), np.nan),
             np.full((K, n, batch), np.nan),
             np.zeros((K, batch), dtype=bool),
             self.is_there(form),
-            ~self.target.misses(form.x, form.e, self.angles),
+            ~self.target.misses(form.x, self.angles),
             np.zeros(batch, dtype=bool),
             np.zeros(batch),
             np.abs(slopes).sum(0) / self.root[:, None],
@@ -141,7 +149,7 @@ class Course:
                 found.lo[k, :, left[good]], found.hi[k, :, left[good]] = below[:, good].T, above[:, good].T
                 found.there[k, left] = there
                 further = good & (width > widest[left])
-                steep = np.abs(form.x[:, 1:]) / self.root[:, None, None]
+                steep = np.abs(form.x[:, 1 : n + 1]) / self.root[:, None, None]
                 found.steep[:, left[further]] = steep.sum(0)[:, further]
                 widest[left] = np.maximum(widest[left], np.where(good, width, 0.0))
                 good &= ~there
@@ -152,7 +160,7 @@ class Course:
         """The states after a step, where (B,) all that is asked for on the way holds, and where a constraint certainly
         does not."""
         n, system = self.system.n, self.system
-        x = np.concatenate([form.x, np.eye(n)[:, :, None] * form.e], 1)
+        x = form.x
         error = 4 * EPS * np.abs(x).sum(1) + TINY
         mid, slopes, wide, _ = self.policy(x, error)
         below, above = form.box
@@ -178,7 +186,7 @@ class Course:
         for expression in self.keep:
             g = evaluate(expression, values, models, {})
             kept, lost = kept & (upper_bound(g)[0] < 0), lost | (upper_bound(g.scaled(-1.0))[0] < 0)
-        return _form(after, n), kept & np.all([np.isfinite(v.c + v.radius()) for v in after], axis=0), lost
+        return self.form(after), kept & np.all([np.isfinite(v.c + v.radius()) for v in after], axis=0), lost
 
     def in_domain(self, below: Array, above: Array) -> Mask:
         """True on boxes (n, B) inside the domain, but for angles."""
@@ -191,11 +199,14 @@ class Course:
 
     def is_there(self, form: Form) -> Mask:
         """True where the states lie in the target."""
-        return self.target.holds(form.x, form.e, self.angles)
+        return self.target.holds(form.x, self.angles)
 
-
-def _form(models: Sequence[Taylor], n: int) -> Form:
-    """The part of models that is of first order in the first n symbols; all else is an error."""
-    x = np.stack([np.concatenate([v.c[None], v.g[:n]]) for v in models])
-    e = np.stack([np.abs(v.g[n:]).sum(0) + np.abs(v.Q).sum((0, 1)) + v.r for v in models])
-    return Form(x, e * (1 + 1e-12))
+    def form(self, models: Sequence[Taylor]) -> Form:
+        """The part of models that is of first order in the box's n symbols; all else is an error."""
+        n = len(models)
+        first = np.stack([np.concatenate([v.c[None], v.g[:n]]) for v in models])
+        rest = np.stack([np.concatenate([v.g[n:], v.Q.reshape(-1, v.Q.shape[-1])]) for v in models])
+        e = np.abs(np.tensordot(self.into, rest, 1)).sum(1)
+        e += np.tensordot(np.abs(self.into), np.stack([v.r for v in models]), 1)
+        e = e * (1 + 1e-12) + _MORE_THAN_ROUNDING * np.tensordot(np.abs(self.into), np.abs(rest).sum(1), 1)
+        return Form(np.concatenate([first, self.back[:, :, None] * e], 1))

@@ -11,6 +11,7 @@ import numpy as np
 from certify.certificates import RankTree
 from certify.certificates.claims import Ranks
 from certify.effort import Effort
+from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression
 from certify.provers.bounds.arrays import Array
@@ -27,6 +28,8 @@ _ORDERS = (2, 3, 4, 5, 6, 7, 8)
 _LITTLE, _GAIN = 1e-7, 0.5  # share of the root box that an error may be; a gain that is worth an order
 _MOST_LEAVES, _MOST_PAIRS = 400_000, 10_000_000  # of an image and a leaf that it meets, in one round
 _OF_A_PAIR, _OF_A_LEAF = 500.0, 50_000.0  # operations, beside those of the steps
+_SMALL, _LOST = 0.002, 1e3  # half-width of a box, as a share of the root box's width; growth that counts for no image
+_DEPENDENT = 1e8  # condition of a frame that is of no use
 _AT_FIRST = 0.1  # share of the effort for the first tree
 
 
@@ -40,6 +43,7 @@ class Question:
     keep : expressions that stay negative on the way.
     root : corners lo and hi (n,) of the box, in deviations; of an angle more than a turn apart.
     order : of the series in time, where inputs are held.
+    frame : N, (n, n), in whose coordinates N x errors of images are bounded; None: in those of the states.
     """
 
     loop: ClosedLoop
@@ -47,11 +51,12 @@ class Question:
     keep: tuple[Expression, ...]
     root: tuple[Array, Array]
     order: int = 2
+    frame: Array | None = None
 
     def course(self, counts: Sequence[int]) -> Course:
         """The course of boxes through the loop, with images after so many steps."""
         lo, hi = self.root
-        return Course(self.loop, self.target, turning(self.loop), self.keep, hi - lo, counts, self.order)
+        return Course(self.loop, self.target, turning(self.loop), self.keep, hi - lo, counts, self.order, self.frame)
 
 
 def with_order(question: Question, x: Array) -> Question:
@@ -71,6 +76,36 @@ def with_order(question: Question, x: Array) -> Question:
         if least < _LITTLE:
             break
     return best
+
+
+def with_frame(question: Question, x: Array) -> Question:
+    """The question with the frame in which images of small boxes around states x (n, N) are the narrowest: that of the
+    states, or the left eigenvectors of the step's linear map at the origin, if there is one."""
+    frame = _eigenframe(question.loop)
+    if frame is None:
+        return question
+    reach = _SMALL * (question.root[1] - question.root[0])[:, None]
+
+    def widths(asked: Question) -> float:
+        found = asked.course(COUNTS_FROM)(x - reach, x + reach, 0.0, 0.0)
+        relative = (found.hi - found.lo) / reach[None]
+        return float(np.where(found.there, 0.0, np.log(np.nan_to_num(relative.max(1), nan=_LOST))).sum())
+
+    other = replace(question, frame=frame)
+    return other if widths(other) < widths(question) else question
+
+
+def _eigenframe(loop: ClosedLoop) -> Array | None:
+    """Left eigenvectors (n, n) of a step's map at the origin, real and imaginary parts; None where there is no map, or
+    where they are nearly dependent."""
+    try:
+        rate = loop.mean_rate()
+    except InputError:  # no Jacobian
+        return None
+    values, vectors = np.linalg.eig(np.eye(len(rate)) + loop.step * rate.T)
+    rows = [v.imag if value.imag < 0 else v.real for value, v in zip(values, vectors.T, strict=True)]
+    frame: Array = np.stack(rows) / np.abs(rows).max(1, keepdims=True)
+    return frame if np.all(np.isfinite(frame)) and np.linalg.cond(frame) < _DEPENDENT else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,11 +21,11 @@ _ENDS = 1e-9  # relative distance kept from a target's boundary, beyond all that
 class Target(Protocol):
     """A set of states."""
 
-    def holds(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
-        """True (B,) where states `x[:, 0] + x[:, 1:] d` within e, (n, n + 1, B) and (n, B), certainly lie in the set;
-        `angles` are numbers of states that are angles: x and x + 2 pi are the same place."""
+    def holds(self, x: Array, angles: Sequence[int]) -> Mask:
+        """True (B,) where states `x[:, 0] + x[:, 1:] d`, (n, N + 1, B), certainly lie in the set; `angles` are numbers
+        of states that are angles: x and x + 2 pi are the same place."""
 
-    def misses(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
+    def misses(self, x: Array, angles: Sequence[int]) -> Mask:
         """True (B,) where none of these states lies in the set."""
 
 
@@ -36,23 +36,23 @@ class Sublevel:
     V: Quadratic
     level: float
 
-    def holds(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
+    def holds(self, x: Array, angles: Sequence[int]) -> Mask:
         """True where V is at most the level."""
-        there: Mask = upper_bound(self._beyond(x, e, angles))[0] < -_ENDS * self.level
+        there: Mask = upper_bound(self._beyond(x, angles))[0] < -_ENDS * self.level
         return there
 
-    def misses(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
+    def misses(self, x: Array, angles: Sequence[int]) -> Mask:
         """True where V is above the level."""
-        away: Mask = upper_bound(self._beyond(x, e, angles).scaled(-1.0))[0] < 0
+        away: Mask = upper_bound(self._beyond(x, angles).scaled(-1.0))[0] < 0
         return away
 
-    def _beyond(self, x: Array, e: Array, angles: Sequence[int]) -> Taylor:
+    def _beyond(self, x: Array, angles: Sequence[int]) -> Taylor:
         """V - level of the places that are nearest to 0."""
         turned = x.copy()
         for i in angles:
             turned[i, 0] -= TURN * np.rint(x[i, 0] / TURN)
         error = 8 * EPS * (np.abs(x).sum(1) + TURN) + TINY
-        states = _models(turned, e, error)
+        states = _models(turned, error)
         rows = Models(states[0]).combined(self.V.P, states)
         V = states[0] * rows[0]
         for state, row in zip(states[1:], rows[1:], strict=True):
@@ -67,32 +67,31 @@ class Region:
     expressions: tuple[Expression, ...]
     states: tuple[Symbol, ...]
 
-    def holds(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
+    def holds(self, x: Array, angles: Sequence[int]) -> Mask:
         """True where all are; with angles they are periodic."""
-        there = np.ones(e.shape[1], dtype=bool)
-        for v in self._values(x, e):
+        there = np.ones(x.shape[2], dtype=bool)
+        for v in self._values(x):
             there &= upper_bound(v)[0] < -_ENDS * (np.abs(v.c) + v.radius())
         return there
 
-    def misses(self, x: Array, e: Array, angles: Sequence[int]) -> Mask:
+    def misses(self, x: Array, angles: Sequence[int]) -> Mask:
         """True where one is positive."""
-        away = np.zeros(e.shape[1], dtype=bool)
-        for v in self._values(x, e):
+        away = np.zeros(x.shape[2], dtype=bool)
+        for v in self._values(x):
             away |= upper_bound(v.scaled(-1.0))[0] < 0
         return away
 
-    def _values(self, x: Array, e: Array) -> list[Taylor]:
+    def _values(self, x: Array) -> list[Taylor]:
         """The expressions; none of no states."""
-        if not e.shape[1]:
+        if not x.shape[2]:
             return []
-        models = _models(x, e, 8 * EPS * np.abs(x).sum(1) + TINY)
+        models = _models(x, 8 * EPS * np.abs(x).sum(1) + TINY)
         values, known = dict(zip(self.states, models, strict=True)), dict[Expression, Taylor]()
         return [evaluate(expression, values, Models(models[0]), known) for expression in self.expressions]
 
 
-def _models(x: Array, e: Array, error: Array) -> list[Taylor]:
-    """The states as models in the coordinates of the box and their errors."""
-    n = len(e)
-    g = np.concatenate([x[:, 1:], np.eye(n)[:, :, None] * e], 1)
-    zeros = np.zeros((2 * n, 2 * n, x.shape[2]))
-    return [Taylor(x[i, 0], g[i], zeros, error[i]) for i in range(n)]
+def _models(x: Array, error: Array) -> list[Taylor]:
+    """The states as models in these symbols, within an error of each."""
+    N = x.shape[1] - 1
+    zeros = np.zeros((N, N, x.shape[2]))
+    return [Taylor(row[0], row[1:], zeros, error[i]) for i, row in enumerate(x)]

@@ -17,7 +17,7 @@ from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.ranks.images import Course, Images
 from certify.provers.ranks.search import Search
 
-COUNTS_FROM = (*range(1, 13), 14, 16, 20, 24)
+COUNTS_FROM = (*range(1, 13), 14, 16, 20, 24, 32, 40, 50, 64, 80)
 MOST_STEPS = COUNTS_FROM[-1]
 _GROWTH = 1.5  # of an image, relative to its leaf, that counts as none
 _NARROW = 1e-11  # share of the root box below which leaves are not halved
