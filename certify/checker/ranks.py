@@ -162,9 +162,7 @@ class Steps(Moving):
     def examine(self, first: int, lo: Array, hi: Array) -> Course:
         """The leaves with these corners, numbered from `first`, and all steps from them."""
         course, numbers = Course(), first + np.arange(lo.shape[1])
-        centre, radius = middle(lo, hi)
-        slopes = np.eye(self.n)[:, :, None] * radius
-        x = Form(np.concatenate([centre[None], slopes, np.zeros_like(slopes)]), Above(np.zeros_like(centre)))
+        x = self.start(lo, hi)
         rank, count = self.rank[numbers], self.count[numbers]
         there = np.flatnonzero(rank == 0)
         course.note("ranks", self.is_in_target(x[:, there]), numbers[there], "the leaf must lie in the target")
@@ -178,6 +176,12 @@ class Steps(Moving):
             hold = self.arrives(x[:, done], bound)
             course.note("ranks", hold, numbers[arrived], "the steps may not lead to the target or to lower ranks")
         return course
+
+    def start(self, lo: Array, hi: Array) -> Form:
+        """The boxes with these corners, in their symbols."""
+        centre, radius = middle(lo, hi)
+        slopes = np.eye(self.n)[:, :, None] * radius
+        return Form(np.concatenate([centre[None], slopes, np.zeros_like(slopes)]), Above(np.zeros_like(centre)))
 
     def step(self, x: Form, numbers: Array, course: Course) -> Form:
         """The images of forms (2 n + 1, n, B) after a step, and what the rules say of it."""

@@ -17,10 +17,8 @@ from typing import Any
 import numpy as np
 
 from certify.checker import document, rules
-from certify.checker.boxes import middle
 from certify.checker.case import Case
 from certify.checker.errors import Rejected
-from certify.checker.near import Above, Form
 from certify.checker.ranks import Course, Steps
 from certify.reference import rules as reference_rules
 from tests.support.rank_truth import Truth, boxes
@@ -32,6 +30,7 @@ from tests.support.ranked import (
     Loop,
     affine,
     dumped,
+    encode,
     least_ranks,
     mapped,
     meets,
@@ -106,6 +105,17 @@ class Draw:
         self.sampled, self.unsure = self.chance.random() < 0.5, self.chance.random() < 0.4
         self.angles = [i for i in range(self.n) if self.chance.random() < 0.35]
         self.straight = [i for i in range(self.n) if i not in self.angles]
+        self.frames = np.random.default_rng([seed, 1])  # of its own: other draws stay as they are
+
+    def frame(self) -> list[list[float]] | None:
+        """None, or a matrix: turned, sheared, nearly singular, or of very different scales."""
+        chance, n = self.frames, self.n
+        kind, M = chance.integers(4), np.linalg.qr(chance.standard_normal((n, n)))[0]
+        if kind == 1:
+            M = M @ np.diag(10.0 ** chance.uniform(-1, 1, n)) @ chance.standard_normal((n, n))
+        if kind == 2:
+            M = np.diag(2.0 ** chance.uniform(-300, 300, n)) @ M
+        return None if kind == 3 else M.tolist()
 
     def fraction(self, lo: float, hi: float) -> str:
         return str(Fraction(round(self.chance.uniform(lo, hi) * 1024), 1024))
@@ -164,6 +174,7 @@ class Draw:
             uncertain=[("q", "-1/8", "1/4")] if self.unsure else [],
             angles=tuple(self.states[i] for i in self.angles),
             domain=("-6", "6"),
+            frame=self.frame(),
         )
 
     def ranked(self, hair: float = HAIR, depths: Sequence[int] = (6, 8, 9)) -> Ranked:
@@ -212,8 +223,7 @@ def _images(
     with np.errstate(all="ignore"):
         steps = Steps(Case(document.certificate(json.loads(dumped(data)), "0" * 64)))
         lo, hi = (np.array([[end[side] for end in box] for box in every]).T for side in (0, 1))
-        centre, radius = middle(lo, hi)
-        x = Form(np.concatenate([centre[None], np.eye(steps.n)[:, :, None] * radius]), Above(np.zeros_like(centre)))
+        x = steps.start(lo, hi)
         there, course = steps.is_in_target(x), _Each(len(every))
         found: list[list[list[Interval] | None]] = [[] for _ in every]
         for _ in range(longest):
@@ -293,6 +303,10 @@ class Forger:
     def of_bytes(self) -> Iterator[Forgery]:
         """Other bytes of the tree, ranks and steps."""
         made, ranking = self.made, "evidence.ranks"
+        n = len(self.states)
+        singular = encode(*[1.0] * n * n) if n > 1 else encode(0.0)
+        for frame, rule in ((singular, "ranks"), (encode(*[1.0] * (n * n + 1)), "format"), (None, "format")):
+            yield Forgery("another frame", edited(self.data, f"{ranking}.frame", frame), {rule})
         some = [i for i, byte in enumerate(made.tree) if byte != 255]
         for i in self.some(some, 1):
             cut = made.tree[:i] + b"\xff" + made.tree[i + 1 :]

@@ -80,6 +80,7 @@ class Loop:
     bound: str = "9"
     most: int = 1000
     squash: str = "identity"
+    frame: list[list[float]] | None = None
 
     def document(self, lo: Sequence[float], hi: Sequence[float], tree: bytes, ranks: bytes, steps: bytes) -> Document:
         n = len(self.states)
@@ -93,6 +94,7 @@ class Loop:
             "ranks": {"angles": list(self.angles), "steps": self.most},
         }  # fmt: skip
         ranking = {"lo": encode(*lo), "hi": encode(*hi), "tree": raw(tree), "ranks": raw(ranks), "steps": raw(steps)}
+        ranking |= {} if self.frame is None else {"frame": encode(*[v for row in self.frame for v in row])}
         return {
             "schema": "certify-certificate/9",
             "claim": claim | ({} if self.keep is None else {"keep": self.keep}),
