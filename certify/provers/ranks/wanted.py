@@ -17,17 +17,19 @@ from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.ranks.images import Course, Images
 from certify.provers.ranks.search import Search
 
-COUNTS_FROM = (*range(1, 13), 14, 16, 20, 24, 32, 40, 50, 64, 80)
+COUNTS_FROM = (*range(1, 13), 14, 16, 20, 24, 32, 40, 50, 64, 80, 100, 120)
 MOST_STEPS = COUNTS_FROM[-1]
 _GROWTH = 1.5  # of an image, relative to its leaf, that counts as none
 _NARROW = 1e-11  # share of the root box below which leaves are not halved
+_FALLS = 0.95  # of the volume without a rank from one round to the next, at most
 _SHARE = 0.7  # of the leaves that may be halved, the largest ones
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
     """A box lo <= x <= hi (n,) of places, each of whose leaves is to have a rank of `most` at most; `direct` says how
-    many boxes are looked at before leaves that do not meet it are, as where few steps suffice."""
+    many boxes are looked at before leaves that do not meet it are, as where few steps suffice: so many, and more as
+    long as they prove more and more of the box."""
 
     lo: Array
     hi: Array
@@ -40,7 +42,7 @@ class SearchFrom(Search):
 
     def __init__(self, course: Course, lo: Array, hi: Array, wanted: Wanted) -> None:
         super().__init__(course, lo, hi)
-        self.wanted, self.seen = wanted, np.zeros(1, dtype=bool)
+        self.wanted, self.seen, self.left = wanted, np.zeros(1, dtype=bool), math.inf
 
     def begin(self, most: float) -> Index:
         """The leaves of a first tree, all of one size, that meet the box: the others cost nothing."""
@@ -69,7 +71,7 @@ class SearchFrom(Search):
         """The needed leaves that have not been seen; if all have, halves of those without a rank."""
         own = self._own
         open_ = own[self.rank[own] == UNPROVED]
-        if self.boxes < self.wanted.direct and len(open_):
+        if len(open_) and self._is_direct(open_):
             self.halve(open_, self.steep[:, open_].argmax(0))
             return self._unseen(self._own)
         new = self._unseen(self._needed())
@@ -77,6 +79,11 @@ class SearchFrom(Search):
             self._halve_some(near)
             new = self._unseen(self._needed())
         return new
+
+    def _is_direct(self, open_: Index) -> bool:
+        """True as long as halves of the box's own leaves without a rank are worth a look before all others."""
+        before, self.left = self.left, float(self.cover.widths(open_).prod(0).sum())
+        return self.boxes < self.wanted.direct or (self.wanted.direct > 0 and self.left < _FALLS * before)
 
     def _halve_some(self, near: Index) -> None:
         """Halve needed leaves without a rank: those whose images meet one with a rank, or that have none."""
