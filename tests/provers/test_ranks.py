@@ -166,16 +166,6 @@ def test_images_hold_trajectories(loop: tuple[System, PolicyNetwork], framed: bo
         assert np.all(np.abs(away) <= bounds + 1e-12)
 
 
-def test_images_in_a_frame_do_not_depend_on_the_boxes_beside_them() -> None:
-    """A product of matrices rounds as its width has it."""
-    course = followed(swinging(), np.random.default_rng(0).normal(size=(2, 2)))
-    lo = np.random.default_rng(1).uniform(-0.7, 0.7, (2, 37))
-    some, whole = [3, 30], course(lo, lo + 0.01, 0.0, 0.0)
-    part = course(lo[:, some], lo[:, some] + 0.01, 0.0, 0.0)
-    assert np.array_equal(part.lo, whole.lo[..., some], equal_nan=True)
-    assert np.array_equal(part.hi, whole.hi[..., some], equal_nan=True)
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_errors_in_a_frame_that_is_nearly_singular_are_not_less_than_they_are(seed: int) -> None:
     """The inverse in binary64 is wrong by the frame's condition."""
