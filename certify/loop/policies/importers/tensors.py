@@ -71,8 +71,7 @@ def load_npz(raw: bytes, what: str) -> dict[str, Numbers]:
 
     Raises
     ------
-    InputError : the file is damaged, holds what are no real numbers, or more digits than binary64 has; or two arrays have
-        one name.
+    InputError : the file is damaged, an array holds no real numbers of at most 64 bits, or two have one name.
     """
     archive, found = Archive(raw, what), dict[str, Numbers]()
     for member in archive.names:
