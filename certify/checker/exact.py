@@ -18,6 +18,7 @@ from .functions import FUNCTIONS, Undecided
 from .networks import Affine, OnNumbers
 
 MAX_MATRIX_BITS = 2**16  # of a number in a matrix, times the matrix's size: beyond, a decision takes minutes
+_MOST_BITS = 2**14  # the same where all of an inverse is wanted
 
 
 def exactly(array: NDArray[np.float64]) -> fmpq_mat:
@@ -31,6 +32,14 @@ def inverse_diagonal(A: fmpq_mat) -> list[Fraction]:
         return []
     inverse = A.inv()
     return [fraction(inverse[i, i]) for i in range(A.nrows())]
+
+
+def inverse(A: fmpq_mat) -> fmpq_mat | None:
+    """`A^-1`; None if there is none, or A is too large to tell soon."""
+    numerator, _ = A.numer_denom()
+    if A.nrows() * max(v.height_bits() for v in numerator.entries()) > _MOST_BITS or numerator.det() == 0:
+        return None
+    return A.inv()
 
 
 def is_definite(A: fmpq_mat) -> bool:

@@ -22,7 +22,7 @@ from flint import fmpq, fmpq_mat
 from .boxes import LEAF, Batch, Boxes, Leaves, batches, in_order, is_whole, keeps_inputs, middle
 from .calls import entries
 from .case import Case, Failures, given, only_where
-from .exact import exactly
+from .exact import exactly, inverse
 from .expression import Call, Tape, evaluate
 from .functions import FUNCTIONS
 from .near import Above, Array, Form, Near, near
@@ -34,7 +34,6 @@ from .wiring import Clip, Concat, Observe, Product, Sum
 if TYPE_CHECKING:
     from .rules import Tally
 
-_MOST_BITS = 2**14  # of a number in a matrix all of whose inverse is wanted, times the matrix's size
 _BATCH_NUMBERS = 1_000_000  # in the largest array of a batch
 
 
@@ -178,14 +177,6 @@ def _below_on_face(function: Function, level: float, doubt: Above, first: int, l
     x = np.concatenate([centre[None], np.eye(len(lo))[:, :, None] * radius])
     below = np.logical_not(function.is_above(Form(x, doubt * np.ones_like(centre)), level))
     return first + np.flatnonzero(below)
-
-
-def inverse(A: fmpq_mat) -> fmpq_mat | None:
-    """`A^-1`; None if there is none, or A is too large to tell soon."""
-    numerator, _ = A.numer_denom()
-    if A.nrows() * max(v.height_bits() for v in numerator.entries()) > _MOST_BITS or numerator.det() == 0:
-        return None
-    return A.inv()
 
 
 def contains_domain(case: Case) -> Failures:

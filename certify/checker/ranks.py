@@ -18,7 +18,7 @@ from flint import arb, fmpq_mat
 
 from .boxes import LEAF, Batch, batches, is_whole, middle
 from .case import Case, Failures, given
-from .exact import exactly, fraction
+from .exact import exactly, fraction, inverse
 from .expression import evaluate
 from .near import Above, Array, Form, Near, all_near, near, near_ball, within
 from .network import enclose_on_boxes
@@ -145,8 +145,7 @@ class Steps(Moving):
         self.widest, self.ranks = [np.inf] * n, given(case.c.ranks)
         self.order = self.ranks.order
         self.frame = np.eye(n) if self.ranks.frame is None else self.ranks.frame
-        inverse = exactly(self.frame).inv()
-        self.back = all_near(fraction(v) for v in inverse.transpose().entries())
+        self.back = all_near(fraction(v) for v in given(inverse(exactly(self.frame))).transpose().entries())
         self.rank, self.count = two_bytes(self.ranks.ranks), np.frombuffer(self.ranks.steps, np.uint8).astype(np.int64)
         self.straight = [i for i in range(n) if i not in self.ranks.angles]  # states that are no angles
 
@@ -275,7 +274,7 @@ def is_stated(case: Case) -> Failures:
         least = Fraction(TURN.ends[1]) if i in ranks.angles else Fraction(0)
         if not Fraction(hi) - Fraction(lo) > least:
             yield f"evidence.ranks, axis {i}", "lo must be below hi, in an angle by more than 2 pi"
-    if ranks.frame is not None and exactly(ranks.frame).det() == 0:
+    if ranks.frame is not None and inverse(exactly(ranks.frame)) is None:
         yield "evidence.ranks.frame", "it must have an inverse"
     leaves = yield from is_whole(ranks.tree, range(n), "ranks, ")
     if (len(ranks.ranks), len(ranks.steps)) != (2 * leaves, leaves):

@@ -181,6 +181,9 @@ HONEST: dict[str, Callable[[], Document]] = {
     "outer network": with_outer,
     "outer expression": lambda: with_outer("expression"),
     "ranks": lambda: with_ranks(loop(leaves=3, time="discrete")),
+    "ranks in a frame": lambda: edited(
+        with_ranks(loop(leaves=3, time="discrete")), "evidence.ranks.frame", encode([1.0, 2.0**-90, -3e-20, 2.0])
+    ),
     "ranks beside a ball of another order": lambda: edited(
         with_ranks(loop(leaves=3, sample=SAMPLE, order=2, levels=(0.25, 0.5, 1.0))), "evidence.local.order", 4
     ),

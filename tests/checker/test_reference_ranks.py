@@ -829,18 +829,22 @@ def moved(x: float, y: float, h: float, q: Callable[[], float], calls: int) -> t
     return x, y
 
 
+@pytest.mark.parametrize("frame", [None, [[1.0, 0.5], [-3.0, 2.0]]])
 @pytest.mark.parametrize(("order", "calls"), [(0, 0), (1, 0), (2, 0), (3, 0), (5, 0), (0, 1), (1, 1)])
-def test_boxes_hold_all_trajectories(order: int, calls: int) -> None:
-    """Each state is within the error of its form, at the same d, after some steps; order 0 is discrete time.
+def test_boxes_hold_all_trajectories(order: int, calls: int, frame: list[list[float]] | None) -> None:
+    """Each N x is within the error of its form, at the same d, after some steps; order 0 is discrete time.
 
     Also where the equations call a network, of a state and of what is uncertain.
     """
     sample = ("1/20", "1/10") if order else None
     called = ["*", "1/3", ["network", "pi", 0, "y", "q"]]
     dynamics = [PENDULUM[0], [*PENDULUM[1], called]] if calls else PENDULUM
-    loop = Loop(dynamics, TANH, [["-", "x", "9"]], ("x", "y"), sample, max(order, 1), [("q", "-1/10", "1/5")])
+    target, uncertain = [["-", "x", "9"]], [("q", "-1/10", "1/5")]
+    loop = Loop(dynamics, TANH, target, ("x", "y"), sample, max(order, 1), uncertain, frame=frame)
     c = read(dumped(loop.document([0.5, -0.5], [0.6, -0.4], b"\xff", two_bytes([3]), b"\3")))
-    chance, walk = random.Random(order), Walk(c, max(order, 1))
+    assert isinstance(c.evidence, Ranked) and c.evidence.ranking is not None
+    chance, walk = random.Random(order), Walk(c, max(order, 1), c.evidence.ranking.frame)
+    N = frame or [[1.0, 0.0], [0.0, 1.0]]
     rows = [walk.start(Box(0, [0.5, -0.5], [0.6, -0.4]))]
     for _ in range(3):
         rows.append(walk.step(rows[-1], "here", *walk.inputs([rows[-1]])))
@@ -858,9 +862,11 @@ def test_boxes_hold_all_trajectories(order: int, calls: int) -> None:
                 state = moved(*state, chance.choice([0.05, 0.1, chance.uniform(0.05, 0.1)]), q, calls)
             else:
                 state = rates(*state, policy(*state), q(), calls)
-            for i, x in enumerate(state):
-                middle, *slopes = (float(v.mid()) for v in row[i])
-                error = abs(x - middle - slopes[0] * d[0] - slopes[1] * d[1])
-                assert error <= slopes[2 + i] + 1e-9 and not slopes[3 - i]
-                nearest = max(nearest, error / slopes[2 + i])
+            forms = [[float(v.mid()) for v in form] for form in row]
+            away = [x - form[0] - form[1] * d[0] - form[2] * d[1] for x, form in zip(state, forms, strict=True)]
+            for i, turned in enumerate(N):
+                error = abs(turned[0] * away[0] + turned[1] * away[1])
+                bounds = [turned[0] * forms[0][3 + k] + turned[1] * forms[1][3 + k] for k in range(2)]
+                assert error <= bounds[i] + 1e-9 and abs(bounds[1 - i]) < 1e-12
+                nearest = max(nearest, error / bounds[i])
     assert nearest > 0.3

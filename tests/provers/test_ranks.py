@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from flint import fmpq, fmpq_mat
 
 from certify import certify_roa
 from certify.certificates import RankTree, run_checker
@@ -22,10 +23,11 @@ from certify.loop.expressions import Number, symbols
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
+from certify.provers.bounds import Taylor
 from certify.provers.execution import Runner, ThreadRunner, rows
 from certify.provers.ranks import Question, RankProof, Sublevel, prove_ranks, root_box, without_leaf
 from certify.provers.ranks.cover import Cover
-from certify.provers.ranks.images import Form
+from certify.provers.ranks.images import Course, Form
 from certify.provers.ranks.search import COUNTS
 from tests.support.jobs import PlayedRunner, Troupe
 from tests.support.loops import box
@@ -128,14 +130,25 @@ def test_ranks_are_the_same_whoever_follows_the_boxes(
     assert made.answered > 3 and (made.refused > 0) == name.startswith("answers")
 
 
+FRAMES = {1: np.array([[-3.0]]), 2: np.array([[1.0, 0.5], [-3.0, 2.0]])}
+
+
+def followed(loop: tuple[System, PolicyNetwork], frame: np.ndarray | None) -> Course:
+    """Boxes of a wide root box, whose errors are bounded in this frame."""
+    n = loop[0].n
+    return replace(question(loop, 0.01), root=(np.full(n, -2.0), np.full(n, 2.0)), frame=frame).course(COUNTS)
+
+
+@pytest.mark.parametrize("framed", [False, True])
 @pytest.mark.parametrize("loop", [bistable(), bistable("held"), hanging(), swinging()])
-def test_images_hold_trajectories(loop: tuple[System, PolicyNetwork]) -> None:
+def test_images_hold_trajectories(loop: tuple[System, PolicyNetwork], framed: bool) -> None:
     system, _ = loop
     generator, n = np.random.default_rng(3), system.n
-    course = replace(question(loop, 0.01), root=(np.full(n, -2.0), np.full(n, 2.0))).course(COUNTS)
+    course = followed(loop, FRAMES[n] if framed else None)
     centre = generator.uniform(-0.7, 0.7, (n, 200))
     radius = generator.uniform(1e-4, 0.05, (n, 200))
-    form = Form(np.concatenate([centre[:, None], np.eye(n)[:, :, None] * radius], 1), np.zeros_like(centre))
+    slopes = np.eye(n)[:, :, None] * radius
+    form = Form(np.concatenate([centre[:, None], slopes, 0 * slopes], 1))
     d = np.sign(generator.normal(size=(n, 200))) * generator.random((n, 200)) ** 0.2
     x, f = (centre + radius * d).T, system.function()
     for _ in range(12):
@@ -148,8 +161,24 @@ def test_images_hold_trajectories(loop: tuple[System, PolicyNetwork]) -> None:
         lo, hi = form.box
         assert np.all(kept)
         assert np.all((lo <= x.T + 1e-12) & (hi + 1e-12 >= x.T))
-        away = np.abs(x.T - form.x[:, 0] - (form.x[:, 1:] * d).sum(1))
-        assert np.all(away <= form.e + 1e-12)
+        away = course.into @ (x.T - form.x[:, 0] - (form.x[:, 1 : n + 1] * d).sum(1))
+        bounds = np.einsum("ij,jib->ib", course.into, form.x[:, n + 1 :])
+        assert np.all(np.abs(away) <= bounds + 1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_errors_in_a_frame_that_is_nearly_singular_are_not_less_than_they_are(seed: int) -> None:
+    """The inverse in binary64 is wrong by the frame's condition."""
+    generator = np.random.default_rng(seed)
+    frame = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-7]]) * generator.uniform(0.5, 1.0, (2, 1))
+    course = followed(swinging(), frame)
+    rest = [Taylor(np.zeros(1), np.zeros((7, 1)), np.zeros((7, 7, 1)), r) for r in generator.uniform(0, 1, (2, 1))]
+    found = np.abs(course.form(rest).x[:, 3:, 0]).sum(1)
+    exact = fmpq_mat([[fmpq(*v.as_integer_ratio()) for v in row] for row in frame.tolist()]).inv().tolist()
+    bound = np.abs(frame) @ np.array([v.r[0] for v in rest])
+    assert np.all(
+        found >= [sum(abs(int(v.p) / int(v.q)) * b for v, b in zip(row, bound, strict=True)) for row in exact]
+    )
 
 
 def held(f: Any, x: np.ndarray, u: np.ndarray, h: np.ndarray, steps: int = 50) -> np.ndarray:

@@ -19,7 +19,7 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, evaluate
 from certify.loop.policies import bounded_by_form
 from certify.provers.bounds import Flow, Models, Taylor, loop_models, policy_enclosure, upper_bound
-from certify.provers.bounds.arrays import Array, Index, Mask
+from certify.provers.bounds.arrays import Array, Index, Mask, product
 from certify.provers.bounds.taylor import EPS, TINY
 from certify.provers.boxes.rule import input_bounds_kept, operations_of_box
 from certify.provers.ranks.targets import Target
@@ -104,6 +104,7 @@ class Course:
         self.angles, self.root, self.counts, self.frame = tuple(angles), root, tuple(counts), frame
         self.into = np.eye(self.system.n) if frame is None else frame
         self.back = np.linalg.inv(self.into)
+        self.doubt = 1e-12 + 16 * EPS * float(np.linalg.cond(self.into))  # relative, of errors: also of the inverse
         self.straight = [i for i in range(self.system.n) if i not in self.angles]
         self.policy = policy_enclosure(loop, 2 * self.system.n)
         self.dynamics = self.system.uncertain_dynamics()
@@ -206,7 +207,6 @@ class Course:
         n = len(models)
         first = np.stack([np.concatenate([v.c[None], v.g[:n]]) for v in models])
         rest = np.stack([np.concatenate([v.g[n:], v.Q.reshape(-1, v.Q.shape[-1])]) for v in models])
-        e = np.abs(np.tensordot(self.into, rest, 1)).sum(1)
-        e += np.tensordot(np.abs(self.into), np.stack([v.r for v in models]), 1)
-        e = e * (1 + 1e-12) + _MORE_THAN_ROUNDING * np.tensordot(np.abs(self.into), np.abs(rest).sum(1), 1)
+        e = np.abs(product(self.into, rest)).sum(1) + product(np.abs(self.into), np.stack([v.r for v in models]))
+        e = e * (1 + self.doubt) + _MORE_THAN_ROUNDING * product(np.abs(self.into), np.abs(rest).sum(1))
         return Form(np.concatenate([first, self.back[:, :, None] * e], 1))
