@@ -80,7 +80,12 @@ def robust_candidate(loop: ClosedLoop, effort: Effort = UNLIMITED) -> Array:
             "the local rule proves nothing with the candidates that solve a Lyapunov equation", effort
         )
     start = max(proved, key=_log_volume)
-    return max((_climbed(known, start, effort, quick) for quick in (True, False)), key=_log_volume)
+    best, before = max((_climbed(known, start, effort, quick) for quick in (True, False)), key=_log_volume), -math.inf
+    while _log_volume(best) > before + _WORTH and not effort.over:  # where one way ends the other may go on
+        before = _log_volume(best)
+        for quick in (True, False):
+            best = _climbed(known, best, effort, quick)
+    return best
 
 
 def solve(problem: cvxpy.Problem) -> bool:
