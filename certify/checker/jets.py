@@ -243,13 +243,12 @@ class Jet:
         _, _, half, sixth = phi.f
         a, s, curve = self.gradient, self.gradient.size, self.curve
         quartic, straight = phi.fourth * (self.radius * self.radius), half.size * s * 2  # 2 half (a.d) (z - d'Q d)
-        square = (
-            half.size * curve + sixth.size * (s * s * 3 + s * curve * 3 + curve * curve) + quartic * (s * 2 + curve)
-        )
+        along = quartic + sixth.size * curve * 3  # of (a.d)^2
+        square = half.size * curve + sixth.size * (s * curve * 3 + curve * curve) + quartic * (s * 2 + curve)
         aa = outer(a, a)
         C = symmetric(a, self.Q) * (half * 2) + symmetric(a, aa) * sixth
         plain = straight * self.twist + square * (self.bend + self.twist)
-        R = times(self.whole, straight + square) + times(aa, quartic)
+        R = times(self.whole, straight + square) + times(aa, along)
         return aa * half, C, R.wider(plain)
 
     def lip_beyond_tangent(self, phi: Expansion) -> Above:

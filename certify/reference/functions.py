@@ -128,7 +128,7 @@ def beyond_tangent(v: Model, phi: Expansion) -> Beyond:
     """The part of phi of v beyond phi(v(0)) and phi' times what v adds to v(0); what is beyond v's K counts with phi'.
 
     With D = v - v(0), y = a.d and z = D - y, within curve and d'Wd: h D^2 is h y^2 and 2 h y d'Qd but for what is
-    left of z in 2 h y z and for h z^2; g D^3 is g y^3 but for g z (3 y^2 + 3 y z + z^2); and D^4 is at most
+    left of z in 2 h y z and for h z^2; g D^3 is g y^3 but for 3 g z y^2 and g z (3 y z + z^2); and D^4 is at most
     radius^2 (y^2 + (2 |y| + |z|) |z|). Here phi', h, g and a are those at y = 0: by what they differ R is larger.
     """
     n, slope, curve, a, phi = v.a.nrows(), v.slope, v.curve, v.a, phi.flat
@@ -137,21 +137,26 @@ def beyond_tangent(v: Model, phi: Expansion) -> Beyond:
     C = no_form(n) if slope.is_zero() else linear_times_square(a, 2 * h * v.Q + g * outer)
     quartic = phi.fourth * v.radius * v.radius
     rest = 2 * phi.bent * slope
-    turned = phi.bent * curve + phi.twisted * (3 * slope * (slope + curve) + curve * curve)
+    turned = phi.bent * curve + phi.twisted * curve * (3 * slope + curve)
     turned += quartic * (2 * slope + curve) + phi.moved[1]
     known = rest * v.twist + turned * (v.bend + v.twist) + total(mistaken(v, phi))
-    R = (rest + turned) * v.whole + quartic * outer + known * identity(n)
+    R = (rest + turned) * v.whole + of_squares(v, phi) * outer + known * identity(n)
     return Beyond(h * outer, C, R, steepness(v, phi))
 
 
+def of_squares(v: Model, phi: Expansion) -> arb:
+    """The factor of y^2 in R: D^4 has one of radius^2, and 3 g z y^2 one of 3 |g| curve."""
+    return phi.fourth * v.radius * v.radius + 3 * phi.twisted * v.curve
+
+
 def mistaken(v: Model, phi: Expansion) -> tuple[arb, arb, arb]:
-    """Bounds of what differs in H, in C and in quartic a a' for other y, on the ball."""
-    s, a, quartic = v.slope, v.slope - v.turn, phi.fourth * v.radius * v.radius
+    """Bounds of what differs in H, in C and in R's multiple of a a' for other y, on the ball."""
+    s, a = v.slope, v.slope - v.turn
     square, cube = s * s - a * a, s * s * s - a * a * a
     of_H = phi.moved[2] * s * s + (phi.bent - phi.moved[2]) * square
     of_C = 2 * (phi.moved[2] * s + (phi.bent - phi.moved[2]) * v.turn) * v.bend
     of_C += phi.moved[3] * s * s * s + (phi.twisted - phi.moved[3]) * cube
-    return of_H, of_C, quartic * square
+    return of_H, of_C, of_squares(v, phi) * square
 
 
 def steepness(v: Model, phi: Expansion) -> arb | None:

@@ -278,6 +278,13 @@ def test_every_power_has_its_place_in_what_a_function_adds(order: int, left: str
     assert used > 0.02 or left == right == "a"
 
 
+def test_a_cube_keeps_the_direction_of_the_gradient() -> None:
+    """3 y^2 z of D^3 counts along the gradient, and across it only what is of second order in z."""
+    jet = plain(0.0, 0.0, np.array([1.0, 0.0]), 0.0, np.diag([0.0, 1e-6]), np.zeros((2, 2)))
+    _, _, R = beyond_tangent(jet, [0.0, 0.0, 0.0, 1.0], 1.0, 0.0)
+    assert 2.9e-6 < R[0, 0] < 3.1e-6 and R[1, 1] < 1e-11
+
+
 @pytest.mark.parametrize("name", FUNCTIONS)
 @pytest.mark.parametrize("c", [0.3, -0.8, 1.7])
 def test_a_function_of_one_direction_is_bounded_tightly(name: str, c: float) -> None:

@@ -21,11 +21,14 @@ from certify.checker.activations import add as add_activations
 from certify.checker.functions import FUNCTIONS as CHECKERS
 from certify.checker.near import Above, Near
 from certify.checker.smooth import add as add_smooth
-from certify.reference.balls import ON_LEAVES, PRECISION, SPREAD
+from certify.reference.balls import ON_LEAVES, PRECISION, SPREAD, ZERO
+from certify.reference.functions import Expansion, beyond_tangent, function_of
+from certify.reference.model import Model
 from certify.reference.networks import MAPS
 from certify.reference.rational import UNTOLD, Exact
 from certify.reference.refusal import Refused
 from certify.reference.smooth import Smooth
+from certify.reference.symmetric import no_form, orders, triples
 from certify.reference.table import FUNCTIONS
 from certify.reference.taylor import Taylor
 from tests.checker.test_networks import CORNERED, checked, hash_of
@@ -203,6 +206,67 @@ def test_models_on_leaves_hold_the_function(name: str) -> None:
                     known += (arb_mat([list(d)]) * model.Q * arb_mat([[x] for x in d]))[0, 0]
                 if not v.contains(0):
                     assert not abs(truth(name, v, 1)[0] - known) > model.r
+
+
+def on_a_ball(a: list[float], Q: list[list[float]], E: float, slack: float = 0.0, c: float = 0.5) -> Model:
+    """c + a'.d + d'Qd within E ||d||^2, the gradient a' within `slack` of a."""
+    n, eye = len(a), np.eye(len(a))
+    square, column = arb_mat(Q), arb_mat(n, 1, [arb(x) for x in a])
+    return Model(arb(c), column, square, no_form(n), arb_mat((E * eye).tolist()), slack=arb(slack))
+
+
+def cubic(K: arb_mat, d: list[float]) -> arb:
+    products = (count * d[h] * d[i] * d[j] for (h, i, j), count in zip(triples(len(d)), orders(len(d)), strict=True))
+    return sum((k * p for k, p in zip(K.entries(), products, strict=True)), arb(0))
+
+
+@pytest.mark.parametrize("name", ["tanh", "sin", "exp", "atan"])
+@pytest.mark.parametrize("slack", [0.0, 0.05])
+def test_models_on_balls_hold_the_function(name: str, slack: float) -> None:
+    """At the boundary, with the gradient and the remainder at the ends of what they may be."""
+    generator, used = np.random.default_rng(8), 0.0
+    with ctx.workprec(PRECISION):
+        for size in (0.05, 0.3, 1.0):
+            for _ in range(10):
+                a, half = size * generator.normal(size=2), size * generator.normal(size=(2, 2))
+                Q, E, c = half + half.T, 0.1 * size * generator.uniform(), float(generator.normal())
+                v = on_a_ball(a.tolist(), Q.tolist(), E, slack, c)
+                model = function_of(v, name)
+                for angle, end in zip(np.linspace(0, 6.2, 12), (1.0, -1.0) * 6, strict=True):
+                    d = [math.cos(angle), math.sin(angle)]
+                    row = arb_mat([d])
+                    turned = end * slack  # along d, which is the worst
+                    inside = c + (row * v.a)[0, 0] + turned + (row * v.Q * row.transpose())[0, 0] + end * E
+                    value = model.v + (row * model.a)[0, 0] + (row * model.Q * row.transpose())[0, 0]
+                    off = abs(truth(name, arb(inside), 1)[0] - value - cubic(model.K, d))
+                    bound = (row * model.E * row.transpose())[0, 0] + model.slack
+                    assert not off > bound
+                    used = max(used, float((off / bound).mid()))
+    assert used > 0.3
+
+
+@pytest.mark.parametrize("order", [2, 3, 4])
+@pytest.mark.parametrize(("slack", "q", "E"), [(0.1, 0.0, 0.0), (0.0, 0.5, 0.0), (0.3, 0.5, 0.0), (0.2, 0.3, 0.4)])
+def test_powers_of_one_direction_reach_their_bounds(order: int, slack: float, q: float, E: float) -> None:
+    """D^order of D = (1 + slack) d + q d^2 + E d^2 at d = 1."""
+    phi = Expansion(tuple(arb(j == order) for j in range(4)), (ZERO,) * 4, arb(order == 4), arb(4 * (order == 4)))
+    with ctx.workprec(PRECISION):
+        found = beyond_tangent(on_a_ball([1.0], [[q]], E, slack), phi)
+        D = arb(1) + slack + q + E
+        off, bound = D**order - found.H[0, 0] - found.C[0, 0], found.R[0, 0]
+        assert not off > bound * (1 + arb(2) ** -60)
+    assert off > 0.99 * bound
+
+
+def test_what_the_third_derivative_adds_keeps_the_direction_of_the_gradient() -> None:
+    """3 g y^2 z is of first order in the curve along the gradient, and of second order across it."""
+    with ctx.workprec(PRECISION):
+        flat, bent = (
+            function_of(on_a_ball([1.0, 0.0], [[0.0, 0.0], [0.0, curve]], 0.0, c=0.0), "sin") for curve in (0.0, 1e-6)
+        )
+        more = bent.E - flat.E
+    assert 2e-7 < float(more[0, 0].mid()) < 2e-6
+    assert float(more[1, 1].mid()) < 1e-7  # slope^2 W would have 5e-7 more
 
 
 @pytest.mark.parametrize("name", [*CORNERED, "abs"])

@@ -79,8 +79,12 @@ def robust_candidate(loop: ClosedLoop, effort: Effort = UNLIMITED) -> Array:
         raise NoCandidateError(
             "the local rule proves nothing with the candidates that solve a Lyapunov equation", effort
         )
-    start = max(proved, key=_log_volume)
-    return max((_climbed(known, start, effort, quick) for quick in (True, False)), key=_log_volume)
+    best, before = max(proved, key=_log_volume), -math.inf
+    while _log_volume(best) > before + _WORTH and not effort.over:
+        before = _log_volume(best)
+        for quick in (True, False):
+            best = _climbed(known, best, effort, quick)
+    return best
 
 
 def solve(problem: cvxpy.Problem) -> bool:
@@ -100,8 +104,8 @@ def solve(problem: cvxpy.Problem) -> bool:
 
 def _climbed(known: Paths, best: Array, effort: Effort, quick: bool) -> Array:
     """From {x'Px <= 1}, P = `best`, on, as far as steps gain and the effort allows; `quick`: with old derivatives as
-    long as what they foretell comes, and levels about those that were asked for. Either way may end far below the
-    other."""
+    long as what they foretell comes, and levels about those that were asked for. Where one way
+    ends the other may go on."""
     trust, about, fresh = _TRUST, None, True
     while trust > _LEAST_TRUST and not effort.over:
         if about is None:

@@ -142,8 +142,9 @@ def remainder(squares: Array, size: Sizes, E: Array, second: Array, third: Array
     flat = size.twist[:, x] * eye + E
     wide = flat + size.bend[:, x] * eye
     m = fourth * size.radius**2
-    spread = second * curve + third * (3 * slope**2 + 3 * slope * curve + curve**2) + m * (2 * slope + curve)
-    return np.asarray((2 * second * slope)[:, x] * flat + spread[:, x] * wide + m[:, x] * squares)
+    spread = second * curve + third * (3 * slope * curve + curve**2) + m * (2 * slope + curve)
+    along = 3 * third * curve + m
+    return np.asarray((2 * second * slope)[:, x] * flat + spread[:, x] * wide + along[:, x] * squares)
 
 
 def product_beyond(

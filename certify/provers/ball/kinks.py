@@ -230,7 +230,7 @@ class OnCone(Algebra[Vector]):
         squares = self.form.square(v.G)
         H, C = beyond_tangent(v.G, squares, v.Q, v.K, second, third)
         h, g, m = np.abs(second), np.abs(third), fourth * size.radius**2
-        turned = (h + m) * (size.slope**2 - plain.slope**2) + g * (size.slope**3 - plain.slope**3)
+        turned = (h + m + 3 * g * size.curve) * (size.slope**2 - plain.slope**2) + g * (size.slope**3 - plain.slope**3)
         turned += 2 * h * tilt * size.bend
         self._with(remainder(squares, size, E, h, g, fourth) + turned[:, None] * self.form.eye)
         return self._units(y, slope, v, L, H, C)

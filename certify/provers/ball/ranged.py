@@ -180,7 +180,7 @@ class RangedJet:
         H, cubic = beyond_tangent(self.a, squares, self.Q, self.K, second, third)
         R = remainder(squares, size, self.rest, h, g, fourth)
         moved = e1 * self._spread(size) + e2 * (slope**2 + 2 * slope * bend) + e3 * slope**3
-        bent = 2 * (h + fourth * size.radius**2) * slope + 2 * h * bend + 3 * g * slope**2
+        bent = 2 * (h + fourth * size.radius**2 + 3 * g * size.curve) * slope + 2 * h * bend + 3 * g * slope**2
         if len(self.moves):
             by_y = 2 * abs(half) * float(np.sum(np.abs(self.moves)))
             error = abs(f1) * self.error + h * far**2
