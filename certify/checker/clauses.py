@@ -1,4 +1,4 @@
-"""Words of claims that only some certificates have: outer, ranks, keep, data, handover, and the claims without V."""
+"""Words of claims that only some certificates have: outer, ranks, keep, data, samples, handover, claims without V."""
 
 from __future__ import annotations
 
@@ -148,6 +148,10 @@ def additions(c: Certificate, start: str) -> list[str]:
         )
     if c.data is not None:
         lines.append(f"  {consistent(c, c.data)}")
+    if c.samples is not None:
+        from . import samples
+
+        lines += samples.sampled(c, c.samples)
     return lines
 
 

@@ -39,7 +39,7 @@ def in_words(c: Certificate) -> str:
     if c.claim == INVARIANT:
         return of_staying(c) + kept(c)
     said = of_ranks(c) if c.target is not None else of_trajectories(c) + further(c) + in_ranks(c)
-    return said + kept(c) + measured(c) + handed_over(c)
+    return said + kept(c) + measured(c) + sampled(c) + handed_over(c)
 
 
 def of_trajectories(c: Certificate) -> str:
@@ -153,6 +153,29 @@ def measured(c: Certificate) -> str:
         f"; and of all constants {constants} none is consistent with the {data.steps} transitions in {len(data.runs)} "
         f"runs that the certificate states (sha256 of their file {data.sha256}; measured {around}{when}), unless it "
         f"lies in these ranges"
+    )
+
+
+def sampled(c: Certificate) -> str:
+    """The words for functions that nobody wrote down."""
+    if c.samples is None:
+        return ""
+    each = []
+    for f in c.samples.functions:
+        box = zip(f.variables, f.axes, strict=True)
+        where = ", ".join(f"{name} in [{axis[0]}, {axis[-1]}]" for name, axis in box)
+        d = range(len(f.variables))
+        bends = ", ".join(
+            f"{f.curvature[i][j]} by {f.variables[i]} and {f.variables[j]}" for i in d for j in d if i <= j
+        )
+        zero = ", is 0 at 0" if f.vanishes else ""
+        each.append(
+            f"{c.plant.states[f.state]}, of {', '.join(f.variables)} in {where}: continuous second derivatives of at "
+            f"most {bends}, values within {f.noise} of the {len(f.values)} that the certificate states{zero}"
+        )
+    return (
+        f"; and this holds, instead of for the equations alone, for all functions of these (samples of a file with "
+        f"sha256 {c.samples.sha256}): {'; '.join(each)}; of other functions nothing is said"
     )
 
 
