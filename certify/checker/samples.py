@@ -22,7 +22,7 @@ from .words import interval, number
 if TYPE_CHECKING:
     from .rules import Tally
 
-MAX_SAMPLES, MAX_VARIABLES, MAX_WEIGHTS, MAX_SHORT = 2**16, 8, 64, 2**7  # bits of a number
+MAX_SAMPLES, MAX_VARIABLES, MAX_WEIGHTS, MAX_SHORT = 2**18, 8, 64, 2**7  # bits of a number
 MAX_TERMS, MAX_DEGREE, MAX_BITS, MAX_PARTS = 2**7, 20, 2**9, 2**11  # of polynomials
 CLAIMS = ("asymptotic", "practical")
 Point = tuple[Fraction, ...]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from .document import Certificate, Interval, Plant
 
 RULE = "samples"
-MAX_VALUES, MAX_VARIABLES, MAX_WEIGHTS, SHORT = 2**16, 8, 64, 2**7  # SHORT in bits
+MAX_VALUES, MAX_VARIABLES, MAX_WEIGHTS, SHORT = 2**18, 8, 64, 2**7  # SHORT in bits
 MAX_TERMS, MAX_DEGREE, LONG, MAX_MOVED = 2**7, 20, 2**9, 2**11  # of polynomials; LONG in bits
 ZERO, ONE, HALF = fmpq(0), fmpq(1), fmpq(1, 2)
 Weighted = tuple[tuple[int, fmpq], ...]

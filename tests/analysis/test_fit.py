@@ -15,10 +15,9 @@ from certify.analysis.fitting import linear
 from certify.analysis.fitting.linear import Contradicted, beyond, slopes
 from certify.analysis.fitting.polynomial import bounded, errors, fitted
 from certify.analysis.fitting.run import fit_plant
-from certify.analysis.fitting.samples import Grid, Unknown
 from certify.cli.main import _run
 from certify.errors import InputError
-from certify.loop.plants import load_system
+from certify.loop.plants import Grid, Unknown, load_system
 from certify.loop.policies import Policy, PolicyNetwork, save_policy
 from tests.support.marks import slow_after
 
@@ -93,7 +92,7 @@ def within(truth: Truth, share: float = 1.0) -> tuple[bool, bool]:
     most = float(bound.constant) + z**2 @ np.array([float(k) for k in bound.rise])
     a = truth.gradient()
     inside = all(
-        float(lo) - 1e-9 <= v <= float(hi) + 1e-9 for (lo, hi), v in zip(slopes(one, grid, noise), a, strict=True)
+        float(lo) - 1e-9 <= v <= float(hi) + 1e-9 for (lo, hi, *_), v in zip(slopes(one, grid, noise), a, strict=True)
     )
     rest = np.array([float(beyond(one, tuple(map(Fraction, point)))) for point in z.tolist()])
     assert share < 1 or (np.abs(truth(z) - z @ a) <= rest + 1e-9).all()

@@ -21,7 +21,7 @@ from math import comb
 import numpy as np
 from scipy.optimize import linprog
 
-from certify.analysis.fitting.samples import Grid, Point, Unknown
+from certify.loop.plants.samples import Grid, Point, Unknown
 
 _DIGITS = 12  # of a coefficient after the point, as a share of the largest sampled value
 _HELD = 10**12  # denominators of bounds that stand in files
@@ -136,6 +136,11 @@ class Bound:
     variables: tuple[str, ...]
     constant: Fraction
     rise: Point
+
+    def least(self, cell: Cell) -> Fraction:
+        """The least value on a cell."""
+        each = zip(self.rise, cell, strict=True)
+        return self.constant + sum((k * (0 if a <= 0 <= b else min(a * a, b * b)) for k, (a, b) in each), Fraction(0))
 
     def text(self) -> str:
         """The bound as an equation of a plant's file."""

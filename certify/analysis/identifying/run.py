@@ -220,13 +220,17 @@ def identify_plant(
 
 
 def with_data(system: System, path: Path, tell: Tell = lambda _: None) -> System:
-    """A plant whose file has a table `data`, with the measurements of that file.
+    """A plant whose file has a table `data` or `samples`, with the measurements or samples of that file.
 
     Raises
     ------
     InputError : the plant has no such table, or the file is another one or cannot be read.
     """
     stated = system.measurements
+    if system.samples is not None and stated is None:
+        from certify.analysis.fitting.samples import with_samples
+
+        return with_samples(system, system.samples, path)
     if stated is None:
         raise InputError(
             f"{system.name} must have a table [data] that says what its data are; certify identify writes such a plant."

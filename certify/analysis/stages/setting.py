@@ -23,7 +23,7 @@ from certify.effort import Effort
 from certify.errors import InputError, OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.equilibrium import Rest, find_rest, seen_from
-from certify.loop.plants import Measurements
+from certify.loop.plants import Measurements, Samples
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,11 @@ class Setting:
         elif system.measurements is not None:
             with self.tools.timing("data"):
                 state = _identified(state, system.measurements)
+        if system.samples is not None and not system.samples.grids:
+            state = _without_samples(state)
+        elif system.samples is not None:
+            with self.tools.timing("data"):
+                state = _sampled(state, system.samples)
         with self.tools.timing("candidate"):
             state = _with_claim(state)
             rest, loop = _rest(state.loop, state.options)
@@ -83,6 +88,29 @@ def _without_data(state: State) -> State:
         "the plant's ranges are taken as they stand; `data` makes the measurements, on which they rest, a part of the "
         "claim"
     )
+
+
+def _without_samples(state: State) -> State:
+    """The plant with its equations as they stand, whatever they were fitted to."""
+    loop = ClosedLoop(replace(state.loop.system, samples=None), state.loop.network)
+    return replace(state, loop=loop).noting(
+        "the plant's equations and their bounds are taken as they stand; `data` makes the samples, to which they were "
+        "fitted, a part of the claim"
+    )
+
+
+def _sampled(state: State, samples: Samples) -> State:
+    """The plant with evidence that its equations stand for all functions of the samples.
+
+    Raises
+    ------
+    InputError : they do not, or another claim is asked for than one that may have samples.
+    """
+    from certify.analysis.fitting.standing import standing_for
+
+    if state.options.enlarges or state.options.claim == "nearby":
+        raise InputError("a claim with samples must be practical or asymptotic, without a tube; leave out `data`.")
+    return replace(state, data=standing_for(state.loop.system, samples))
 
 
 def _identified(state: State, measurements: Measurements) -> State:

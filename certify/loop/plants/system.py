@@ -34,6 +34,7 @@ from certify.loop.expressions.numerical import Module
 from certify.loop.plants.calls import Call
 from certify.loop.plants.floating_point import function_of
 from certify.loop.plants.measurements import Measurements
+from certify.loop.plants.samples import Samples
 from certify.loop.plants.validation import validate
 
 Interval = tuple[Fraction, Fraction]
@@ -94,6 +95,7 @@ class System:
     angles : names of states that are angles: x and x + 2 pi are the same place.
     constraints : expressions g by name, as the dynamics; g < 0 is asked for along trajectories.
     measurements : those with which uncertain parameters, constants, are consistent; None where ranges are assumed.
+    samples : of unknown functions for which equations stand; None where these are the plant.
 
     Raises
     ------
@@ -124,6 +126,7 @@ class System:
     angles: tuple[str, ...] = ()
     constraints: Mapping[str, Expression] = field(default_factory=dict)
     measurements: Measurements | None = None
+    samples: Samples | None = None
 
     def __post_init__(self) -> None:
         for key in ("parameters", "ranges", "units", "rest_of_calls", "constraints"):
@@ -199,6 +202,12 @@ class System:
     def with_sample(self, sample: Interval | None) -> System:
         """The same plant whose inputs are held over periods of these lengths; None for inputs that follow at once."""
         return replace(self, sample=sample)
+
+    @property
+    def bounds(self) -> dict[str, Interval]:
+        """The domain and the input bounds, by the names of states and inputs."""
+        both = zip((*self.states, *self.inputs), (*self.domain, *self.input_bounds), strict=True)
+        return {s.name: interval for s, interval in both}
 
     @property
     def in_steps(self) -> bool:
