@@ -216,10 +216,11 @@ def _lasting(period: tuple[Fraction, Fraction]) -> str:
 def handed_over(c: Certificate, then: Certificate) -> list[str]:
     """The statement of chapter handover; what is stated of the second certificate follows."""
     left, each = ("x+ = g(k, x, u)", "step") if c.discrete else ("xdot = g(t, x, u)", "time")
+    sampled = "; so are the plants that have functions of its samples" if c.samples or then.samples else ""
     return [
         f"handover: a plant {left} is one of a certificate if at every {each}, state in its domain and input in its "
         "bounds g is a value of its f, for some of what is uncertain, of which measured parameters are constant and "
-        "consistent with the measurements",
+        f"consistent with the measurements{sampled}",
         "  of every plant that is one of the certificate above and of the one below, every trajectory above enters "
         f"V <= {c.c0!r}, which lies in V <= {then.c2!r} of the one below, and from then on is one of those below",
         "certificate that takes over:",

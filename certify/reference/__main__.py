@@ -185,11 +185,13 @@ def handed_over(c: Certificate) -> str:
     if then is None:
         return ""
     right = "x+ = g(k, x, u)" if c.plant.discrete else "x' = g(t, x, u)"
+    sampled = c.samples is not None or then.samples is not None
+    also = " (those with functions of its samples are among them)" if sampled else ""
     return (
         f"; and of every plant {right} whose right side, at any time and wherever x and u are in domain and input "
         "bounds, is one that the equations of this certificate have, and also one that those of the next have (for "
-        "some of what is uncertain, what was measured being constant and consistent), each of these trajectories is, "
-        f"once in V <= {c.floor!r}, one from V <= {then.outer!r} of the next, which says: {in_words(then)}"
+        f"some of what is uncertain, what was measured being constant and consistent){also}, each of these "
+        f"trajectories is, once in V <= {c.floor!r}, one from V <= {then.outer!r} of the next, which says: {in_words(then)}"
     )
 
 

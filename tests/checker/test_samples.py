@@ -89,7 +89,7 @@ def near() -> Document:
     a, b = (-1, Fraction(1, 50)), (Fraction(1, 2), Fraction(3, 200))
     ranges = [(name, str(m - e), str(m + e)) for name, (m, e) in zip("ab", (a, b), strict=True)]
     data = make([linear()], [([[1.0]], [0.0])], [[1.0]], (0.1, 1.0), uncertain=[*ranges, ("r", "-1", "1")],
-                cells=[1, 1, 1])  # fmt: skip
+                cells=[1, 1, 1], centre="none")  # fmt: skip
     f = function("x", ("x", "u"), [["1/5", "1/50"], ["1/50", "1/10"]], "1/1000", True, [NEAR_X, NEAR_U],
                  lambda x, u: -x + u / 2)  # fmt: skip
     both = [[[7, "-5"], [17, "5"]], [[11, "-5"], [13, "5"]]]  # from (-1/10, 0) and (1/10, 0), (0, -1/10) and (0, 1/10)
