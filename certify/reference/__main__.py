@@ -191,7 +191,8 @@ def handed_over(c: Certificate) -> str:
         f"; and of every plant {right} whose right side, at any time and wherever x and u are in domain and input "
         "bounds, is one that the equations of this certificate have, and also one that those of the next have (for "
         f"some of what is uncertain, what was measured being constant and consistent){also}, each of these "
-        f"trajectories is, once in V <= {c.floor!r}, one from V <= {then.outer!r} of the next, which says: {in_words(then)}"
+        f"trajectories is, once in V <= {c.floor!r}, one from V <= {then.outer!r} of the next, which says: "
+        f"{in_words(then)}"
     )
 
 
