@@ -16,8 +16,9 @@ from certify.checker import document
 from certify.checker.words import report
 from certify.reference.__main__ import in_words
 from certify.reference.document import read
-from tests.checker.test_handover import dumped, joined, verdicts
+from tests.checker.test_handover import dumped, joined, nearby, verdicts
 from tests.checker.test_limits import counts
+from tests.checker.test_reference_data import true
 from tests.support.certificates import Document, edited, encode, grow, make
 from tests.support.earlier import newer
 from tests.support.marks import slow_after
@@ -98,6 +99,13 @@ def near() -> Document:
 
 
 @cache
+def aslant() -> Document:
+    """The same, with weights of (1/10, 1/10) and (-1/10, 1/10) for the slope in x, which leave 27/1000."""
+    data = edited(near(), f"{BY}.weights.0", [[[8, "-5"], [18, "5"]]] * 2)
+    return edited(data, "plant.uncertain.0.range", texts([-1 - Fraction(27, 1000), -1 + Fraction(27, 1000)]))
+
+
+@cache
 def two() -> Document:
     """x' = g(x), y' = h(y), samples of straight lines."""
     names = (("r", "x"), ("q", "y"))
@@ -108,12 +116,18 @@ def two() -> Document:
     return with_samples(grow(data), functions, [{**ALONE, "error": r} for r, _ in names])
 
 
-TRUE = {"far": far, "near": near, "two": two, "composed": lambda: joined(far(), near())}
+TRUE = {"far": far, "near": near, "aslant": aslant, "two": two, "composed": lambda: joined(far(), near())}
 
 
 @pytest.mark.parametrize("name", TRUE)
 def test_a_true_claim(name: str) -> None:
     assert verdicts(TRUE[name]()) == ACCEPTED
+
+
+@pytest.mark.parametrize("more", [["**", "x", 2], ["*", ["**", "x", 2], ["**", "u", 2]], ["**", "u", 4]])
+def test_a_bound_may_grow_with_the_state(more: list[Any]) -> None:
+    data = edited(far(), "plant.dynamics.0", equation(["+", str(E_FAR), ["*", "1/1000", more]]))
+    assert verdicts(data) == ACCEPTED
 
 
 def plus(by: Any) -> Callable[[str], str]:
@@ -176,6 +190,12 @@ def of_far() -> dict[str, list[Document]]:
         "a bound that is too small": [
             edited(data, "plant.dynamics.0", equation(E_FAR - d)) for d in (TINY, Fraction(1, 1000), E_FAR)
         ],
+        "a bound that is too small somewhere": [
+            edited(data, "plant.dynamics.0", equation(["+", str(E_FAR - d), more]))
+            for d in (TINY, Fraction(1, 1000))
+            for more in (["**", "x", 2], ["**", "u", 2], ["*", ["**", "x", 2], ["**", "u", 2]], ["*", "1/100", "x"],
+                         ["-", ["*", "1/100", ["**", "u", 3]]], ["*", "x", "u", "1/100"])
+        ],
         "a bound that is 0 somewhere": [
             edited(data, "plant.dynamics.0", equation(["*", "r", E])) for E in (["**", "x", 2], "x", ["*", "x", "u"])
         ],
@@ -187,7 +207,8 @@ def of_far() -> dict[str, list[Document]]:
         "no polynomial": [
             edited(data, "plant.dynamics.0", lambda tree, v=v: [*tree, v])
             for v in (["sin", ["*", "x", "1/100000"]], ["/", "x", ["+", "2", "x"]], ["abs", "x"],
-                      ["*", "0", ["sin", "x"]], ["*", "r", "r", "1/1000"], ["*", "1/1000000", ["**", "x", 21]])
+                      ["*", "0", ["sin", "x"]], ["*", "r", "r", "1/1000"], ["*", "1/1000000", ["**", "x", 21]],
+                      ["*", "r", "r", "1/1000", ["**", "x", 2]])
         ],
         "a range of the error": e("plant.uncertain.0.range", ["-1", "999/1000"], ["-9/10", "1"], ["0", "1"]),
         "no error": e(f"{BY}.error", None),
@@ -247,6 +268,7 @@ def of_near() -> dict[str, list[Document]]:
         ],
         "weights of the other slope": e(f"{BY}.weights", lambda w: w[::-1]),
         "lists of weights": e(f"{BY}.weights.0", [], [[[7, "-5"], [17, "5"]]], None)
+        + [edited(data, f"{BY}.weights.{k}.{side}", [[12, "0"]]) for k, side in ends]
         + e(f"{BY}.weights.0.0", [], [[7, "-5", "5"]], [[7]], [[7, "0"]] * 65),
         "slopes in another order": e(f"{BY}.slopes", ["b", "a"], ["a"], ["a", "a"], ["a", "r"], []),
         "what need not vanish": e(f"{F}.vanishes", False),
@@ -260,11 +282,25 @@ def of_near() -> dict[str, list[Document]]:
         ],
         "another linear part": [
             edited(data, "plant.dynamics.0", lambda tree, v=v: [*tree, v])
-            for v in (["*", "a", "x"], "x", ["*", "a", "u"], ["*", "1/1000", ["**", "x", 2]], ["*", "a", "b", "x"])
+            for v in (["*", "a", "x"], "x", ["*", "a", "u"], ["*", "r", "a", ["**", "x", 2]],
+                      ["*", "1/1000", ["**", "x", 2]], ["*", "a", "b", "x"])
         ],
         "a wider domain": e("plant.domain.0", ["-301/100", "3"], ["-3", "4"]),
         "wider input bounds": e("plant.input_bounds.0", ["-1", "11/10"]),
-    }
+    }  # fmt: skip
+
+
+def of_aslant() -> dict[str, list[Document]]:
+    data = aslant()
+    return {
+        "a range of a slope": [
+            edited(data, f"plant.uncertain.0.range.{side}", plus((1 - 2 * side) * d))
+            for side in (0, 1) for d in (TINY, Fraction(1, 1000), Fraction(1, 5000))
+        ],
+        "mixed curvature": [
+            edited(data, f"{F}.curvature", [["1/5", q], [q, "1/10"]]) for q in ("201/10000", "-1/50", "1/10")
+        ],
+    }  # fmt: skip
 
 
 def of_two() -> dict[str, list[Document]]:
@@ -274,6 +310,9 @@ def of_two() -> dict[str, list[Document]]:
         "an error in another equation": e(
             "plant.dynamics.1", *([*["+", ["-", "y"]], ["*", "q", "1/10"], ["*", "r", w]] for w in ("1/1000", "0"))
         ) + e("plant.dynamics.0", ["+", ["-", "x"], ["*", "r", "1/10"], ["*", "1/1000", "q"]]),
+        "a name that is none of the function's": e(
+            "plant.dynamics.0", *(["+", ["-", "x"], ["*", "r", "1/10"], ["*", "1/1000", z]] for z in "yu")
+        ) + e("plant.dynamics.0", ["+", ["-", "x"], ["*", "r", "1/10", ["+", "1", ["*", "1/1000", "y"]]]]),
         "one error for both": [
             edited(e("evidence.samples.1.error", "r")[0], "plant.dynamics.1", ["+", ["-", "y"], ["*", "r", "1/10"]])
         ],
@@ -284,7 +323,31 @@ def of_two() -> dict[str, list[Document]]:
     }  # fmt: skip
 
 
-FORGED = {"far": of_far, "near": of_near, "two": of_two}
+FORGED = {"far": of_far, "near": of_near, "aslant": of_aslant, "two": of_two}
+BY_FORM = ("samples that are none", "what vanishes", "long numbers", "no function")
+
+
+def odd() -> dict[str, Document]:
+    """True claims with sections that no certificate may have, though what they say would follow."""
+    claims, same = "claim.samples.functions", edited(two(), "plant.dynamics.1", ["-", "y"])
+    same = edited(same, f"{claims}.1", lambda _: two()["claim"]["samples"]["functions"][0])
+    once = edited(two(), f"{F}.axes.0", lambda axis: [*axis[:3], *axis[2:]])
+    data = newer(true("scalar"))
+    straight = function("x", ("x", "u"), [[0, 0], [0, 0]], 0, False, [X, U], lambda x, u: x / 4 + u)
+    nearly = newer(nearby()["then"])
+    constant = function("x", ("x", "u"), [[0, 0], [0, 0]], 0, False, [X, U], lambda x, u: u / 2 - x)
+    return {
+        "a state twice": edited(same, "evidence.samples.1", {**ALONE, "error": "q"}),
+        "a quantity that stands for two": edited(two(), "evidence.samples.1.error", "r"),
+        "an axis with a number twice": edited(once, f"{F}.values", lambda v: [*v[:3], *v[2:]]),
+        "data": with_samples(data, [straight], [{**ALONE, "error": None}]),
+        "nearby": with_samples(nearly, [constant], [{**ALONE, "error": None}]),
+    }
+
+
+@pytest.mark.parametrize("kind", odd())
+def test_sections_that_no_certificate_may_have(kind: str) -> None:
+    assert verdicts(odd()[kind]) == ("format", "format")
 
 
 @pytest.mark.parametrize(("name", "kind"), [(name, kind) for name, of in FORGED.items() for kind in of()])
@@ -292,7 +355,29 @@ def test_forgeries_are_refused_by_both(name: str, kind: str) -> None:
     forged = FORGED[name]()[kind]
     assert forged
     for number, data in enumerate(forged):
-        assert None not in verdicts(data), f"{kind} {number}: {verdicts(data)}"
+        found = verdicts(data)
+        assert None not in found, f"{kind} {number}: {found}"
+        assert kind not in BY_FORM or found == ("format", "format")
+
+
+SMALL = f"1/{10**40}"
+LARGE = {
+    "degree": [["*", SMALL, ["**", "x", 21]]],
+    "terms": [["*", SMALL, ["**", "x", i], ["**", "u", j]] for i in range(1, 12) for j in range(1, 12)],
+    "bits": [["*", f"1/{3**324}", "x"]],
+    "parts": [["*", SMALL, ["**", "x", 20], ["**", "u", k]] for k in range(1, 20)],
+    "on the way": [["*", SMALL, ["**", ["+", "x", "u", "1"], 20]]],
+    "on the way, to nothing": [["**", "x", 21], ["-", ["**", "x", 21]]],
+}
+
+
+@pytest.mark.parametrize("kind", LARGE)
+def test_polynomials_that_are_too_large(kind: str) -> None:
+    """They change nothing that counts, and fewer of the same are accepted."""
+    data = edited(far(), "plant.dynamics.0", [*equation(E_FAR + Fraction(1, 1000)), *LARGE[kind]])
+    assert verdicts(data) == ("samples", "samples")
+    fewer = [["*", SMALL, ["**", "x", 20]], ["*", SMALL, "x", "u"], ["*", f"1/{3**300}", "x"]]
+    assert verdicts(edited(data, "plant.dynamics.0", [*equation(E_FAR + Fraction(1, 1000)), *fewer])) == ACCEPTED
 
 
 def test_there_are_many_kinds() -> None:

@@ -108,9 +108,13 @@ def _sampled(state: State, samples: Samples) -> State:
     """
     from certify.analysis.fitting.standing import standing_for
 
-    if state.options.enlarges or state.options.claim == "nearby":
-        raise InputError("a claim with samples must be practical or asymptotic, without a tube; leave out `data`.")
-    return replace(state, data=standing_for(state.loop.system, samples))
+    system = state.loop.system
+    if state.options.claim == "nearby":
+        raise OptionError("a claim with samples must be practical or asymptotic; leave out `data`.")
+    turning = next((v for one in samples.unknowns for v in one.variables if v in system.angles), None)
+    if turning is not None:
+        raise InputError(f"a claim with samples must have {turning} as a number; leave it out of [angles].")
+    return replace(state, data=standing_for(system, samples))
 
 
 def _identified(state: State, measurements: Measurements) -> State:
@@ -143,7 +147,7 @@ def _with_claim(state: State) -> State:
     InputError : the claim `asymptotic` is asked for, and the loop does not rest at the origin.
     """
     options = state.options
-    converging = options.claim in ("auto", "nearby")
+    converging = options.claim in ("auto", "nearby") and state.loop.system.samples is None
     kind, why = _kind_of(state.loop, options)
     state = replace(state, converging=converging, insists=options.claim == "nearby")
     if why is not None:
