@@ -32,7 +32,7 @@ class Standing:
 
 
 SampleBounds = tuple[Standing, ...]
-"""What stands for each of the functions, in their order."""
+"""The equations' quantities for each of the functions, in their order."""
 
 
 def samples_claim(samples: Samples, bounds: SampleBounds) -> dict[str, Any]:

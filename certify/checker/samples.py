@@ -57,7 +57,7 @@ class Function:
         return tuple((axis[0], axis[-1]) for axis in self.axes)
 
     def point(self, k: int) -> Point:
-        """That of value k."""
+        """The point of value k."""
         found = []
         for axis in reversed(self.axes):
             k, i = divmod(k, len(axis))

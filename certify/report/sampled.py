@@ -82,13 +82,13 @@ class Sampled:
 
     @property
     def consistent(self) -> str:
-        """What the claim is for every one of."""
+        """The functions for every one of which the claim is."""
         word = "function" if len(self.functions) == 1 else "functions"
         return f"{word} {self.names} with which {self.count:,} samples are consistent"
 
     @property
     def assumed(self) -> str:
-        """What a consistent function is, as declared."""
+        """The properties of a consistent function, as declared."""
         each = []
         for f in self.functions:
             pairs = combinations_with_replacement(enumerate(map(symbol, f["variables"])), 2)

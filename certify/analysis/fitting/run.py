@@ -19,7 +19,7 @@ from typing import Any
 
 from certify.analysis.fitting.linear import residual_text, slopes
 from certify.analysis.fitting.polynomial import Bound, Polynomial, bounded, errors, fitted
-from certify.analysis.fitting.samples import read_samples, require_covered, suffix_of
+from certify.analysis.fitting.samples import bounds_of, read_samples, require_covered, suffix_of
 from certify.certificates import write_atomically
 from certify.errors import InputError
 from certify.loop.plants import Grid, System, Unknown, load_system
@@ -132,7 +132,7 @@ def _fitted(one: Unknown, grid: Grid, noise: Fraction, system: System, degree: i
     if noise < 0:
         raise InputError(f"the bound of the noise must be at least 0; found {float(noise):g} for {one.state}.")
     p = fitted(one, grid, degree)
-    sizes = [max(abs(lo), abs(hi)) for lo, hi in (system.bounds[name] for name in one.variables)]
+    sizes = [max(abs(lo), abs(hi)) for lo, hi in (bounds_of(system)[name] for name in one.variables)]
     each = errors(p, one, grid, noise)
     error = bounded(one.variables, each)
     a = tuple((slope.lo, slope.hi) for slope in slopes(one, grid, noise))

@@ -18,7 +18,7 @@ from pathlib import Path
 from certify.errors import InputError
 from certify.loop.plants.equations import decimal
 from certify.loop.plants.samples import Grid, Samples, Unknown
-from certify.loop.plants.system import System
+from certify.loop.plants.system import Interval, System
 
 _MOST_SAMPLES, _MOST_BITS = 200_000, 2**7  # bits of a number, as the checkers read them
 
@@ -55,7 +55,7 @@ def read_samples(path: Path, unknowns: Sequence[Unknown], suffix: str) -> tuple[
 
 def require_covered(system: System, one: Unknown, grid: Grid, which: str) -> None:
     """Reject samples that do not reach over the domain, the input bounds and 0, or whose numbers are too long."""
-    bounds = system.bounds
+    bounds = bounds_of(system)
     for name, axis in zip(one.variables, grid.axes, strict=True):
         lo, hi = bounds[name]
         if not (axis[0] <= min(lo, Fraction(0)) and max(hi, Fraction(0)) <= axis[-1]):
@@ -63,6 +63,12 @@ def require_covered(system: System, one: Unknown, grid: Grid, which: str) -> Non
                 f"samples {which} must reach over all of {name} in [{float(lo):g}, {float(hi):g}]; they reach over "
                 f"[{float(axis[0]):g}, {float(axis[-1]):g}]. Take more, or make the domain smaller."
             )
+
+
+def bounds_of(system: System) -> dict[str, Interval]:
+    """The domain and the input bounds, by the names of states and inputs."""
+    both = zip((*system.states, *system.inputs), (*system.domain, *system.input_bounds), strict=True)
+    return {s.name: interval for s, interval in both}
 
 
 def with_samples(system: System, samples: Samples, path: Path) -> System:

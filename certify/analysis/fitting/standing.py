@@ -15,7 +15,7 @@ from typing import Any
 
 from certify.analysis.fitting.linear import least_square, slopes
 from certify.analysis.fitting.polynomial import Bound, Polynomial, errors
-from certify.analysis.fitting.samples import require_covered
+from certify.analysis.fitting.samples import bounds_of, require_covered
 from certify.certificates.samples import SampleBounds, Standing, Weights
 from certify.errors import InputError
 from certify.loop.expressions import to_tree
@@ -77,7 +77,7 @@ def _of_slopes(system: System, found: Equation, grid: Grid, noise: Fraction) -> 
     one, d = found.unknown, len(found.slopes)
     if {tuple(int(i % d == j) for i in range(2 * d)): Fraction(1) for j in range(d)} != found.P:
         raise found.refused("the sum of slopes times variables")
-    sizes = [max(abs(lo), abs(hi)) for lo, hi in (system.bounds[name] for name in one.variables)]
+    sizes = [max(abs(lo), abs(hi)) for lo, hi in (bounds_of(system)[name] for name in one.variables)]
     if found.E.constant or any(k < q for k, q in zip(found.E.rise, least_square(one, sizes), strict=True)):
         raise found.refused("a bound [residual] that holds what second derivatives allow beyond the linear part")
     number, weights = {z: k for k, z in enumerate(product(*grid.axes))}, list[tuple[Weights, Weights]]()

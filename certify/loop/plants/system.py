@@ -81,8 +81,7 @@ class System:
     units : unit of each state, input and parameter by name.
     description : one line for people.
     x_eq : n expressions in the parameters, with rational values; empty means zeros. `dynamics` and `domain` are in
-        deviations from it already (`in_deviations` brings equations there), so that nothing of what is proved depends
-        on it.
+        deviations from it already (`in_deviations` brings equations there): nothing that is proved depends on it.
     disturbances : symbols of the dynamics that are 0 unless they have a range.
     ranges : intervals by name, of uncertain parameters and of disturbances that act; values may change at any time. A
         parameter's value in `parameters` lies in its range and is the nominal one, which u_eq and simulation use.
@@ -95,13 +94,12 @@ class System:
     angles : names of states that are angles: x and x + 2 pi are the same place.
     constraints : expressions g by name, as the dynamics; g < 0 is asked for along trajectories.
     measurements : those with which uncertain parameters, constants, are consistent; None where ranges are assumed.
-    samples : of unknown functions for which equations stand; None where these are the plant.
+    samples : of unknown functions for which equations stand; None where they stand for themselves.
 
     Raises
     ------
-    InputError : counts do not match, a domain does not contain 0 in its interior, a parameter that
-        must be positive is not, an expression is outside the grammar, x_eq is irrational, a name with a range is
-        neither a parameter nor a disturbance, or an angle is no state.
+    InputError : counts do not match, a domain does not contain 0 in its interior, a parameter that must be positive is
+        not, an expression is outside the grammar, x_eq is irrational, a range is of no name, or an angle is no state.
     """
 
     name: str
@@ -202,12 +200,6 @@ class System:
     def with_sample(self, sample: Interval | None) -> System:
         """The same plant whose inputs are held over periods of these lengths; None for inputs that follow at once."""
         return replace(self, sample=sample)
-
-    @property
-    def bounds(self) -> dict[str, Interval]:
-        """The domain and the input bounds, by the names of states and inputs."""
-        both = zip((*self.states, *self.inputs), (*self.domain, *self.input_bounds), strict=True)
-        return {s.name: interval for s, interval in both}
 
     @property
     def in_steps(self) -> bool:
