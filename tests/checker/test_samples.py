@@ -191,10 +191,10 @@ def of_far() -> dict[str, list[Document]]:
             edited(data, "plant.dynamics.0", equation(E_FAR - d)) for d in (TINY, Fraction(1, 1000), E_FAR)
         ],
         "a bound that is too small somewhere": [
-            edited(data, "plant.dynamics.0", equation(["+", str(E_FAR - d), more]))
-            for d in (TINY, Fraction(1, 1000))
-            for more in (["**", "x", 2], ["**", "u", 2], ["*", ["**", "x", 2], ["**", "u", 2]], ["*", "1/100", "x"],
-                         ["-", ["*", "1/100", ["**", "u", 3]]], ["*", "x", "u", "1/100"])
+            edited(data, "plant.dynamics.0", equation(["+", str(E_FAR - d), ["*", "1/1000", more]]))
+            for d in (TINY, Fraction(1, 10000))
+            for more in (["**", "x", 2], ["**", "u", 2], ["*", ["**", "x", 2], ["**", "u", 2]], "x",
+                         ["-", ["**", "u", 3]], ["*", "x", "u"])
         ],
         "a bound that is 0 somewhere": [
             edited(data, "plant.dynamics.0", equation(["*", "r", E])) for E in (["**", "x", 2], "x", ["*", "x", "u"])
