@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from fractions import Fraction
 from itertools import product
 from pathlib import Path
@@ -397,6 +398,18 @@ def test_other_samples_are_refused(fitted_box: Path) -> None:
 def test_a_nearby_equilibrium_is_no_claim_with_samples(fitted_box: Path) -> None:
     with pytest.raises(InputError, match="leave out `data`"):
         proved(fitted_box, "near", claim="nearby")
+
+
+@pytest.mark.parametrize("bias", [0.01, -0.02])
+def test_a_policy_that_is_not_0_at_0(fitted_box: Path, bias: float) -> None:
+    """V stays around 0, where the samples are; a policy with an origin of its own is refused."""
+    policy = PolicyNetwork.of_layers([np.array([[0.5, 0.5]])], [np.full(1, bias)], [-1.0], [0.0], centre="none")
+    save_policy(fitted_box / "box.pt", Policy(policy, "box", {}))
+    assert proved(fitted_box, "far", claim="auto").verdict == "PROVED"
+    moved = replace(policy, origin=np.array([0.1, 0.0]))
+    with pytest.raises(InputError, match="must be around x = 0"):
+        certify_roa(load_system(fitted_box / "out" / "far.toml"), moved, fitted_box / "far", claim="practical",
+                    data=fitted_box / "samples.csv")  # fmt: skip
 
 
 def test_an_angle_is_no_number(fitted_box: Path) -> None:

@@ -111,6 +111,8 @@ def _sampled(state: State, samples: Samples) -> State:
     system = state.loop.system
     if state.options.claim == "nearby":
         raise OptionError("a claim with samples must be practical or asymptotic; leave out `data`.")
+    if any(system.exact_x_eq()) or state.loop.network.is_moved:
+        raise InputError("a claim with samples must be around x = 0, as is what was sampled; leave out `data`.")
     turning = next((v for one in samples.unknowns for v in one.variables if v in system.angles), None)
     if turning is not None:
         raise InputError(f"a claim with samples must have {turning} as a number; leave it out of [angles].")
@@ -185,9 +187,9 @@ def _rest(loop: ClosedLoop, options: RoaOptions) -> tuple[Rest | None, ClosedLoo
     """
     if loop.network.is_moved:
         return None, loop
-    if options.claim != "practical" or loop.network.centre != "none":
+    if options.claim != "practical" or loop.network.centre != "none" or loop.system.samples is not None:
         if options.around == "rest" and options.claim == "practical":
-            raise OptionError("`around` rest needs a policy without centring.")
+            raise OptionError("`around` rest needs a policy without centring, and a plant without samples.")
         return None, loop
     rest = find_rest(loop)
     given = options.P is not None or options.level is not None or options.lyapunov is not None
