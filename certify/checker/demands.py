@@ -77,11 +77,11 @@ def of_samples(sizes: Sizes) -> int:
         return 0
     for f in samples.functions:
         d, cells = len(f.variables), prod(len(axis) - 1 for axis in f.axes)
-        found += 2**17 * d * len(f.values)
+        bits = max(q.height_bits() for axis in f.axes for q in axis)
         if f.slopes:
             found += 2**17 * d**2 * sum(len(weights) for pair in f.weights for weights in pair)
         else:
-            found += cells * (2**21 * d + 2 ** (d + 10))
+            found += 2**12 * bits * d * len(f.values) + cells * (2**18 * bits * d + 2 ** (d + 10))
     return found + 2**24 * len(sizes.c.dynamics.operations)
 
 

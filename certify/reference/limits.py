@@ -277,12 +277,11 @@ def of_samples(c: Certificate) -> int:
         return 0
     work = 2**24 * len(c.plant.dynamics.steps)
     for f in c.samples.functions:
-        d = len(f.variables)
-        work += 2**17 * d * len(f.values)
+        d, b = len(f.variables), max(q.height_bits() for axis in f.axes for q in axis)
         if f.slopes:
             work += 2**17 * d**2 * sum(len(lower) + len(upper) for lower, upper in f.weights)
         else:
-            work += f.cells * (2**21 * d + 2 ** (d + 10))
+            work += 2**12 * b * d * len(f.values) + f.cells * (2**18 * b * d + 2 ** (d + 10))
     return work
 
 

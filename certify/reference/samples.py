@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 RULE = "samples"
 MAX_VALUES, MAX_VARIABLES, MAX_WEIGHTS, SHORT = 2**18, 8, 64, 2**7  # SHORT in bits
-MAX_TERMS, MAX_DEGREE, LONG, MAX_MOVED = 2**7, 20, 2**9, 2**11  # of polynomials; LONG in bits
+MAX_TERMS, MAX_PAIRS, MAX_DEGREE, LONG, MAX_MOVED = 2**7, 2**10, 20, 2**9, 2**9  # of polynomials; LONG in bits
 ZERO, ONE, HALF = fmpq(0), fmpq(1), fmpq(1, 2)
 Weighted = tuple[tuple[int, fmpq], ...]
 Coefficients = Mapping[tuple[int, ...], fmpq]  # by the powers of variables
@@ -163,7 +163,7 @@ class Expanded:
         return expanded(found)
 
     def __mul__(self, other: Expanded) -> Expanded:
-        if self.sum is None or other.sum is None:
+        if self.sum is None or other.sum is None or len(self.sum) * len(other.sum) > MAX_PAIRS:
             return NEVER
         found: dict[Monomial, fmpq] = {}
         for one, c in self.sum.items():

@@ -367,6 +367,20 @@ LARGE = {
     "bits": [["*", f"1/{3**324}", "x"]],
     "parts": [["*", SMALL, ["**", "x", 20], ["**", "u", k]] for k in range(1, 20)],
     "on the way": [["*", SMALL, ["**", ["+", "x", "u", "1"], 20]]],
+    "pairs": [
+        [
+            "*",
+            SMALL,
+            ["+", *[["**", "x", i] for i in range(1, 13)], *[["**", "u", i] for i in range(1, 21)], "1"],
+            [
+                "+",
+                *[["**", "x", i] for i in range(1, 8)],
+                *[["**", "u", i] for i in range(1, 21)],
+                *[["*", "x", ["**", "u", i]] for i in range(1, 6)],
+            ],
+            "0",
+        ]
+    ],
     "on the way, to nothing": [["**", "x", 21], ["-", ["**", "x", 21]]],
 }
 
