@@ -328,6 +328,7 @@ def test_samples_are_a_part_of_the_claim(fitted_box: Path, capsys: pytest.Captur
         assert {**again, "provenance": {}} == {**json.loads(raw), "provenance": {}}
         page = page_of(raw, fitted_box / name / "certificate.json", dict(result.checker or {}), None)
         assert "For every function v′ = g(x, v, u) with which 54 samples are consistent" in page
+        assert "The equation stands for v′ = g(x, v, u): whatever the function is" in page
         assert ("and 0 at the origin" in page) is zero and "a corner between two points of the grid" in page
     paths = [str(fitted_box / name / "certificate.json") for name in ("far", "near")]
     assert _run(["compose", *paths, "--out", str(fitted_box / "both")], False) == 0
