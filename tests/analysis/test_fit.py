@@ -263,10 +263,11 @@ def test_three_states_from_samples_to_one_claim(tmp_path: Path) -> None:
     kinds = {"far": "practical", "near": "asymptotic"}
     for name, claim in kinds.items():
         result = certify_roa(tmp_path / f"{name}.toml", tmp_path / "box.pt", tmp_path / name, claim=claim,
-                             candidate="lyapunov")  # fmt: skip
+                             candidate="lyapunov", data=tmp_path / "samples.csv")  # fmt: skip
         assert result.verdict == "PROVED", result.reason
     both = compose(*(tmp_path / name / "certificate.json" for name in kinds), tmp_path / "both")
     assert both.verdict == "PROVED" and (both.checker or {})["result"] == "ACCEPTED", both.reason
+    assert (both.to_dict()["samples"] or {})["functions"][0]["samples"] == len(points)
     assert both.outer.roa > 2 * both.outer.claim.levels["floor"]
     draw = np.random.default_rng(0).normal(size=(200, 3))
     x = draw * np.sqrt(both.outer.roa / np.einsum("ki,ij,kj->k", draw, both.outer.P, draw))[:, None]
