@@ -139,7 +139,8 @@ def _shown(value: Value, f: Function, c: Certificate) -> Function:
     d, first = len(f.variables), len(c.states) + len(c.inputs)
 
     def quantity(name: Value) -> int:
-        return first + c.uncertain.index(name.choice(*c.uncertain))
+        name.must(name.raw in c.uncertain, "the name of an uncertain quantity")
+        return first + c.uncertain.index(name.raw)
 
     named = slopes.listed(quantity, d if slopes.raw else 0)
     slopes.must(f.vanishes or not named, "empty where the function need not vanish")

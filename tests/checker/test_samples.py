@@ -336,7 +336,13 @@ def odd() -> dict[str, Document]:
     straight = function("x", ("x", "u"), [[0, 0], [0, 0]], 0, False, [X, U], lambda x, u: x / 4 + u)
     nearly = newer(nearby()["then"])
     constant = function("x", ("x", "u"), [[0, 0], [0, 0]], 0, False, [X, U], lambda x, u: u / 2 - x)
+    exact = edited(
+        edited(edited(two(), "plant.uncertain", []), "evidence.cells", []), "plant.dynamics", [["-", "x"], "0"]
+    )
+    exact = edited(exact, "evidence.samples", [{**ALONE, "error": None}] * 2)
     return {
+        "no name, of no quantities": edited(exact, "evidence.samples.0.error", ""),
+        "no name": edited(two(), "evidence.samples.0.error", ""),
         "a state twice": edited(same, "evidence.samples.1", {**ALONE, "error": "q"}),
         "a quantity that stands for two": edited(two(), "evidence.samples.1.error", "r"),
         "an axis with a number twice": edited(once, f"{F}.values", lambda v: [*v[:3], *v[2:]]),
