@@ -147,8 +147,8 @@ class Held(Stepping):
 
     @cached_property
     def enclosed(self) -> Enclosed | None:
-        """The a-priori enclosure of the states during a period, and of f there, the first that holds of a few attempts:
-        what f may come to, over the longest period, is less. None if none does."""
+        """The a-priori enclosure of the states during a period, and of f there, from the first that holds of a few
+        attempts: what f may come to, over the longest period, is less, and is as far as they go. None if none does."""
         n, h = len(self.J), longest(self.case.c)
         far, along = np.zeros(n), np.zeros(n)
         for _ in range(1 + _ATTEMPTS):
@@ -156,7 +156,7 @@ class Held(Stepping):
             most = np.array([0.0 if self.at_rest else (f.v0.size * h).top for f in F])
             steepest = np.array([(self.steepness(f) * h).top for f in F])
             if np.all((most < far) | self.at_rest) and np.all(steepest < along):
-                return (far, along), F
+                return (most, steepest), F
             far, along = (0 * most if self.at_rest else 1.25 * most), 1.25 * steepest
         return None
 

@@ -58,7 +58,8 @@ def contains(
     if proved.system.constraints:
         data["constraints"] = in_words(proved.system)
         if found.answer is Containment.CONTAINED:
-            said += f"\n(kept along every trajectory from there: {'; '.join(data['constraints'].values())})"
+            until = " until the region is reached" if proved.claim == Reaches.kind else ""
+            said += f"\n(kept along every trajectory from there{until}: {'; '.join(data['constraints'].values())})"
     say(json.dumps(data) if as_json else said)
     raise typer.Exit(found.answer.exit_status)
 

@@ -64,7 +64,7 @@ def _rows(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if result["reason"] not in ("requested", "done"):
         yield "reason", result["reason"]
     if ranks is not None:
-        share = f"{100 * ranks['covered']:.3g} % of the domain"
+        share = f"{below(100 * ranks['covered'], 4)} % of the box that was cut"
         yield (
             "boxes",
             f"{ranks['proved']:,} of {ranks['leaves']:,} leaves have a rank, {share}, volume {below(ranks['volume'])}",

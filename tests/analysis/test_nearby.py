@@ -10,12 +10,16 @@ import numpy as np
 import pytest
 
 from certify import RoaOptions, System, Verdict, certify_roa, symbols
-from certify.certificates.claims import Problem
+from certify.certificates import Certificate, PartitionTree
+from certify.certificates.checking import run_checker
+from certify.certificates.claims import Practical, Problem
 from certify.effort import Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
-from certify.provers.ball.local import Rule, prove_band
+from certify.provers.ball.local import Rule, local_ball, prove_band
+from tests.support.corners import plant as cornered
+from tests.support.corners import regulator
 from tests.support.loops import chain
 
 
@@ -96,3 +100,23 @@ def test_a_loop_that_rests_exactly_in_floats_has_an_enclosure_of_a_period(tmp_pa
     held = plant.with_sample((Fraction(1, 20), Fraction(1, 20)))
     result = certify_roa(held, law, tmp_path, RoaOptions(candidate="lyapunov", claim="nearby"))
     assert (result.verdict, result.claim) == (Verdict.PROVED, "nearby")
+
+
+def test_the_checker_follows_a_period_as_closely_as_the_engine(tmp_path: Path) -> None:
+    """Where rates at the equilibrium are only rounding the checker takes one more attempt at how far a period leads.
+
+    The next 1.25 of what was already enough made its abs(y) in the period larger than the engine's: it refused balls.
+    """
+    system = cornered("x y", "y", "-abs(y)*y + min(x, 3/10) + 2*u", bound=5).with_sample((Fraction(0), Fraction(1, 20)))
+    P, T = np.array([[0.1215, 0.0355], [0.0355, 0.1215]]), np.array([[-0.448, -2.966], [2.968, 0.438]])
+    problem = Problem(ClosedLoop(system, regulator(1, 1)), Quadratic(P))
+    level, floor = 0.0025, 1e-10
+    ball, cells = local_ball(problem, T, level, floor)
+    evidence = PartitionTree(T, np.ones(2), bytes([255]), ball, cells=cells)
+    certificate = Certificate(
+        system, regulator(1, 1), problem.V, Practical(roa=level, local=level, floor=floor), evidence
+    )
+    path = tmp_path / "certificate.json"
+    path.write_bytes(certificate.to_json().encode())
+    answer = run_checker(path)
+    assert answer["result"] == "ACCEPTED", answer

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from certify.cli.main import _run
 from certify.loop.policies import Policy, PolicyNetwork, save_policy
+from certify.report.reached import summary
 
 PLANT = """
 name = "cart"
@@ -83,6 +86,21 @@ def test_what_is_not_so(asked: list[str], capsys: pytest.CaptureFixture[str]) ->
     assert status == 0 and data["constraints"]
     status, data = said(capsys, [*asked, "--target", "v >= 0.1"])
     assert status == 3 and data["verdict"] == "UNKNOWN" and "in a simulation" in data["reason"]
+
+
+def test_constraints_are_kept_until_then(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """Nothing is said of what happens in the region: the command must not promise more."""
+    _, data = said(capsys, [*asked, "--keep", "v >= -2"])
+    assert _run(["contains", data["certificate"], "p=2.5..3", "v=0"], False) == 0
+    assert "(kept along every trajectory from there until the region is reached: " in capsys.readouterr().out
+
+
+def test_a_share_is_rounded_down(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """A share of 0.99996 is not 100 %, and is one of the box that was cut, which is smaller than the domain."""
+    _, data = said(capsys, asked)
+    console = Console(file=io.StringIO(), width=300)
+    console.print(summary(data | {"ranks": data["ranks"] | {"covered": 0.99996}}))
+    assert ", 99.99 % of the box that was cut, volume" in console.file.getvalue()  # type: ignore[attr-defined]
 
 
 def test_text_for_people(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:

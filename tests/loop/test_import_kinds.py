@@ -366,6 +366,11 @@ def test_files_of_numbers(tmp_path: Path) -> None:
     np.savez(tmp_path / "objects.npz", a=np.array([{}], dtype=object))
     with pytest.raises(InputError, match="no plain array"):
         import_policy(tmp_path / "objects.npz", PLANT, LAYERS)
+    for odd in (np.complex64, np.complex128, *([np.longdouble] if np.dtype(np.longdouble).itemsize > 8 else [])):
+        arrays = {k: v.numpy().astype(odd if k == "0.bias" else np.float32) for k, v in net.state_dict().items()}
+        np.savez(tmp_path / "odd.npz", **arrays)
+        with pytest.raises(InputError, match=r"0\.bias.* must hold real numbers of at most 64 bits"):
+            import_policy(tmp_path / "odd.npz", PLANT, LAYERS)
 
 
 class Shared(nn.Module):  # type: ignore[misc]

@@ -71,7 +71,7 @@ def load_npz(raw: bytes, what: str) -> dict[str, Numbers]:
 
     Raises
     ------
-    InputError : the file is damaged, holds objects, or two arrays have one name.
+    InputError : the file is damaged, numbers are complex or have more than 64 bits, or two arrays have one name.
     """
     archive, found = Archive(raw, what), dict[str, Numbers]()
     for member in archive.names:
@@ -80,6 +80,8 @@ def load_npz(raw: bytes, what: str) -> dict[str, Numbers]:
             array = np.lib.format.read_array(io.BytesIO(archive.read(member)), allow_pickle=False)
         except (ValueError, EOFError, TypeError, SyntaxError, MemoryError) as error:
             raise InputError(f"{member} in {what} is no plain array of numpy: {error}.") from error
+        if array.dtype.kind == "c" or (array.dtype.kind in "fiu" and array.dtype.itemsize > 8):
+            raise InputError(f"{member} in {what} must hold real numbers of at most 64 bits; found {array.dtype}.")
         if name.rpartition(".")[2] == "kernel" and array.ndim == 2:
             name, array = f"{name.removesuffix('kernel')}weight", array.T
         if name in found:
