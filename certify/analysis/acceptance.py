@@ -35,7 +35,7 @@ _BELOW_LEAVES, _LEVELS = 2, 5  # weaker certificates: below a refused leaf so lo
 _LONG = 1_000_000  # bytes of a certificate, from which on several processes check it
 _MOST_JOBS = 64
 _QUICK = 2**27  # operations of the reference, as FORMAT.md counts them: at most some five seconds
-_WITH_KINKS = 2**31  # the same for certificates with kinks on a ball: about a minute
+_NEWEST = {b'"directions"': 2**31, b'"samples"': 2**33}  # the same of the newest rules: about a minute at most
 _HIGHER = 1.5  # the next floor, after one that is refused
 
 
@@ -82,9 +82,10 @@ class Desk:
     def _twice(self, path: Path, answer: Mapping[str, Any]) -> Mapping[str, Any]:
         """The checker's answer with the reference's, or that alone if it refuses; the checker's if it needs long.
 
-        Of kinks on a ball, the newest rule, the reference is asked although it may need a minute.
+        Of kinks on a ball and samples, the newest rules, the reference is asked although it may need a minute.
         """
-        quick = _WITH_KINKS if b'"directions"' in path.read_bytes() else _QUICK
+        raw = path.read_bytes()
+        quick = max([_QUICK, *(most for mark, most in _NEWEST.items() if mark in raw)])
         second = run_checker(path, program="reference", operations=quick)
         if (second.get("rule"), second.get("at")) == ("limits", "operations"):
             return answer

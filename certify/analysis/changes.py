@@ -58,9 +58,10 @@ class PlantChanges:
         written="As in '(x - 1)**2 + y**2 < 0.25'; repeatable.",
         python="A comparison or several, as text.")
     data: str | PathLike[str] | None = option(None, "loop", "file", metavar="FILE", varies=False, help=(
-        "Measured transitions of which the plant's file has the table [data]: the claim then is for every constant "
-        "value of its parameters with which they are consistent."),
-        written="The file that certify identify has read.")
+        "Measured transitions of which the plant's file has the table [data], or samples of which it has the table "
+        "[samples]: the claim then is for every constant value of its parameters, or for every function, with which "
+        "they are consistent."),
+        written="The file that certify identify or certify fit has read.")
     # fmt: on
 
     def of(self, plant: System) -> System:

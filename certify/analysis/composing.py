@@ -18,7 +18,9 @@ from certify.certificates import Certificate, parse_certificate, read_raw, sole_
 from certify.certificates.handover import joined, require_joinable, share
 from certify.certificates.verdict import Verdict
 from certify.errors import SoundnessError
+from certify.loop.plants import System
 from certify.lyapunov import volume
+from certify.report.sampled import described
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +56,8 @@ class ComposeResult:
             "then": {"system": self.inner.system.name, "levels": dict(self.inner.claim.levels)},
             "levels": dict(self.outer.claim.levels),
             "states": [s.name for s in self.outer.system.states],
+            "time": self.outer.system.time,
+            "samples": self._samples(),
             "volume": volume(self.outer.P, self.outer.roa),
             "share": self.share,
             "policy": {"sha256": self.outer.network.sha256()},
@@ -62,6 +66,26 @@ class ComposeResult:
             "checked": checker.get("result"),
             "reference": checker.get("reference", {}).get("result"),
         }
+
+    def _samples(self) -> dict[str, Any] | None:
+        """The samples of both, if every plant with functions that the second describes is one of the first as well."""
+        outer, inner = described(self.outer.system), described(self.inner.system)
+        if outer is None or inner is None or any(f["vanishes"] for f in outer["functions"]):
+            return None
+        return inner if _known(self.outer.system, outer) == _known(self.inner.system, inner) != {} else None
+
+
+def _known(system: System, found: Mapping[str, Any]) -> dict[str, Any]:
+    """The parts of a plant with sampled functions by which its plants are known; nothing where other quantities are
+    uncertain."""
+    functions = {f["state"]: f for f in found["functions"]}
+    if {*system.ranges} - {name for f in functions.values() for name in f["quantities"]}:
+        return {}
+    equations = {s.name: e for s, e in zip(system.states, system.uncertain_dynamics(), strict=True)}
+    same = ("variables", "curvature", "noise", "samples")
+    return {"sha256": found["sha256"]} | {
+        name: [functions[name][key] for key in same] if name in functions else e for name, e in equations.items()
+    }
 
 
 def compose(outer: Path | str, inner: Path | str, out: Path | str, jobs: int | None = None) -> ComposeResult:

@@ -11,6 +11,7 @@ from certify.loop.plants import Measurements, System, kind_of
 from certify.lyapunov import extents, semi_axes
 from certify.provers.falsify import Witness
 from certify.report.rows import STAGES
+from certify.report.sampled import described
 
 if TYPE_CHECKING:
     from certify.analysis.results import RoaResult
@@ -30,6 +31,7 @@ def to_dict(result: RoaResult) -> dict[str, Any]:
         "parameters": {name: str(q) for name, q in system.parameters.items()},
         "uncertain": _uncertain(system),
         "data": None if system.measurements is None else _data(system, system.measurements),
+        "samples": described(system),
         "states": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.states],
         "operating_point": {name: str(q) for name, q in system.operating_point().items()},
         "inputs": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.inputs],

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from certify.certificates.verdict import Verdict
 from certify.report.measured import Measured
+from certify.report.sampled import Sampled
 from certify.report.timing import TimingInWords
 from certify.report.words import below, estimated, share_of_runs, varying, varying_in, volume_name, volume_unit
 
@@ -30,11 +31,15 @@ def stated(result: RoaResult) -> list[tuple[str, str]]:
     """The rows, names and values."""
     rows = [("verdict", result.verdict.value), ("plant", result.system.name), ("claim", result.claim)]
     data, found = Measured.of(result.system), list(varying_in(result.system))
+    sampled = Sampled.of(result.system)
+    if sampled is not None:
+        rows.append(("for every", sampled.consistent))
+        found = sampled.others(found)
     if data is not None:
         rows.append(("for every", f"constant {data.in_priors} {data.consistent}"))
         found = data.others(found)
     if found:
-        rows.append(("for every" if data is None else "and every", varying(found)))
+        rows.append(("for every" if data is None and sampled is None else "and every", varying(found)))
     timing = TimingInWords.of(result.system, result.timing.rate)
     if not timing.is_plain:
         rows.append(("in time", "by steps" if timing.discrete else f"input held over {timing.periods}"))

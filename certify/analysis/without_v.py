@@ -20,7 +20,8 @@ from certify.loop.policies import PolicyNetwork
 from certify.provers.base import Progress
 
 AS_THEY_STAND = (
-    "the plant's ranges are taken as they stand: no claim of this kind has the measurements on which they rest yet"
+    "the plant's ranges are taken as they stand: no claim of this kind has the measurements or samples on which they "
+    "rest yet"
 )
 C = TypeVar("C", ReachCertificate, InvariantCertificate)
 
@@ -101,7 +102,7 @@ class Tools:
 
     def notice(self, system: System) -> str | None:
         """The notice about a run for a plant."""
-        rests = [] if system.measurements is None else [AS_THEY_STAND]
+        rests = [] if system.measurements is None and system.samples is None else [AS_THEY_STAND]
         return "; ".join([*rests, *self.remarks]) or None
 
     def clerk(self, path: Path, jobs: int | None, many: bool, cluster: str | None = None) -> Clerk:

@@ -18,6 +18,7 @@ from certify.certificates.data import DataBounds, data_claim, data_evidence
 from certify.certificates.encoding import encode, network_section
 from certify.certificates.evidence import OuterTree, PartitionTree, RanksAlone, TrustedSolver, evidence_section
 from certify.certificates.formats import SCHEMA
+from certify.certificates.samples import SampleBounds, samples_claim, samples_evidence
 from certify.errors import InputError
 from certify.loop.expressions import Expression, to_tree
 from certify.loop.plants import System, kept_constraints
@@ -86,7 +87,8 @@ class Certificate(_Stated):
     V : the Lyapunov function.
     claim : the claim about them, with its levels.
     provenance : anything that helps people; the checker ignores it.
-    data : the evidence that the plant's measurements bound its parameters; None if ranges are assumed.
+    data : the evidence that the plant's measurements bound its parameters, or that its equations stand for sampled
+        functions; None if ranges and equations are assumed.
     then : the certificate that takes over where a practical claim ends; None if nothing is said of that.
 
     Raises
@@ -101,7 +103,7 @@ class Certificate(_Stated):
     claim: Claim
     evidence: PartitionTree | TrustedSolver
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    data: DataBounds | None = None
+    data: DataBounds | SampleBounds | None = None
     then: Certificate | None = None
 
     def __post_init__(self) -> None:
@@ -162,10 +164,13 @@ class Certificate(_Stated):
         }
 
     def _of_data(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """The entries `data` of the claim and of the evidence; nothing without data."""
-        if self.data is None or self.system.measurements is None:
-            return {}, {}
-        return {"data": data_claim(self.system.measurements, self.system)}, {"data": data_evidence(self.data)}
+        """The entries `data` or `samples` of the claim and of the evidence; nothing without data."""
+        by, measured, sampled = self.data, self.system.measurements, self.system.samples
+        if isinstance(by, DataBounds) and measured is not None:
+            return {"data": data_claim(measured, self.system)}, {"data": data_evidence(by)}
+        if isinstance(by, tuple) and sampled is not None:
+            return {"samples": samples_claim(sampled, by)}, {"samples": samples_evidence(by)}
+        return {}, {}
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,11 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates.claims import CLAIMS, Claim, Invariant, Outer, Ranks, Reaches
-from certify.certificates.data import read_data_bounds, read_measurements
+from certify.certificates.data import DataBounds, read_data_bounds, read_measurements
 from certify.certificates.encoding import decode, network_named, read_network
 from certify.certificates.evidence import read_evidence, read_outer_alone, read_ranks_alone
 from certify.certificates.formats import SCHEMA, other_version
 from certify.certificates.model import AnyCertificate, Certificate, InvariantCertificate, ReachCertificate
+from certify.certificates.samples import SampleBounds, read_samples
 from certify.errors import CertificateFormatError
 from certify.loop.expressions import Expression, Number, Symbol, from_tree
 from certify.loop.plants import System
@@ -131,13 +132,11 @@ def parse_any(raw: bytes, name: str) -> AnyCertificate:
             )
             tree = read_outer_alone(data["evidence"], n)
             return InvariantCertificate(_with_constraints(system, stays, names), network, stays, tree, provenance)
-        claim, measured, bounds = _read_claim(data, system), None, None
-        if "data" in data["claim"]:
-            measured = read_measurements(data["claim"]["data"], n, system.m)
-            bounds = read_data_bounds(data["evidence"]["data"], measured)
+        claim = _read_claim(data, system)
+        system, bounds = _with_data(_with_constraints(system, claim, names), data)
         return Certificate(
             then=None if "then" not in data else parse_certificate(json.dumps(data["then"]).encode(), name),
-            system=replace(_with_constraints(system, claim, names), measurements=measured),
+            system=system,
             network=network,
             V=Quadratic(decode(data["lyapunov"]["P"], (n, n))),
             claim=claim,
@@ -207,6 +206,18 @@ def _with_constraints(system: System, claim: Claim | Reaches | Invariant, names:
     called = found if usable else [f"constraint_{k + 1}" for k in range(len(claim.keep))]
     angles = () if claim.ranks is None else claim.ranks.angles
     return replace(system, angles=angles, constraints=dict(zip(called, claim.keep, strict=True)))
+
+
+def _with_data(system: System, data: Mapping[str, Any]) -> tuple[System, DataBounds | SampleBounds | None]:
+    """The plant with the claim's measurements or samples, and the evidence about them."""
+    claim, evidence = data["claim"], data["evidence"]
+    if "data" in claim:
+        measured = read_measurements(claim["data"], system.n, system.m)
+        return replace(system, measurements=measured), read_data_bounds(evidence["data"], measured)
+    if "samples" in claim:
+        samples, bounds = read_samples(claim["samples"], evidence["samples"])
+        return replace(system, samples=samples), bounds
+    return system, None
 
 
 def _read_claim(data: Mapping[str, Any], system: System) -> Claim:

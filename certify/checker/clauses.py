@@ -1,4 +1,4 @@
-"""Words of claims that only some certificates have: outer, ranks, keep, data, handover, and the claims without V."""
+"""Words of claims that only some certificates have: outer, ranks, keep, data, samples, handover, claims without V."""
 
 from __future__ import annotations
 
@@ -148,6 +148,10 @@ def additions(c: Certificate, start: str) -> list[str]:
         )
     if c.data is not None:
         lines.append(f"  {consistent(c, c.data)}")
+    if c.samples is not None:
+        from . import samples
+
+        lines += samples.sampled(c, c.samples)
     return lines
 
 
@@ -212,10 +216,11 @@ def _lasting(period: tuple[Fraction, Fraction]) -> str:
 def handed_over(c: Certificate, then: Certificate) -> list[str]:
     """The statement of chapter handover; what is stated of the second certificate follows."""
     left, each = ("x+ = g(k, x, u)", "step") if c.discrete else ("xdot = g(t, x, u)", "time")
+    sampled = "; so are the plants that have functions of its samples" if c.samples or then.samples else ""
     return [
         f"handover: a plant {left} is one of a certificate if at every {each}, state in its domain and input in its "
         "bounds g is a value of its f, for some of what is uncertain, of which measured parameters are constant and "
-        "consistent with the measurements",
+        f"consistent with the measurements{sampled}",
         "  of every plant that is one of the certificate above and of the one below, every trajectory above enters "
         f"V <= {c.c0!r}, which lies in V <= {then.c2!r} of the one below, and from then on is one of those below",
         "certificate that takes over:",

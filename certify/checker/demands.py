@@ -1,4 +1,4 @@
-"""Sums of rule `limits` for what only some certificates have: outer, ranks, data, a tube, a second certificate."""
+"""Sums of rule `limits` for what only some have: outer, ranks, data, samples, a tube, a second certificate."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def numbers(sizes: Sizes) -> int:
 
 def work(sizes: Sizes) -> int:
     """Elementary operations."""
-    return of_ranks(sizes) + of_outer(sizes) + of_data(sizes) + of_tube(sizes) + of_balls(sizes)
+    return of_ranks(sizes) + of_outer(sizes) + of_data(sizes) + of_samples(sizes) + of_tube(sizes) + of_balls(sizes)
 
 
 def of_function(sizes: Sizes) -> int:
@@ -69,6 +69,21 @@ def of_data(sizes: Sizes) -> int:
     found = sizes.boxes(followed, models, a * (data.order + 1), sizes.n + k, 0)
     found += 2**6 * k * followed * sizes.n * (sizes.n + k + 2**6)
     return found + 2**17 * rounds * data.order * data.pieces * (a + 4 * sizes.n)  # however few transitions are left
+
+
+def of_samples(sizes: Sizes) -> int:
+    """Equations as polynomials, and what these may be off by on cells or at weighted points."""
+    samples, found = sizes.c.samples, 0
+    if samples is None:
+        return 0
+    for f in samples.functions:
+        d, cells = len(f.variables), prod(len(axis) - 1 for axis in f.axes)
+        bits = max(q.height_bits() for axis in f.axes for q in axis)
+        if f.slopes:
+            found += 2**17 * d**2 * sum(len(weights) for pair in f.weights for weights in pair)
+        else:
+            found += 2**12 * bits * d * len(f.values) + cells * (2**18 * bits * d + 2 ** (d + 10))
+    return found + 2**24 * len(sizes.c.dynamics.operations)
 
 
 def of_handover(sizes: Sizes, then: Certificate) -> int:

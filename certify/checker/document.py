@@ -19,6 +19,7 @@ from .schema import Array, Binary64, Matrix, Value, section
 from .strict import load
 
 if TYPE_CHECKING:
+    from .samples import Samples
     from .sections import Contraction, Data, Outer, Ranks, Trusted, Tube
 
 MAX_STATES = 64
@@ -27,7 +28,7 @@ MAX_CELLS, MAX_CUTS = 4096, 64  # of the box of uncertain quantities in all, and
 PLAIN, WITH_TUBE, WITHOUT_V = ("asymptotic", "practical"), ("enlarged", "reached"), ("reaches", "invariant")
 PRACTICAL = ("practical", "nearby")
 CLAIMS = {  # the keys of each claim, and those that may be missing
-    **dict.fromkeys((*PLAIN, "nearby"), ("rate sample outer", "ranks keep data")),
+    **dict.fromkeys((*PLAIN, "nearby"), ("rate sample outer", "ranks keep data samples")),
     "enlarged": ("rate sample outer start", "keep"),
     "reached": ("rate sample outer start centre", "keep"),
     "reaches": ("sample target ranks", "keep"),
@@ -154,6 +155,7 @@ class Certificate:
     target: Tape | None = None  # whose outputs are at most 0 there; None if the target is {V <= c2}
     keep: Tape | None = None  # whose outputs stay negative
     data: Data | None = None  # with which the uncertain parameters are consistent
+    samples: Samples | None = None  # of functions that equations stand for
     then: Certificate | None = None  # that takes over where a practical claim ends
 
     @property
@@ -211,7 +213,7 @@ def certificate(data: Any, sha256: str, at: str = "", kinds: Sequence[str] = tup
     by = {"reaches": "ranks", "invariant": "outer"}.get(kind, "partition-tree")
     solved = kind in PLAIN and not (beyond or c.rate or c.discrete or c.uncertain)
     by = whole["evidence"].kind((by, "trusted-solver") if solved else (by,))
-    both = ("ranks", "data") if by == "partition-tree" else ()
+    both = ("ranks", "data", "samples") if by == "partition-tree" else ()
     shown = whole["evidence"].entries(" ".join(["kind", EVIDENCE[by], *(key for key in both if key in beyond)]))
     if by == "partition-tree":
         c = replace(c, evidence=_partition(shown, c, MAX_ORDER if "sample" in beyond else 1))

@@ -122,7 +122,8 @@ class Sizes:
     def of_features(self) -> tuple[int, int]:
         """Numbers and operations of what only some certificates have."""
         c, local = self.c, isinstance(self.evidence, Partition) and self.evidence.local
-        if not (c.outer or c.ranks or c.data or c.tube or c.contraction or (local and local.directions is not None)):
+        has = (c.outer, c.ranks, c.data, c.samples, c.tube, c.contraction, local and local.directions is not None)
+        if not any(has):
             return 0, 0
         from . import demands
 

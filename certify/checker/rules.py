@@ -128,6 +128,7 @@ ON_LEAVES: Table[ring.RingLeaves] = (
 OTHERS: Sequence[tuple[str, Callable[[Certificate], object]]] = (  # modules with rules of their own, and who needs them
     ("handover", lambda c: c.then),
     ("data", lambda c: c.data),
+    ("samples", lambda c: c.samples),
     ("", lambda c: isinstance(c.evidence, Partition)),  # the rules about ball and tree
     ("tube", lambda c: c.tube),
     ("contraction", lambda c: c.contraction),
@@ -139,7 +140,7 @@ READ = {"format": 1, "hash": 1}  # rules of document.py, which have held
 RULES = (
     *READ,
     *dict.fromkeys(name for table in (STATED, ON_THE_BALL, OF_THE_TREE, ON_LEAVES) for name, _ in table),
-    *("handover", "data", "tube", "contraction", "outer", "faces", "angles", "ranks"),  # in their own modules
+    *("handover", "data", "samples", "tube", "contraction", "outer", "faces", "angles", "ranks"),  # in modules
 )
 
 

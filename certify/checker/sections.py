@@ -229,6 +229,10 @@ def completed(
         c = replace(c, ranks=_ranks(said["ranks"], shown["ranks"], c, order))
     if "data" in said:
         c = replace(c, data=_data(said["data"], shown["data"], c))
+    if "samples" in said:
+        from . import samples
+
+        c = replace(c, samples=samples.read(said["samples"], shown["samples"], c))
     if kind == "nearby":
         close = shown["contraction"]
         c = replace(c, contraction=section(close, Contraction, n=n, order=most))

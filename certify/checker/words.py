@@ -22,7 +22,7 @@ AT_ONCE = {"start": "", "stays": "stays there", "enters": "in finite time", "rem
 
 def has_more(c: Certificate) -> bool:
     """True if clauses.py has words of the claim: it is of another kind, of steps, or states more."""
-    parts = (c.outer, c.ranks, c.keep, c.data, c.then)
+    parts = (c.outer, c.ranks, c.keep, c.data, c.samples, c.then)
     return c.claim not in PLAIN or c.step > 0 or any(parts) or not isinstance(c.evidence, Partition)
 
 

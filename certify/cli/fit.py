@@ -70,4 +70,5 @@ def _lines(result: FitResult) -> list[str]:
             lines.append(f"slope        {v}: {below(lo)} to {above(hi)}")
         lines.append(f"beyond       at most {one.beyond}")
     lines.append("assumed      the bounds of second derivatives and of the noise, and that 0 is an equilibrium")
+    lines.append("in a claim   with certify roa --data, for which both checkers derive error and slopes again")
     return [*lines, f"far          {result.far}", f"near         {result.near}"]

@@ -236,6 +236,8 @@ def _rows(result: IdentifyResult) -> list[tuple[str, str]]:
     rows = [("noise at most", each), ("data allow", noise_in_words(result.least_noise))]
     if data.period is not None:
         rows.append(("period", " to ".join(dict.fromkeys(f"{float(h):g}" for h in data.period))))
+    if result.not_narrowed():
+        rows.append(("not narrowed", f"{', '.join(result.not_narrowed())}: {result.next_step()}"))
     if axis is not None:
         rows.append(("least determined", direction_in_words(axis.entries, axis.share)))
         rows.append(("to narrow it", f"more like {result.readings.places[axis.telling]}: {result.at(axis.telling)}"))

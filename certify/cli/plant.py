@@ -121,6 +121,10 @@ def _facts(s: System, eigenvalues: Sequence[complex], reach: Controllability) ->
         )
     if s.measurements is not None:
         rows += _measured(s, s.measurements)
+    if s.samples is not None:
+        named = ", and ".join(f"{one.state} of {', '.join(one.variables)}" for one in s.samples.unknowns)
+        said = f"the equation stands for a function that was sampled, {named}; sha256 {s.samples.sha256[:16]}..."
+        rows.append(("samples", f"{said}; --data makes the file a part of a claim"))
     if s.operating_point():
         reads = ", ".join(f"{x} - {_number(q)}" if q else x.name for x, q in zip(s.states, s.exact_x_eq(), strict=True))
         rows.append(("policy reads", f"{reads}: deviations from x_eq, and so do A, B, V and the certificate"))

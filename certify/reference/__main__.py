@@ -39,7 +39,7 @@ def in_words(c: Certificate) -> str:
     if c.claim == INVARIANT:
         return of_staying(c) + kept(c)
     said = of_ranks(c) if c.target is not None else of_trajectories(c) + further(c) + in_ranks(c)
-    return said + kept(c) + measured(c) + handed_over(c)
+    return said + kept(c) + measured(c) + sampled(c) + handed_over(c)
 
 
 def of_trajectories(c: Certificate) -> str:
@@ -156,17 +156,43 @@ def measured(c: Certificate) -> str:
     )
 
 
+def sampled(c: Certificate) -> str:
+    """The words for functions that nobody wrote down."""
+    if c.samples is None:
+        return ""
+    each = []
+    for f in c.samples.functions:
+        box = zip(f.variables, f.axes, strict=True)
+        where = ", ".join(f"{name} in [{axis[0]}, {axis[-1]}]" for name, axis in box)
+        d = range(len(f.variables))
+        bends = ", ".join(
+            f"{f.curvature[i][j]} by {f.variables[i]} and {f.variables[j]}" for i in d for j in d if i <= j
+        )
+        zero = ", is 0 at 0" if f.vanishes else ""
+        each.append(
+            f"{c.plant.states[f.state]}, of {', '.join(f.variables)} in {where}: continuous second derivatives of at "
+            f"most {bends}, values within {f.noise} of the {len(f.values)} that the certificate states{zero}"
+        )
+    return (
+        f"; and this holds, instead of for the equations alone, for all functions of these (samples of a file with "
+        f"sha256 {c.samples.sha256}): {'; '.join(each)}; of other functions nothing is said"
+    )
+
+
 def handed_over(c: Certificate) -> str:
     """The words for the certificate that takes over."""
     then = c.then
     if then is None:
         return ""
     right = "x+ = g(k, x, u)" if c.plant.discrete else "x' = g(t, x, u)"
+    sampled = c.samples is not None or then.samples is not None
+    also = " (those with functions of its samples are among them)" if sampled else ""
     return (
         f"; and of every plant {right} whose right side, at any time and wherever x and u are in domain and input "
         "bounds, is one that the equations of this certificate have, and also one that those of the next have (for "
-        "some of what is uncertain, what was measured being constant and consistent), each of these trajectories is, "
-        f"once in V <= {c.floor!r}, one from V <= {then.outer!r} of the next, which says: {in_words(then)}"
+        f"some of what is uncertain, what was measured being constant and consistent){also}, each of these "
+        f"trajectories is, once in V <= {c.floor!r}, one from V <= {then.outer!r} of the next, which says: "
+        f"{in_words(then)}"
     )
 
 

@@ -30,6 +30,7 @@ from .expressions import Equations, equations, rational
 from .fields import IDENTIFIER, MAX_NAMES, binary64, column, entries, exact, keys, numbers, square
 from .networks import Network, packed, read_networks
 from .refusal import Refused, require
+from .samples import Samples, read_samples
 
 MAX_BYTES, MAX_BYTES_BEYOND_ASCII = 256 * 2**20, 16 * 2**20
 MAX_TOKENS = 10**6  # commas and opening brackets
@@ -133,7 +134,7 @@ class Certificate:
     `start` is P_0 of a claim with a tube, `centre` the column c_0 around which it lies where the tube follows a path.
     `beyond` is the second function of a claim with an outer set, called `outer` in the file. Expressions of `keep` are
     claimed to be negative, those of `target` to become at most 0. With `data` the ranges of some uncertain quantities
-    are those that measurements leave.
+    are those that measurements leave, with `samples` some equations stand for functions that nobody wrote down.
 
     Some claims have no V: P has no entries and its levels are no numbers, so that no rule about V can hold.
     """
@@ -155,6 +156,7 @@ class Certificate:
     inner: float
     outer: float
     evidence: Tree | Ranked | Covering | Trusted
+    samples: Samples | None = None
     then: Certificate | None = None  # which takes over where this one ends
 
     @property
@@ -254,12 +256,23 @@ def read_sections(value: Any, claims: tuple[str, ...]) -> Certificate:
         ranked=ranks is not None,
         fitted=fitted,
         held=sample is not None,
+        functions="samples" in said,
     )
-    replayed = not isinstance(evidence, Trusted) or (simple and not further and keep is None)
+    replayed = not isinstance(evidence, Trusted) or (simple and not further and keep is None and "samples" not in said)
     words = "a rate, a sample, discrete time, another set and constraints must be replayed"
     require(replayed, "format", "evidence.kind", words)
     more = (start, centre, beyond, ranks, keep, target, measured)
-    return Certificate(claim, rate, sample, *more, plant, policy, P, least, inner, outer, evidence)
+    c = Certificate(claim, rate, sample, *more, plant, policy, P, least, inner, outer, evidence)
+    return with_samples(c, said["samples"], data["evidence"]["samples"]) if "samples" in said else c
+
+
+def with_samples(c: Certificate, value: Any, shown: Any) -> Certificate:
+    """The same with what was sampled, if it may have that."""
+    plain = c.claim in ("asymptotic", "practical") and c.data is None and not c.plant.dynamics.calls
+    plain = plain and not any(c.policy.origin)
+    require(plain, "format", "claim.samples", "it was not expected with this claim, data, calls or the policy's origin")
+    angles = () if c.ranks is None else c.ranks.angles
+    return replace(c, samples=read_samples(value, shown, SHA256, c.plant, angles))
 
 
 def read_claim(value: Any) -> dict[str, Any]:
@@ -275,7 +288,7 @@ def read_claim(value: Any) -> dict[str, Any]:
         said = keys(value, "claim", "kind", "sample", "target", "ranks", maybe=("keep",))
         return {**said, "rate": (0.0).hex(), "outer": None}
     more = {"enlarged": ("start",), "reached": ("start", "centre")}.get(value["kind"], ())
-    maybe = ("keep",) if more else ("ranks", "keep", "data")
+    maybe = ("keep",) if more else ("ranks", "keep", "data", "samples")
     return keys(value, "claim", "kind", "rate", "sample", "outer", *more, maybe=maybe)
 
 

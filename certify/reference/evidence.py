@@ -190,9 +190,11 @@ def read_evidence(
     ranked: bool,
     fitted: Fitted | None,
     held: bool,
+    functions: bool = False,
 ) -> Tree | Ranked | Covering | Trusted:
     """`sampled` says whether a series in time may have an order above 1, `further` whether the claim has an `outer`,
-    `ranked` whether it has `ranks`, `held` whether inputs are; `fitted` is there with `data`."""
+    `ranked` whether it has `ranks`, `held` whether inputs are, `functions` whether some are sampled; `fitted` is there
+    with `data`."""
     if claim == REACHES:
         return read_ranked(value, n, sampled)
     if claim == INVARIANT:
@@ -205,7 +207,11 @@ def read_evidence(
         require(k == 0, "format", "evidence.kind", "what is uncertain must be replayed")
         return read_trusted(value)
     names = ("kind", "T", "root", "tree", "order", "cells", "local", "contraction", "tube", "outer")
-    further_names = (*(("ranks",) if ranked else ()), *(("data",) if fitted else ()))
+    further_names = (
+        *(("ranks",) if ranked else ()),
+        *(("data",) if fitted else ()),
+        *(("samples",) if functions else ()),
+    )
     evidence = keys(value, "evidence", *names, *further_names)
     require(evidence["kind"] == "partition-tree", "format", "evidence.kind", "an unknown kind")
     T, root = square(evidence["T"], "evidence.T", n), numbers(evidence["root"], "evidence.root", n)

@@ -238,7 +238,7 @@ def operations(c: Certificate) -> int:
         leaves = evidence.tree.count(LEAF)
         work += models_on_leaves(c, z, leaves, evidence.order) + on_leaves(c, z, leaves, evidence.order)
     work += on_balls(c, z, evidence) + in_tube(c, z, evidence) + beyond(c, z, evidence.covering)
-    return work + in_ranks(c, z, evidence) + of_data(c, z, evidence)
+    return work + in_ranks(c, z, evidence) + of_data(c, z, evidence) + of_samples(c)
 
 
 def models_on_leaves(c: Certificate, z: Sizes, leaves: int, order: int) -> int:
@@ -270,6 +270,20 @@ def of_data(c: Certificate, z: Sizes, evidence: Tree) -> int:
     work = on_boxes(transitions, z.n, fit.pieces * (a * series + 4 * z.n), a * (fit.order + 1), symbols, 0)
     work += 2**17 * rounds * fit.order * fit.pieces * (a + 4 * z.n)
     return work + 2**6 * count * transitions * z.n * (symbols + 2**6)
+
+
+def of_samples(c: Certificate) -> int:
+    """Operations to expand the equations, and for each function on its grid."""
+    if c.samples is None:
+        return 0
+    work = 2**24 * len(c.plant.dynamics.steps)
+    for f in c.samples.functions:
+        d, b = len(f.variables), max(q.height_bits() for axis in f.axes for q in axis)
+        if f.slopes:
+            work += 2**17 * d**2 * sum(len(lower) + len(upper) for lower, upper in f.weights)
+        else:
+            work += 2**12 * b * d * len(f.values) + f.cells * (2**18 * b * d + 2 ** (d + 10))
+    return work
 
 
 def handing_over(c: Certificate) -> int:

@@ -23,6 +23,7 @@ from .outer import outer
 from .periodic import angles
 from .ranks import ranks
 from .refusal import Refused
+from .samples import samples
 from .tube import tube
 
 
@@ -93,6 +94,7 @@ def check(c: Certificate, jobs: int) -> int | None:
     if evidence.fit is not None:
         with ctx.workprec(ON_LEAVES):
             data(c, evidence.fit)
+    samples(c)
     loop = None
     if evidence.ball is not None:
         loop = Loop(c)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from certify.report.sampled import Sampled
 from certify.report.words import above, below
 
 if TYPE_CHECKING:
@@ -56,14 +57,17 @@ def summary_lines(result: Mapping[str, Any]) -> list[str]:
     """The result of `certify compose` for the terminal."""
     name, then, levels = result["system"], result["then"], result["levels"]
     pair = name if name == then["system"] else f"{name}, then {then['system']}"
+    sampled = Sampled.of_result(result)
+    which = "of every plant that is one of both" if sampled is None else f"for every {sampled.consistent}"
     if result["verdict"] != "PROVED":
         return [f"UNKNOWN  {pair}: nothing was proved: {result['reason']}"]
     ends = _ENDS[result["claim"]["then"]["kind"]]
     return [
-        f"PROVED  {pair}: of every plant that is one of both, every trajectory from {{V <= {below(levels['roa'])}}} "
+        f"PROVED  {pair}: {which}, every trajectory from {{V <= {below(levels['roa'])}}} "
         f"enters {{V <= {above(levels['floor'])}}}, which lies in {{V' <= {below(then['levels']['roa'])}}} of the "
         f"second, and {ends}",
         f"{['length', 'area', 'volume'][min(len(result['states']), 3) - 1]:<13}{below(result['volume'])}",
+        *([] if sampled is None else [f"consistent   {sampled.assumed}"]),
         f"handover     on the floor V' is at most {above(100 * result['share'], 3)} % of its level",
         f"checker      {result['checked']}"
         + (f", reference {result['reference']}" if result["reference"] is not None else ""),

@@ -8,6 +8,7 @@ from fractions import Fraction
 from typing import Any, Self
 
 from certify.loop.plants import System
+from certify.report.sampled import Sampled
 from certify.report.words import (
     Varying,
     below,
@@ -120,8 +121,13 @@ class Measured:
 
 
 def stated_of(system: System, statement: str, *, by_steps: bool = False) -> str:
-    """A claim's statement for all that is uncertain of a plant, with its measurements where it has any."""
-    data, quantities = Measured.of(system), varying_in(system)
+    """A claim's statement for all that is uncertain of a plant, with its measurements or samples where it has any."""
+    data, sampled, quantities = Measured.of(system), Sampled.of(system), varying_in(system)
+    if sampled is not None:
+        others = sampled.others(quantities)
+        also = f", and every {varying(others)}, whatever moves it within its range," if others else ""
+        means = f"Consistent means: {sampled.assumed}."
+        return f"For every {sampled.consistent}{also} the following holds. {statement} {means}"
     if data is None:
         return stated_for(quantities, statement, by_steps=by_steps)
     others = data.others(quantities)

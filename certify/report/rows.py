@@ -11,6 +11,7 @@ from certify.certificates.timing import reach_time
 from certify.report.claims import Additions, Words, words_for
 from certify.report.limits import AT_A_POINT, hardest, limited_by, outer_limited_by
 from certify.report.measured import Measured
+from certify.report.sampled import Sampled
 from certify.report.timing import TimingInWords
 from certify.report.words import (
     ABSENT,
@@ -70,13 +71,18 @@ def _claim_rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]
     """The functions of time and the periods that the claim is for, its rate, and what limits it."""
     rows, found, timing = [], uncertain_of(result), TimingInWords.of_result(result)
     data, what = Measured.of_result(result), "for every" if shown else "asked for every"
+    sampled = Sampled.of_result(result)
+    if sampled is not None:
+        rows += [(what, sampled.consistent), ("consistent", sampled.assumed)]
+        found = sampled.others(found)
     if data is not None:
         rows += [(what, f"constant {data.in_priors} {data.consistent}"), ("consistent", data.assumed)]
         rows.append(("data leave", data.in_ranges))
         found = data.others(found)
     if found:
         each = "; ".join(q.words for q in found)
-        rows.append((what if data is None else "and every", f"{each}: {_functions(timing)}"))
+        first = what if data is None and sampled is None else "and every"
+        rows.append((first, f"{each}: {_functions(timing)}"))
     if timing.sample is not None:
         rows.append(("input held over" if shown else "asked to hold", timing.periods))
     if shown:

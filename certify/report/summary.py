@@ -21,6 +21,7 @@ from certify.report.rows import (
     uncertain_of,
     words_of,
 )
+from certify.report.sampled import Sampled
 from certify.report.timing import TimingInWords
 from certify.report.words import (
     above,
@@ -121,7 +122,10 @@ _FEW = 3  # uncertain quantities that a headline names
 
 def _whatever(result: Mapping[str, Any]) -> str:
     """The uncertain quantities for the headline; empty for an exact plant."""
-    found, data = uncertain_of(result), Measured.of_result(result)
+    found, data, sampled = uncertain_of(result), Measured.of_result(result), Sampled.of_result(result)
+    if sampled is not None:
+        others = sampled.others(found)
+        return f"for every {sampled.consistent}{f' and every {varying(others)}' if others else ''}, "
     if data is not None:
         others = data.others(found)
         also = f" and every {varying(others)}" if others else ""

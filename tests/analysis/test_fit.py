@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from fractions import Fraction
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from certify import certify_roa, compose
+from certify import RoaResult, certify_roa, compose
 from certify.analysis.fitting import linear
 from certify.analysis.fitting.linear import Contradicted, beyond, slopes
 from certify.analysis.fitting.polynomial import bounded, errors, fitted
 from certify.analysis.fitting.run import fit_plant
-from certify.analysis.fitting.samples import Grid, Unknown
+from certify.analysis.stated import stated
+from certify.certificates import Certificate, parse_certificate
 from certify.cli.main import _run
 from certify.errors import InputError
-from certify.loop.plants import load_system
+from certify.loop.plants import Grid, Unknown, load_system
 from certify.loop.policies import Policy, PolicyNetwork, save_policy
+from certify.report.drawn import page_of
 from tests.support.marks import slow_after
 
 STRUCTURE = """
@@ -93,7 +98,7 @@ def within(truth: Truth, share: float = 1.0) -> tuple[bool, bool]:
     most = float(bound.constant) + z**2 @ np.array([float(k) for k in bound.rise])
     a = truth.gradient()
     inside = all(
-        float(lo) - 1e-9 <= v <= float(hi) + 1e-9 for (lo, hi), v in zip(slopes(one, grid, noise), a, strict=True)
+        float(lo) - 1e-9 <= v <= float(hi) + 1e-9 for (lo, hi, *_), v in zip(slopes(one, grid, noise), a, strict=True)
     )
     rest = np.array([float(beyond(one, tuple(map(Fraction, point)))) for point in z.tolist()])
     assert share < 1 or (np.abs(truth(z) - z @ a) <= rest + 1e-9).all()
@@ -258,10 +263,11 @@ def test_three_states_from_samples_to_one_claim(tmp_path: Path) -> None:
     kinds = {"far": "practical", "near": "asymptotic"}
     for name, claim in kinds.items():
         result = certify_roa(tmp_path / f"{name}.toml", tmp_path / "box.pt", tmp_path / name, claim=claim,
-                             candidate="lyapunov")  # fmt: skip
+                             candidate="lyapunov", data=tmp_path / "samples.csv")  # fmt: skip
         assert result.verdict == "PROVED", result.reason
     both = compose(*(tmp_path / name / "certificate.json" for name in kinds), tmp_path / "both")
     assert both.verdict == "PROVED" and (both.checker or {})["result"] == "ACCEPTED", both.reason
+    assert (both.to_dict()["samples"] or {})["functions"][0]["samples"] == len(points)
     assert both.outer.roa > 2 * both.outer.claim.levels["floor"]
     draw = np.random.default_rng(0).normal(size=(200, 3))
     x = draw * np.sqrt(both.outer.roa / np.einsum("ki,ij,kj->k", draw, both.outer.P, draw))[:, None]
@@ -289,3 +295,134 @@ def test_a_contradiction_is_shown_in_rationals(seed: int, monkeypatch: pytest.Mo
     monkeypatch.setattr(linear, "linprog", slips)
     with pytest.raises(InputError, match="cannot be bounded"):
         slopes(truth.unknown(), grid, Fraction(1, 10**6) + Fraction(1, 10**12))
+
+
+# ------------------------------------------------------------------------------------------- samples as part of a claim
+
+
+@pytest.fixture
+def fitted_box(asked: list[str], tmp_path: Path) -> Path:
+    """The folder with both plants of the box, its samples and a policy."""
+    assert _run(asked, False) == 0
+    policy = PolicyNetwork.of_layers([np.array([[0.5, 0.5]])], [np.zeros(1)], [-1.0], [0.0], centre="none")
+    save_policy(tmp_path / "box.pt", Policy(policy, "box", {}))
+    return tmp_path
+
+
+def proved(folder: Path, name: str, **more: Any) -> RoaResult:
+    options = {"data": folder / "samples.csv", "candidate": "lyapunov", "effort": 0.05} | more
+    return certify_roa(folder / "out" / f"{name}.toml", folder / "box.pt", folder / name, **options)
+
+
+def test_samples_are_a_part_of_the_claim(fitted_box: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of both certificates and of the two joined; both checkers are asked."""
+    for name, claim, zero in (("far", "practical", False), ("near", "asymptotic", True)):
+        result = proved(fitted_box, name, claim=claim)
+        assert result.verdict == "PROVED", result.reason
+        assert (result.checker or {})["reference"]["result"] == "ACCEPTED"
+        said = result.to_dict()["samples"]
+        assert said["functions"][0]["samples"] == 54 and said["functions"][0]["vanishes"] is zero
+        assert dict(stated(result))["for every"] == "function v′ = g(x, v, u) with which 54 samples are consistent"
+        raw = (fitted_box / name / "certificate.json").read_bytes()
+        c = parse_certificate(raw, name)
+        again = Certificate(c.system, c.network, c.V, c.claim, c.evidence, c.provenance, c.data).document()
+        assert {**again, "provenance": {}} == {**json.loads(raw), "provenance": {}}
+        page = page_of(raw, fitted_box / name / "certificate.json", dict(result.checker or {}), None)
+        assert "For every function v′ = g(x, v, u) with which 54 samples are consistent" in page
+        assert "The equation stands for v′ = g(x, v, u): whatever the function is" in page
+        assert ("and 0 at the origin" in page) is zero and "a corner between two points of the grid" in page
+    paths = [str(fitted_box / name / "certificate.json") for name in ("far", "near")]
+    assert _run(["compose", *paths, "--out", str(fitted_box / "both")], False) == 0
+    said = capsys.readouterr().out
+    assert "for every function v′ = g(x, v, u) with which 54 samples are consistent, every trajectory" in said
+    assert "checker      ACCEPTED, reference ACCEPTED" in said
+
+
+def test_two_that_are_of_other_plants_are_not_joined_in_words(
+    fitted_box: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second has another known equation: then the words are of plants that are one of both."""
+    proved(fitted_box, "far", claim="practical")
+    near = fitted_box / "out" / "near.toml"
+    near.write_text(near.read_text().replace('x = "v"', 'x = "v*9/10"'))
+    assert proved(fitted_box, "near").verdict == "PROVED"
+    paths = [str(fitted_box / name / "certificate.json") for name in ("far", "near")]
+    assert _run(["compose", *paths, "--out", str(fitted_box / "both")], False) == 0
+    assert "of every plant that is one of both" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["far", "near"])
+def test_equations_may_be_taken_as_they_stand(fitted_box: Path, name: str) -> None:
+    result = proved(fitted_box, name, data=None, claim="practical" if name == "far" else "asymptotic")
+    assert result.verdict == "PROVED" and "are taken as they stand" in str(result.notice)
+    assert result.to_dict()["samples"] is None
+    assert "samples" not in json.loads((fitted_box / name / "certificate.json").read_bytes())["claim"]
+
+
+def test_claims_by_default_have_samples(fitted_box: Path) -> None:
+    """Where the origin need not rest, a nearby equilibrium is not looked for: what the residual is depends on x."""
+    result = proved(fitted_box, "far", claim="auto")
+    assert result.verdict == "PROVED" and result.claim == "practical", result.reason
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "said"),
+    [
+        ("far", 'v = "(', 'v = "(1/100000) + (', "holds all that the samples allow"),
+        ("far", 'v = "(', 'v = "sin(x)*0 + (', "must have a polynomial"),
+        ("far", 'v = "(', 'v = "residual_v*x + (', "a number and squares of variables"),
+        ("far", 'noise = { v = "1/1000000000" }', 'noise = { v = "1" }', "holds all that the samples allow"),
+        ("far", '"x*x" = 2', '"x*x" = 3', "holds all that the samples allow"),
+        ("far", "x = [-1, 1]", "x = [-2, 1]", "must reach over all of x"),
+        ("far", 'sha256 = "', 'sha256 = "00', "must be 64 hexadecimal digits"),
+        ("far", "noise = {", "nose = {", "is no entry of a plant's samples"),
+        ("far", 'v = "1/', 'w = "1/', "is no unknown function"),
+        ("near", "slope_v_x = [-2", "slope_v_x = [-1.9", "the range of slope_v_x must hold"),
+        ("near", "slope_v_x*x", "slope_v_x*x*2", "must have the sum of slopes times variables"),
+        ("near", '"x*x" = 2', '"x*x" = 3', "must have a bound [residual]"),
+    ],
+)
+def test_files_that_were_changed(fitted_box: Path, name: str, old: str, new: str, said: str) -> None:
+    path = fitted_box / "out" / f"{name}.toml"
+    assert old in path.read_text()
+    path.write_text(re.sub(r"(-1\.9)[.0-9]*,", r"\1,", path.read_text().replace(old, new, 1)))
+    with pytest.raises(InputError, match=re.escape(said)):
+        proved(fitted_box, name, claim="practical" if name == "far" else "asymptotic")
+
+
+def test_other_samples_are_refused(fitted_box: Path) -> None:
+    path = fitted_box / "samples.csv"
+    path.write_text(path.read_text() + "\n")
+    with pytest.raises(InputError, match="must be the one to which the plant was fitted"):
+        proved(fitted_box, "far", claim="practical")
+
+
+def test_a_nearby_equilibrium_is_no_claim_with_samples(fitted_box: Path) -> None:
+    with pytest.raises(InputError, match="leave out `data`"):
+        proved(fitted_box, "near", claim="nearby")
+
+
+@pytest.mark.parametrize("bias", [0.01, -0.02])
+def test_a_policy_that_is_not_0_at_0(fitted_box: Path, bias: float) -> None:
+    """V stays around 0, where the samples are; a policy with an origin of its own is refused."""
+    policy = PolicyNetwork.of_layers([np.array([[0.5, 0.5]])], [np.full(1, bias)], [-1.0], [0.0], centre="none")
+    save_policy(fitted_box / "box.pt", Policy(policy, "box", {}))
+    assert proved(fitted_box, "far", claim="auto").verdict == "PROVED"
+    moved = replace(policy, origin=np.array([0.1, 0.0]))
+    with pytest.raises(InputError, match="must be around x = 0"):
+        certify_roa(load_system(fitted_box / "out" / "far.toml"), moved, fitted_box / "far", claim="practical",
+                    data=fitted_box / "samples.csv")  # fmt: skip
+
+
+def test_an_angle_is_no_number(fitted_box: Path) -> None:
+    path = fitted_box / "out" / "near.toml"
+    path.write_text(path.read_text() + '\n[angles]\nx = "2*pi"\n')
+    with pytest.raises(InputError, match="must have x as a number"):
+        proved(fitted_box, "near")
+
+
+def test_coq_takes_no_samples(fitted_box: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    proved(fitted_box, "near")
+    path = str(fitted_box / "near" / "certificate.json")
+    assert _run(["prove-in-coq", path, "--out", str(fitted_box / "coq")], False) == 2
+    assert "Coq's statement covers; found" in capsys.readouterr().err

@@ -438,6 +438,29 @@ def test_measurements_that_narrow_nothing_end_with_what_to_do(tmp_path: Path) ->
         identified(tmp_path, transitions()[:6], noise={"theta": "1e-3", "theta_dot": "10"})
 
 
+@pytest.mark.parametrize(
+    ("equation", "prior", "left", "said"),
+    [
+        ("a*sin(theta)/d - b*theta_dot + c*u", "d = [0.9, 1.1]", ["d"], "not linear in the parameters"),
+        ("a*sin(theta) - b*theta_dot + c*u + d*0.00001*theta", "d = [0, 1]", ["d"], "measure where states or inputs"),
+    ],
+)
+def test_a_prior_that_is_left_as_it_is_has_an_advice(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], equation: str, prior: str, left: list[str], said: str
+) -> None:
+    rows = transitions(20)
+    text = STRUCTURE.replace("a*sin(theta) - b*theta_dot + c*u", equation).replace(
+        "[parameters]", f"[parameters]\n{prior}"
+    )
+    assert _run(command(tmp_path, text=text, rows=rows), False) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert f"not narrowed {', '.join(left)}: " in shown and said in shown
+    assert _run(command(tmp_path, "--json", text=text, rows=rows), True) == 0
+    assert json.loads(capsys.readouterr().out)["not_narrowed"] == left
+    assert _run(command(tmp_path, "--json", rows=rows), True) == 0
+    assert json.loads(capsys.readouterr().out)["not_narrowed"] == []
+
+
 def test_inputs_in_another_unit_under_which_states_diverge_are_asked_about(tmp_path: Path) -> None:
     """Of a car whose force is a thousand times too large the flow has no enclosure, and more rows help little."""
     car = """name = "car"

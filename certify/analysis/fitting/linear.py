@@ -11,15 +11,16 @@ rationals, so that nothing rests on its solver.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 from flint import fmpq, fmpq_mat
 from scipy.optimize import linprog
 
-from certify.analysis.fitting.samples import Grid, Point, Unknown
 from certify.errors import CertifyError, InputError
+from certify.loop.plants.samples import Grid, Point, Unknown
 
 
 class Contradicted(CertifyError):
@@ -35,7 +36,16 @@ def beyond(one: Unknown, z: Point) -> Fraction:
     return sum((m * abs(v * w) for row, v in pairs for m, w in zip(row, z, strict=True)), Fraction(0)) / 2
 
 
-def slopes(one: Unknown, grid: Grid, noise: Fraction) -> tuple[tuple[Fraction, Fraction], ...]:
+class Slope(NamedTuple):
+    """An interval that holds a first derivative of g at the origin, and the weights of samples that show each end."""
+
+    lo: Fraction
+    hi: Fraction
+    lower: Mapping[Point, Fraction]
+    upper: Mapping[Point, Fraction]
+
+
+def slopes(one: Unknown, grid: Grid, noise: Fraction) -> tuple[Slope, ...]:
     """Intervals that hold the first derivatives of g at the origin.
 
     Raises
@@ -51,13 +61,12 @@ def slopes(one: Unknown, grid: Grid, noise: Fraction) -> tuple[tuple[Fraction, F
     found = []
     for j in range(len(size)):
         unit = [Fraction(int(i == j)) for i in range(len(size))]
-        ends = [_end(Z, y, e, near, j, sign, unit) for sign in (1, -1)]
-        if not ends[0] <= ends[1]:
+        (lo, lower), (hi, upper) = (_end(Z, y, e, near, j, sign, unit) for sign in (1, -1))
+        if not lo <= hi:
             raise Contradicted(
-                f"{one.state} would have a slope along {one.variables[j]} from {float(ends[0]):.6g} to "
-                f"{float(ends[1]):.6g}"
+                f"{one.state} would have a slope along {one.variables[j]} from {float(lo):.6g} to {float(hi):.6g}"
             )
-        found.append((ends[0], ends[1]))
+        found.append(Slope(lo, hi, lower, upper))
     return tuple(found)
 
 
@@ -72,8 +81,8 @@ def _widest(near: Sequence[Row]) -> list[Row]:
 
 def _end(
     Z: np.ndarray, y: np.ndarray, e: np.ndarray, rows: Sequence[Row], j: int, sign: int, unit: Sequence[Fraction]
-) -> Fraction:
-    """The lower (sign 1) or upper end of a_j, from samples that a linear program chooses."""
+) -> tuple[Fraction, Mapping[Point, Fraction]]:
+    """The lower (sign 1) or upper end of a_j, from samples that a linear program chooses, and their weights."""
     cost = np.zeros(Z.shape[1])
     cost[j] = sign
     solved = linprog(cost, A_ub=np.vstack([Z, -Z]), b_ub=np.concatenate([y + e, e - y]), bounds=(None, None))
@@ -86,7 +95,7 @@ def _end(
     weights = _weights(rows, chosen, unit)
     middle = sum((w * rows[k][2] for k, w in weights.items()), Fraction(0))
     doubt = sum((abs(w) * rows[k][0] for k, w in weights.items()), Fraction(0))
-    return middle - sign * doubt
+    return middle - sign * doubt, {rows[k][1]: w for k, w in weights.items()}
 
 
 def _contradiction(Z: np.ndarray, y: np.ndarray, e: np.ndarray, rows: Sequence[Row]) -> CertifyError:
@@ -132,12 +141,15 @@ def _exact(q: Fraction) -> fmpq:
 
 def residual_text(one: Unknown, size: Sequence[Fraction]) -> str:
     """A smooth bound of |r| as an equation: |z_a z_b| is at most (s z_a^2 + z_b^2/s)/2 for any s, here by the sizes."""
-    terms = []
-    for a, (v, row) in enumerate(zip(one.variables, one.curvature, strict=True)):
-        share = sum((m * size[b] / size[a] for b, m in enumerate(row)), Fraction(0)) / 2
-        if share:
-            terms.append(f"{_upwards(share)}*{v}**2")
-    return " + ".join(terms) or "0"
+    shares = zip(one.variables, least_square(one, size), strict=True)
+    return " + ".join(f"{_upwards(share)}*{v}**2" for v, share in shares if share) or "0"
+
+
+def least_square(one: Unknown, size: Sequence[Fraction]) -> list[Fraction]:
+    """The factors of the squares of variables in such a bound."""
+    return [
+        sum((m * size[b] for b, m in enumerate(row)), Fraction(0)) / 2 / size[a] for a, row in enumerate(one.curvature)
+    ]
 
 
 def _upwards(q: Fraction) -> str:

@@ -16,15 +16,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise, product
-from math import comb
+from math import comb, prod
 
 import numpy as np
 from scipy.optimize import linprog
 
-from certify.analysis.fitting.samples import Grid, Point, Unknown
+from certify.errors import InputError
+from certify.loop.plants.samples import Grid, Point, Unknown
 
 _DIGITS = 12  # of a coefficient after the point, as a share of the largest sampled value
 _HELD = 10**12  # denominators of bounds that stand in files
+_TERMS, _PARTS = 2**7, 2**9  # terms z^k of a polynomial that the checkers expand, and their sum of prod (k_j + 1)
 Cell = tuple[tuple[Fraction, Fraction], ...]
 """The interval of each variable."""
 
@@ -101,6 +103,8 @@ def fitted(one: Unknown, grid: Grid, degree: int) -> Polynomial:
     powers = [
         p for p in product(*(range(k + 1) for k in most)) if 0 < sum(p) <= (3 if sum(map(bool, p)) > 1 else degree)
     ]
+    if len(powers) > _TERMS or sum(prod(k + 1 for k in p) for p in powers) > _PARTS:
+        raise InputError(f"`degree` {degree} makes a larger polynomial than the checkers expand: try a lower one.")
     scale = tuple(max(abs(axis[0]), abs(axis[-1])) for axis in grid.axes)
     points = np.array([[float(v / s) for v, s in zip(z, scale, strict=True)] for z in grid.values])
     values = np.array([float(y) for y in grid.values.values()])
@@ -136,6 +140,11 @@ class Bound:
     variables: tuple[str, ...]
     constant: Fraction
     rise: Point
+
+    def least(self, cell: Cell) -> Fraction:
+        """The least value on a cell."""
+        each = zip(self.rise, cell, strict=True)
+        return self.constant + sum((k * (0 if a <= 0 <= b else min(a * a, b * b)) for k, (a, b) in each), Fraction(0))
 
     def text(self) -> str:
         """The bound as an equation of a plant's file."""

@@ -3,15 +3,15 @@ it the linear part within an error that vanishes there.
 
 Each is a plant of which `certify roa` proves a claim; `certify compose` joins the two. What the claims say is about
 every plant within these errors. That the sampled plant is one of them follows from the samples, their noise and the
-declared bounds of second derivatives by what stands in `polynomial.py` and `linear.py`; the certificates do not have
-this step, which `certify fit` says of its own.
+declared bounds of second derivatives by what stands in `polynomial.py` and `linear.py`. `certify roa --data` makes the
+samples a part of the claim, and both checkers derive this again.
 """
 
 from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -19,15 +19,16 @@ from typing import Any
 
 from certify.analysis.fitting.linear import residual_text, slopes
 from certify.analysis.fitting.polynomial import Bound, Polynomial, bounded, errors, fitted
-from certify.analysis.fitting.samples import Grid, Unknown, read_samples, unknowns_in
+from certify.analysis.fitting.samples import bounds_of, read_samples, require_covered, suffix_of
 from certify.certificates import write_atomically
 from certify.errors import InputError
-from certify.loop.plants import System, load_system
+from certify.loop.plants import Grid, System, Unknown, load_system
+from certify.loop.plants.samples import slope_name
 from certify.loop.plants.source import PlantFile, read_plant_file
 from certify.loop.plants.toml import build_system
+from certify.loop.plants.unknown import unknowns_in
 
 Interval = tuple[Fraction, Fraction]
-_SECTION, _OURS = re.compile(r"\s*\[+\s*([A-Za-z_]+)"), re.compile(r"\s*\[+\s*unknown\b")
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +43,10 @@ class Fitted:
     largest: Fraction
     slopes: tuple[Interval, ...]
     beyond: str
+
+    def of_variables(self) -> Iterator[tuple[str, Interval]]:
+        """The variables with the ranges of their slopes."""
+        return zip(self.unknown.variables, self.slopes, strict=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +70,7 @@ class FitResult:
                     "terms": len(one.polynomial.powers),
                     "error": one.error.text(),
                     "largest_error": str(one.largest),
-                    "slopes": {
-                        v: [str(lo), str(hi)] for v, (lo, hi) in zip(one.unknown.variables, one.slopes, strict=True)
-                    },
+                    "slopes": {v: [str(lo), str(hi)] for v, (lo, hi) in one.of_variables()},
                     "beyond": one.beyond,
                 }
                 for one in self.found
@@ -103,13 +106,16 @@ def fit_plant(
     zeros = {**known, "dynamics": {**table, **{one.state: "0" for one in unknowns}}}
     system = build_system(replace(file, data=zeros))
     _require_at_rest(system, file)
-    grids, sha256 = read_samples(samples, unknowns, "_next" if system.time == "discrete" else "_rate")
+    grids, sha256 = read_samples(samples, unknowns, suffix_of(system))
     found = tuple(_fitted(one, grids[one.state], noise(one.state), system, degree, samples) for one in unknowns)
-    text = structure.read_text(encoding="utf-8")
+    said = [f'file = "{samples.name}"', f'sha256 = "{sha256}"']
+    bounds = ", ".join(f'{one.state} = "{noise(one.state)}"' for one in unknowns)
+    said.append(f"noise = {{ {bounds} }}")
+    text = "\n".join(_into(structure.read_text(encoding="utf-8").splitlines(), "samples", said))
     out.mkdir(parents=True, exist_ok=True)
     far = {one.unknown.state: (one.polynomial.text(), one.error.text()) for one in found}
     near = {one.unknown.state: (_sum(one), one.beyond) for one in found}
-    ranges = {_slope(one, v): pair for one in found for v, pair in zip(one.unknown.variables, one.slopes, strict=True)}
+    ranges = {slope_name(one.unknown.state, v): pair for one in found for v, pair in one.of_variables()}
     _write(out / "far.toml", _text(text, far, {}, f"fitted to {samples.name} (sha256 {sha256})"))
     _write(out / "near.toml", _text(text, near, ranges, f"from {samples.name} (sha256 {sha256}), around the origin"))
     return FitResult(found, out / "far.toml", out / "near.toml", sha256)
@@ -122,43 +128,26 @@ def _require_at_rest(system: System, file: PlantFile) -> None:
 
 
 def _fitted(one: Unknown, grid: Grid, noise: Fraction, system: System, degree: int, samples: Path) -> Fitted:
-    bounds = {s.name: pair for s, pair in zip(system.states, system.domain, strict=True)}
-    bounds |= {u.name: pair for u, pair in zip(system.inputs, system.input_bounds, strict=True)}
-    for name, axis in zip(one.variables, grid.axes, strict=True):
-        lo, hi = bounds[name]
-        if not (axis[0] <= min(lo, Fraction(0)) and max(hi, Fraction(0)) <= axis[-1]):
-            raise InputError(
-                f"samples {samples} must reach over all of {name} in [{float(lo):g}, {float(hi):g}]; they reach over "
-                f"[{float(axis[0]):g}, {float(axis[-1]):g}]. Take more, or make the domain smaller."
-            )
+    require_covered(system, one, grid, str(samples))
     if noise < 0:
         raise InputError(f"the bound of the noise must be at least 0; found {float(noise):g} for {one.state}.")
     p = fitted(one, grid, degree)
-    sizes = [max(abs(lo), abs(hi)) for lo, hi in (bounds[name] for name in one.variables)]
+    sizes = [max(abs(lo), abs(hi)) for lo, hi in (bounds_of(system)[name] for name in one.variables)]
     each = errors(p, one, grid, noise)
     error = bounded(one.variables, each)
-    a, beyond = slopes(one, grid, noise), residual_text(one, sizes)
+    a = tuple((slope.lo, slope.hi) for slope in slopes(one, grid, noise))
+    beyond = residual_text(one, sizes)
     return Fitted(one, len(grid.values), p, error, max(each.values()), a, beyond)
-
-
-def _slope(one: Fitted, variable: str) -> str:
-    return f"slope_{one.unknown.state}_{variable}"
 
 
 def _sum(one: Fitted) -> str:
     """The linear part as an equation."""
-    return " + ".join(f"{_slope(one, v)}*{v}" for v in one.unknown.variables)
+    return " + ".join(f"{slope_name(one.unknown.state, v)}*{v}" for v in one.unknown.variables)
 
 
 def _text(text: str, equations: Mapping[str, tuple[str, str]], ranges: Mapping[str, Interval], source: str) -> str:
-    """The structure's text without its tables `unknown`, with these equations, residuals and ranges."""
-    kept, ours = list[str](), False
-    for line in text.splitlines():
-        if _SECTION.match(line):
-            ours = _OURS.match(line) is not None
-        if not ours:
-            kept.append(line)
-    kept = _into(kept, "dynamics", [f'{state} = "{e}" # {source}' for state, (e, _) in equations.items()])
+    """The structure's text with these equations, residuals and ranges."""
+    kept = _into(text.splitlines(), "dynamics", [f'{state} = "{e}" # {source}' for state, (e, _) in equations.items()])
     if ranges:
         kept = _into(kept, "parameters", [f"{name} = {_decimals(pair)}" for name, pair in ranges.items()])
     lacking = [f'{state} = "{bound}"' for state, (_, bound) in equations.items() if bound != "0"]

@@ -1,4 +1,4 @@
-"""Samples of an unknown right-hand side on a grid, and what is declared of it: bounds of its second derivatives.
+"""Samples of an unknown right-hand side on a grid, from a file.
 
 Numbers are the decimals of the file, as exact fractions: nothing here is rounded.
 """
@@ -9,7 +9,7 @@ import csv
 import hashlib
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from fractions import Fraction
 from itertools import product
 from math import prod
@@ -17,84 +17,10 @@ from pathlib import Path
 
 from certify.errors import InputError
 from certify.loop.plants.equations import decimal
-from certify.loop.plants.source import PlantFile, number_at
+from certify.loop.plants.samples import Grid, Samples, Unknown
+from certify.loop.plants.system import Interval, System
 
-Point = tuple[Fraction, ...]
-_MOST_SAMPLES = 200_000
-
-
-@dataclass(frozen=True, slots=True)
-class Unknown:
-    """A state whose derivative, in discrete time next value, is a function g of some variables that nobody wrote down.
-
-    Parameters
-    ----------
-    state : its name.
-    variables : names of the states and inputs that g depends on, and of no others.
-    curvature : bounds of the absolute second derivatives of g on the domain and the input bounds, (d, d), symmetric.
-    """
-
-    state: str
-    variables: tuple[str, ...]
-    curvature: tuple[Point, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Grid:
-    """Samples of g at all points of a grid.
-
-    Parameters
-    ----------
-    axes : the values of each variable, ascending.
-    values : g at each point, by the point; each is off by at most the noise.
-    """
-
-    axes: tuple[Point, ...]
-    values: Mapping[Point, Fraction]
-
-
-def unknowns_in(file: PlantFile, names: Sequence[str], states: Sequence[str]) -> tuple[Unknown, ...]:
-    """The tables `unknown.STATE` of a structure, whose entries are as in `"theta*u" = 0.5`.
-
-    Raises
-    ------
-    InputError : there is none, a name is unknown, a number is negative, or a pair of variables has no bound.
-    """
-    file.require_known("unknown", list(states), "state")
-    found = tuple(_unknown(file, state, names) for state in file.table("unknown"))
-    if not found:
-        raise file.refuse("there must be a table [unknown.STATE] with bounds of second derivatives; found none.")
-    return found
-
-
-def _unknown(file: PlantFile, state: str, names: Sequence[str]) -> Unknown:
-    table, bounds = file.table("unknown")[state], dict[frozenset[str], Fraction]()
-    if not isinstance(table, dict) or not table:
-        raise file.refuse('must be a table with entries as in "x*u" = 0.5; found none.', "unknown", state)
-    for key, value in table.items():
-        pair = [name.strip() for name in key.split("*")]
-        if len(pair) != 2 or not set(pair) <= set(names):
-            raise file.refuse(
-                f"must be two states or inputs with * between them, of {', '.join(names)}; found {key!r}.",
-                "unknown",
-                state,
-            )
-        bound = number_at(file, value, "unknown", state, key)
-        if bound < 0 or frozenset(pair) in bounds:
-            raise file.refuse(
-                f"the bound of {key} must be at least 0, and stand once; found {value}.", "unknown", state
-            )
-        bounds[frozenset(pair)] = bound
-    variables = tuple(name for name in names if any(name in pair for pair in bounds))
-    missing = [(a, b) for a in variables for b in variables if frozenset((a, b)) not in bounds]
-    if missing:
-        raise file.refuse(
-            f"there must be a bound for each pair of {', '.join(variables)}; found none for {'*'.join(missing[0])}.",
-            "unknown",
-            state,
-        )
-    rows = tuple(tuple(bounds[frozenset((a, b))] for b in variables) for a in variables)
-    return Unknown(state, variables, rows)
+_MOST_SAMPLES, _MOST_BITS = 200_000, 2**7  # bits of a number, as the checkers read them
 
 
 def read_samples(path: Path, unknowns: Sequence[Unknown], suffix: str) -> tuple[dict[str, Grid], str]:
@@ -127,11 +53,53 @@ def read_samples(path: Path, unknowns: Sequence[Unknown], suffix: str) -> tuple[
     return grids, hashlib.sha256(raw).hexdigest()
 
 
+def require_covered(system: System, one: Unknown, grid: Grid, which: str) -> None:
+    """Reject samples that do not reach over the domain, the input bounds and 0, or whose numbers are too long."""
+    bounds = bounds_of(system)
+    for name, axis in zip(one.variables, grid.axes, strict=True):
+        lo, hi = bounds[name]
+        if not (axis[0] <= min(lo, Fraction(0)) and max(hi, Fraction(0)) <= axis[-1]):
+            raise InputError(
+                f"samples {which} must reach over all of {name} in [{float(lo):g}, {float(hi):g}]; they reach over "
+                f"[{float(axis[0]):g}, {float(axis[-1]):g}]. Take more, or make the domain smaller."
+            )
+
+
+def bounds_of(system: System) -> dict[str, Interval]:
+    """The domain and the input bounds, by the names of states and inputs."""
+    both = zip((*system.states, *system.inputs), (*system.domain, *system.input_bounds), strict=True)
+    return {s.name: interval for s, interval in both}
+
+
+def with_samples(system: System, samples: Samples, path: Path) -> System:
+    """A plant whose file has a table `samples`, with the samples of that file.
+
+    Raises
+    ------
+    InputError : the file is another one or cannot be read.
+    """
+    grids, sha256 = read_samples(path, samples.unknowns, suffix_of(system))
+    if sha256 != samples.sha256:
+        raise InputError(
+            f"data file {path} must be the one to which the plant was fitted, of sha256 {samples.sha256}; found "
+            f"{sha256}. For other samples run certify fit again."
+        )
+    return replace(system, samples=replace(samples, grids=grids))
+
+
+def suffix_of(system: System) -> str:
+    """The end of the name of a column of values."""
+    return "_next" if system.time == "discrete" else "_rate"
+
+
 def _number(row: Sequence[str], at: int, path: Path, line: int) -> Fraction:
     try:
-        return Fraction(decimal(row[at].strip()))
+        found = Fraction(decimal(row[at].strip()))
     except (IndexError, ValueError) as error:
         raise InputError(f"samples {path}, line {line}: entry {at + 1} must be a decimal number.") from error
+    if max(found.numerator.bit_length(), found.denominator.bit_length()) > _MOST_BITS:
+        raise InputError(f"samples {path}, line {line}: entry {at + 1} must have some 35 digits at most.")
+    return found
 
 
 def _grid(one: Unknown, columns: Mapping[str, Sequence[Fraction]], name: str, path: Path) -> Grid:

@@ -14,6 +14,7 @@ import numpy as np
 from certify.analysis.identifying.reading import Readings, read_data
 from certify.analysis.identifying.writing import rounded, write_known
 from certify.errors import InputError, OptionError
+from certify.loop.expressions import Symbol, differentiate, symbols_of
 from certify.loop.plants import Measurements, System
 from certify.loop.plants.system import Interval
 from certify.report.identified import Residuals
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from certify.provers.data import Identified
 
 SCHEMA = "certify-identify/1"
+_NARROWED = 1.01  # least factor by which a prior that is narrowed becomes smaller
 Tell = Callable[[str], None]
 
 
@@ -69,6 +71,21 @@ class IdentifyResult:
         (a, b), (lo, hi) = self.measurements.priors[name], self.system.ranges[name]
         return float((b - a) / (hi - lo))
 
+    def not_narrowed(self) -> tuple[str, ...]:
+        """The parameters whose priors are left as they are."""
+        return tuple(name for name in self.measurements.priors if self.shrink(name) < _NARROWED)
+
+    def next_step(self) -> str:
+        """The advice where some priors are not narrowed, by whether the equations are linear in the parameters."""
+        parameters = [Symbol(name) for name in self.measurements.priors]
+        slopes = [differentiate(e, p) for e in self.system.dynamics for p in parameters]
+        if symbols_of(*slopes) & {*parameters}:
+            return (
+                "the equations are not linear in the parameters: write each quotient or product of some as one "
+                "parameter, as in a = R/L, or narrow the priors"
+            )
+        return "measure where states or inputs beside them are larger, or more often"
+
     def at(self, transition: int) -> str:
         """The measured state and the input of a transition, in words."""
         for states, inputs in self.measurements.runs:
@@ -98,6 +115,7 @@ class IdentifyResult:
             "data": data_in_json(self.source, self.readings) | {"used": int(self.found.used.sum())},
             "period": None if data.period is None else [str(h) for h in data.period],
             "noise": {s.name: str(w) for s, w in zip(system.states, data.noise, strict=True)},
+            "not_narrowed": list(self.not_narrowed()),
             "parameters": [
                 {
                     "name": name,
@@ -220,13 +238,17 @@ def identify_plant(
 
 
 def with_data(system: System, path: Path, tell: Tell = lambda _: None) -> System:
-    """A plant whose file has a table `data`, with the measurements of that file.
+    """A plant whose file has a table `data` or `samples`, with the measurements or samples of that file.
 
     Raises
     ------
     InputError : the plant has no such table, or the file is another one or cannot be read.
     """
     stated = system.measurements
+    if system.samples is not None and stated is None:
+        from certify.analysis.fitting.samples import with_samples
+
+        return with_samples(system, system.samples, path)
     if stated is None:
         raise InputError(
             f"{system.name} must have a table [data] that says what its data are; certify identify writes such a plant."

@@ -23,7 +23,7 @@ from certify.effort import Effort
 from certify.errors import InputError, OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.equilibrium import Rest, find_rest, seen_from
-from certify.loop.plants import Measurements
+from certify.loop.plants import Measurements, Samples
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,11 @@ class Setting:
         elif system.measurements is not None:
             with self.tools.timing("data"):
                 state = _identified(state, system.measurements)
+        if system.samples is not None and not system.samples.grids:
+            state = _without_samples(state)
+        elif system.samples is not None:
+            with self.tools.timing("data"):
+                state = _sampled(state, system.samples)
         with self.tools.timing("candidate"):
             state = _with_claim(state)
             rest, loop = _rest(state.loop, state.options)
@@ -83,6 +88,35 @@ def _without_data(state: State) -> State:
         "the plant's ranges are taken as they stand; `data` makes the measurements, on which they rest, a part of the "
         "claim"
     )
+
+
+def _without_samples(state: State) -> State:
+    """The plant with its equations as they stand, whatever they were fitted to."""
+    loop = ClosedLoop(replace(state.loop.system, samples=None), state.loop.network)
+    return replace(state, loop=loop).noting(
+        "the plant's equations and their bounds are taken as they stand; `data` makes the samples, to which they were "
+        "fitted, a part of the claim"
+    )
+
+
+def _sampled(state: State, samples: Samples) -> State:
+    """The plant with evidence that its equations stand for all functions of the samples.
+
+    Raises
+    ------
+    InputError : they do not, or another claim is asked for than one that may have samples.
+    """
+    from certify.analysis.fitting.standing import standing_for
+
+    system = state.loop.system
+    if state.options.claim == "nearby":
+        raise OptionError("a claim with samples must be practical or asymptotic; leave out `data`.")
+    if any(system.exact_x_eq()) or state.loop.network.is_moved:
+        raise InputError("a claim with samples must be around x = 0, as is what was sampled; leave out `data`.")
+    turning = next((v for one in samples.unknowns for v in one.variables if v in system.angles), None)
+    if turning is not None:
+        raise InputError(f"a claim with samples must have {turning} as a number; leave it out of [angles].")
+    return replace(state, data=standing_for(system, samples))
 
 
 def _identified(state: State, measurements: Measurements) -> State:
@@ -115,7 +149,7 @@ def _with_claim(state: State) -> State:
     InputError : the claim `asymptotic` is asked for, and the loop does not rest at the origin.
     """
     options = state.options
-    converging = options.claim in ("auto", "nearby")
+    converging = options.claim in ("auto", "nearby") and state.loop.system.samples is None
     kind, why = _kind_of(state.loop, options)
     state = replace(state, converging=converging, insists=options.claim == "nearby")
     if why is not None:
@@ -153,9 +187,9 @@ def _rest(loop: ClosedLoop, options: RoaOptions) -> tuple[Rest | None, ClosedLoo
     """
     if loop.network.is_moved:
         return None, loop
-    if options.claim != "practical" or loop.network.centre != "none":
+    if options.claim != "practical" or loop.network.centre != "none" or loop.system.samples is not None:
         if options.around == "rest" and options.claim == "practical":
-            raise OptionError("`around` rest needs a policy without centring.")
+            raise OptionError("`around` rest needs a policy without centring, and a plant without samples.")
         return None, loop
     rest = find_rest(loop)
     given = options.P is not None or options.level is not None or options.lyapunov is not None

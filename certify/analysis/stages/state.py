@@ -20,6 +20,7 @@ from certify.certificates import PartitionTree, TrustedSolver
 from certify.certificates.claims import Claim
 from certify.certificates.claims.claim import Kind
 from certify.certificates.data import DataBounds
+from certify.certificates.samples import SampleBounds
 from certify.effort import WHOLE, Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.provers.base import Progress, Proof
@@ -48,7 +49,8 @@ class State:
     notes : remarks for a person, in order; none is ever taken away.
     race, proof : the candidates, and what the prover says of the best.
     claim, evidence : what is to be certified.
-    data : evidence that measurements bound the plant's parameters; None where ranges are assumed.
+    data : evidence that measurements bound the plant's parameters, or that equations stand for sampled functions; None
+        where ranges and equations are assumed.
     beyond : the set of another function around the ellipsoid.
     ranked : boxes with ranks, as the search found them.
     simulated : the region of attraction by runs.
@@ -68,7 +70,7 @@ class State:
     proof: Proof | None = None
     claim: Claim | None = None
     evidence: PartitionTree | TrustedSolver | None = None
-    data: DataBounds | None = None
+    data: DataBounds | SampleBounds | None = None
     beyond: OuterProof | None = None
     ranked: RankProof | None = None
     simulated: SimulatedRegion | None = None

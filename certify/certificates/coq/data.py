@@ -164,6 +164,7 @@ def _require_supported(claim: Any, networks: Any, plant: Any, policy: Any, lyapu
         "boxes with ranks": "ranks" in claim,
         "constraints": "keep" in claim,
         "ranges that measurements bound": "data" in claim,
+        "functions known by samples": "samples" in claim,
         "an input that is held over a period": claim["sample"] is not None,
         f"plants in {plant['time']} time": plant["time"] != "continuous",
         "more than one network": len(networks) > 1,

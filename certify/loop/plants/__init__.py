@@ -15,16 +15,20 @@ from certify.loop.plants.linear import Controllability, Matrix, controllability,
 from certify.loop.plants.measurements import Measurements, Run
 from certify.loop.plants.operating_point import require_equilibrium, residuals, rests_where
 from certify.loop.plants.registry import available_systems, chosen_system, get_system, shipped_system
+from certify.loop.plants.samples import Grid, Samples, Unknown
 from certify.loop.plants.system import System, exact
 from certify.loop.plants.toml import load_system
 from certify.loop.plants.uncertainty import at_values, corners, input_errors, kind_of, with_input_errors
 
 __all__ = [
     "Controllability",
+    "Grid",
     "Matrix",
     "Measurements",
     "Run",
+    "Samples",
     "System",
+    "Unknown",
     "at_values",
     "available_systems",
     "chosen_system",

@@ -34,6 +34,7 @@ from certify.loop.expressions.numerical import Module
 from certify.loop.plants.calls import Call
 from certify.loop.plants.floating_point import function_of
 from certify.loop.plants.measurements import Measurements
+from certify.loop.plants.samples import Samples
 from certify.loop.plants.validation import validate
 
 Interval = tuple[Fraction, Fraction]
@@ -80,8 +81,7 @@ class System:
     units : unit of each state, input and parameter by name.
     description : one line for people.
     x_eq : n expressions in the parameters, with rational values; empty means zeros. `dynamics` and `domain` are in
-        deviations from it already (`in_deviations` brings equations there), so that nothing of what is proved depends
-        on it.
+        deviations from it already (`in_deviations` brings equations there): nothing that is proved depends on it.
     disturbances : symbols of the dynamics that are 0 unless they have a range.
     ranges : intervals by name, of uncertain parameters and of disturbances that act; values may change at any time. A
         parameter's value in `parameters` lies in its range and is the nominal one, which u_eq and simulation use.
@@ -94,12 +94,12 @@ class System:
     angles : names of states that are angles: x and x + 2 pi are the same place.
     constraints : expressions g by name, as the dynamics; g < 0 is asked for along trajectories.
     measurements : those with which uncertain parameters, constants, are consistent; None where ranges are assumed.
+    samples : of unknown functions for which equations stand; None where they stand for themselves.
 
     Raises
     ------
-    InputError : counts do not match, a domain does not contain 0 in its interior, a parameter that
-        must be positive is not, an expression is outside the grammar, x_eq is irrational, a name with a range is
-        neither a parameter nor a disturbance, or an angle is no state.
+    InputError : counts do not match, a domain does not contain 0 in its interior, a parameter that must be positive is
+        not, an expression is outside the grammar, x_eq is irrational, a range is of no name, or an angle is no state.
     """
 
     name: str
@@ -124,6 +124,7 @@ class System:
     angles: tuple[str, ...] = ()
     constraints: Mapping[str, Expression] = field(default_factory=dict)
     measurements: Measurements | None = None
+    samples: Samples | None = None
 
     def __post_init__(self) -> None:
         for key in ("parameters", "ranges", "units", "rest_of_calls", "constraints"):

@@ -29,7 +29,7 @@ from certify.loop.plants.equations import nearest, parse_constraint, parse_expre
 from certify.loop.plants.operating_point import require_equilibrium
 from certify.loop.plants.source import PlantFile, interval_at, number_at, read_plant_file
 from certify.loop.plants.system import Interval, System, Time
-from certify.loop.plants.unknown import measurements_in, parameter, residual_ranges, with_residuals
+from certify.loop.plants.unknown import measurements_in, parameter, residual_ranges, samples_in, with_residuals
 
 _REQUIRED = ("name", "states", "inputs", "dynamics", "u_eq", "domain", "input_bounds")
 _KEYS = (
@@ -48,6 +48,8 @@ _KEYS = (
     "angles",
     "constraints",
     "residual",
+    "samples",
+    "unknown",
     "data",
 )
 _TURN = "2*pi"  # the only period of an angle
@@ -113,6 +115,7 @@ def build_system(file: PlantFile) -> System:
             constraints=dict(zip(constraints, in_deviations(list(constraints.values()), *at), strict=True)),
             observations=tuple(_observations(file, {s: symbol[s] for s in (*states, *parameters)})),
             measurements=measurements_in(file, states, ranges, time),
+            samples=samples_in(file, states, inputs),
         )
     except InputError as error:
         if str(file.path) in str(error):
@@ -128,6 +131,8 @@ def _check_keys(file: PlantFile) -> None:
         if key not in _KEYS:
             close = nearest(key, _KEYS) or f"; known are {', '.join(_KEYS)}."
             raise file.refuse(f"unknown keys are refused: {key!r} is none of a plant's{close}", key)
+    if "unknown" in file.data and "samples" not in file.data:
+        raise file.refuse("unknown functions must be sampled first: certify fit writes plants from samples.", "unknown")
     missing = [key for key in _REQUIRED if key not in file.data]
     if missing:
         raise file.refuse(f"missing keys: a plant must have {', '.join(missing)}.")

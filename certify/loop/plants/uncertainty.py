@@ -75,7 +75,14 @@ def at_values(system: System, values: Mapping[str, Fraction]) -> System:
     u_eq = tuple(map(Number, system.exact_u_eq()))
     plant = system.with_parameters(known)
     return replace(
-        plant, dynamics=dynamics, constraints=constraints, u_eq=u_eq, disturbances=(), ranges={}, measurements=None
+        plant,
+        dynamics=dynamics,
+        constraints=constraints,
+        u_eq=u_eq,
+        disturbances=(),
+        ranges={},
+        measurements=None,
+        samples=None,
     )
 
 

@@ -1,4 +1,4 @@
-"""Tables of a plant's file for what is not known of it: ranges of parameters, residuals of equations, measurements."""
+"""Tables of a plant's file for what is not known of it: ranges of parameters, residuals, measurements, samples."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from typing import Any
 
 from certify.loop.expressions import Expression, Operation, Symbol
 from certify.loop.plants.measurements import Measurements
+from certify.loop.plants.samples import Samples, Unknown
 from certify.loop.plants.source import PlantFile, interval_at, interval_in, number_at
 from certify.loop.plants.system import Interval
 
 _DATA = ("file", "sha256", "period", "noise", "priors")
+_SAMPLES = ("file", "sha256", "noise")
 _DIGITS = frozenset("0123456789abcdef")
 
 
@@ -33,11 +35,13 @@ def residual_ranges(file: PlantFile, states: Sequence[str]) -> dict[str, Interva
     """
     file.require_known("residual", list(states), "state")
     twice = next(
-        (s for s in states if s in file.table("residual") and _residual(s) in file.table("disturbances")), None
+        (s for s in states if s in file.table("residual") and residual_name(s) in file.table("disturbances")), None
     )
     if twice is not None:
-        raise file.refuse(f"its disturbance is {_residual(twice)}, a name that stands for another.", "residual", twice)
-    return {_residual(s): (Fraction(-1), Fraction(1)) for s in states if s in file.table("residual")}
+        raise file.refuse(
+            f"its disturbance is {residual_name(twice)}, a name that stands for another.", "residual", twice
+        )
+    return {residual_name(s): (Fraction(-1), Fraction(1)) for s in states if s in file.table("residual")}
 
 
 def with_residuals(
@@ -51,7 +55,7 @@ def with_residuals(
     The bound's sign does not count, so that its factors abs(e) are written as e: these have no corner where e is 0.
     """
     return [
-        Operation("+", e, Operation("*", symbol[_residual(s)], _without_corners(bounds[s]))) if s in bounds else e
+        Operation("+", e, Operation("*", symbol[residual_name(s)], _without_corners(bounds[s]))) if s in bounds else e
         for s, e in zip(states, dynamics, strict=True)
     ]
 
@@ -67,7 +71,8 @@ def _without_corners(bound: Expression) -> Expression:
     return bound
 
 
-def _residual(state: str) -> str:
+def residual_name(state: str) -> str:
+    """The name of the disturbance by which an equation may be off."""
     return f"residual_{state}"
 
 
@@ -89,33 +94,108 @@ def measurements_in(
         raise file.refuse(f"must have {', '.join(wanted)}. `certify identify` writes this table.", "data")
     if time == "discrete" and "period" in table:
         raise file.refuse("must be left out in discrete time, where a transition is a step.", "data", "period")
-    sha256 = table["sha256"]
-    if not isinstance(sha256, str) or len(sha256) != 64 or not set(sha256) <= _DIGITS:
-        raise file.refuse(f"must be 64 hexadecimal digits; found {sha256!r:.80}.", "data", "sha256")
-    if not isinstance(table["file"], str):
-        raise file.refuse(f"must be the name of a file; found {table['file']!r:.80}.", "data", "file")
-    noise = _inner(file, "noise", list(states), "state")
+    sha256 = _file_of(file, "data")
+    noise = _inner(file, "data", "noise", list(states), "state")
     missing = [s for s in states if s not in noise]
     if missing:
         raise file.refuse(f"there must be a bound for every state; {missing[0]} has none.", "data", "noise")
     bounds = tuple(number_at(file, noise[s], "data", "noise", s) for s in states)
     if min(bounds) < 0:
         raise file.refuse("must be at least 0 in each state.", "data", "noise")
-    stated = _inner(file, "priors", list(ranges), "ranged parameter")
+    stated = _inner(file, "data", "priors", list(ranges), "ranged parameter")
     priors = {p: interval_in(file, value, "data", "priors", p) for p, value in stated.items()}
     if not priors:
         raise file.refuse("there must be a range for a parameter at least.", "data", "priors")
     return Measurements(priors, _period(file) if time == "continuous" else None, bounds, (), sha256)
 
 
-def _inner(file: PlantFile, key: str, known: list[str], what: str) -> Mapping[str, Any]:
-    """A table within the table `data`."""
-    found = file.table("data")[key]
+def unknowns_in(file: PlantFile, names: Sequence[str], states: Sequence[str]) -> tuple[Unknown, ...]:
+    """The tables `unknown.STATE` of a structure, whose entries are as in `"theta*u" = 0.5`.
+
+    Raises
+    ------
+    InputError : there is none, a name is unknown, a number is negative, or a pair of variables has no bound.
+    """
+    file.require_known("unknown", list(states), "state")
+    found = tuple(_unknown(file, state, names) for state in file.table("unknown"))
+    if not found:
+        raise file.refuse("there must be a table [unknown.STATE] with bounds of second derivatives; found none.")
+    return found
+
+
+def _unknown(file: PlantFile, state: str, names: Sequence[str]) -> Unknown:
+    table, bounds = file.table("unknown")[state], dict[frozenset[str], Fraction]()
+    if not isinstance(table, dict) or not table:
+        raise file.refuse('must be a table with entries as in "x*u" = 0.5; found none.', "unknown", state)
+    for key, value in table.items():
+        pair = [name.strip() for name in key.split("*")]
+        if len(pair) != 2 or not set(pair) <= set(names):
+            raise file.refuse(
+                f"must be two states or inputs with * between them, of {', '.join(names)}; found {key!r}.",
+                "unknown",
+                state,
+            )
+        bound = number_at(file, value, "unknown", state, key)
+        if bound < 0 or frozenset(pair) in bounds:
+            raise file.refuse(
+                f"the bound of {key} must be at least 0, and stand once; found {value}.", "unknown", state
+            )
+        bounds[frozenset(pair)] = bound
+    variables = tuple(name for name in names if any(name in pair for pair in bounds))
+    missing = [(a, b) for a in variables for b in variables if frozenset((a, b)) not in bounds]
+    if missing:
+        raise file.refuse(
+            f"there must be a bound for each pair of {', '.join(variables)}; found none for {'*'.join(missing[0])}.",
+            "unknown",
+            state,
+        )
+    rows = tuple(tuple(bounds[frozenset((a, b))] for b in variables) for a in variables)
+    return Unknown(state, variables, rows)
+
+
+def samples_in(file: PlantFile, states: Sequence[str], inputs: Sequence[str]) -> Samples | None:
+    """The tables `samples` and `unknown`, without the sampled numbers, which another file has; None without them.
+
+    Raises
+    ------
+    InputError : an entry is missing, unknown or no number.
+    """
+    if "samples" not in file.data:
+        return None
+    file.require_known("samples", list(_SAMPLES), "entry of a plant's samples")
+    missing = [key for key in _SAMPLES if key not in file.table("samples")]
+    if missing:
+        raise file.refuse(f"must have {', '.join(missing)}. `certify fit` writes this table.", "samples")
+    unknowns = unknowns_in(file, [*states, *inputs], states)
+    named = [one.state for one in unknowns]
+    noise = _inner(file, "samples", "noise", named, "unknown function")
+    odd = [state for state in named if state not in noise]
+    if odd:
+        raise file.refuse(f"there must be a bound for {odd[0]}; found none.", "samples", "noise")
+    bounds = {state: number_at(file, noise[state], "samples", "noise", state) for state in named}
+    if min(bounds.values()) < 0:
+        raise file.refuse("must be at least 0.", "samples", "noise")
+    return Samples(_file_of(file, "samples"), unknowns, bounds, {})
+
+
+def _file_of(file: PlantFile, table: str) -> str:
+    """The sha256 of the file that a table names."""
+    sha256, name = (file.table(table)[key] for key in ("sha256", "file"))
+    if not isinstance(sha256, str) or len(sha256) != 64 or not set(sha256) <= _DIGITS:
+        raise file.refuse(f"must be 64 hexadecimal digits; found {sha256!r:.80}.", table, "sha256")
+    if not isinstance(name, str):
+        raise file.refuse(f"must be the name of a file; found {name!r:.80}.", table, "file")
+    return sha256
+
+
+def _inner(file: PlantFile, table: str, key: str, known: list[str], what: str) -> Mapping[str, Any]:
+    """A table within a table."""
+    found = file.table(table)[key]
     if not isinstance(found, dict):
-        raise file.refuse(f"must be a table with an entry for each {what}; found {found!r:.80}.", "data", key)
+        raise file.refuse(f"must be a table with an entry for each {what}; found {found!r:.80}.", table, key)
     for name in found:
         if name not in known:
-            raise file.refuse(f"{name!r} is no {what}; known are {', '.join(known) or 'none'}.", "data", key, name)
+            raise file.refuse(f"{name!r} is no {what}; known are {', '.join(known) or 'none'}.", table, key, name)
     return found
 
 

@@ -22,6 +22,7 @@ from certify.report.claims import CHECKED_ALWAYS, INPUTS
 from certify.report.figures.sets import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of, start_of
 from certify.report.mathml import inequality, typeset
 from certify.report.measured import Measured, stated_of
+from certify.report.sampled import Sampled
 from certify.report.sections.shared import centre_in_words, duration_in_words, ranks_of, timing_of, words_of
 from certify.report.timing import TimingInWords
 from certify.report.words import (
@@ -120,7 +121,17 @@ def _parts(certificate: Certificate, notes: Mapping[str, str]) -> list[tuple[str
         else:
             text = f"{condition}, {shown_by}." if shown_by else condition
         parts.append((name, text, note))
-    data = Measured.of(certificate.system)
+    data, sampled = Measured.of(certificate.system), Sampled.of(certificate.system)
+    if sampled is not None:
+        parts.append(
+            (
+                "Samples",
+                "Wherever states are in the domain and inputs in their bounds, the equations have the values of every "
+                "consistent function: between the grid's points by how far interpolation may be off, at the origin by "
+                "slopes that sums of samples bound; in rationals.",
+                f"From {sampled.count:,} samples of a file with the sha256 {sampled.sha256}.",
+            )
+        )
     if data is not None:
         parts.append(
             (

@@ -11,6 +11,7 @@ from certify.certificates import AnyCertificate, Certificate, InvariantCertifica
 from certify.loop.plants import System, input_errors
 from certify.report.claims import Words
 from certify.report.measured import Measured
+from certify.report.sampled import Sampled
 from certify.report.sections.shared import timing_of
 from certify.report.timing import TimingInWords
 from certify.report.words import Varying, held_at, listed, symbol, varying_in
@@ -146,6 +147,9 @@ def _not_of_the_plant(system: System) -> list[tuple[str, str]]:
     data = Measured.of(system)
     if data is not None:
         return _not_of_the_measured(system, data)
+    sampled = Sampled.of(system)
+    if sampled is not None:
+        return _not_of_the_sampled(system, sampled)
     names = listed([symbol(name) for name in system.ranges])
     within = "its range" if len(system.ranges) == 1 else "their ranges"
     return [
@@ -159,6 +163,27 @@ def _not_of_the_plant(system: System) -> list[tuple[str, str]]:
             f"Only what {names} can be in these equations: no other force, no sensor noise, no estimation error, no "
             "delay.",
         ),
+    ]
+
+
+def _not_of_the_sampled(system: System, sampled: Sampled) -> list[tuple[str, str]]:
+    """The gaps about a plant of which functions are known by samples."""
+    others = [symbol(q.name) for q in sampled.others(varying_in(system))]
+    beside = f" beside {listed(others)} in {'its range' if len(others) == 1 else 'their ranges'}" if others else ""
+    zero = ", and that they are 0 at the origin" if any(f["vanishes"] for f in sampled.functions) else ""
+    return [
+        (
+            "That the plant is one of these.",
+            "That the functions depend on these variables alone, the bounds of their second derivatives, the bound of "
+            f"the samples' errors{zero} are assumed: samples can contradict them and never show them. A single error "
+            "that is larger, or a corner between two points of the grid, makes the plant another one, and so does "
+            "anything else in the other equations.",
+        ),
+        (
+            "Functions that change.",
+            "Each is one function of its variables, when it was sampled and ever after.",
+        ),
+        ("Other disturbances.", f"None{beside}: no other force, no sensor noise for the policy, no delay."),
     ]
 
 

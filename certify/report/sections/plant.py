@@ -12,6 +12,7 @@ from certify.loop.expressions import Expression, Number, Symbol, nodes
 from certify.loop.plants import System, input_errors
 from certify.report.mathml import identifier, is_long, multiplied_out, typeset
 from certify.report.measured import Measured
+from certify.report.sampled import Sampled
 from certify.report.sections.shared import centre_in_words, read_in_words
 from certify.report.words import (
     above,
@@ -19,6 +20,7 @@ from certify.report.words import (
     below,
     held_at,
     is_free,
+    listed,
     number,
     pretty_unit,
     symbol,
@@ -54,9 +56,20 @@ def plant_of(certificate: AnyCertificate) -> dict[str, Any]:
         "uncertain": [q.words for q in varying_in(system)],
         "held": held_at(system),
         "data": data_of(system),
+        "stands": _stands_for(system),
         "listed": ", ".join(symbol(name) for name in system.ranges),
         "errors": [f"{symbol(u)} + {symbol(e)}" for u, e in input_errors(system).items()],
     }
+
+
+def _stands_for(system: System) -> str:
+    """The words of equations that stand for sampled functions; empty where there are none."""
+    sampled = Sampled.of(system)
+    if sampled is None:
+        return ""
+    own = listed([symbol(name) for f in sampled.functions for name in f["quantities"]])
+    which = "equation stands" if len(sampled.functions) == 1 else "equations stand"
+    return f"The {which} for {sampled.names}: whatever the function is, the two are the same for some values of {own}."
 
 
 def data_of(system: System) -> dict[str, str]:

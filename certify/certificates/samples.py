@@ -1,0 +1,93 @@
+"""Samples of unknown functions in a claim, and the evidence that equations stand for all these functions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import product
+from typing import Any
+
+from certify.errors import InputError
+from certify.loop.plants import Grid, Samples, Unknown
+
+Weights = tuple[tuple[int, Fraction], ...]
+"""Numbers of samples in the grid's order, the last axis fastest, and the weight of each."""
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """The quantities of an equation P + r E that stands for an unknown function.
+
+    Parameters
+    ----------
+    error : the name of r; None where E is 0.
+    slopes : names of the slopes at the origin of which P is made, one for each variable; none where P is of variables.
+    weights : of samples that bound each slope, from below and from above.
+    """
+
+    error: str | None
+    slopes: tuple[str, ...] = ()
+    weights: tuple[tuple[Weights, Weights], ...] = ()
+
+
+SampleBounds = tuple[Standing, ...]
+"""The equations' quantities for each of the functions, in their order."""
+
+
+def samples_claim(samples: Samples, bounds: SampleBounds) -> dict[str, Any]:
+    """The entry `samples` of a claim."""
+    each = zip(samples.unknowns, bounds, strict=True)
+    return {"sha256": samples.sha256, "functions": [_function(one, samples, bool(by.slopes)) for one, by in each]}
+
+
+def _function(one: Unknown, samples: Samples, vanishes: bool) -> dict[str, Any]:
+    grid = samples.grids[one.state]
+    return {
+        "state": one.state,
+        "variables": list(one.variables),
+        "curvature": list(map(_texts, one.curvature)),
+        "noise": str(samples.noise[one.state]),
+        "vanishes": vanishes,
+        "axes": list(map(_texts, grid.axes)),
+        "values": _texts([grid.values[z] for z in product(*grid.axes)]),
+    }
+
+
+def _texts(numbers: Sequence[Fraction]) -> list[str]:
+    return list(map(str, numbers))
+
+
+def samples_evidence(bounds: SampleBounds) -> list[dict[str, Any]]:
+    """The entry `samples` of the evidence."""
+    return [
+        {
+            "error": by.error,
+            "slopes": list(by.slopes),
+            "weights": [[[[k, str(v)] for k, v in weights] for weights in ends] for ends in by.weights],
+        }
+        for by in bounds
+    ]
+
+
+def read_samples(claim: Mapping[str, Any], evidence: Sequence[Mapping[str, Any]]) -> tuple[Samples, SampleBounds]:
+    """The samples of both entries, and what stands for the functions."""
+    unknowns, grids = list[Unknown](), dict[str, Grid]()
+    for f in claim["functions"]:
+        axes, values = tuple(map(_numbers, f["axes"])), _numbers(f["values"])
+        grids[f["state"]] = Grid(axes, dict(zip(product(*axes), values, strict=True)))
+        unknowns.append(Unknown(f["state"], tuple(f["variables"]), tuple(map(_numbers, f["curvature"]))))
+    noise = {f["state"]: Fraction(f["noise"]) for f in claim["functions"]}
+    bounds = tuple(Standing(e["error"], tuple(e["slopes"]), tuple(map(_ends, e["weights"]))) for e in evidence)
+    if len(bounds) != len(unknowns) or len(grids) != len(unknowns):
+        raise InputError("samples must have an entry of the evidence for each function, of different states.")
+    return Samples(str(claim["sha256"]), tuple(unknowns), noise, grids), bounds
+
+
+def _numbers(texts: Sequence[str]) -> tuple[Fraction, ...]:
+    return tuple(map(Fraction, texts))
+
+
+def _ends(stored: Sequence[Sequence[tuple[int, str]]]) -> tuple[Weights, Weights]:
+    lower, upper = (tuple((int(k), Fraction(v)) for k, v in weights) for weights in stored)
+    return lower, upper

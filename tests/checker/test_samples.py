@@ -1,0 +1,530 @@
+"""Rule `samples` in both checkers: true claims, forgeries of each part, bounds that just do not fit, true functions."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from functools import cache
+from itertools import pairwise, product
+from typing import Any
+
+import numpy as np
+import pytest
+
+from certify.checker import document
+from certify.checker.words import report
+from certify.reference.__main__ import in_words
+from certify.reference.document import read
+from tests.checker.test_handover import dumped, joined, nearby, verdicts
+from tests.checker.test_limits import counts
+from tests.checker.test_reference_data import true
+from tests.support.certificates import Document, edited, encode, grow, make
+from tests.support.earlier import newer
+from tests.support.marks import slow_after
+
+ACCEPTED = (None, None)
+F, BY = "claim.samples.functions.0", "evidence.samples.0"
+TINY = Fraction(1, 10**12)
+
+
+def texts(numbers: Sequence[Fraction | int]) -> list[str]:
+    return [str(Fraction(q)) for q in numbers]
+
+
+def with_samples(data: Document, functions: Sequence[Document], shown: Sequence[Document]) -> Document:
+    data = newer(data)
+    claim = {**data["claim"], "samples": {"sha256": "0" * 64, "functions": list(functions)}}
+    return {**data, "claim": claim, "evidence": {**data["evidence"], "samples": list(shown)}}
+
+
+def function(
+    state: str, variables: Sequence[str], M: Sequence[Sequence[Any]], noise: Any, vanishes: bool,
+    axes: Sequence[Sequence[Any]], g: Callable[..., Any],
+) -> Document:  # fmt: skip
+    """Samples of g."""
+    values = [g(*map(Fraction, z)) for z in product(*axes)]
+    return {
+        "state": state, "variables": list(variables), "curvature": [texts(row) for row in M], "noise": str(noise),
+        "vanishes": vanishes, "axes": [texts(axis) for axis in axes], "values": texts(values),
+    }  # fmt: skip
+
+
+ALONE = {"error": "r", "slopes": [], "weights": []}
+# Far: P = -x + u/2 + x^2/50, samples off by 1/50 in turn, M_xx = 1/10. On a cell of widths 1 and 2
+E_FAR = Fraction(1, 50) + Fraction(1, 100) + Fraction(1, 8) * (Fraction(1, 10) + Fraction(1, 25))
+X, U = range(-3, 4), (-1, 1)
+
+
+def term(E: Any) -> list[Any]:
+    return ["*", "r", str(E)] if isinstance(E, Fraction) else ["*", "r", E]
+
+
+def equation(E: Any = E_FAR) -> list[Any]:
+    return ["+", ["-", "x"], ["*", "1/2", "u"], ["*", "1/50", ["**", "x", 2]], term(E)]
+
+
+@cache
+def far() -> Document:
+    """x' = g(x, u), of which V = x^2 falls until |x| = 1/5."""
+    data = make([equation()], [([[1.0]], [0.0])], [[1.0]], (0.04, 1.0), claim="practical", uncertain=[("r", "-1", "1")],
+                cells=[1], centre="none")  # fmt: skip
+    turn = iter([1, -1] * 99)
+    f = function("x", ("x", "u"), [["1/10", "1/50"], ["1/50", 0]], "1/100", False, [X, U],
+                 lambda x, u: -x + u / 2 + x**2 / 50 + Fraction(next(turn), 50))  # fmt: skip
+    return with_samples(grow(data), [f], [ALONE])
+
+
+NEAR_X, NEAR_U = [-3, Fraction(-1, 10), 0, Fraction(1, 10), 3], [-1, Fraction(-1, 10), 0, Fraction(1, 10), 1]
+K = Fraction(1, 10) + Fraction(1, 300), Fraction(8, 100)  # (M s)_j / (2 s_j), s = (3, 1)
+
+
+def linear(k: tuple[Fraction, Fraction] = K) -> list[Any]:
+    E = ["+", *(["*", str(q), ["**", z, 2]] for q, z in zip(k, "xu", strict=True))]
+    return ["+", ["*", "a", "x"], ["*", "b", "u"], ["*", "r", E]]
+
+
+@cache
+def near() -> Document:
+    """x' = g(x, u) with g(0) = 0, whose slopes are within 1/50 and 3/200 of -1 and 1/2."""
+    a, b = (-1, Fraction(1, 50)), (Fraction(1, 2), Fraction(3, 200))
+    ranges = [(name, str(m - e), str(m + e)) for name, (m, e) in zip("ab", (a, b), strict=True)]
+    data = make([linear()], [([[1.0]], [0.0])], [[1.0]], (0.1, 1.0), uncertain=[*ranges, ("r", "-1", "1")],
+                cells=[1, 1, 1], centre="none")  # fmt: skip
+    f = function("x", ("x", "u"), [["1/5", "1/50"], ["1/50", "1/10"]], "1/1000", True, [NEAR_X, NEAR_U],
+                 lambda x, u: -x + u / 2)  # fmt: skip
+    both = [[[7, "-5"], [17, "5"]], [[11, "-5"], [13, "5"]]]  # from (-1/10, 0) and (1/10, 0), (0, -1/10) and (0, 1/10)
+    shown = {"error": "r", "slopes": ["a", "b"], "weights": [[each, each] for each in both]}
+    return with_samples(grow(data), [f], [shown])
+
+
+@cache
+def aslant() -> Document:
+    """The same, with weights of (1/10, 1/10) and (-1/10, 1/10) for the slope in x, which leave 27/1000."""
+    data = edited(near(), f"{BY}.weights.0", [[[8, "-5"], [18, "5"]]] * 2)
+    return edited(data, "plant.uncertain.0.range", texts([-1 - Fraction(27, 1000), -1 + Fraction(27, 1000)]))
+
+
+@cache
+def two() -> Document:
+    """x' = g(x), y' = h(y), samples of straight lines."""
+    names = (("r", "x"), ("q", "y"))
+    data = make([["+", ["-", z], ["*", r, "1/10"]] for r, z in names], [([[1.0, 0.0]], [0.0])], np.eye(2), (0.25, 1.0),
+                states=("x", "y"), domain=[("-3", "3")] * 2, claim="practical", cells=[1, 1],
+                uncertain=[("r", "-1", "1"), ("q", "-1", "1")])  # fmt: skip
+    functions = [function(z, (z,), [["1/2"]], "1/40", False, [[-3, -2, -1, 0, 1, 2, 3]], lambda v: -v) for z in "xy"]
+    return with_samples(grow(data), functions, [{**ALONE, "error": r} for r, _ in names])
+
+
+TRUE = {"far": far, "near": near, "aslant": aslant, "two": two, "composed": lambda: joined(far(), near())}
+
+
+@pytest.mark.parametrize("name", TRUE)
+def test_a_true_claim(name: str) -> None:
+    assert verdicts(TRUE[name]()) == ACCEPTED
+
+
+@pytest.mark.parametrize("more", [["**", "x", 2], ["*", ["**", "x", 2], ["**", "u", 2]], ["**", "u", 4]])
+def test_a_bound_may_grow_with_the_state(more: list[Any]) -> None:
+    data = edited(far(), "plant.dynamics.0", equation(["+", str(E_FAR), ["*", "1/1000", more]]))
+    assert verdicts(data) == ACCEPTED
+
+
+def plus(by: Any) -> Callable[[str], str]:
+    return lambda text: str(Fraction(text) + Fraction(by))
+
+
+def dropped(k: int) -> Callable[[Document], Document]:
+    """A coarser grid: without one value of the first axis and its samples."""
+
+    def edit(f: Document) -> Document:
+        rows = len(f["values"]) // len(f["axes"][0])
+        values = [y for j, y in enumerate(f["values"]) if j // rows != k]
+        axis = [z for j, z in enumerate(f["axes"][0]) if j != k]
+        return {**f, "axes": [axis, *f["axes"][1:]], "values": values}
+
+    return edit
+
+
+def coarser(data: Document, k: int) -> Document:
+    return edited(data, F, dropped(k))
+
+
+def alone(z: str, axis: Sequence[int]) -> Callable[[Document], Document]:
+    """A function of one variable, with samples that are 0."""
+    own = {"variables": [z], "curvature": [["1/10"]], "axes": [texts(axis)], "values": texts([0] * len(axis))}
+    return lambda f: {**f, **own}
+
+
+def of_far() -> dict[str, list[Document]]:
+    """Kinds of forgeries, with the values of each."""
+    data, n = far(), len(far()["claim"]["samples"]["functions"][0]["values"])
+    e = lambda path, *values: [edited(data, path, v) for v in values]  # noqa: E731
+    return {
+        "a sampled value": [edited(data, f"{F}.values.{k}", plus(d)) for k in range(n) for d in ("1/20", "-1/20", 3)],
+        "a sampled value, by little": [
+            edited(data, f"{F}.values.{k}", plus(TINY * (-1) ** k)) for k in range(n)
+        ],
+        "noise": e(f"{F}.noise", *(plus(d) for d in (TINY, "1/1000", 1))),
+        "negative noise": e(f"{F}.noise", "-1/100", "-1"),
+        "noise of another kind": e(f"{F}.noise", "0.01", 0, None, ["1/100"], "1/0", "01/100"),
+        "curvature": e(f"{F}.curvature.0.0", *(plus(d) for d in (TINY, "1/1000", 5))),
+        "curvature along the other axis": e(f"{F}.curvature.1.1", str(TINY), "1/10"),
+        "curvature that is not symmetric": e(f"{F}.curvature.0.1", "0", "1/49"),
+        "negative curvature": e(f"{F}.curvature", [["-1/10", "1/50"], ["1/50", "0"]], [["1/10", "-1"], ["-1", "0"]]),
+        "curvature of another shape": e(f"{F}.curvature", [["1/10"]], [["1/10", "1/50"]], [], [["1/10", "1/50"]] * 3),
+        "a coarser grid": [coarser(data, k) for k in range(1, 6)],
+        "a grid that ends early": [coarser(data, k) for k in (0, 6)],
+        "a missing row": e(f"{F}.values", lambda v: v[1:], lambda v: v[:-1], lambda v: v[:5] + v[6:]),
+        "a row too many": e(f"{F}.values", lambda v: [*v, v[-1]], lambda v: [v[0], *v]),
+        "no samples": e(f"{F}.values", []),
+        "a hole in the axis": e(f"{F}.axes.0", texts([-3, -2, -1, 1, 2, 3]), texts([-3, -2, -1, 0, 0, 2, 3])),
+        "an axis out of order": e(f"{F}.axes.0", texts([-3, -1, -2, 0, 1, 2, 3]), texts(range(3, -4, -1))),
+        "a step of the grid": e(f"{F}.axes.0.3", "1/10", "-1/1000", "1/2"),
+        "the end of the grid": e(f"{F}.axes.0.0", "-299/100", "-4") + e(f"{F}.axes.1.1", "99/100", "2"),
+        "an axis of one value": e(f"{F}.axes.1", ["0"], [], ["-1"]),
+        "a domain beyond": e("plant.domain.0", ["-3", "301/100"], ["-31/10", "3"], ["-3", "100"]),
+        "input bounds beyond": e("plant.input_bounds.0", ["-1", "101/100"], ["-3", "1"], ["-1", "10"]),
+        "swapped axes": e(f"{F}.axes", lambda a: a[::-1]) + e(f"{F}.variables", ["u", "x"]),
+        "swapped samples": e(f"{F}.values", lambda v: [*v[7:], *v[:7]], lambda v: v[::-1], sorted),
+        "a bound that is too small": [
+            edited(data, "plant.dynamics.0", equation(E_FAR - d)) for d in (TINY, Fraction(1, 1000), E_FAR)
+        ],
+        "a bound that is too small somewhere": [
+            edited(data, "plant.dynamics.0", equation(["+", str(E_FAR - d), ["*", "1/1000", more]]))
+            for d in (TINY, Fraction(1, 10000))
+            for more in (["**", "x", 2], ["**", "u", 2], ["*", ["**", "x", 2], ["**", "u", 2]], "x",
+                         ["-", ["**", "u", 3]], ["*", "x", "u"])
+        ],
+        "a bound that is 0 somewhere": [
+            edited(data, "plant.dynamics.0", equation(["*", "r", E])) for E in (["**", "x", 2], "x", ["*", "x", "u"])
+        ],
+        "another polynomial": [
+            edited(data, "plant.dynamics.0", lambda tree, k=k, v=v: [*tree[:k], v, *tree[k + 1 :]])
+            for k, v in ((1, ["-", ["*", "x", "1001/1000"]]), (2, ["*", "51/100", "u"]), (3, "0"),
+                         (3, ["*", "1/50", ["**", "x", 3]]), (2, "0"))
+        ],
+        "no polynomial": [
+            edited(data, "plant.dynamics.0", lambda tree, v=v: [*tree, v])
+            for v in (["sin", ["*", "x", "1/100000"]], ["/", "x", ["+", "2", "x"]], ["abs", "x"],
+                      ["*", "0", ["sin", "x"]], ["*", "r", "r", "1/1000"], ["*", "1/1000000", ["**", "x", 21]],
+                      ["*", "r", "r", "1/1000", ["**", "x", 2]])
+        ],
+        "a range of the error": e("plant.uncertain.0.range", ["-1", "999/1000"], ["-9/10", "1"], ["0", "1"]),
+        "no error": e(f"{BY}.error", None),
+        "an error that is none": e(f"{BY}.error", "x", "u", "q", 0, [], "R"),
+        "slopes of what need not vanish": [
+            edited(edited(data, f"{BY}.slopes", s), f"{BY}.weights", w)
+            for s, w in ((["r", "r"], [[[[0, "1"]]] * 2] * 2), (["r"], [[[[0, "1"]]] * 2]))
+        ],
+        "weights without slopes": e(f"{BY}.weights", [[[[0, "1"]], [[0, "1"]]]], None),
+        "what vanishes": e(f"{F}.vanishes", None, 1, 0, "true", "false", []),
+        "another state": e(f"{F}.state", "y", "u", "r", 0, None),
+        "other variables": e(f"{F}.variables", ["x", "x"], ["x", "r"], ["x", "y"], [], ["x"], ["x", "u", "u"], "xu"),
+        "a variable less": [edited(data, F, alone(z, a)) for z, a in (("x", X), ("u", U))],
+        "a function twice": [
+            edited(edited(data, "claim.samples.functions", lambda f: f * 2), "evidence.samples", lambda s: s * 2)
+        ],
+        "no function": e("claim.samples.functions", [], None, {}),
+        "evidence of another": e("evidence.samples", [], lambda s: s * 2, None, {}),
+        "long numbers": e(f"{F}.noise", f"1/{2**128}") + e(f"{F}.axes.0.0", f"-{2**128}") + e(
+            f"{F}.values.0", f"{3**90}/{2**140}") + e(f"{F}.curvature.0.0", str(2**128)),
+        "a hash that is none": e("claim.samples.sha256", "0" * 63, "G" * 64, "A" * 64, 0, None, ""),
+        "other keys": e(F, lambda f: {**f, "more": 1}, lambda f: {k: v for k, v in f.items() if k != "noise"})
+        + e(BY, lambda f: {**f, "more": 1}) + e("claim.samples", lambda s: {**s, "file": "x"}),
+        "one section alone": [
+            {**data, part: {k: v for k, v in data[part].items() if k != "samples"}} for part in ("claim", "evidence")
+        ],
+        "an origin of the policy": e("policy.origin", encode([0.125]), encode([-1e-9])),
+        "a claim that may have none": e("claim.kind", "nearby", "asymptotic"),
+    }  # fmt: skip
+
+
+def of_near() -> dict[str, list[Document]]:
+    data = near()
+    e = lambda path, *values: [edited(data, path, v) for v in values]  # noqa: E731
+    ends = [(k, side) for k in (0, 1) for side in (0, 1)]
+    return {
+        "a range of a slope": [
+            edited(data, f"plant.uncertain.{k}.range.{side}", plus((1 - 2 * side) * d))
+            for k, side in ends
+            for d in (TINY, Fraction(1, 1000), Fraction(1, 100))
+        ],
+        "a sampled value that a slope rests on": [
+            edited(data, f"{F}.values.{k}", plus(d)) for k in (7, 17, 11, 13) for d in (TINY, -TINY, 1)
+        ],
+        "noise": e(f"{F}.noise", *(plus(d) for d in (TINY, 1))),
+        "curvature": e(f"{F}.curvature.0.0", *(plus(d) for d in (TINY, 1)))
+        + e(f"{F}.curvature.1.1", *(plus(d) for d in (TINY, 1))),
+        "mixed curvature": e(f"{F}.curvature", [["1/5", "1/49"], ["1/49", "1/10"]], [["1/5", "1"], ["1", "1/10"]]),
+        "weights": [
+            edited(data, f"{BY}.weights.{k}.{side}.0.1", v) for k, side in ends for v in ("-4", "0", "5", "-5001/1000")
+        ],
+        "other samples": [
+            edited(data, f"{BY}.weights.{k}.{side}.0.0", v) for k, side in ends for v in (0, 6, 12, 24, 8)
+        ],
+        "samples that are none": [
+            edited(data, f"{BY}.weights.{k}.{side}.0.0", v) for k, side in ends for v in (25, -1, True, "7", None, 7.0)
+        ],
+        "weights of the other slope": e(f"{BY}.weights", lambda w: w[::-1]),
+        "lists of weights": e(f"{BY}.weights.0", [], [[[7, "-5"], [17, "5"]]], None)
+        + [edited(data, f"{BY}.weights.{k}.{side}", [[12, "0"]]) for k, side in ends]
+        + e(f"{BY}.weights.0.0", [], [[7, "-5", "5"]], [[7]], [[7, "0"]] * 65),
+        "slopes in another order": e(f"{BY}.slopes", ["b", "a"], ["a"], ["a", "a"], ["a", "r"], []),
+        "what need not vanish": e(f"{F}.vanishes", False),
+        "a bound that is too small": [
+            edited(data, "plant.dynamics.0", linear(k))
+            for k in ((K[0] - TINY, K[1]), (K[0], K[1] - TINY), (K[0], Fraction(0)), (Fraction(0), K[1]))
+        ],
+        "a bound of another form": [
+            edited(data, "plant.dynamics.0", lambda tree, v=v: [*tree, ["*", "r", v]])
+            for v in (["*", "x", "u"], "x", "1/1000", ["**", "x", 4], "-1")
+        ],
+        "another linear part": [
+            edited(data, "plant.dynamics.0", lambda tree, v=v: [*tree, v])
+            for v in (["*", "a", "x"], "x", ["*", "a", "u"], ["*", "r", "a", ["**", "x", 2]],
+                      ["*", "1/1000", ["**", "x", 2]], ["*", "a", "b", "x"])
+        ],
+        "a wider domain": e("plant.domain.0", ["-301/100", "3"], ["-3", "4"]),
+        "wider input bounds": e("plant.input_bounds.0", ["-1", "11/10"]),
+    }  # fmt: skip
+
+
+def of_aslant() -> dict[str, list[Document]]:
+    data = aslant()
+    return {
+        "a range of a slope": [
+            edited(data, f"plant.uncertain.0.range.{side}", plus((1 - 2 * side) * d))
+            for side in (0, 1) for d in (TINY, Fraction(1, 1000), Fraction(1, 5000))
+        ],
+        "mixed curvature": [
+            edited(data, f"{F}.curvature", [["1/5", q], [q, "1/10"]]) for q in ("201/10000", "-1/50", "1/10")
+        ],
+    }  # fmt: skip
+
+
+def of_two() -> dict[str, list[Document]]:
+    data = two()
+    e = lambda path, *values: [edited(data, path, v) for v in values]  # noqa: E731
+    return {
+        "an error in another equation": e(
+            "plant.dynamics.1", *([*["+", ["-", "y"]], ["*", "q", "1/10"], ["*", "r", w]] for w in ("1/1000", "0"))
+        ) + e("plant.dynamics.0", ["+", ["-", "x"], ["*", "r", "1/10"], ["*", "1/1000", "q"]]),
+        "a name that is none of the function's": e(
+            "plant.dynamics.0", *(["+", ["-", "x"], ["*", "r", "1/10"], ["*", "1/1000", z]] for z in "yu")
+        ) + e("plant.dynamics.0", ["+", ["-", "x"], ["*", "r", "1/10", ["+", "1", ["*", "1/1000", "y"]]]]),
+        "one error for both": [
+            edited(e("evidence.samples.1.error", "r")[0], "plant.dynamics.1", ["+", ["-", "y"], ["*", "r", "1/10"]])
+        ],
+        "functions in another order": e("claim.samples.functions", lambda f: f[::-1]) + e(
+            "evidence.samples", lambda s: s[::-1]),
+        "another variable": e("claim.samples.functions.0.variables", ["y"], ["u"]),
+        "a sampled state in another equation": e("plant.dynamics.1", ["+", ["-", "y"], ["*", "q", "1/10"], "x"]),
+    }  # fmt: skip
+
+
+FORGED = {"far": of_far, "near": of_near, "aslant": of_aslant, "two": of_two}
+BY_FORM = ("samples that are none", "what vanishes", "long numbers", "no function")
+
+
+def odd() -> dict[str, Document]:
+    """True claims with sections that no certificate may have, though what they say would follow."""
+    claims, same = "claim.samples.functions", edited(two(), "plant.dynamics.1", ["-", "y"])
+    same = edited(same, f"{claims}.1", lambda _: two()["claim"]["samples"]["functions"][0])
+    once = edited(two(), f"{F}.axes.0", lambda axis: [*axis[:3], *axis[2:]])
+    data = newer(true("scalar"))
+    straight = function("x", ("x", "u"), [[0, 0], [0, 0]], 0, False, [X, U], lambda x, u: x / 4 + u)
+    nearly = newer(nearby()["then"])
+    constant = function("x", ("x", "u"), [[0, 0], [0, 0]], 0, False, [X, U], lambda x, u: u / 2 - x)
+    exact = edited(
+        edited(edited(two(), "plant.uncertain", []), "evidence.cells", []), "plant.dynamics", [["-", "x"], "0"]
+    )
+    exact = edited(exact, "evidence.samples", [{**ALONE, "error": None}] * 2)
+    return {
+        "no name, of no quantities": edited(exact, "evidence.samples.0.error", ""),
+        "no name": edited(two(), "evidence.samples.0.error", ""),
+        "a state twice": edited(same, "evidence.samples.1", {**ALONE, "error": "q"}),
+        "a quantity that stands for two": edited(two(), "evidence.samples.1.error", "r"),
+        "an axis with a number twice": edited(once, f"{F}.values", lambda v: [*v[:3], *v[2:]]),
+        "data": with_samples(data, [straight], [{**ALONE, "error": None}]),
+        "nearby": with_samples(nearly, [constant], [{**ALONE, "error": None}]),
+    }
+
+
+@pytest.mark.parametrize("kind", odd())
+def test_sections_that_no_certificate_may_have(kind: str) -> None:
+    assert verdicts(odd()[kind]) == ("format", "format")
+
+
+@pytest.mark.parametrize(("name", "kind"), [(name, kind) for name, of in FORGED.items() for kind in of()])
+def test_forgeries_are_refused_by_both(name: str, kind: str) -> None:
+    forged = FORGED[name]()[kind]
+    assert forged
+    for number, data in enumerate(forged):
+        found = verdicts(data)
+        assert None not in found, f"{kind} {number}: {found}"
+        assert kind not in BY_FORM or found == ("format", "format")
+
+
+SMALL = f"1/{10**40}"
+LARGE = {
+    "degree": [["*", SMALL, ["**", "x", 21]]],
+    "terms": [["*", SMALL, ["**", "x", i], ["**", "u", j]] for i in range(1, 12) for j in range(1, 12)],
+    "bits": [["*", f"1/{3**324}", "x"]],
+    "parts": [["*", SMALL, ["**", "x", 20], ["**", "u", k]] for k in range(1, 20)],
+    "on the way": [["*", SMALL, ["**", ["+", "x", "u", "1"], 20]]],
+    "pairs": [
+        [
+            "*",
+            SMALL,
+            ["+", *[["**", "x", i] for i in range(1, 13)], *[["**", "u", i] for i in range(1, 21)], "1"],
+            [
+                "+",
+                *[["**", "x", i] for i in range(1, 8)],
+                *[["**", "u", i] for i in range(1, 21)],
+                *[["*", "x", ["**", "u", i]] for i in range(1, 6)],
+            ],
+            "0",
+        ]
+    ],
+    "on the way, to nothing": [["**", "x", 21], ["-", ["**", "x", 21]]],
+}
+
+
+@pytest.mark.parametrize("kind", LARGE)
+def test_polynomials_that_are_too_large(kind: str) -> None:
+    """They change nothing that counts, and fewer of the same are accepted."""
+    data = edited(far(), "plant.dynamics.0", [*equation(E_FAR + Fraction(1, 1000)), *LARGE[kind]])
+    assert verdicts(data) == ("samples", "samples")
+    fewer = [["*", SMALL, ["**", "x", 20]], ["*", SMALL, "x", "u"], ["*", f"1/{3**300}", "x"]]
+    assert verdicts(edited(data, "plant.dynamics.0", [*equation(E_FAR + Fraction(1, 1000)), *fewer])) == ACCEPTED
+
+
+def test_there_are_many_kinds() -> None:
+    kinds = [forged for of in FORGED.values() for forged in of().values()]
+    assert len(kinds) >= 60 and sum(map(len, kinds)) >= 250
+
+
+# ------------------------------------------------------------------------------------------------------ just inside
+
+
+def one(M: Fraction, step: Fraction, noise: Fraction, E: Fraction, off: Fraction = Fraction(0)) -> Document:
+    """x' = -x + r E, samples -x + off at the multiples of a step."""
+    data = edited(two(), "plant.dynamics.0", ["+", ["-", "x"], ["*", "r", str(E)]])
+    axis = [k * step for k in range(int(-3 / step), int(3 / step) + 1)]
+    f = function("x", ("x",), [[M]], noise, False, [axis], lambda v: -v + off)
+    return edited(data, "claim.samples.functions.0", f)
+
+
+def is_shown(data: Document) -> bool:
+    """True if the rule holds in both programs, False if in neither."""
+    found = {rule == "samples" for rule in verdicts(data)}
+    assert len(found) == 1
+    return not found.pop()
+
+
+@pytest.mark.parametrize("M", [Fraction(0), Fraction(1, 3), Fraction(2), Fraction(10**6)])
+@pytest.mark.parametrize("step", [Fraction(1), Fraction(3, 7), Fraction(1, 20)])
+@pytest.mark.parametrize("noise", [Fraction(0), Fraction(1, 10)])
+def test_a_bump_between_two_samples_is_what_is_allowed(M: Fraction, step: Fraction, noise: Fraction) -> None:
+    """-x + noise + M/2 v (step - v) on each cell, v from its lower end, reaches the bound in the middle of the cell: so
+    no smaller one is true, and with a little more curvature the same function is outside."""
+    top = noise + M / 2 * (step / 2) * (step / 2)
+    assert is_shown(one(M, step, noise, top))
+    for less in (TINY, top / 100, top):
+        assert less == 0 or not is_shown(one(M, step, noise, top - less))
+    assert not is_shown(one(M + TINY, step, noise, top)) and not is_shown(one(M, step, noise + TINY, top))
+    assert not is_shown(one(M, step, noise, top, off=TINY)) and not is_shown(one(M, step, noise, top, off=-TINY))
+
+
+class Random:
+    """g = p + sum_k c_k cos(w_k.z + s_k) of d variables, sampled on a grid, beside a polynomial P near p."""
+
+    def __init__(self, seed: int) -> None:
+        draw = self.draw = np.random.default_rng(seed)
+        self.d = int(draw.integers(1, 4))
+        self.names = ("x", "y", "u")[: self.d]
+        self.c, self.w, self.s = draw.normal(size=2), draw.normal(size=(2, self.d)), draw.uniform(0, 6, 2)
+        self.powers = [tuple(draw.integers(0, 4, self.d).tolist()) for _ in range(4)]
+        self.P = [Fraction(int(draw.integers(-99, 99)), 100) for _ in self.powers]
+        self.axes = [self.axis(-3, 3) if name != "u" else self.axis(-1, 1) for name in self.names]
+
+    def axis(self, lo: int, hi: int) -> list[Fraction]:
+        inner = {Fraction(int(v), 100) for v in self.draw.integers(100 * lo + 1, 100 * hi, self.draw.integers(0, 4))}
+        return sorted({Fraction(lo), Fraction(hi)} | inner)
+
+    def value(self, z: np.ndarray) -> np.ndarray:
+        return np.cos(z @ self.w.T + self.s) @ self.c + self.polynomial(z)
+
+    def polynomial(self, z: np.ndarray) -> np.ndarray:
+        each = zip(self.P, self.powers, strict=True)
+        return sum(float(q) * np.prod(z ** np.array(k), axis=-1) for q, k in each)
+
+    @property
+    def curvature(self) -> list[list[Fraction]]:
+        """A bound, of the cosines by their sizes, of the polynomial by those of its terms on the box."""
+        reach = [float(max(abs(axis[0]), abs(axis[-1]))) for axis in self.axes]
+        M = np.einsum("k,ki,kj->ij", np.abs(self.c), np.abs(self.w), np.abs(self.w))
+        for q, k in zip(self.P, self.powers, strict=True):
+            for i, j in product(range(self.d), repeat=2):
+                left, factor = list(k), abs(float(q))
+                for axis in (i, j):
+                    factor *= left[axis]
+                    left[axis] = max(left[axis] - 1, 0)
+                M[i, j] += factor * np.prod([v**e for v, e in zip(reach, left, strict=True)])
+        return [[Fraction(int(max(M[i, j], M[j, i]) * 1e6) + 1, 10**6) for j in range(self.d)] for i in range(self.d)]
+
+    def document(self, E: Fraction) -> Document:
+        terms = [["*", str(q), *(["**", z, e] for z, e in zip(self.names, k, strict=True) if e)]
+                 for q, k in zip(self.P, self.powers, strict=True)]  # fmt: skip
+        data = edited(two(), "plant.dynamics.0", ["+", *terms, ["*", "r", str(E)]])
+        points = np.array([[float(v) for v in z] for z in product(*self.axes)])
+        wrong = self.draw.choice([-0.0099, 0.0099], len(points))
+        values = [Fraction(f"{y:.12f}") for y in self.value(points) + wrong]
+        f = {
+            **function("x", self.names, self.curvature, "1/100", False, self.axes, lambda *_: 0),
+            "values": texts(values),
+        }
+        return edited(data, "claim.samples.functions.0", f)
+
+
+@pytest.mark.parametrize("seed", slow_after(12, range(200)))
+def test_true_functions_are_within_the_least_bound(seed: int) -> None:
+    """The least E that both programs accept holds g - P at drawn points and in cells' middles; the two agree on it."""
+    g, lo, hi = Random(seed), Fraction(0), Fraction(10**8)
+    data = g.document(hi)
+
+    def shown(E: Fraction) -> bool:
+        return is_shown(edited(data, "plant.dynamics.0", lambda tree: [*tree[:-1], ["*", "r", str(E)]]))
+
+    assert shown(hi)
+    while hi - lo > hi / 1000:
+        middle = (lo + hi) / 2
+        lo, hi = (lo, middle) if shown(middle) else (middle, hi)
+    ends = np.array([[float(axis[0]), float(axis[-1])] for axis in g.axes])
+    drawn = g.draw.uniform(ends[:, 0], ends[:, 1], (500, g.d))
+    middles = np.array(list(product(*([float(a + b) / 2 for a, b in pairwise(axis)] for axis in g.axes))))
+    for z in (drawn, middles):
+        assert np.abs(g.value(z) - g.polynomial(z)).max() <= float(hi)
+
+
+# ------------------------------------------------------------------------------------------------- words and numbers
+
+
+def test_the_words() -> None:
+    c = document.certificate(json.loads(dumped(near())), "0" * 64)
+    said = "\n".join(report(c, {"result": "ACCEPTED", "rules": {}, "margins": {}, "modules": []}))
+    assert "for every plant in which x' is instead a function of x, u with continuous second derivatives" in said
+    assert "within 1/1000 (about 0.001) of 25 samples at the points of a grid there, and is 0 at 0" in said
+    assert "of other functions nothing is claimed" in said
+    words = in_words(read(dumped(near())))
+    assert "values within 1/1000 of the 25 that the certificate states, is 0 at 0" in words
+    assert "is 0 at 0" not in in_words(read(dumped(far())))
+
+
+@pytest.mark.parametrize("name", ["far", "near", "two"])
+def test_both_programs_count_the_same(name: str, tmp_path: Any) -> None:
+    data = TRUE[name]()
+    plain = {part: {k: v for k, v in data[part].items() if k != "samples"} for part in ("claim", "evidence")}
+    less, more = counts({**data, **plain}, tmp_path), counts(data, tmp_path)
+    assert less[0] == more[0] and less[1] < more[1]
