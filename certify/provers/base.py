@@ -20,6 +20,8 @@ from certify.provers.falsify import Witness
 
 FEW = 3
 """States, up to which a tree of boxes may carry a practical claim without a ball."""
+MANY = 6
+"""States, beyond which boxes add next to nothing to a ball."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,6 +29,7 @@ from certify.lyapunov.function import Quadratic
 from certify.provers.ball.decrease import Corner, Multipliers, best_at, corners_of, rests_of
 from certify.provers.ball.local import Rule, ball_around, prove_local
 from certify.provers.ball.models import Models, Paths, paths
+from certify.provers.base import MANY
 
 if TYPE_CHECKING:
     import cvxpy
@@ -79,12 +80,12 @@ def robust_candidate(loop: ClosedLoop, effort: Effort = UNLIMITED) -> Array:
         raise NoCandidateError(
             "the local rule proves nothing with the candidates that solve a Lyapunov equation", effort
         )
-    best, before = max(proved, key=_log_volume), -math.inf
-    while _log_volume(best) > before + _WORTH and not effort.over:
+    best = max(proved, key=_log_volume)
+    while True:
         before = _log_volume(best)
-        for quick in (True, False):
-            best = _climbed(known, best, effort, quick)
-    return best
+        best = max((_climbed(known, best, effort, quick) for quick in (True, False)), key=_log_volume)
+        if loop.system.n <= MANY or effort.over or _log_volume(best) <= before + _WORTH:
+            return best  # boxes add to a ball in few states, and a climb for its sake alone may cost what they add
 
 
 def solve(problem: cvxpy.Problem) -> bool:
@@ -104,8 +105,8 @@ def solve(problem: cvxpy.Problem) -> bool:
 
 def _climbed(known: Paths, best: Array, effort: Effort, quick: bool) -> Array:
     """From {x'Px <= 1}, P = `best`, on, as far as steps gain and the effort allows; `quick`: with old derivatives as
-    long as what they foretell comes, and levels about those that were asked for. Where one way
-    ends the other may go on."""
+    long as what they foretell comes, and levels about those that were asked for. Either way may end far below the
+    other, and go on from where that ended."""
     trust, about, fresh = _TRUST, None, True
     while trust > _LEAST_TRUST and not effort.over:
         if about is None:

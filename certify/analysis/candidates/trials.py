@@ -31,7 +31,7 @@ from certify.lyapunov import (
 )
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.optimised import FIRM
-from certify.provers.base import FEW, Task
+from certify.provers.base import FEW, MANY, Task
 from certify.provers.falsify import Witness, falsify, survey, touch
 
 Array = NDArray[np.float64]
@@ -41,7 +41,6 @@ _BELOW_WITNESS = 1e-3
 _NEXT_TO = 1e-6  # share of a level: violations below it are next to the equilibrium
 _SMALLEST = 1e-120  # the least level: squares of states and products of bounds must not underflow
 _BLENDS = (0.05, 0.15, 0.3)
-MANY = 6  # states, beyond which there is next to nothing but the local set
 _BOXES_SUFFICE = 0.1  # share of a volume within reach
 _MORE = 10.0  # boxes to be economical for, relative to those there are, from where a ball shows much: as much or more
 OPTIMISING = 0.2  # share of the effort that the optimised candidate may take

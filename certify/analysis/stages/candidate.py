@@ -16,7 +16,6 @@ from certify.analysis.candidates.economical import is_forecast
 from certify.analysis.candidates.robust import NoCandidateError
 from certify.analysis.candidates.trials import (
     FOR_PEAK,
-    MANY,
     OPTIMISING,
     SAMPLING,
     Trial,
@@ -48,7 +47,7 @@ from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov import volume
 from certify.lyapunov.optimised import DECAYS, FURTHER
-from certify.provers.base import FEW, Attempt, Budget
+from certify.provers.base import FEW, MANY, Attempt, Budget
 from certify.provers.boxes.rule import operations_of_box
 from certify.provers.falsify import Witness
 
