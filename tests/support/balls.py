@@ -37,7 +37,7 @@ def with_ball(data: Document) -> Document:
 
 def is_bearable_on_a_ball(network: Network, operations: int, n: int) -> bool:
     """True if rule `limits` takes the numbers of a certificate of a ball alone, of which these sizes are known."""
-    none = dict.fromkeys(("sample", "keep", "target", "outer", "ranks", "data", "tube", "contraction"))
+    none = dict.fromkeys(("sample", "keep", "target", "outer", "ranks", "data", "samples", "tube", "contraction"))
     local = LocalBall(np.eye(n), ((), (), ()), np.eye(n), 0.0, 1)
     c = SimpleNamespace(
         **none,
