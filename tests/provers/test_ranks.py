@@ -25,7 +25,7 @@ from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
 from certify.provers.bounds import Taylor
 from certify.provers.execution import Runner, ThreadRunner, rows
-from certify.provers.ranks import Question, RankProof, Sublevel, prove_ranks, root_box, without_leaf
+from certify.provers.ranks import Question, RankProof, Sublevel, prove_ranks, root_box, with_frame, without_leaf
 from certify.provers.ranks.cover import Cover
 from certify.provers.ranks.images import Course, Form
 from certify.provers.ranks.search import COUNTS
@@ -179,6 +179,36 @@ def test_errors_in_a_frame_that_is_nearly_singular_are_not_less_than_they_are(se
     assert np.all(
         found >= [sum(abs(int(v.p) / int(v.q)) * b for v, b in zip(row, bound, strict=True)) for row in exact]
     )
+
+
+def steep(rate: int, period: Fraction) -> Question:
+    """x' = y, y' = rate x + u with u = 200 tanh(-5 x - 3/10 y) held over a period."""
+    x, y, u = symbols("x y u")
+    system = System(
+        name="steep",
+        states=(x, y),
+        inputs=(u,),
+        parameters={},
+        dynamics=(y, rate * x + u),
+        u_eq=(Number(0),),
+        domain=box(2, 2),
+        input_bounds=box(10**9),
+        sample=(period, period),
+    )
+    weights, zeros = (np.array([[-5.0, -0.3]]), np.full((1, 1), 200.0)), np.zeros(1)
+    network = PolicyNetwork.of_layers(weights, (zeros, zeros), np.ones(1), zeros, "identity", "none")
+    return question((system, network), 0.01)
+
+
+def test_a_frame_is_taken_where_images_are_narrower_in_it() -> None:
+    """A steep loop's errors grow in the states' own coordinates; a step whose map overflows has no other ones."""
+    probes = np.random.default_rng(0).uniform(-1, 1, (2, 30))
+    found = with_frame(steep(0, Fraction(1, 40)), probes / 10)
+    assert found.frame is not None
+    M = np.eye(2) + found.loop.step * found.loop.mean_rate()
+    turned = found.frame @ M @ np.linalg.inv(found.frame)
+    assert max(np.abs(np.linalg.eigvals(np.abs(M)))) > 0.99 > 0.6 > max(np.abs(np.linalg.eigvals(np.abs(turned))))
+    assert with_frame(steep(10**6, Fraction(5)), probes).frame is None
 
 
 def held(f: Any, x: np.ndarray, u: np.ndarray, h: np.ndarray, steps: int = 50) -> np.ndarray:

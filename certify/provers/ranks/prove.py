@@ -87,7 +87,7 @@ def with_frame(question: Question, x: Array) -> Question:
     reach = _SMALL * (question.root[1] - question.root[0])[:, None]
 
     def widths(asked: Question) -> float:
-        found = asked.course(COUNTS_FROM)(x - reach, x + reach, 0.0, 0.0)
+        found = asked.course(COUNTS)(x - reach, x + reach, 0.0, 0.0)
         relative = (found.hi - found.lo) / reach[None]
         return float(np.where(found.there, 0.0, np.log(np.nan_to_num(relative.max(1), nan=_LOST))).sum())
 
@@ -96,11 +96,14 @@ def with_frame(question: Question, x: Array) -> Question:
 
 
 def _eigenframe(loop: ClosedLoop) -> Array | None:
-    """Left eigenvectors (n, n) of a step's map at the origin, real and imaginary parts; None where there is no map, or
-    where they are nearly dependent."""
+    """Left eigenvectors (n, n) of a step's map at the origin, real and imaginary parts; None where there is no map, its
+    numbers are too large, or they are nearly dependent."""
     try:
-        rate = loop.mean_rate()
+        with np.errstate(all="ignore"):
+            rate = loop.mean_rate()
     except InputError:  # no Jacobian
+        return None
+    if not np.all(np.isfinite(rate)):
         return None
     values, vectors = np.linalg.eig(np.eye(len(rate)) + loop.step * rate.T)
     rows = [v.imag if value.imag < 0 else v.real for value, v in zip(values, vectors.T, strict=True)]
