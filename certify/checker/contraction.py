@@ -15,7 +15,7 @@ from . import ball
 from .ball import Ball
 from .case import Case, Failures, given
 from .decrease import Models, are_finite, diagonal, rational, vectors
-from .exact import exactly, is_definite, root_above
+from .exact import exactly, is_definite, quotient, root_above
 from .jets import unpacked
 from .local import is_large_enough
 from .near import Above, Array, Tensor, size
@@ -56,7 +56,7 @@ def contracts(ball_: Contracted) -> Failures:
     """V(e + h g) - V(e), over h, is negative for any two points of the ball; e is their difference, g that of G, and h
     is 0 in continuous time, where this is 2 e'P g, and the longest period where inputs are held."""
     P, step, count = exactly(ball_.case.c.P), ball_.case.c.step, 0
-    h = fmpq(step.numerator, step.denominator)
+    h = quotient(step)
     for part, cell in ((part, cell) for part in ball_.on_cones() for cell in ball_.case.cells):
         G = part.change(cell)
         doubts = [g.lipschitz + g.slack for g in G]

@@ -66,7 +66,7 @@ def is_definite(A: fmpq_mat) -> bool:
 
 def contains_ball(J: fmpq_mat, P: fmpq_mat, level: Fraction) -> bool:
     """True if {x'Px <= level} lies in {J d : ||d|| <= 1}: J'PJ - level I is positive definite."""
-    n, c = J.nrows(), fmpq(level.numerator, level.denominator)
+    n, c = J.nrows(), quotient(level)
     identity = fmpq_mat([[fmpq(int(i == j)) for j in range(n)] for i in range(n)])
     return is_definite(J.transpose() * P * J - c * identity)
 
@@ -88,6 +88,10 @@ def root_above(q: fmpq) -> fmpq:
 
 def fraction(q: fmpq) -> Fraction:
     return Fraction(int(q.p), int(q.q))
+
+
+def quotient(q: Fraction) -> fmpq:
+    return fmpq(q.numerator, q.denominator)
 
 
 @dataclass(frozen=True)

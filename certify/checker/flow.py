@@ -18,12 +18,11 @@ from operator import add
 from typing import Any
 
 import numpy as np
-from flint import fmpq
 
 from .case import Failures
 from .decrease import rational
 from .document import Certificate, Intervals
-from .exact import fraction, root_above
+from .exact import fraction, quotient, root_above
 from .expression import Tape, evaluate
 from .jets import Jet
 from .near import Above, Array, Near, near, norm, size
@@ -221,7 +220,7 @@ def stays_on_ball(local: Held) -> Failures:
     _, F = local.enclosed
     for i, (f, name, (lo, hi)) in enumerate(zip(F, c.states, c.domain, strict=True)):
         p = local.case.P_inverse[i]
-        reach = root_above(rational(c.c1) * fmpq(p.numerator, p.denominator))
+        reach = root_above(rational(c.c1) * quotient(p))
         of_ball = float(norm(local.J[i]).top)
         reach = min(reach, rational(of_ball)) if np.isfinite(of_ball) else reach
         moved = float(((f.radius if local.at_rest else f.radius + f.v0.size) * longest(c)).top)

@@ -20,7 +20,7 @@ from .boxes import batches, is_whole
 from .case import Failures
 from .decrease import OF_ONE, Models, rational, vectors
 from .elementary import least_share, sqrt
-from .exact import Exact, exactly, fraction
+from .exact import Exact, exactly, fraction, quotient
 from .expression import evaluate
 from .functions import FUNCTIONS, Undecided
 from .jets import Jet, Units
@@ -236,7 +236,7 @@ class Cone:
         more = [[fmpq(0)] * (n + first) for _ in range(n + first)]
         for i in range(n):
             for j in range(n):
-                more[first + i][first + j] = form[i, j] - fmpq(short.numerator, short.denominator) * int(i == j)
+                more[first + i][first + j] = form[i, j] - quotient(short) * int(i == j)
         C = fmpq_mat(more)
         return decay - _best(decay - rest, C) * C
 

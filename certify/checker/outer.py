@@ -22,7 +22,7 @@ from flint import fmpq, fmpq_mat
 from .boxes import LEAF, Batch, Boxes, Leaves, batches, in_order, is_whole, keeps_inputs, middle
 from .calls import entries
 from .case import Case, Failures, given, only_where
-from .exact import exactly, inverse
+from .exact import exactly, inverse, quotient
 from .expression import Call, Tape, evaluate
 from .functions import FUNCTIONS
 from .near import Above, Array, Form, Near, near
@@ -188,7 +188,7 @@ def contains_domain(case: Case) -> Failures:
         return 0
     far = [max(-lo, hi) for lo, hi in case.c.domain]
     sizes = fmpq_mat([[abs(v) for v in row] for row in to_z.tolist()])
-    reach = sizes * fmpq_mat([[fmpq(x.numerator, x.denominator)] for x in far])
+    reach = sizes * fmpq_mat([[quotient(x)] for x in far])
     for i, b in enumerate(outer.root.tolist()):
         if not reach[i, 0] <= fmpq(*b.as_integer_ratio()):
             yield f"evidence.outer.root, axis {i}", "the root box must contain the domain"

@@ -12,7 +12,7 @@ from flint import fmpq
 
 from .boxes import Batch, Boxes, Leaves, batches, is_whole, middle
 from .case import Case, Failures
-from .exact import fraction, root_above
+from .exact import fraction, quotient, root_above
 from .near import Array, near
 from .network import enclose_on_boxes
 from .taylor import Taylor, combination
@@ -79,7 +79,7 @@ class Ring(Moving):
         lo, hi = case.c.sample or (0, 0)
         super().__init__(case, case.partition.T, case.S, lo < hi)
         c2, self.order = fmpq(*self.c.c2.as_integer_ratio()), case.partition.order
-        roots = (root_above(c2 * fmpq(p.numerator, p.denominator)) for p in case.P_inverse)
+        roots = (root_above(c2 * quotient(p)) for p in case.P_inverse)
         self.widest = [near(fraction(root)).ends[1] for root in roots]
 
     def leaves(self) -> Iterator[Batch]:

@@ -17,7 +17,7 @@ from flint import fmpq
 
 from .case import Case, Failures, given
 from .document import Certificate
-from .exact import fraction
+from .exact import fraction, quotient
 from .expression import evaluate
 from .schema import Value
 from .words import interval, number
@@ -103,12 +103,8 @@ def _own(f: Function) -> tuple[int, ...]:
     return f.slopes if f.error is None else (f.error, *f.slopes)
 
 
-def rational(q: Fraction) -> fmpq:
-    return fmpq(q.numerator, q.denominator)
-
-
 def _short(value: Value) -> fmpq:
-    q = rational(value.rational())
+    q = quotient(value.rational())
     value.must(q.height_bits() <= MAX_SHORT, f"of {MAX_SHORT} bits at most")
     return q
 
@@ -153,7 +149,7 @@ def _weights(value: Value, count: int) -> Weights:
     def weight(pair: Value) -> tuple[int, fmpq]:
         pair.must(isinstance(pair.raw, list) and len(pair.raw) == 2, "a number of a value and its weight")
         k, v = (Value(raw, f"{pair.at}[{i}]") for i, raw in enumerate(pair.raw))
-        return k.integer(0, count - 1), rational(v.rational())
+        return k.integer(0, count - 1), quotient(v.rational())
 
     return value.listed(weight, 1, MAX_WEIGHTS)
 
@@ -209,7 +205,7 @@ def equations(c: Certificate) -> list[Polynomial]:
     count = len(c.states) + len(c.inputs) + len(c.uncertain)
     alone = [tuple(int(i == k) for i in range(count)) for k in range(count)]
     names = [Polynomial({powers: fmpq(1)}, frozenset([k])) for k, powers in enumerate(alone)]
-    return evaluate(c.dynamics, lambda q: Polynomial.of({(0,) * count: rational(q)}, frozenset()), names)
+    return evaluate(c.dynamics, lambda q: Polynomial.of({(0,) * count: quotient(q)}, frozenset()), names)
 
 
 def parted(f: Function, terms: Terms) -> tuple[Terms, Terms] | None:
@@ -288,7 +284,7 @@ def is_enclosed(case: Case) -> Failures:
 
 
 def _exactly(pair: tuple[Fraction, Fraction]) -> Pair:
-    lo, hi = map(rational, pair)
+    lo, hi = map(quotient, pair)
     return lo, hi
 
 

@@ -13,7 +13,7 @@ from .boxes import multipliers
 from .case import Case
 from .decrease import Inequality, Models, rational
 from .document import Intervals
-from .exact import root_above
+from .exact import quotient, root_above
 from .local import Local
 from .near import Above, Array, Near, at_least_0, norm, size, triples
 from .ring import Motion, Moving, Ring
@@ -62,7 +62,7 @@ class Stepping(Local):
 
     def inequality(self, models: Models) -> Inequality:
         made, h = OfStep(models, *self.terms), self.case.c.step
-        made.h = fmpq(h.numerator, h.denominator)
+        made.h = quotient(h)
         return made
 
 

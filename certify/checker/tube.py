@@ -21,7 +21,7 @@ from .ball import Ball
 from .case import Case, Failures, given
 from .decrease import Inequality, Models, are_finite, are_usable, rational
 from .document import Multipliers
-from .exact import contains_ball, exactly, inverse_diagonal, is_definite, root_above
+from .exact import contains_ball, exactly, inverse_diagonal, is_definite, quotient, root_above
 from .near import Array
 from .sections import Path, Slab
 
@@ -69,7 +69,7 @@ class Piece(Ball):
         if self.slab.path is None:
             return []
         moves = [(b - a) / Fraction(self.slab.duration) for a, b in self.centres]
-        return [fmpq(v.numerator, v.denominator) for v in moves]
+        return [quotient(v) for v in moves]
 
 
 def pieces(case: Case) -> Iterator[Piece]:
@@ -105,7 +105,7 @@ def lies_in(case: Case, P: fmpq_mat, centres: list[tuple[Fraction, Fraction]]) -
 def is_attracted(case: Case, P_N: fmpq_mat, centre: list[Fraction]) -> bool:
     """True if {(x - c)'P_N (x - c) <= 1} lies in {V <= c2}: by the triangle inequality for (x'Px)^(1/2)."""
     P, c2 = exactly(case.c.P), Fraction(case.c.c2)
-    c = fmpq_mat(len(centre), 1, [fmpq(q.numerator, q.denominator) for q in centre])
+    c = fmpq_mat(len(centre), 1, [quotient(q) for q in centre])
     level = fmpq(c2.numerator, c2.denominator)
     left = 1 - root_above((c.transpose() * P * c)[0, 0] / level)
     return left > 0 and is_definite(P_N - P / (level * left * left))
