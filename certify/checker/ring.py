@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import reduce
-from operator import add
 
 import numpy as np
 from flint import fmpq
@@ -15,7 +13,7 @@ from .case import Case, Failures
 from .exact import fraction, quotient, root_above
 from .near import Array, near
 from .network import enclose_on_boxes
-from .taylor import Taylor, combination
+from .taylor import Taylor, combination, inner_product
 
 _BATCH_NUMBERS = 800_000  # in the largest array of a batch: more would not stay in a cache
 
@@ -119,13 +117,12 @@ class Ring(Moving):
         return least > self.c.c2, most < self.c.c1, least >= self.c.c1
 
     def rise(self, states: list[Taylor], G: list[Taylor]) -> Taylor:
-        """D = 2 sum_i G_i (P x)_i."""
+        """D = 2 sum_i G_i (P x)_i, from above."""
         return self.product(G, [v.scaled(2.0) for v in states])
 
     def product(self, x: list[Taylor], y: list[Taylor]) -> Taylor:
-        """x'P y."""
-        rows = [combination(*zip(row, y, strict=True)) for row in self.c.P.tolist()]
-        return reduce(add, [row * v for row, v in zip(rows, x, strict=True)])
+        """x'P y, from above."""
+        return inner_product([combination(*zip(row, y, strict=True)) for row in self.c.P.tolist()], x)
 
     def bound(self, rise: Taylor, centre: Array, radius: Array, beyond: Array = None) -> Array:
         """Upper bound of D' on the part of each box that lies in the ring.

@@ -102,7 +102,7 @@ class StepRing(Ring):
     """The bounds that the rules for a leaf ask for."""
 
     def rise(self, states: list[Taylor], G: list[Taylor]) -> Taylor:
-        """D = sum_i G_i (2 P x + h P G)_i."""
+        """D = sum_i G_i (2 P x + h P G)_i, from above."""
         step = self.number(self.c.sample or (self.c.step,) * 2, self.symbols - 1, len(states[0].c))
         return self.product(G, [v.scaled(2.0) + step * g for v, g in zip(states, G, strict=True)])
 

@@ -18,7 +18,7 @@ from .keep import kept
 from .motion import Motion, Stage
 from .rational import inverse_diagonal
 from .refusal import require
-from .taylor import Taylor, is_negative, kinks
+from .taylor import Taylor, inner_product, is_negative, kinks
 
 LEAF = 255
 MAX_WAITING = 4096  # boxes of the tree beside the one in hand
@@ -162,20 +162,20 @@ class Leaves(Motion):
         return self.mean(leaf, within)
 
     def D(self, leaf: Leaf, within: dict[str, Taylor] | None = None) -> Taylor:
-        """(2 P x + h P G)'G: Vdot in continuous time. What V changes by over a step, by its length.
+        """(2 P x + h P G)'G from above: Vdot in continuous time. What V changes by over a step, by its length.
 
         h is the very number on which G depends, with the same symbol where it may be one of many.
         """
-        G, result, h = self.G(leaf, within), Taylor(ZERO), self.period()
-        for i, (row, g) in enumerate(zip(leaf.gradient, G, strict=True)):
+        G, rows, h = self.G(leaf, within), list[Taylor](), self.period()
+        for i, row in enumerate(leaf.gradient):
             along = self.affine(row)
             if self.steps:
                 moved = Taylor(ZERO)
                 for k, other in enumerate(G):
                     moved += other.scaled(self.P[i, k])
                 along += h * moved if self.c.varies else moved.scaled(self.step)
-            result += along * g
-        return result
+            rows.append(along)
+        return inner_product(rows, G)
 
     def V(self, leaf: Leaf) -> Taylor:
         """z'Sz, the off-diagonal part in the remainder."""

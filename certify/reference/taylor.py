@@ -123,8 +123,15 @@ class Taylor:
         if p.g is None or q.g is None:
             p, q = (p, q) if p.g is None else (q, p)
             return q.scaled(p.c).widened(p.r * (abs(q.c) + q.first + q.second + q.r))
+        return p.without_third(q).widened(p.first * q.second + p.second * q.first)
+
+    def without_third(self, other: Taylor) -> Taylor:
+        """The product without what is of third order."""
+        p, q = self, other
+        if p.g is None or q.g is None:
+            return p * q
         (p_first, p_second), (q_first, q_second) = p.reaches(), q.reaches()
-        r = p_first * q_second + p_second * (q_first + q_second)
+        r = p_second * q_second
         if not q.r.is_zero():
             r += q.r * (abs(p.c) + p_first + p_second)
         if not p.r.is_zero():
@@ -252,6 +259,42 @@ def directions(g: list[arb], rows: list[list[arb]]) -> list[bool]:
         else s
         for s, row in zip(told, rows, strict=True)
     ]
+
+
+def inner_product(x: Sequence[Taylor], y: Sequence[Taylor]) -> Taylor:
+    """At least sum_i x_i y_i, and nothing else is known of it.
+
+    Its terms of third order have their coefficients from all products, c_ijk for i <= j <= k, and |d_i d_j d_k| is at
+    most (d_i^2 + d_j^2 + d_k^2) / 3.
+    """
+    result, gradients, forms = Taylor(ZERO), list[arb_mat](), list[arb_mat]()
+    for p, q in zip(x, y, strict=True):
+        result += p.without_third(q)
+        for g, Q in ((p.g, q.Q), (q.g, p.Q)):
+            if g is not None and Q is not None:
+                gradients.append(g)
+                forms.append(Q)
+    if not forms:
+        return result
+    N = forms[0].ncols()
+    pairs = [(j, k) for j in range(N) for k in range(j, N)]
+    rows = arb_mat([[Q[j, k] if j == k else 2 * Q[j, k] for j, k in pairs] for Q in forms])
+    times = arb_mat([list(g.entries()) for g in gradients]).transpose() * rows
+    third: dict[tuple[int, ...], arb] = {}
+    for i, row in enumerate(times.tolist()):
+        for (j, k), c in zip(pairs, row, strict=True):
+            at = tuple(sorted((i, j, k)))
+            third[at] = third[at] + c if at in third else c
+    squares = [ZERO] * N
+    for at, c in third.items():
+        if not c.is_zero():
+            share = abs(c) / 3
+            for i in at:
+                squares[i] += share
+    more = arb_mat(N, N)
+    for i, v in enumerate(squares):
+        more[i, i] = v
+    return Taylor(result.c, result.g, plus(result.Q, more), result.r)
 
 
 def constant(q: fmpq) -> Taylor:

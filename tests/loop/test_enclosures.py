@@ -165,7 +165,7 @@ def on_tape(expression: Expression, x: Taylor, y: Taylor, way: Way) -> Taylor:
     system = SimpleNamespace(n=2, m=0, uncertain=())
     with bounded(way):
         loops = compiled.loops(1)
-    return played(loops, two, cast(System, system), states, none, none[:0], states[:0, 1:], none[:0])
+    return played(loops, two, cast(System, system), states, none, none[:0], states[:0, 1:], none[:0])[0]
 
 
 EVALUATED = {"models": on_models, **{way: partial(on_tape, way=way) for way in WAYS}}

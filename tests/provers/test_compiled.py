@@ -286,7 +286,7 @@ def test_a_tape_knows_every_function_of_the_grammar(way: Way) -> None:
         found = tape.recorded(1, lambda values, algebra, name=name: algebra.function(name, values[0]))
         assert len(found.steps) == (4 if name == "tan" else 1)
         given = [np.array([[[0.5], [0.25]]]), np.zeros((1, 1)), np.zeros((0, 1)), np.zeros((0, 1, 1)), np.zeros((0, 1))]
-        result = [np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1, 1)), np.zeros(1)]
+        result = [np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1, 1)), np.zeros(1), np.zeros((1, 1))]
         with bounded(way):
             compiled.loops(1).play(found.steps, found.k, found.places, *given, np.zeros((0, 3)), *result)
         at_half = abs(0.5) if name == "abs" else getattr(math, name)(0.5)
@@ -325,7 +325,7 @@ def test_a_tape_allows_for_the_same_rounding_as_models(place: int) -> None:
         lambda v: v[place] + v[(place + 1) % 5],
         lambda v: v[place].shifted(0.3),
     ):
-        found = played(
+        found, _ = played(
             vectors, tape.recorded(5, lambda v, _, f=calculate: f(v)), system, x, 1e-15 * error, mid, slopes, wide
         )
         model = calculate(values)

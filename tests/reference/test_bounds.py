@@ -115,7 +115,7 @@ def test_numbers_that_are_not_known_exactly(shift: int) -> None:
 
 
 def test_the_peak_of_a_parabola() -> None:
-    """Of g t + q t^2 for |t| <= 1, for all g and q in two balls: exact where they are points, at least all elsewhere."""
+    """Of g t + q t^2 for |t| <= 1: exact where g and q are points, and at least all where they are balls."""
     exact = {(2, 1): 3, (0, -1): 0, (1, -1): 0.25, (2, -1): 1, (3, -1): 2, (0, 0): 0, (1, 0): 1}
     for (g, q), most in exact.items():
         assert peak(arb(g), arb(q)) == most

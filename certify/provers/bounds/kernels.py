@@ -24,6 +24,7 @@ from certify.provers.bounds.tape import (
     CONSTANT,
     COS,
     EXP,
+    INNER,
     INVERSE,
     MULTIPLY,
     SCALED,
@@ -42,6 +43,7 @@ Two: TypeAlias = tuple[Real, Real]
 Four: TypeAlias = tuple[Real, Real, Real, Real]
 Five: TypeAlias = tuple[Real, Real, Real, Real, Real]
 EPS, TINY, EXP_END = 2.0**-50, 2.0**-900, 64.0  # as in taylor.py; written here, because numba keeps what it has seen
+THIRD = (1 + 2.0**-40) / 3  # likewise
 SLACK = 2.0**-47  # error allowed to tanh, relative to 1; numpy's errs by 2^-51 at most
 CHUNK = 32  # boxes at a time in the plant: their models stay in a core's cache
 LOST = 2.0**-500  # more than a 2-norm loses where squares underflow
@@ -197,6 +199,9 @@ def coefficients(operation: int, k: float, u: Four, v: Four) -> Five:
     if operation == MULTIPLY:
         rest = abs(c) * vr + abs(vc) * r + G * vS + vG * S + S * vS + r * (vG + vS + vr) + vr * (G + S)
         return vc, c, 1.0, c * vc, rest + EPS * (whole * other + rest) + TINY
+    if operation == INNER:  # what is of third order has at most 2^9 roundings
+        rest = abs(c) * vr + abs(vc) * r + S * vS + r * (vG + vS + vr) + vr * (G + S)
+        return vc, c, 1.0, c * vc, rest + 64 * EPS * (whole * other + rest) + TINY
     q = S + r
     rho = G + q
     if operation == ABS:
@@ -371,6 +376,35 @@ def result(w: Plane, first: int, count: int, c: Line, g: Plane, Q: Block, r: Lin
             row += 1
 
 
+def cube(u: Plane, v: Plane, symbols: int, T: Plane) -> None:
+    """Add what is of third order in the product of two models: row i P + p of T is for d_i times the p-th of the P
+    pairs d_j d_k, j <= k."""
+    P = symbols * (symbols + 1) // 2
+    for i in range(symbols):
+        for p in range(P):
+            for b in range(CHUNK):
+                T[i * P + p, b] += u[1 + i, b] * v[1 + symbols + p, b] + v[1 + i, b] * u[1 + symbols + p, b]
+
+
+def third(T: Plane, symbols: int, first: int, count: int, t: Plane) -> None:
+    """t (N, B) for which what T holds lies within sum_i t_i d_i^2: |d_i d_j d_k| <= (d_i^2 + d_j^2 + d_k^2) / 3."""
+    P = symbols * (symbols + 1) // 2
+    for i in range(symbols):
+        for j in range(i, symbols):
+            ij = i * symbols - i * (i - 1) // 2 + j - i
+            for k in range(j, symbols):
+                ik = i * symbols - i * (i - 1) // 2 + k - i
+                jk = j * symbols - j * (j - 1) // 2 + k - j
+                for b in range(count):
+                    c = T[i * P + jk, b]
+                    c = c + T[j * P + ik, b] if j > i else c
+                    c = c + T[k * P + ij, b] if k > j else c
+                    c = abs(c) * THIRD
+                    t[i, first + b] += c
+                    t[j, first + b] += c
+                    t[k, first + b] += c
+
+
 def play(
     steps: Steps,
     constants: Line,
@@ -385,9 +419,11 @@ def play(
     g: Plane,
     Q: Block,
     r: Line,
+    t: Plane,
 ) -> None:
     """The result (c, g, Q, r) of a tape whose inputs are n states, m inputs and k uncertain quantities, as
-    `loop_models` makes them; `quantities` (k, 3) are the middle of each, its reach and the rounding of these.
+    `loop_models` makes them; `quantities` (k, 3) are the middle of each, its reach and the rounding of these. The third
+    order of an inner product is within sum_i t_i d_i^2, t (N, B).
 
     A place holds a model of CHUNK boxes, a row each: c, g, the coefficients of d_i d_j for i <= j, ordered by i and
     then by j, then r, sum |g_i| and the sum of the coefficients' magnitudes. Each operation is `alpha u + beta v`, with
@@ -398,9 +434,13 @@ def play(
     R = 1 + N + N * (N + 1) // 2
     G, S = R + 1, R + 2
     memory = np.zeros((places, R + 3, CHUNK))
+    inner = np.any(steps[:, 0] == INNER)
+    T = np.zeros((N * (R - 1 - N) if inner else 0, CHUNK))
+    t[:] = 0.0
     alpha, beta, gamma, start = np.zeros(CHUNK), np.zeros(CHUNK), np.zeros(CHUNK), np.zeros(CHUNK)
     for first in range(0, batch, CHUNK):
         count = min(CHUNK, batch - first)
+        T[:] = 0.0
         for i in range(N):
             w = memory[i]
             w[:] = 0.0
@@ -435,5 +475,9 @@ def play(
                     for b in range(CHUNK):
                         w[row + j - i, b] += gamma[b] * (u[1 + i, b] * v[1 + j, b] + u[1 + j, b] * v[1 + i, b])
                 row += N - i
+            if operation == INNER:
+                cube(u, v, N, T)
             sizes(w, N)
+        if inner:
+            third(T, N, first, count, t)
         result(memory[steps[-1, 3]], first, count, c, g, Q, r)

@@ -56,14 +56,15 @@ def loop_models(
 
 def played(
     loops: Loops, tape: Tape, system: System, x: Array, error: Array, mid: Array, slopes: Array, wide: Array
-) -> Taylor:
-    """The result of a tape whose inputs are all of `loop_models`; the other parameters are those of that."""
+) -> tuple[Taylor, Array]:
+    """The result of a tape whose inputs are all of `loop_models`, and t (N, B) of `inner_product` if it ends with one;
+    the other parameters are those of `loop_models`."""
     N, batch = system.n + system.m + len(system.uncertain), x.shape[2]
-    c, g, Q, r = (np.empty((*shape, batch)) for shape in ((), (N,), (N, N), ()))
+    c, g, Q, r, t = (np.empty((*shape, batch)) for shape in ((), (N,), (N, N), (), (N,)))
     given = (np.ascontiguousarray(v) for v in (x, error, mid, slopes, wide))
     ranges = np.array(_ranges(system)).reshape(-1, 3)
-    loops.play(tape.steps, tape.k, tape.places, *given, ranges, c, g, Q, r)
-    return Taylor(c, g, Q, r)
+    loops.play(tape.steps, tape.k, tape.places, *given, ranges, c, g, Q, r, t)
+    return Taylor(c, g, Q, r), t
 
 
 def _ranges(system: System) -> list[tuple[float, float, float]]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from certify.provers.bounds.taylor import ConstantsLast
 
-ADD, SCALED, SHIFTED, CONSTANT, ABS, MULTIPLY, INVERSE, SQRT, EXP, TANH, ATAN, SIN, COS = range(13)
+ADD, SCALED, SHIFTED, CONSTANT, ABS, MULTIPLY, INNER, INVERSE, SQRT, EXP, TANH, ATAN, SIN, COS = range(14)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +45,10 @@ class Value:
 
     def __mul__(self, other: Value) -> Value:
         return self._then(MULTIPLY, other)
+
+    def in_inner(self, other: Value) -> Value:
+        """The product, as a term of the inner product that the tape ends with: see `taylor.inner_product`."""
+        return self._then(INNER, other)
 
     def scaled(self, k: float) -> Value:
         return self._then(SCALED, k=k)

@@ -11,6 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import reduce
+from operator import add
 from typing import Protocol, Self, TypeVar
 
 import numpy as np
@@ -22,7 +24,8 @@ EPS = 2.0**-50
 TINY = 2.0**-900
 CERTAIN = 1 + 2.0**-30  # share of its range by which a number must be away from 0 for its sign, beyond all rounding
 NOISE = 2.0**-30  # of all coefficients of first order
-_PAIRED = 3.0  # times what a symbol's terms in two symbols come to is what splitting it may take away, besides: measured
+_PAIRED = 3.0  # times what a symbol's terms in two symbols come to, it matters besides: measured
+THIRD = (1 + 2.0**-40) / 3
 EXP_END = 64.0  # the exponent beyond which the checker knows nothing of exp
 
 
@@ -58,10 +61,18 @@ class Taylor:
         return Taylor(self.c + k, self.g, self.Q, self.r + EPS * (np.abs(self.c) + abs(k)) + TINY)
 
     def __mul__(self, other: Taylor) -> Taylor:
+        return self._times(other, True, EPS)
+
+    def in_inner(self, other: Taylor) -> Taylor:
+        """The product without what is of third order, which may have 2^9 roundings."""
+        return self._times(other, False, 64 * EPS)
+
+    def _times(self, other: Taylor, third: bool, rounding: float) -> Taylor:
         a, b = self, other
         (ca, Ga, Qa), (cb, Gb, Qb) = a.norms(), b.norms()
-        r = ca * b.r + cb * a.r + Ga * Qb + Gb * Qa + Qa * Qb + a.r * (Gb + Qb + b.r) + b.r * (Ga + Qa)
-        r = r + EPS * ((ca + Ga + Qa) * (cb + Gb + Qb) + r) + TINY
+        r = ca * b.r + cb * a.r + (Ga * Qb + Gb * Qa if third else 0.0) + Qa * Qb
+        r = r + a.r * (Gb + Qb + b.r) + b.r * (Ga + Qa)
+        r = r + rounding * ((ca + Ga + Qa) * (cb + Gb + Qb) + r) + TINY
         joint = 0.5 * (a.g[:, None] * b.g[None])
         Q = a.c * b.Q + b.c * a.Q + (joint + joint.swapaxes(0, 1))
         return Taylor(a.c * b.c, a.c * b.g + b.c * a.g, Q, r)
@@ -74,6 +85,12 @@ class Taylor:
         r = np.abs(f1) * self.r + np.abs(f2) * (2 * G * q + q * q) + third * (rho * rho * rho)
         r = r + 2 * EPS * (np.abs(f0) + np.abs(f1) * (1 + rho) + np.abs(f2) * (1 + rho * rho) + r) + TINY
         return Taylor(f0, f1 * self.g, f1 * self.Q + f2 * self.g[:, None] * self.g[None], r)
+
+    def with_squares(self, t: Array) -> Taylor:
+        """A model that is larger by sum_i t_i d_i^2, t (N, B), and perhaps by a rounding."""
+        Q = self.Q.copy()
+        np.einsum("iib->ib", Q)[:] += t * (1 + EPS)
+        return Taylor(self.c, self.g, Q, self.r + EPS * np.abs(self.Q).sum((0, 1)) + TINY)
 
     def radius(self) -> Array:
         """Bound of |v - c|."""
@@ -186,6 +203,36 @@ class Models(ConstantsLast[Taylor]):
         c, g, Q = (product(matrix, part) for part in (c, g, Q))
         r = product(np.abs(matrix), r) * (1 + len(values) * EPS) + TINY
         return [Taylor(*row) for row in zip(c, g, Q, r, strict=True)]
+
+
+def inner_product(x: Sequence[Taylor], y: Sequence[Taylor]) -> tuple[Taylor, Array]:
+    """sum_i x_i y_i without what is of third order, which lies within sum_j t_j d_j^2, and t (N, B).
+
+    The coefficients of all products are summed up before their magnitudes are taken.
+    """
+    terms = [v.in_inner(w) for v, w in zip(x, y, strict=True)]
+    i, j = np.triu_indices(len(x[0].g))
+    share, t = np.where(i == j, 0.5, 1.0)[:, None], np.zeros_like(x[0].g)
+    T = np.zeros((len(t), len(i), t.shape[1]))
+    for a, b in zip(x, y, strict=True):
+        p, q = (share * (v.Q[i, j] + v.Q[j, i]) for v in (a, b))
+        T += a.g[:, None] * q + b.g[:, None] * p
+    third(T, t)
+    return reduce(add, terms), t
+
+
+def third(T: Array, t: Array) -> None:
+    """Add to t (N, B) numbers for which sum_i d_i T_i lies within sum_i t_i d_i^2, T_i = sum_p T_ip d_j d_k for the
+    p-th pair j <= k: |d_i d_j d_k| <= (d_i^2 + d_j^2 + d_k^2) / 3."""
+    N = len(T)
+    place = {pair: p for p, pair in enumerate((i, j) for i in range(N) for j in range(i, N))}
+    for i, j in place:
+        for k in range(j, N):
+            c = T[i, place[j, k]]
+            c = c + T[j, place[i, k]] if j > i else c
+            c = np.abs(c + T[k, place[i, j]] if k > j else c) * THIRD
+            for at in (i, j, k):
+                t[at] += c
 
 
 def upper_bound(model: Taylor) -> tuple[Array, Array]:

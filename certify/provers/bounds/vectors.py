@@ -20,8 +20,8 @@ from certify.provers.bounds.kernels import (
     relaxed,
     smaller,
 )
-from certify.provers.bounds.tape import MULTIPLY
-from certify.provers.bounds.taylor import EPS, TINY
+from certify.provers.bounds.tape import INNER, MULTIPLY
+from certify.provers.bounds.taylor import EPS, TINY, third
 
 
 def ranges(
@@ -112,12 +112,15 @@ def play(
     g: Plane,
     Q: Block,
     r: Line,
+    t: Plane,
 ) -> None:
     """See `kernels.play`."""
     n, inputs = len(x), len(x) + len(wide)
     N = inputs + len(quantities)
     R = 1 + N + N * (N + 1) // 2
     memory = np.zeros((places, R + 3, len(c)))
+    inner = bool(np.any(steps[:, 0] == INNER))
+    T = np.zeros((N, R - 1 - N, len(c)) if inner else (0, 0, 0))
     memory[:n, : 1 + n], memory[:n, R] = x, x_error
     memory[n:inputs, 0], memory[n:inputs, 1 : 1 + n] = middle, slopes
     for i in range(n, N):
@@ -134,7 +137,12 @@ def play(
             w[row] += gamma * (u[i] * v[i])
             w[row + 1 : row + 1 + N - i] += gamma * (u[i] * v[i + 1 : 1 + N] + u[i + 1 : 1 + N] * v[i])
             row += 1 + N - i
+        if operation == INNER:
+            T += u[1 : 1 + N, None] * v[1 + N : R] + v[1 : 1 + N, None] * u[1 + N : R]
         _sizes(w, N)
+    t[:] = 0.0
+    if inner:
+        third(T, t)
     c[:], g[:], r[:], row = w[0], w[1 : 1 + N], w[R], 1 + N
     for i in range(N):
         Q[i, i:] = 0.5 * w[row : row + N - i]

@@ -42,7 +42,7 @@ class ConstraintModels:
         """The models at the states and inputs of `loop_models`, whose parameters these are."""
         if self.tapes is None:
             self.tapes = [self._recorded(g) for g in self.expressions]
-        return [played(loops(0), tape, self.system, x, error, mid, slopes, wide) for tape in self.tapes]
+        return [played(loops(0), tape, self.system, x, error, mid, slopes, wide)[0] for tape in self.tapes]
 
     def during(self, values: Mapping[Symbol, Taylor]) -> list[Taylor]:
         """The models at these states, inputs and quantities."""

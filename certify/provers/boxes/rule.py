@@ -38,8 +38,8 @@ from certify.provers.bounds.arrays import Array, Mask, chosen, product
 from certify.provers.bounds.compiled import loops
 from certify.provers.bounds.flow import Mean, Values
 from certify.provers.bounds.loop import played
-from certify.provers.bounds.tape import Tape, recorded
-from certify.provers.bounds.taylor import EPS, TINY, ConstantsLast, V
+from certify.provers.bounds.tape import Recording, Tape, Value, recorded
+from certify.provers.bounds.taylor import EPS, TINY, ConstantsLast, V, inner_product
 from certify.provers.boxes.form import FormBound
 from certify.provers.boxes.kept import ConstraintModels, held_back
 from certify.provers.boxes.lessening import lessened
@@ -48,6 +48,7 @@ _SLACK = 1e-9  # relative distance from the inner level at which a box counts as
 _ENDS = 1e-11  # relative distance kept from the ends of the domain
 _EACH = 2.0  # operations of an entry of a model
 _PIECES = 2  # the most pieces of the policy in one of a batch
+_THIRD = 6.0  # times what a symbol's terms of third order come to, it matters besides: measured
 _POINT = 2.0**-20  # share of a box that is left of it around its centre
 
 
@@ -145,17 +146,21 @@ class VdotBound:
         x = np.concatenate([product(self.T, centre)[:, None], slopes_x], 1)
         error = 2 * (n + 4) * EPS * product(np.abs(self.T), np.abs(centre) + radius) + TINY
         mid, slopes, wide, share = self.policy(x, error)
-        decrease, kept, during = self._decrease(x, error, mid, slopes, wide, outer)
+        decrease, third, kept, during = self._decrease(x, error, mid, slopes, wide, outer)
         if self.rate:
             decrease = decrease + self.V.model(centre, radius, decrease).scaled(2 * self.rate)
-        bound, excess = upper_bound(decrease)
+        above = decrease.with_squares(third)
+        bound, excess = upper_bound(above)
+        excess = excess + _THIRD * third
         smooth = np.isfinite(bound)  # a component of F that is not enclosed leaves a NaN in the sum over all
         # At the box's centre, and for the worst values of the uncertain quantities, only the inputs' errors, the terms
         # of second order in all these, and the remainder are left.
         known = n + self.system.m
-        doubt = np.abs(decrease.g[n:known]).sum(0) + np.abs(decrease.Q[n:, n:]).sum((0, 1)) + decrease.r
+        doubt = (
+            np.abs(decrease.g[n:known]).sum(0) + np.abs(decrease.Q[n:, n:]).sum((0, 1)) + decrease.r + third[n:].sum(0)
+        )
         violated = decrease.c + np.abs(decrease.g[known:]).sum(0) - doubt >= 0
-        bound = self._within_ring(bound, decrease, lo, hi, centre, radius, inner, outer)
+        bound = self._within_ring(bound, above, lo, hi, centre, radius, inner, outer)
         proved = bound < 0
         if self.inside and self.step == 0:
             proved = smooth & (proved | (self.levels(lo, hi)[1] < inner * (1 - _SLACK)))
@@ -182,9 +187,9 @@ class VdotBound:
 
     def _decrease(
         self, x: Array, error: Array, mid: Array, slopes: Array, wide: Array, outer: float
-    ) -> tuple[Taylor, Mask | None, Values | None]:
-        """D, where (B,) the solution stays in the domain over a period in which the input is held, if it is, and what
-        all values are in the period.
+    ) -> tuple[Taylor, Array, Mask | None, Values | None]:
+        """D, what its third order adds (see `inner_product`), where (B,) the solution stays in the domain over a period
+        in which the input is held, if it is, and what all values are in the period.
 
         Symbols: n box coordinates, m input errors, k uncertain quantities, and the period if that is in a range.
         """
@@ -193,33 +198,32 @@ class VdotBound:
                 count = self.system.n + self.system.m + len(self.system.uncertain)
                 self.tape = recorded(count, self._at_rates)
             how = loops(0)  # the policy's own output counts
-            return played(how, self.tape, self.system, x, error, mid, slopes, wide), None, None
+            return *played(how, self.tape, self.system, x, error, mid, slopes, wide), None, None
         states, inputs, quantities = loop_models(self.system, x, error, mid, slopes, wide, self.flow.symbols)
         here = list(states.values())
         models = Models(here[0])
         mean = self.flow(states, inputs, quantities, self.system.n + self.system.m)
         moved = [self.flow.times_period(rate) for rate in mean.G]
         kept = mean.exists & self._in_domain(here, mean, outer)
-        return self._increment(here, mean.G, moved, models), kept, mean.during
+        return *inner_product(self._along(here, moved, models), mean.G), kept, mean.during
 
-    def _at_rates(self, values: Sequence[V], algebra: ConstantsLast[V]) -> V:
+    def _at_rates(self, values: Sequence[Value], algebra: Recording) -> Value:
         """D where the input is not held over time, from states, inputs and uncertain quantities."""
         system = self.system
-        known: dict[Expression, V] = {}
+        known: dict[Expression, Value] = {}
         symbols = [*system.states, *system.inputs, *(symbol for symbol, _ in system.uncertain)]
         named, here = dict(zip(symbols, values, strict=True)), values[: system.n]
-        G: list[V] = [evaluate(expression, named, algebra, known) for expression in self.dynamics]
+        G: list[Value] = [evaluate(expression, named, algebra, known) for expression in self.dynamics]
         if system.time == "discrete":
             G = [after + before.scaled(-1.0) for after, before in zip(G, here, strict=True)]
-        return self._increment(here, G, G, algebra)
-
-    def _increment(self, here: Sequence[V], G: Sequence[V], moved: Sequence[V], algebra: ConstantsLast[V]) -> V:
-        """`2 x'P G + h G'P G`, `moved` being h G."""
-        along, factor = here, 2.0
-        if self.step:
-            along, factor = [v.scaled(2.0) + by for v, by in zip(here, moved, strict=True)], 1.0
-        terms = [row * rate for row, rate in zip(algebra.combined(factor * self.P, along), G, strict=True)]
+        terms = [row.in_inner(rate) for row, rate in zip(self._along(here, G, algebra), G, strict=True)]
         return algebra.total(None, terms)
+
+    def _along(self, here: Sequence[V], moved: Sequence[V], algebra: ConstantsLast[V]) -> list[V]:
+        """P (2 x + h G), of which the inner product with G is D; `moved` is h G."""
+        if not self.step:
+            return algebra.combined(2.0 * self.P, here)
+        return algebra.combined(self.P, [v.scaled(2.0) + by for v, by in zip(here, moved, strict=True)])
 
     def _in_domain(self, states: list[Taylor], mean: Mean, outer: float) -> Mask:
         """True (B,) if the solution from V <= outer stays inside the domain over the longest period."""
