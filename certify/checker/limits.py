@@ -1,7 +1,7 @@
 """The rule `limits`: count a file's demands from the sizes that it states, before any other computation.
 
-Each rule alone is cheap, and so is each size; their product is not. docs/mathematics/limits.md has these sums, which count
-the work of this checker and the reference generously: a unit is about a nanosecond here. They read sizes only.
+Each rule alone is cheap, and so is each size; their product is not. docs/mathematics/limits.md has these sums, which
+count the work of this checker and the reference generously: a unit is about a nanosecond here. They read sizes only.
 """
 
 from __future__ import annotations
