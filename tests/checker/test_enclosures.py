@@ -41,6 +41,7 @@ from tests.support.plain import (
     enclose_on_boxes,
     exp,
     float_with_error,
+    inner_product,
     norm,
     relax_tanh,
     sin_cos,
@@ -454,6 +455,39 @@ def test_taylor_sine_and_cosine_contain(spread: int) -> None:
     a = Taylor(generator.uniform(-80, 80, 60), a.g, a.Q, a.r)
     assert assert_contains(a.function("sin"), [a], lambda x: x.sin(), generator) == 60
     assert assert_contains(a.function("cos"), [a], lambda x: x.cos(), generator) == 60
+
+
+@pytest.mark.parametrize(("low", "high"), RANGES)
+@pytest.mark.parametrize("count", [1, 3])
+def test_an_inner_product_is_nowhere_below(low: int, high: int, count: int) -> None:
+    """Of all members; with a second summand that cancels the first but for rounding, of what is of third order too."""
+    generator = np.random.default_rng([count, low + 2000])
+    x, y = ([models(generator, 3, 30, low, high) for _ in range(count)] for _ in range(2))
+    for cancelled in (False, True):
+        more = [Taylor(-v.c, -v.g * (1 + 2.0**-50), -v.Q, v.r) for v in x] if cancelled else []
+        firsts, seconds = [*x, *more], [*y, *(y if cancelled else [])]
+        bound, finite = inner_product(firsts, seconds), 0
+        with ctx.workprec(400):
+            for b in np.flatnonzero(np.isfinite(bound.r)):
+                finite += 1
+                for d in points_in_the_box(generator, 3):
+                    value = arb(0)
+                    for v, w in zip(firsts, seconds, strict=True):
+                        ends = (arb(float(m.r[b])) * arb(float(generator.choice([-1.0, 1.0]))) for m in (v, w))
+                        value += (polynomial(v, b, d) + next(ends)) * (polynomial(w, b, d) + next(ends))
+                    assert value <= polynomial(bound, b, d) + arb(float(bound.r[b])), (b, d)
+        assert finite > 0 or high > 500
+
+
+def test_an_inner_product_knows_what_cancels() -> None:
+    """x y^2 - x y^2, of which term by term nothing is known, and x y^2 alone, at most (x^2 + 2 y^2) / 3."""
+    x, y, none = np.array([[1.0], [0.0]]), np.array([[0.0], [1.0]]), np.zeros(1)
+    first = Taylor(none, x, np.zeros((2, 2, 1)), none)
+    second = Taylor(none, 0 * x, np.einsum("ib,jb->ijb", y, y), none)
+    assert upper_bound(inner_product([first, first], [second, Taylor(none, 0 * x, -second.Q, none)])) < 1e-14
+    alone = inner_product([first], [second])
+    assert abs(alone.Q[0, 0, 0] - 1 / 3) < 1e-15 and abs(alone.Q[1, 1, 0] - 2 / 3) < 1e-15 and alone.r[0] < 1e-14
+    assert 3 * Fraction(float(alone.Q[0, 0, 0])) >= 1 and 3 * Fraction(float(alone.Q[1, 1, 0])) >= 2
 
 
 @pytest.mark.parametrize("spread", [-40, -6, -2, 0, 3])

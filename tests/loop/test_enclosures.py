@@ -5,7 +5,7 @@ from __future__ import annotations
 from fractions import Fraction
 from functools import partial
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import flint
 import numpy as np
@@ -22,7 +22,7 @@ from certify.loop.rigorous import evaluate_arb, evaluate_policy
 from certify.provers.bounds import Models, Taylor, compiled, policy_enclosure, upper_bound
 from certify.provers.bounds.loop import played
 from certify.provers.bounds.tape import recorded
-from certify.provers.bounds.taylor import ConstantsLast
+from certify.provers.bounds.taylor import ConstantsLast, inner_product
 from tests.support.algebra import to_sympy
 from tests.support.loops import box, pendulum_network
 from tests.support.ways import WAYS, Way, bounded, relax_tanh
@@ -275,3 +275,27 @@ def test_the_enclosure_is_invariant_under_the_oddness_of_tanh(pendulum: System) 
     first, second = (policy_enclosure(ClosedLoop(pendulum, w))(x, none) for w in (network, flipped))
     for a, c in zip(first[:3], second[:3], strict=True):
         np.testing.assert_allclose(a, c, rtol=1e-9, atol=1e-12)
+
+
+def test_an_inner_product_lies_within_its_third_order() -> None:
+    """Of members of models at points: beside c, g and Q only sum t_i d_i^2 and the remainder."""
+    generator, N, batch = np.random.default_rng(7), 3, 20
+
+    def models() -> list[Taylor]:
+        Q = generator.standard_normal((4, N, N, batch))
+        parts = (generator.standard_normal((4, batch)), generator.standard_normal((4, N, batch)), Q + Q.swapaxes(1, 2))
+        return [Taylor(*row, np.full(batch, 1e-6)) for row in zip(*parts, strict=True)]
+
+    def at(v: Taylor, d: Any) -> Any:
+        return v.c + np.einsum("ib,ib->b", v.g, d) + np.einsum("ib,ijb,jb->b", d, v.Q, d)
+
+    x, y = [Taylor(v.c, v.g, 0 * v.Q, v.r) for v in models()], models()  # so nothing is of fourth order
+    found, t = inner_product(x, y)
+    third = 0.0
+    for _ in range(200):
+        d = generator.uniform(-1, 1, (N, batch))
+        truth = sum((at(v, d) + 1e-6) * (at(w, d) - 1e-6) for v, w in zip(x, y, strict=True))
+        assert np.all(np.abs(truth - at(found, d)) <= (t * d * d).sum(0) + found.r)
+        third = max(third, float(np.max((np.abs(truth - at(found, d)) - found.r) / (t * d * d).sum(0))))
+    each = [v.norms()[1] * w.norms()[2] + v.norms()[2] * w.norms()[1] for v, w in zip(x, y, strict=True)]
+    assert third > 0.2 and np.all(t.sum(0) < sum(each))

@@ -10,7 +10,7 @@ import pytest
 from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from certify.reference.balls import ON_LEAVES
-from certify.reference.taylor import Taylor, peak
+from certify.reference.taylor import Taylor, inner_product, peak
 from tests.support.marks import slow_after
 from tests.support.oracle import ball
 
@@ -143,3 +143,42 @@ def test_no_bound_is_above_those_that_take_each_pair_at_its_largest(kind: str) -
             assert 0 in g or bounded.from_corner() <= steep + arb(2) ** -40
             below += bool(bounded.bound() < apart - arb(2) ** -40) and bool(bounded.bound() < steep - arb(2) ** -40)
     assert below > 20
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_an_inner_product_is_nowhere_below(count: int) -> None:
+    """Of exact models without remainders, and of balls around others: the products of members, at many points."""
+    generator, n = np.random.default_rng(count), 3
+    with ctx.workprec(ON_LEAVES):
+        for wide in (0, 0.25):
+            for _ in range(30):
+                drawn_of = [[drawn(generator, n, "level") for _ in range(count)] for _ in range(2)]
+                sides = [[widened(*one, wide) for one in side] for side in drawn_of]
+                bound = inner_product(*sides)
+                assert bound.g is not None and bound.Q is not None
+                for _ in range(8):
+                    d = [Fraction(int(v), 8) for v in generator.integers(-8, 9, n)]
+                    truth = sum((value(*v, d) * value(*w, d) for v, w in zip(*drawn_of, strict=True)), Fraction(0))
+                    column = arb_mat([[ball(v)] for v in d])
+                    most = (
+                        bound.c + (bound.g * column)[0, 0] + (column.transpose() * (bound.Q * column))[0, 0] + bound.r
+                    )
+                    assert not most < ball(truth)
+
+
+def widened(g: list[Fraction], Q: Rows, by: float) -> Taylor:
+    """Balls of this radius around what is off by half as much."""
+    off = arb(by / 2, by)
+    return Taylor(arb(0), arb_mat([[ball(v) + off for v in g]]), arb_mat([[ball(v) + off for v in row] for row in Q]))
+
+
+def test_an_inner_product_knows_what_cancels() -> None:
+    """x y^2 - x y^2, of which term by term nothing is known; and x y^2 alone is at most (x^2 + 2 y^2) / 3."""
+    x, squares = Taylor(arb(0), arb_mat([[1, 0]])), arb_mat([[0, 0], [0, 1]])
+    both = inner_product([x, x], [Taylor(arb(0), None, squares), Taylor(arb(0), None, -squares)])
+    assert both.bound() == 0
+    alone = inner_product([x], [Taylor(arb(0), None, squares)])
+    assert alone.Q is not None and alone.Q[0, 0].contains(fmpq(1, 3)) and alone.Q[1, 1].contains(fmpq(2, 3))
+    assert alone.r == 0
+    constants = inner_product([Taylor(arb(2))], [Taylor(arb(3), None, squares)])
+    assert constants.c == 6 and constants.Q is not None and constants.Q[1, 1] == 2

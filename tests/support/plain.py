@@ -169,6 +169,10 @@ def constant(q: Fraction, symbols: int, batch: int) -> Taylor:
     return Taylor.of(taylor.constant(q, symbols, batch))
 
 
+def inner_product(x: Sequence[Taylor], y: Sequence[Taylor]) -> Taylor:
+    return Taylor.of(taylor.inner_product([v.model for v in x], [v.model for v in y]))
+
+
 def upper_bound(model: Taylor) -> Array:
     return taylor.upper_bound(model.model)
 
