@@ -486,7 +486,7 @@ def test_an_inner_product_knows_what_cancels() -> None:
     second = Taylor(none, 0 * x, np.einsum("ib,jb->ijb", y, y), none)
     assert upper_bound(inner_product([first, first], [second, Taylor(none, 0 * x, -second.Q, none)])) < 1e-14
     alone = inner_product([first], [second])
-    assert abs(alone.Q[0, 0, 0] - 1 / 3) < 1e-15 and abs(alone.Q[1, 1, 0] - 2 / 3) < 1e-15 and alone.r[0] < 1e-14
+    assert abs(alone.Q[0, 0, 0] - 1 / 3) < 1e-14 and abs(alone.Q[1, 1, 0] - 2 / 3) < 1e-14 and alone.r[0] < 1e-14
     assert 3 * Fraction(float(alone.Q[0, 0, 0])) >= 1 and 3 * Fraction(float(alone.Q[1, 1, 0])) >= 2
 
 
