@@ -27,11 +27,12 @@ from certify.certificates import (
 from certify.certificates.claims import Claim, Problem
 from certify.errors import BackendError, InputError, SoundnessError
 from certify.provers.ball.contraction import contraction
-from certify.provers.boxes.mend import below_leaf, split_again
+from certify.provers.boxes.mend import below_leaves, split_again
 from certify.provers.ranks import without_leaf
 
 _SPLITS, _LOWERINGS = 3, 9  # the most splits and lowerings for leaves that the checker refuses
 _BELOW_LEAVES, _LEVELS = 2, 5  # weaker certificates: below a refused leaf so long, and with a lower level at all
+_MOST_LEAVES = 1000  # that are split again
 _LONG = 1_000_000  # bytes of a certificate, from which on several processes check it
 _MOST_JOBS = 64
 _QUICK = 2**27  # operations of the reference, as docs/mathematics/limits.md counts: at most some five seconds
@@ -94,7 +95,7 @@ class Desk:
     def _answered(self, path: Path, patient: bool) -> Mapping[str, Any]:
         """The checker's answer; where there are many leaves, several processes share them."""
         cores = len(os.sched_getaffinity(0)) if self.ranked or path.stat().st_size > _LONG else 1
-        return run_checker(path, jobs=self.jobs or min(cores, _MOST_JOBS), patient=patient)
+        return run_checker(path, jobs=self.jobs or min(cores, _MOST_JOBS), patient=patient, every=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,8 +104,6 @@ class Clerk:
 
     Parameters
     ----------
-    left : operations that may still be spent on leaves that were refused; without any the first of them is split
-        again, and then only the level is lowered.
     stage : times the stages `write` and `check`.
     tell : called before each check.
     show : called with the bytes of a certificate that the run ends with if they are accepted, before they are checked.
@@ -113,7 +112,6 @@ class Clerk:
     """
 
     path: Path
-    left: Callable[[], float]
     stage: Callable[[str], AbstractContextManager[None]]
     tell: Callable[[], None]
     show: Callable[[bytes], None]
@@ -121,7 +119,7 @@ class Clerk:
     cluster: str | None = None
 
     def accepted(self, certificate: Certificate, problem: Problem) -> Accepted:
-        """This certificate, or one with a refused leaf split again or a lower level.
+        """This certificate, or one with refused leaves split again or a lower level.
 
         Raises
         ------
@@ -136,7 +134,7 @@ class Clerk:
             if answer["result"] == _wanted(certificate):
                 return Accepted(certificate, self.path, data, answer, mended)
             finer = None
-            if splits < _SPLITS and (splits == 0 or self.left() > 0):  # a lower level takes a check as well
+            if splits < _SPLITS:
                 finer = _finer(certificate, problem, answer)
             if finer is not None:
                 splits += 1
@@ -224,10 +222,12 @@ def _wanted(certificate: AnyCertificate) -> str:
     return "TRUSTED" if isinstance(certificate.evidence, TrustedSolver) else "ACCEPTED"
 
 
-def _leaf_of(answer: Mapping[str, Any]) -> int | None:
-    """The number of the leaf that the checker refuses; None if it refuses something else."""
-    found = re.fullmatch(r"leaf (\d+)", str(answer.get("at", "")))
-    return int(found[1]) if found and answer.get("rule") in ("ring", "inputs", "flow", "keep") else None
+def _leaves_of(answer: Mapping[str, Any]) -> list[int]:
+    """The numbers of the leaves that the checker refuses, the lowest first; none if it refuses something else."""
+    if answer.get("rule") not in ("ring", "inputs", "flow", "keep"):
+        return []
+    found = (re.fullmatch(r"leaf (\d+)", str(at)) for at in answer.get("every", (answer.get("at"),)))
+    return sorted({int(one[1]) for one in found if one is not None})
 
 
 def _finer(certificate: Certificate, problem: Problem, answer: Mapping[str, Any]) -> PartitionTree | None:
@@ -235,11 +235,11 @@ def _finer(certificate: Certificate, problem: Problem, answer: Mapping[str, Any]
     without one of ranks; None if it refuses something else."""
     from certify.provers.outer import mend as outer
 
-    evidence, claim, leaf = certificate.evidence, certificate.claim, _leaf_of(answer)
+    evidence, claim, leaves = certificate.evidence, certificate.claim, _leaves_of(answer)
     if not isinstance(evidence, PartitionTree):
         return None
-    if leaf is not None:
-        return split_again(problem, evidence, claim, leaf)
+    if leaves:
+        return split_again(problem, evidence, claim, leaves) if len(leaves) <= _MOST_LEAVES else None
     refused = re.fullmatch(r"rank leaf (\d+)", str(answer.get("at", "")))
     if refused is not None and evidence.ranks is not None:
         lower = without_leaf(evidence.ranks, int(refused[1]))
@@ -254,14 +254,14 @@ def _finer(certificate: Certificate, problem: Problem, answer: Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class _Refused:
-    """A certificate that the checker refuses under a `rule`, at a `leaf` of the ring (None: elsewhere), after `tries`
-    weaker ones."""
+    """A certificate that the checker refuses under a `rule`, at `leaves` of the ring or elsewhere, after `tries` weaker
+    ones."""
 
     certificate: Certificate
     evidence: PartitionTree
     problem: Problem
     rule: str
-    leaf: int | None
+    leaves: list[int]
     tries: int
 
     @property
@@ -284,7 +284,7 @@ def _without_outer(refused: _Refused) -> Certificate | None:
 def _with_higher_floor(refused: _Refused) -> Certificate | None:
     """Not for a leaf of the ring, and to one equilibrium only where trajectories still come closer."""
     claim = refused.claim
-    higher = None if claim.floor is None or refused.leaf is not None else claim.with_floor(_HIGHER * claim.floor)
+    higher = None if claim.floor is None or refused.leaves else claim.with_floor(_HIGHER * claim.floor)
     if higher is None or higher.floor is None or not claim.one_equilibrium:
         return refused.with_claim(higher)
     if refused.rule != "local":
@@ -299,12 +299,12 @@ def _without_tube(refused: _Refused) -> Certificate | None:
 
 
 def _with_lower_level(refused: _Refused) -> Certificate | None:
-    """Below the refused leaf at first, then halfway to the inner level."""
+    """Below the refused leaves at first, then halfway to the inner level."""
     claim = refused.claim
-    if refused.leaf is None or refused.tries >= _LEVELS:
+    if not refused.leaves or refused.tries >= _LEVELS:
         return None
     if refused.tries < _BELOW_LEAVES:
-        return refused.with_claim(claim.lowered(below_leaf(refused.problem, refused.evidence, refused.leaf)))
+        return refused.with_claim(claim.lowered(below_leaves(refused.problem, refused.evidence, refused.leaves)))
     return refused.with_claim(claim.lowered(math.sqrt(claim.inner * claim.roa)))
 
 
@@ -343,6 +343,6 @@ def _lowered(certificate: Certificate, answer: Mapping[str, Any], problem: Probl
     evidence, claim = certificate.evidence, certificate.claim
     if not isinstance(evidence, PartitionTree):
         return None
-    leaf = _leaf_of(answer) if claim.inner < claim.roa else None
-    refused = _Refused(certificate, evidence, problem, str(answer.get("rule")), leaf, tries)
+    leaves = _leaves_of(answer) if claim.inner < claim.roa else []
+    refused = _Refused(certificate, evidence, problem, str(answer.get("rule")), leaves, tries)
     return next((weaker for concede in _CONCESSIONS if (weaker := concede(refused)) is not None), None)

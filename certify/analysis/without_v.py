@@ -108,7 +108,7 @@ class Tools:
     def clerk(self, path: Path, jobs: int | None, many: bool, cluster: str | None = None) -> Clerk:
         """Somebody who writes certificates and has them checked; by several processes where leaves are `many`."""
         desk = Desk(jobs, many, self.remarks)
-        return Clerk(path, lambda: 0.0, self.timing, lambda: self.tell("check"), lambda _: None, desk.checked, cluster)
+        return Clerk(path, self.timing, lambda: self.tell("check"), lambda _: None, desk.checked, cluster)
 
 
 def accepted(

@@ -38,6 +38,7 @@ def ask(
     jobs: int = 1,
     patient: bool = False,
     operations: int | None = None,
+    every: bool = False,
 ) -> tuple[int, dict[str, Any]]:
     """Run a checker on a file in a separate process; return its exit status and its JSON answer.
 
@@ -48,6 +49,7 @@ def ask(
     jobs : number of processes that examine the leaves.
     patient : True to accept a file that needs hours, which its rule `limits` refuses otherwise.
     operations : the most that rule `limits` of the reference allows; None for its own limit.
+    every : True if the checker's refusal of leaves should have all of their places, as `every`.
 
     Raises
     ------
@@ -55,6 +57,7 @@ def ask(
     """
     options = [] if jobs == 1 else ["--jobs", str(jobs)]
     options += ["--patient"] if patient else []
+    options += ["--every"] if every else []
     options += [] if operations is None else ["--operations", str(operations)]
     line = command(program, ["--json", *options, "--", str(path)])
     done = subprocess.run(line, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
@@ -74,6 +77,7 @@ def run_checker(
     jobs: int = 1,
     patient: bool = False,
     operations: int | None = None,
+    every: bool = False,
 ) -> dict[str, Any]:
     """The JSON answer of a checker that reached a verdict; the parameters are those of `ask`.
 
@@ -81,7 +85,7 @@ def run_checker(
     ------
     BackendError : it ended with neither ACCEPTED, nor TRUSTED, nor REJECTED.
     """
-    status, answer = ask(path, program, jobs, patient, operations)
+    status, answer = ask(path, program, jobs, patient, operations, every)
     if "error" in answer:
         raise BackendError(f"the {program} ended with status {status} and no verdict: {answer['error']}")
     return answer

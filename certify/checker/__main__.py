@@ -1,4 +1,4 @@
-"""`python -I -m certify.checker FILE [--json] [--jobs N] [--patient]`: check one certificate.
+"""`python -I -m certify.checker FILE [--json] [--jobs N] [--patient] [--every]`: check one certificate.
 
 Exit status: 0 accepted, 1 rejected, 2 usage or unreadable file, 3 trusted (the evidence is a solver's answer, which
 cannot be checked; all else was), 70 internal error.
@@ -25,6 +25,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--jobs", metavar="N", type=_jobs, default=1, help="examine the leaves in N processes")
     parser.add_argument("--patient", action="store_true", help="take a file that may need hours")
+    parser.add_argument("--every", action="store_true", help="name every leaf that is refused, in the JSON object")
     try:
         options = parser.parse_args(arguments)
     except SystemExit as stop:
@@ -32,9 +33,10 @@ def main(arguments: list[str]) -> int:
     # Threads of several processes would wait for each other. numpy reads this when it is first imported: below.
     os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     try:
-        status, answer = _examine(options.file, options.jobs, options.patient)
+        status, answer = _examine(options.file, options.jobs, options.patient, options.every)
     except Rejected as no:
         status, answer = 1, {"result": "REJECTED", "rule": no.rule, "at": no.at, "detail": no.detail, "text": [str(no)]}
+        answer |= {"every": no.every} if no.every else {}
     except Unreadable as error:
         status, answer = 2, {"error": str(error), "text": []}
     except Exception as error:
@@ -56,7 +58,7 @@ def _jobs(text: str) -> int:
     return jobs
 
 
-def _examine(path: str, jobs: int, patient: bool) -> tuple[int, dict[str, Any]]:
+def _examine(path: str, jobs: int, patient: bool, every: bool) -> tuple[int, dict[str, Any]]:
     """Status and answer of a certificate that no rule rejects."""
     from . import document, words
 
@@ -65,7 +67,7 @@ def _examine(path: str, jobs: int, patient: bool) -> tuple[int, dict[str, Any]]:
     from . import rules  # after parsing: a malformed file needs no tables
 
     ready = time.perf_counter()
-    tally = rules.check(c, jobs, patient)
+    tally = rules.check(c, jobs, patient, every)
     seconds = {"start": ready - start, "check": time.perf_counter() - ready}
     answer: dict[str, Any] = {"certificate_sha256": c.sha256, "policy_sha256": c.policy.sha256(), "claim": c.claim}
     sample = None if c.sample is None else [str(h) for h in c.sample]

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 
 class Rejected(Exception):
-    """The certificate was read and is not valid: a rule failed at a place, for a reason."""
+    """The certificate was read and is not valid: a rule failed at a place, for a reason; and maybe at every one of
+    these leaves."""
+
+    every: tuple[str, ...] = ()
 
     def __init__(self, rule: str, at: str, detail: str) -> None:
         super().__init__(rule, at, detail)

@@ -143,9 +143,8 @@ def is_partition(case: Case) -> Failures:
 def decreases(leaves: RingLeaves) -> Failures:
     """`ring`: D + 2 lambda V < 0 on leaves that may meet the ring; on others of which anything is asked, F is smooth,
     or a step does not lead out."""
-    if not np.all(leaves.hold):
-        first = np.argmin(leaves.hold)
-        smooth = f"the decrease is not shown: {leaves.bound[first]:.3g}"
+    for k in np.flatnonzero(np.logical_not(leaves.hold)):
+        smooth = f"the decrease is not shown: {leaves.bound[k]:.3g}"
         steps = leaves.boxes.c.step > 0
-        yield f"leaf {leaves.numbers[first]}", smooth if leaves.meet[first] or steps else "F may be undefined"
+        yield f"leaf {leaves.numbers[k]}", smooth if leaves.meet[k] or steps else "F may be undefined"
     return int(np.sum(leaves.meet))

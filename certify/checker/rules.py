@@ -9,10 +9,11 @@ names the modules that it rests on.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from importlib import import_module
+from itertools import islice
 from typing import Any, TypeVar
 
 import numpy as np
@@ -152,17 +153,22 @@ class Tally:
     rules: Counter[str] = field(default_factory=lambda: Counter(dict.fromkeys(RULES, 0) | READ))
     margins: dict[str, float | None] = field(default_factory=lambda: dict.fromkeys(("local", "ring", "outer")))
     then: Tally | None = None  # of the certificate that takes over
+    every: bool = False  # whether a tree is refused at its first leaf that fails, or when all are known
 
     def hold(self, table: Table[Subject], subject: Subject) -> None:
         """Raise `Rejected` at the first failure of the first rule that fails; count what the rules have looked at."""
+        for failure in self.failures(table, subject):
+            raise failure
+
+    def failures(self, table: Table[Subject], subject: Subject) -> Iterator[Rejected]:
+        """The failures, and a count of what the rules have looked at that have none."""
         for name, rule in table:
             failures = rule(subject)
             try:
-                at, detail = next(failures)
+                while True:
+                    yield Rejected(name, *next(failures))
             except StopIteration as done:
                 self.rules[name] += done.value
-            else:
-                raise Rejected(name, at, detail)
 
     def hold_on_leaves(
         self, table: Table[Any], bounds: boxes.Boxes, tree: bytes, asked: Callable[[Any], Array]
@@ -170,24 +176,31 @@ class Tally:
         """Do so on the leaves of a tree; returns the margin of the bounds that must be negative, None if there are
         none."""
 
-        def examine(first: int, lo: Array, hi: Array) -> tuple[Counter[str], float]:
+        def examine(first: int, lo: Array, hi: Array) -> tuple[Counter[str], float, list[Rejected]]:
             own, leaves = Tally(Counter()), bounds.examine(first, lo, hi)
-            own.hold(table, leaves)
-            return own.rules, float(np.min(-asked(leaves), initial=np.inf))
+            failures = own.failures(table, leaves)
+            found = list(failures if self.every else islice(failures, 1))
+            return own.rules, float(np.min(-asked(leaves), initial=np.inf)), found
 
-        least = np.inf
-        for counts, margin in in_order(examine, bounds.leaves(), tree.count(boxes.LEAF), bounds.case.jobs):
+        least, refused = np.inf, list[Rejected]()
+        for counts, margin, found in in_order(examine, bounds.leaves(), tree.count(boxes.LEAF), bounds.case.jobs):
             self.rules.update(counts)
-            least = min(least, margin)
+            least, refused = min(least, margin), refused + found
+            if found and not self.every:
+                break
+        if refused:
+            refused[0].every = tuple(no.at for no in refused) if self.every else ()
+            raise refused[0]
         return least if least < np.inf else None
 
 
-def check(c: Certificate, jobs: int = 1, patient: bool = False) -> Tally:
+def check(c: Certificate, jobs: int = 1, patient: bool = False, every: bool = False) -> Tally:
     """Check every rule, those for leaves in so many processes; returns the tally, raises `Rejected` at the first rule
     that fails.
 
     Where evidence cannot be replayed, only the rules about what is stated are checked, and the caller must not say
     ACCEPTED; the tally then has no leaves. Rule `limits` takes files that need hours if the caller is `patient`.
+    If `every` leaf that fails is wanted, a refusal of leaves names them.
     """
     self_test()
     np.empty(_KEPT)  # given back at once: an allocator that adapts then keeps arrays, and need not ask for each anew
@@ -195,7 +208,7 @@ def check(c: Certificate, jobs: int = 1, patient: bool = False) -> Tally:
     spared = {"equilibrium": c.practical, "coordinates": not replayed, "root": not replayed}
     spared |= dict.fromkeys(("levels", "lyapunov", "equilibrium", "domain"), True) if c.without_V else {}
     with np.errstate(all="ignore"):  # overflow becomes infinity or NaN, and every test then fails
-        tally, case = Tally(), Case(c, jobs, patient)
+        tally, case = Tally(every=every), Case(c, jobs, patient)
         tally.hold([(name, rule) for name, rule in STATED if not spared.get(name)], case)
         for module, needs in OTHERS:
             if needs(c):

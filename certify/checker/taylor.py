@@ -162,7 +162,7 @@ def inner_product(x: Sequence[Taylor], y: Sequence[Taylor]) -> Taylor:
     N, T = found.symbols, np.zeros((found.symbols, *found.q.shape))
     for v, w in zip(x, y, strict=True):
         T += v.g[:, None] * w.q + w.g[:, None] * v.q
-    T = T.reshape(-1, T.shape[-1])
+    T = T.reshape(N * len(found.q), -1)
     places, there, thirds = _triples(N)
     cubic = sum(there[k][:, None] * T[places[k]] for k in range(3))
     all_terms = reduce(add, [v.third(w) for v, w in zip(x, y, strict=True)])

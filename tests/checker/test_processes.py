@@ -29,6 +29,7 @@ from certify.certificates import checking, run_checker
 from certify.checker import boxes, outer, processes, rules
 from certify.checker.__main__ import main
 from certify.checker.boxes import Batch, in_order
+from certify.checker.case import Case
 from certify.checker.errors import Rejected
 from certify.checker.ring import Ring
 from certify.errors import BackendError
@@ -72,6 +73,26 @@ def some(count: int, size: int = SIZE) -> Iterator[Batch]:
 
 
 # ----------------------------------------------------------------------------------------------- acceptance and refusal
+
+
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_every_refused_leaf_is_named_if_that_is_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], jobs: int
+) -> None:
+    """Those whose bound is not negative, and the answer is otherwise the same; what is accepted has none to name."""
+    data = with_tree(honest("rotor"), uniform(range(2), 6))
+    ring = Ring.of(Case(parse(data)))
+    found = [(leaves.numbers, leaves.hold) for leaves in (ring.examine(*batch) for batch in ring.leaves())]
+    numbers, hold = (np.concatenate(each) for each in zip(*found, strict=True))
+    names = [f"leaf {k}" for k in numbers[~hold]]
+    assert SIZE < len(names) < len(numbers) - 2
+    path, answers = str(write(data, tmp_path)), []
+    for more in ([], ["--every"]):
+        assert main([path, "--json", "--jobs", str(jobs), *more]) == 1
+        answers.append(json.loads(capsys.readouterr().out))
+    assert answers[1].pop("every") == names and answers[0] == answers[1] and answers[0]["at"] == names[0]
+    assert main([str(write(divided(), tmp_path)), "--json", "--every"]) == 0
+    assert "every" not in json.loads(capsys.readouterr().out)
 
 
 @pytest.mark.parametrize("jobs", slow_after(1, [3, 2, 7]))

@@ -47,7 +47,7 @@ class Acceptance:
         system, network = state.loop.system, state.loop.network
         parts = system, network, problem.V, state.claim, state.evidence, self.tools.provenance, state.data
         certificate = Certificate(*parts)  # type: ignore[arg-type]
-        clerk = _Desk(state, self.tools, effort).clerk()
+        clerk = _Desk(state, self.tools).clerk()
         accepted = clerk.accepted(certificate, problem)
         state = replace(state, accepted=accepted).noting(accepted.mended)
         return _concluded(_with_facts(state, accepted), accepted)
@@ -59,14 +59,12 @@ class _Desk:
 
     state: State
     tools: Tools
-    effort: Effort
 
     def clerk(self) -> Clerk:
         tools, claim = self.tools, self.state.claim
         ranked = claim is not None and claim.ranks is not None
         return Clerk(
             tools.out / "certificate.json",
-            lambda: self.effort.left,
             tools.timing,
             partial(tools.tell, "check"),
             tools.show,

@@ -1,4 +1,4 @@
-"""Remedies for a leaf that the checker refuses: split it again, or keep the level below it.
+"""Remedies for leaves that the checker refuses: split them again, or keep the level below one.
 
 Producer and checker round in their own ways, and a bound that is barely negative for the one may be barely positive for
 the other. Neither remedy starts anew: the tree stays, with one leaf more finely cut, or with a lower level.
@@ -6,7 +6,7 @@ the other. Neither remedy starts anew: the tree stays, with one leaf more finely
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,11 +23,13 @@ _DEPTH = 3  # halvings of a leaf that was refused
 _SLACK = 2e-9  # relative distance of a level from the leaves that it leaves out
 
 
-def split_again(problem: Problem, evidence: PartitionTree, claim: Claim, leaf: int) -> PartitionTree:
-    """The tree with the leaf of this number, counted in preorder, cut into eight along the axes that matter most."""
+def split_again(problem: Problem, evidence: PartitionTree, claim: Claim, refused: Sequence[int]) -> PartitionTree:
+    """The tree with the leaves of these numbers, counted in preorder, cut into eight along the axes that matter
+    most."""
     lo, hi = leaves(evidence.tree, evidence.root)
-    rule = VdotBound(problem, evidence.T, order=evidence.order)
-    tree = cut_leaf(evidence.tree, leaf, lo[leaf], hi[leaf], lambda a, b: rule(a, b, claim.inner, claim.roa).score)
+    rule, tree = VdotBound(problem, evidence.T, order=evidence.order), evidence.tree
+    for leaf in sorted(refused, reverse=True):  # a cut moves the numbers of those that come later
+        tree = cut_leaf(tree, leaf, lo[leaf], hi[leaf], lambda a, b: rule(a, b, claim.inner, claim.roa).score)
     return replace(evidence, tree=tree)
 
 
@@ -50,10 +52,10 @@ def _cut(score: Callable[[Array, Array], Array], lo: Array, hi: Array, depth: in
     return bytes([axis]) + b"".join(_cut(score, low, high, depth - 1) for low, high in halves)
 
 
-def below_leaf(problem: Problem, evidence: PartitionTree, leaf: int) -> float:
-    """A level that leaves the leaf outside; it may be negative, if the leaf holds the origin."""
+def below_leaves(problem: Problem, evidence: PartitionTree, refused: Sequence[int]) -> float:
+    """A level that leaves these leaves outside; it may be negative, if one holds the origin."""
     lowest, _ = leaf_levels(problem, evidence)
-    return float(lowest[leaf]) * (1 - _SLACK)
+    return float(np.min(lowest[list(refused)])) * (1 - _SLACK)
 
 
 def leaf_levels(problem: Problem, evidence: PartitionTree) -> tuple[Array, Array]:
