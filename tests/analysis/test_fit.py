@@ -351,6 +351,22 @@ def test_two_that_are_of_other_plants_are_not_joined_in_words(
     assert "of every plant that is one of both" in capsys.readouterr().out
 
 
+def test_two_of_other_samples_are_not_joined_in_words(fitted_box: Path) -> None:
+    """Both state the same sha256, which nobody compares with the numbers; in the second those are others where no slope
+    rests on them. A function near these is far from the samples of the first, and that claims nothing of it."""
+    for name, claim in (("far", "practical"), ("near", "asymptotic")):
+        assert proved(fitted_box, name, claim=claim).verdict == "PROVED"
+    far, near = (fitted_box / name / "certificate.json" for name in ("far", "near"))
+    assert compose(far, near, fitted_box / "same").to_dict()["samples"] is not None
+    data = json.loads(near.read_bytes())
+    rests = {k for ends in data["evidence"]["samples"][0]["weights"] for end in ends for k, _ in end}
+    values = data["claim"]["samples"]["functions"][0]["values"]
+    values[next(k for k in range(len(values)) if k not in rests)] = "5"
+    near.write_text(json.dumps(data))
+    both = compose(far, near, fitted_box / "both")
+    assert both.verdict == "PROVED" and both.to_dict()["samples"] is None
+
+
 @pytest.mark.parametrize("name", ["far", "near"])
 def test_equations_may_be_taken_as_they_stand(fitted_box: Path, name: str) -> None:
     result = proved(fitted_box, name, data=None, claim="practical" if name == "far" else "asymptotic")
