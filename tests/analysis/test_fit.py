@@ -241,6 +241,36 @@ def test_samples_that_refute_the_bounds(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("z", "said"),
+    [((0, 0, 0), "v is 0.5 away from 0 at the origin"), ((0.75, 0, 1), "v bends more along x around x = ")],
+)
+def test_one_sample_that_refutes_the_bounds(
+    asked: list[str], capsys: pytest.CaptureFixture[str], z: tuple[float, float, float], said: str
+) -> None:
+    """No slope at the origin rests on it: all that was proved of such samples would be of no function at all."""
+    rows = ["x,v,u,v_rate"]
+    for x, v, u in product(np.linspace(-1, 1, 9), (-1, 0, 1), (-1, 0, 1)):
+        rows.append(f"{x},{v},{u},{float(-2 * np.sin(x) - v + u) + 0.5 * ((x, v, u) == z)!r}")
+    Path(asked[1]).write_text("\n".join(rows))
+    assert _run(asked, False) == 1
+    assert said in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("M", [Fraction(2), Fraction(1, 3)])
+@pytest.mark.parametrize("noise", [Fraction(0), Fraction(1, 10)])
+def test_samples_may_bend_as_much_as_is_declared(M: Fraction, noise: Fraction) -> None:
+    """M z^2/2 on a grid of other steps, each sample off by all the noise, in turn; a bit less of either is refuted."""
+    axis = tuple(Fraction(k, 10) for k in (-10, -6, -5, 1, 2, 10))
+    values = {(z,): M * z * z / 2 + noise * (-1) ** k for k, z in enumerate(axis)}
+    grid, less = Grid((axis,), values), Fraction(1, 10**12)
+    linear.require_possible(Unknown("y", ("z",), ((M,),)), grid, noise)
+    for bent, off in ((M - less, noise), (M, noise - less)):
+        if off >= 0:
+            with pytest.raises(Contradicted, match="bends more along z"):
+                linear.require_possible(Unknown("y", ("z",), ((bent,),)), grid, off)
+
+
 @pytest.mark.slow
 def test_three_states_from_samples_to_one_claim(tmp_path: Path) -> None:
     """x' = y, y' = v, v' = 3 sin x - y - v + u, of which |g_xx| <= 3 is declared and that all else is linear."""
