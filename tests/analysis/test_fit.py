@@ -200,6 +200,7 @@ def test_samples_that_are_none(
         ('"x*v" = 0\n', "", "there must be a bound for each pair"),
         ('"x*v" = 0', '"x*w" = 0', "must be two states or inputs"),
         ('"x*v" = 0', '"x*v" = -1', "must be at least 0, and stand once"),
+        ('"x*v" = 0', '"x*v" = 1e400', "must have some 35 digits at most"),
         ('"x*v" = 0', '"x*v" = 0\n"v*x" = 1', "must be at least 0, and stand once"),
         ("[unknown.v]", "[unknown.y]", "is no state"),
         ('x = "v"', 'x = "v"\nv = "u"', "not both"),
@@ -255,6 +256,14 @@ def test_one_sample_that_refutes_the_bounds(
     Path(asked[1]).write_text("\n".join(rows))
     assert _run(asked, False) == 1
     assert said in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("noise", ["1e400", "1e-40", "-1", "v=1,v=2", "x=1"])
+def test_bounds_of_the_noise_that_are_none(asked: list[str], capsys: pytest.CaptureFixture[str], noise: str) -> None:
+    asked[asked.index("--noise") + 1] = noise
+    assert _run(asked, False) == 2
+    said = {"1": "some 35 digits at most", "-": "at least 0", "v": "found v twice", "x": "a bound for v"}[noise[0]]
+    assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("M", [Fraction(2), Fraction(1, 3)])
@@ -436,6 +445,17 @@ def test_files_that_were_changed(fitted_box: Path, name: str, old: str, new: str
     path.write_text(re.sub(r"(-1\.9)[.0-9]*,", r"\1,", path.read_text().replace(old, new, 1)))
     with pytest.raises(InputError, match=re.escape(said)):
         proved(fitted_box, name, claim="practical" if name == "far" else "asymptotic")
+
+
+def test_axes_may_have_numbers_of_many_digits(asked: list[str], fitted_box: Path) -> None:
+    """Both checkers expand a polynomial of high degree around them."""
+    rows, ends = ["x,v,u,v_rate"], (-1.4142135623730951, 1.4142135623730951)
+    for x, v, u in product(np.linspace(-2 * np.pi / 3, 2 * np.pi / 3, 17).tolist(), ends, ends):
+        rows.append(f"{x!r},{v!r},{u!r},{float(-2 * np.sin(x) - v + u)!r}")
+    Path(asked[1]).write_text("\n".join(rows))
+    assert _run([*asked, "--degree", "14"], False) == 0
+    result = proved(fitted_box, "far", claim="practical")
+    assert result.verdict == "PROVED" and (result.checker or {})["reference"]["result"] == "ACCEPTED"
 
 
 def test_other_samples_are_refused(fitted_box: Path) -> None:

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise, product
-from math import comb, prod
+from math import comb, frexp, prod
 
 import numpy as np
 from scipy.optimize import linprog
@@ -105,7 +105,8 @@ def fitted(one: Unknown, grid: Grid, degree: int) -> Polynomial:
     ]
     if len(powers) > _TERMS or sum(prod(k + 1 for k in p) for p in powers) > _PARTS:
         raise InputError(f"`degree` {degree} makes a larger polynomial than the checkers expand: try a lower one.")
-    scale = tuple(max(abs(axis[0]), abs(axis[-1])) for axis in grid.axes)
+    # powers of 2, whose own powers are short numbers
+    scale = tuple(Fraction(2) ** frexp(max(abs(axis[0]), abs(axis[-1])))[1] for axis in grid.axes)
     points = np.array([[float(v / s) for v, s in zip(z, scale, strict=True)] for z in grid.values])
     values = np.array([float(y) for y in grid.values.values()])
     columns = np.stack([np.prod(points ** np.array(p), axis=1) for p in powers], axis=1)

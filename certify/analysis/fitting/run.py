@@ -128,7 +128,7 @@ def _require_at_rest(system: System, file: PlantFile) -> None:
 
 
 def _fitted(one: Unknown, grid: Grid, noise: Fraction, system: System, degree: int, samples: Path) -> Fitted:
-    require_covered(system, one, grid, str(samples))
+    require_covered(system, one, grid, noise, str(samples))
     if noise < 0:
         raise InputError(f"the bound of the noise must be at least 0; found {float(noise):g} for {one.state}.")
     require_possible(one, grid, noise)
