@@ -458,6 +458,20 @@ def test_axes_may_have_numbers_of_many_digits(asked: list[str], fitted_box: Path
     assert result.verdict == "PROVED" and (result.checker or {})["reference"]["result"] == "ACCEPTED"
 
 
+def test_samples_without_noise_of_what_does_not_bend(asked: list[str], tmp_path: Path, fitted_box: Path) -> None:
+    """Of these the polynomial is exact: nothing of the equation is uncertain, and far and near may be asymptotic."""
+    (tmp_path / "box.toml").write_text(STRUCTURE.replace('"x*x" = 2', '"x*x" = 0'))
+    rows = [f"{x},{v},{u},{u - v - 2 * x}" for x, v, u in product((-1, 1), repeat=3)]
+    Path(asked[1]).write_text("\n".join(["x,v,u,v_rate", *rows]))
+    asked[asked.index("--noise") + 1] = "0"
+    assert _run(asked, False) == 0
+    for name in ("far", "near"):
+        result = proved(fitted_box, name, claim="asymptotic")
+        assert result.verdict == "PROVED" and (result.checker or {})["reference"]["result"] == "ACCEPTED"
+    claim = json.loads((fitted_box / "far" / "certificate.json").read_bytes())
+    assert claim["plant"]["uncertain"] == [] and claim["evidence"]["samples"][0]["error"] is None
+
+
 def test_other_samples_are_refused(fitted_box: Path) -> None:
     path = fitted_box / "samples.csv"
     path.write_text(path.read_text() + "\n")

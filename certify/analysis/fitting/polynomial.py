@@ -150,15 +150,17 @@ class Bound:
     def text(self) -> str:
         """The bound as an equation of a plant's file."""
         each = zip(self.variables, self.rise, strict=True)
-        return " + ".join([f"({self.constant})", *(f"({k})*{v}**2" for v, k in each if k)])
+        constant = [f"({self.constant})"] if self.constant else []
+        return " + ".join([*constant, *(f"({k})*{v}**2" for v, k in each if k)]) or "0"
 
 
 def bounded(variables: tuple[str, ...], each: Mapping[Cell, Fraction], flat: bool = False) -> Bound:
     """A bound of so simple a form of what is known cell by cell, `flat` a constant: by a linear program that asks for
-    the least mean of its ratios to these, then raised by as much as it misses in rationals."""
+    the least mean of its ratios to these, then raised by as much as it misses in rationals. A constant too if some of
+    these are 0."""
     rise = [Fraction(0)] * len(variables)
     least = {cell: [Fraction(0) if lo <= 0 <= hi else min(lo * lo, hi * hi) for lo, hi in cell] for cell in each}
-    if not flat:
+    if not flat and all(each.values()):
         rows = np.array([[1.0, *map(float, squares)] for squares in least.values()])
         sizes = np.array([float(e) for e in each.values()])
         solved = linprog((rows / sizes[:, None]).mean(axis=0), A_ub=-rows, b_ub=-sizes)
