@@ -200,7 +200,7 @@ def test_samples_that_are_none(
         ('"x*v" = 0\n', "", "there must be a bound for each pair"),
         ('"x*v" = 0', '"x*w" = 0', "must be two states or inputs"),
         ('"x*v" = 0', '"x*v" = -1', "must be at least 0, and stand once"),
-        ('"x*v" = 0', '"x*v" = 1e400', "must have some 35 digits at most"),
+        ('"x*v" = 0', '"x*v" = 1e40', "must have some 35 digits at most"),
         ('"x*v" = 0', '"x*v" = 0\n"v*x" = 1', "must be at least 0, and stand once"),
         ("[unknown.v]", "[unknown.y]", "is no state"),
         ('x = "v"', 'x = "v"\nv = "u"', "not both"),
