@@ -193,7 +193,12 @@ def widths(text: str, name: str) -> dict[str, float]:
 
 def state(text: str, name: str) -> dict[str, Fraction]:
     """Exact numbers by name, separated by commas or spaces."""
-    return {key: _exact(value, key) for key, value in _assignments(text, f"`{name}`")}
+    found = dict[str, Fraction]()
+    for key, value in _assignments(text, f"`{name}`"):
+        if key in found:
+            raise OptionError(f"`{name}` must name each number once; found {key} twice.")
+        found[key] = _exact(value, key)
+    return found
 
 
 def bound_or_bounds(text: str, name: str) -> Fraction | dict[str, Fraction]:

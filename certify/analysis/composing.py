@@ -76,16 +76,14 @@ class ComposeResult:
 
 
 def _known(system: System, found: Mapping[str, Any]) -> dict[str, Any]:
-    """The parts of a plant with sampled functions by which its plants are known; nothing where other quantities are
-    uncertain."""
-    functions = {f["state"]: f for f in found["functions"]}
-    if {*system.ranges} - {name for f in functions.values() for name in f["quantities"]}:
+    """The parts of a plant with sampled functions by which its plants are known, the sampled numbers among them;
+    nothing where other quantities are uncertain."""
+    samples = system.samples
+    if samples is None or {*system.ranges} - {name for f in found["functions"] for name in f["quantities"]}:
         return {}
-    equations = {s.name: e for s, e in zip(system.states, system.uncertain_dynamics(), strict=True)}
-    same = ("variables", "curvature", "noise", "samples")
-    return {"sha256": found["sha256"]} | {
-        name: [functions[name][key] for key in same] if name in functions else e for name, e in equations.items()
-    }
+    equations: dict[str, Any] = {s.name: e for s, e in zip(system.states, system.uncertain_dynamics(), strict=True)}
+    functions = {one.state: (one, samples.noise[one.state], samples.grids[one.state]) for one in samples.unknowns}
+    return {"sha256": samples.sha256, **equations, **functions}
 
 
 def compose(outer: Path | str, inner: Path | str, out: Path | str, jobs: int | None = None) -> ComposeResult:

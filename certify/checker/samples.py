@@ -357,7 +357,8 @@ def sampled(c: Certificate, samples: Samples) -> list[str]:
         lines.append(
             f"  and so for every plant in which {c.states[f.state]}{'+' if c.discrete else chr(39)} is instead a "
             f"function of {', '.join(z)} with continuous second derivatives, of size at most {bends} where {box}, that "
-            f"is within {number(fraction(f.noise))} of {len(f.values)} samples at the points of a grid there{rest}"
+            f"is within {number(fraction(f.noise))} of the {len(f.values)} samples that the certificate states "
+            f"at the points of a grid there{rest}"
         )
-    end = f"  the samples are from a file with sha256 {samples.sha256}; of other functions nothing is claimed"
+    end = f"  of other functions nothing is claimed; the samples are said to be of a file with sha256 {samples.sha256}"
     return [*lines, end]

@@ -32,8 +32,8 @@ def fit(
 ) -> None:
     """Fit functions that nobody wrote down, with bounds of what they may be off by.
 
-    The bounds of second derivatives in the structure are what is assumed. The exit status is 1 if the samples refute
-    them.
+    The bounds of second derivatives in the structure are what is assumed, wherever the grid of samples reaches. The
+    exit status is 1 if the samples refute them.
     """
     from certify.analysis.fitting.linear import Contradicted
     from certify.analysis.fitting.run import fit_plant
@@ -49,7 +49,10 @@ def fit(
     try:
         result = fit_plant(samples, structure, of, out, degree)
     except Contradicted as error:
-        what = "these samples refute the bounds of second derivatives and of the noise, or that 0 is an equilibrium"
+        what = (
+            "these samples refute the bounds of second derivatives and of the noise, as far as the grid reaches, or "
+            "that 0 is an equilibrium"
+        )
         found = {"verdict": "REFUTED", "reason": f"{what}: {error}"}
         say(json.dumps(found) if as_json else f"REFUTED  {found['reason']}")
         raise typer.Exit(1) from None
@@ -69,6 +72,7 @@ def _lines(result: FitResult) -> list[str]:
         for v, (lo, hi) in zip(one.unknown.variables, one.slopes, strict=True):
             lines.append(f"slope        {v}: {below(lo)} to {above(hi)}")
         lines.append(f"beyond       at most {one.beyond}")
-    lines.append("assumed      the bounds of second derivatives and of the noise, and that 0 is an equilibrium")
+    assumed = "the bounds of second derivatives and of the noise, as far as the grid reaches"
+    lines.append(f"assumed      {assumed}, and that 0 is an equilibrium")
     lines.append("in a claim   with certify roa --data, for which both checkers derive error and slopes again")
     return [*lines, f"far          {result.far}", f"near         {result.near}"]

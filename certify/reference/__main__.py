@@ -174,8 +174,8 @@ def sampled(c: Certificate) -> str:
             f"most {bends}, values within {f.noise} of the {len(f.values)} that the certificate states{zero}"
         )
     return (
-        f"; and this holds, instead of for the equations alone, for all functions of these (samples of a file with "
-        f"sha256 {c.samples.sha256}): {'; '.join(each)}; of other functions nothing is said"
+        f"; and this holds, instead of for the equations alone, for all functions of these (samples said to be of a "
+        f"file with sha256 {c.samples.sha256}): {'; '.join(each)}; of other functions nothing is said"
     )
 
 

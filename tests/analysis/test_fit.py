@@ -171,7 +171,8 @@ def test_two_plants_are_written(asked: list[str], tmp_path: Path, capsys: pytest
     assert np.abs(far.function()(z[:, :2], z[:, 2:])[:, 1] - true).max() < 0.035
     assert [p for p in near.ranges if p.startswith("slope_v_")] == ["slope_v_x", "slope_v_v", "slope_v_u"]
     assert _run(asked, False) == 0
-    assert "assumed      the bounds of second derivatives" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "assumed      the bounds of second derivatives and of the noise, as far as the grid reaches, and" in said
 
 
 @pytest.mark.parametrize(
@@ -199,6 +200,7 @@ def test_samples_that_are_none(
         ('"x*v" = 0\n', "", "there must be a bound for each pair"),
         ('"x*v" = 0', '"x*w" = 0', "must be two states or inputs"),
         ('"x*v" = 0', '"x*v" = -1', "must be at least 0, and stand once"),
+        ('"x*v" = 0', '"x*v" = 1e40', "must have some 35 digits at most"),
         ('"x*v" = 0', '"x*v" = 0\n"v*x" = 1', "must be at least 0, and stand once"),
         ("[unknown.v]", "[unknown.y]", "is no state"),
         ('x = "v"', 'x = "v"\nv = "u"', "not both"),
@@ -235,8 +237,47 @@ def test_samples_that_refute_the_bounds(
         rows = [row.rsplit(",", 1) for row in samples.read_text().splitlines()[1:]]
         samples.write_text("x,v,u,v_rate\n" + "\n".join(f"{z},{float(y) + 3!r}" for z, y in rows))
     assert _run(asked, False) == 1
-    assert capsys.readouterr().out.startswith("REFUTED  these samples refute the bounds of second derivatives")
+    said = "REFUTED  these samples refute the bounds of second derivatives and of the noise, as far as the grid reaches"
+    assert capsys.readouterr().out.startswith(said)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("z", "said"),
+    [((0, 0, 0), "v is 0.5 away from 0 at the origin"), ((0.75, 0, 1), "v bends more along x around x = ")],
+)
+def test_one_sample_that_refutes_the_bounds(
+    asked: list[str], capsys: pytest.CaptureFixture[str], z: tuple[float, float, float], said: str
+) -> None:
+    """No slope at the origin rests on it: all that was proved of such samples would be of no function at all."""
+    rows = ["x,v,u,v_rate"]
+    for x, v, u in product(np.linspace(-1, 1, 9), (-1, 0, 1), (-1, 0, 1)):
+        rows.append(f"{x},{v},{u},{float(-2 * np.sin(x) - v + u) + 0.5 * ((x, v, u) == z)!r}")
+    Path(asked[1]).write_text("\n".join(rows))
+    assert _run(asked, False) == 1
+    assert said in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("noise", ["1e400", "1e-40", "-1", "v=1,v=2", "x=1"])
+def test_bounds_of_the_noise_that_are_none(asked: list[str], capsys: pytest.CaptureFixture[str], noise: str) -> None:
+    asked[asked.index("--noise") + 1] = noise
+    assert _run(asked, False) == 2
+    said = {"1": "some 35 digits at most", "-": "at least 0", "v": "found v twice", "x": "a bound for v"}[noise[0]]
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("M", [Fraction(2), Fraction(1, 3)])
+@pytest.mark.parametrize("noise", [Fraction(0), Fraction(1, 10)])
+def test_samples_may_bend_as_much_as_is_declared(M: Fraction, noise: Fraction) -> None:
+    """M z^2/2 on a grid of other steps, each sample off by all the noise, in turn; a bit less of either is refuted."""
+    axis = tuple(Fraction(k, 10) for k in (-10, -6, -5, 1, 2, 10))
+    values = {(z,): M * z * z / 2 + noise * (-1) ** k for k, z in enumerate(axis)}
+    grid, less = Grid((axis,), values), Fraction(1, 10**12)
+    linear.require_possible(Unknown("y", ("z",), ((M,),)), grid, noise)
+    for bent, off in ((M - less, noise), (M, noise - less)):
+        if off >= 0:
+            with pytest.raises(Contradicted, match="bends more along z"):
+                linear.require_possible(Unknown("y", ("z",), ((bent,),)), grid, off)
 
 
 @pytest.mark.slow
@@ -351,6 +392,22 @@ def test_two_that_are_of_other_plants_are_not_joined_in_words(
     assert "of every plant that is one of both" in capsys.readouterr().out
 
 
+def test_two_of_other_samples_are_not_joined_in_words(fitted_box: Path) -> None:
+    """Both state the same sha256, which nobody compares with the numbers; in the second those are others where no slope
+    rests on them. A function near these is far from the samples of the first, and that claims nothing of it."""
+    for name, claim in (("far", "practical"), ("near", "asymptotic")):
+        assert proved(fitted_box, name, claim=claim).verdict == "PROVED"
+    far, near = (fitted_box / name / "certificate.json" for name in ("far", "near"))
+    assert compose(far, near, fitted_box / "same").to_dict()["samples"] is not None
+    data = json.loads(near.read_bytes())
+    rests = {k for ends in data["evidence"]["samples"][0]["weights"] for end in ends for k, _ in end}
+    values = data["claim"]["samples"]["functions"][0]["values"]
+    values[next(k for k in range(len(values)) if k not in rests)] = "5"
+    near.write_text(json.dumps(data))
+    both = compose(far, near, fitted_box / "both")
+    assert both.verdict == "PROVED" and both.to_dict()["samples"] is None
+
+
 @pytest.mark.parametrize("name", ["far", "near"])
 def test_equations_may_be_taken_as_they_stand(fitted_box: Path, name: str) -> None:
     result = proved(fitted_box, name, data=None, claim="practical" if name == "far" else "asymptotic")
@@ -388,6 +445,31 @@ def test_files_that_were_changed(fitted_box: Path, name: str, old: str, new: str
     path.write_text(re.sub(r"(-1\.9)[.0-9]*,", r"\1,", path.read_text().replace(old, new, 1)))
     with pytest.raises(InputError, match=re.escape(said)):
         proved(fitted_box, name, claim="practical" if name == "far" else "asymptotic")
+
+
+def test_axes_may_have_numbers_of_many_digits(asked: list[str], fitted_box: Path) -> None:
+    """Both checkers expand a polynomial of high degree around them."""
+    rows, ends = ["x,v,u,v_rate"], (-1.4142135623730951, 1.4142135623730951)
+    for x, v, u in product(np.linspace(-2 * np.pi / 3, 2 * np.pi / 3, 17).tolist(), ends, ends):
+        rows.append(f"{x!r},{v!r},{u!r},{float(-2 * np.sin(x) - v + u)!r}")
+    Path(asked[1]).write_text("\n".join(rows))
+    assert _run([*asked, "--degree", "14"], False) == 0
+    result = proved(fitted_box, "far", claim="practical")
+    assert result.verdict == "PROVED" and (result.checker or {})["reference"]["result"] == "ACCEPTED"
+
+
+def test_samples_without_noise_of_what_does_not_bend(asked: list[str], tmp_path: Path, fitted_box: Path) -> None:
+    """Of these the polynomial is exact: nothing of the equation is uncertain, and far and near may be asymptotic."""
+    (tmp_path / "box.toml").write_text(STRUCTURE.replace('"x*x" = 2', '"x*x" = 0'))
+    rows = [f"{x},{v},{u},{u - v - 2 * x}" for x, v, u in product((-1, 1), repeat=3)]
+    Path(asked[1]).write_text("\n".join(["x,v,u,v_rate", *rows]))
+    asked[asked.index("--noise") + 1] = "0"
+    assert _run(asked, False) == 0
+    for name in ("far", "near"):
+        result = proved(fitted_box, name, claim="asymptotic")
+        assert result.verdict == "PROVED" and (result.checker or {})["reference"]["result"] == "ACCEPTED"
+    claim = json.loads((fitted_box / "far" / "certificate.json").read_bytes())
+    assert claim["plant"]["uncertain"] == [] and claim["evidence"]["samples"][0]["error"] is None
 
 
 def test_other_samples_are_refused(fitted_box: Path) -> None:

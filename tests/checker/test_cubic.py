@@ -278,6 +278,16 @@ def test_every_power_has_its_place_in_what_a_function_adds(order: int, left: str
     assert used > 0.02 or left == right == "a"
 
 
+@pytest.mark.parametrize("order", [2, 3, 4])
+@pytest.mark.parametrize(("slack", "q", "E"), [(0.1, 0.0, 0.0), (0.0, 0.5, 0.0), (0.3, 0.5, 0.0), (0.2, 0.3, 0.4)])
+def test_powers_of_one_direction_reach_their_bounds(order: int, slack: float, q: float, E: float) -> None:
+    """D^order of D = (1 + slack) d + q d^2 + E d^2 at d = 1."""
+    jet = plain(0.0, 0.0, np.array([1.0]), slack, np.array([[q]]), np.array([[E]]))
+    H, C, R = beyond_tangent(jet, [float(j == order) for j in range(4)], 1.0, float(order == 4))
+    off, bound = (1 + slack + q + E) ** order - H[0, 0] - C[0], R[0, 0]
+    assert off <= bound * (1 + 1e-12) and off > 0.99 * bound
+
+
 def test_a_cube_keeps_the_direction_of_the_gradient() -> None:
     """3 y^2 z of D^3 counts along the gradient, and across it only what is of second order in z."""
     jet = plain(0.0, 0.0, np.array([1.0, 0.0]), 0.0, np.diag([0.0, 1e-6]), np.zeros((2, 2)))

@@ -575,6 +575,7 @@ def _entries(matrix: sympy.Matrix) -> tuple[tuple[Expression, ...], ...]:
     [
         ('name = "tank"', "name = tank", "in 'name = tank'. Put text and equations in quotes: name = \"tank\"."),
         ("level = [0, 1]", "level = [1, 0]", "domain.level: the bounds of level must satisfy lo < hi; found [1, 0]."),
+        ("level = [0, 1]", "level = [0, 1e400]", "domain.level: must be a number below 1.8e308 in size; found"),
     ],
 )
 def test_a_fault_of_the_file_is_named_with_its_repair(tmp_path: Path, old: str, new: str, said: str) -> None:

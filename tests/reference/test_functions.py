@@ -21,7 +21,7 @@ from certify.checker.activations import add as add_activations
 from certify.checker.functions import FUNCTIONS as CHECKERS
 from certify.checker.near import Above, Near
 from certify.checker.smooth import add as add_smooth
-from certify.reference.balls import ON_LEAVES, PRECISION, SPREAD, ZERO
+from certify.reference.balls import ON_LEAVES, PRECISION, SPREAD
 from certify.reference.functions import Expansion, beyond_tangent, function_of
 from certify.reference.model import Model
 from certify.reference.networks import MAPS
@@ -246,14 +246,17 @@ def test_models_on_balls_hold_the_function(name: str, slack: float) -> None:
 
 
 @pytest.mark.parametrize("order", [2, 3, 4])
+@pytest.mark.parametrize("moved", [0.0, 0.25])
 @pytest.mark.parametrize(("slack", "q", "E"), [(0.1, 0.0, 0.0), (0.0, 0.5, 0.0), (0.3, 0.5, 0.0), (0.2, 0.3, 0.4)])
-def test_powers_of_one_direction_reach_their_bounds(order: int, slack: float, q: float, E: float) -> None:
-    """D^order of D = (1 + slack) d + q d^2 + E d^2 at d = 1."""
-    phi = Expansion(tuple(arb(j == order) for j in range(4)), (ZERO,) * 4, arb(order == 4), arb(4 * (order == 4)))
+def test_powers_of_one_direction_reach_their_bounds(order: int, moved: float, slack: float, q: float, E: float) -> None:
+    """(1 + moved) D^order of D = (1 + slack) d + q d^2 + E d^2 at d = 1."""
+    at, more = (tuple(arb(c * (j == order)) for j in range(4)) for c in (1, moved))
+    fourth = arb((1 + moved) * (order == 4))
+    phi = Expansion((at[0], at[1], at[2], at[3]), (more[0], more[1], more[2], more[3]), fourth, 4 * fourth)
     with ctx.workprec(PRECISION):
         found = beyond_tangent(on_a_ball([1.0], [[q]], E, slack), phi)
         D = arb(1) + slack + q + E
-        off, bound = D**order - found.H[0, 0] - found.C[0, 0], found.R[0, 0]
+        off, bound = (1 + arb(moved)) * D**order - found.H[0, 0] - found.C[0, 0], found.R[0, 0]
         assert not off > bound * (1 + arb(2) ** -60)
     assert off > 0.99 * bound
 

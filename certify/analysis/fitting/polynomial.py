@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise, product
-from math import comb, prod
+from math import comb, frexp, prod
 
 import numpy as np
 from scipy.optimize import linprog
@@ -105,7 +105,8 @@ def fitted(one: Unknown, grid: Grid, degree: int) -> Polynomial:
     ]
     if len(powers) > _TERMS or sum(prod(k + 1 for k in p) for p in powers) > _PARTS:
         raise InputError(f"`degree` {degree} makes a larger polynomial than the checkers expand: try a lower one.")
-    scale = tuple(max(abs(axis[0]), abs(axis[-1])) for axis in grid.axes)
+    # powers of 2, whose own powers are short numbers
+    scale = tuple(Fraction(2) ** frexp(max(abs(axis[0]), abs(axis[-1])))[1] for axis in grid.axes)
     points = np.array([[float(v / s) for v, s in zip(z, scale, strict=True)] for z in grid.values])
     values = np.array([float(y) for y in grid.values.values()])
     columns = np.stack([np.prod(points ** np.array(p), axis=1) for p in powers], axis=1)
@@ -149,15 +150,17 @@ class Bound:
     def text(self) -> str:
         """The bound as an equation of a plant's file."""
         each = zip(self.variables, self.rise, strict=True)
-        return " + ".join([f"({self.constant})", *(f"({k})*{v}**2" for v, k in each if k)])
+        constant = [f"({self.constant})"] if self.constant else []
+        return " + ".join([*constant, *(f"({k})*{v}**2" for v, k in each if k)]) or "0"
 
 
 def bounded(variables: tuple[str, ...], each: Mapping[Cell, Fraction], flat: bool = False) -> Bound:
     """A bound of so simple a form of what is known cell by cell, `flat` a constant: by a linear program that asks for
-    the least mean of its ratios to these, then raised by as much as it misses in rationals."""
+    the least mean of its ratios to these, then raised by as much as it misses in rationals. A constant too if some of
+    these are 0."""
     rise = [Fraction(0)] * len(variables)
     least = {cell: [Fraction(0) if lo <= 0 <= hi else min(lo * lo, hi * hi) for lo, hi in cell] for cell in each}
-    if not flat:
+    if not flat and all(each.values()):
         rows = np.array([[1.0, *map(float, squares)] for squares in least.values()])
         sizes = np.array([float(e) for e in each.values()])
         solved = linprog((rows / sizes[:, None]).mean(axis=0), A_ub=-rows, b_ub=-sizes)

@@ -17,7 +17,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from certify.analysis.fitting.linear import residual_text, slopes
+from certify.analysis.fitting.linear import require_possible, residual_text, slopes
 from certify.analysis.fitting.polynomial import Bound, Polynomial, bounded, errors, fitted
 from certify.analysis.fitting.samples import bounds_of, read_samples, require_covered, suffix_of
 from certify.certificates import write_atomically
@@ -128,9 +128,10 @@ def _require_at_rest(system: System, file: PlantFile) -> None:
 
 
 def _fitted(one: Unknown, grid: Grid, noise: Fraction, system: System, degree: int, samples: Path) -> Fitted:
-    require_covered(system, one, grid, str(samples))
+    require_covered(system, one, grid, noise, str(samples))
     if noise < 0:
         raise InputError(f"the bound of the noise must be at least 0; found {float(noise):g} for {one.state}.")
+    require_possible(one, grid, noise)
     p = fitted(one, grid, degree)
     sizes = [max(abs(lo), abs(hi)) for lo, hi in (bounds_of(system)[name] for name in one.variables)]
     each = errors(p, one, grid, noise)

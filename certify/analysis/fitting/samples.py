@@ -11,7 +11,7 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
-from itertools import product
+from itertools import chain, product
 from math import prod
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from certify.loop.plants.samples import Grid, Samples, Unknown
 from certify.loop.plants.system import Interval, System
 
 _MOST_SAMPLES, _MOST_BITS = 200_000, 2**7  # bits of a number, as the checkers read them
+_LENGTH = "some 35 digits at most"
 
 
 def read_samples(path: Path, unknowns: Sequence[Unknown], suffix: str) -> tuple[dict[str, Grid], str]:
@@ -53,9 +54,11 @@ def read_samples(path: Path, unknowns: Sequence[Unknown], suffix: str) -> tuple[
     return grids, hashlib.sha256(raw).hexdigest()
 
 
-def require_covered(system: System, one: Unknown, grid: Grid, which: str) -> None:
-    """Reject samples that do not reach over the domain, the input bounds and 0, or whose numbers are too long."""
+def require_covered(system: System, one: Unknown, grid: Grid, noise: Fraction, which: str) -> None:
+    """Reject samples that do not reach over the domain, the input bounds and 0, or bounds of too long numbers."""
     bounds = bounds_of(system)
+    if any(map(_is_long, (noise, *chain(*one.curvature)))):
+        raise InputError(f"bounds of the noise and of second derivatives of {one.state} must have {_LENGTH}.")
     for name, axis in zip(one.variables, grid.axes, strict=True):
         lo, hi = bounds[name]
         if not (axis[0] <= min(lo, Fraction(0)) and max(hi, Fraction(0)) <= axis[-1]):
@@ -97,9 +100,13 @@ def _number(row: Sequence[str], at: int, path: Path, line: int) -> Fraction:
         found = Fraction(decimal(row[at].strip()))
     except (IndexError, ValueError) as error:
         raise InputError(f"samples {path}, line {line}: entry {at + 1} must be a decimal number.") from error
-    if max(found.numerator.bit_length(), found.denominator.bit_length()) > _MOST_BITS:
-        raise InputError(f"samples {path}, line {line}: entry {at + 1} must have some 35 digits at most.")
+    if _is_long(found):
+        raise InputError(f"samples {path}, line {line}: entry {at + 1} must have {_LENGTH}.")
     return found
+
+
+def _is_long(q: Fraction) -> bool:
+    return max(q.numerator.bit_length(), q.denominator.bit_length()) > _MOST_BITS
 
 
 def _grid(one: Unknown, columns: Mapping[str, Sequence[Fraction]], name: str, path: Path) -> Grid:

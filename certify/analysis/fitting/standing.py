@@ -60,7 +60,7 @@ def standing_for(system: System, samples: Samples) -> SampleBounds:
 
 
 def _standing(system: System, one: Unknown, grid: Grid, noise: Fraction) -> Standing:
-    require_covered(system, one, grid, f"of {one.state}")
+    require_covered(system, one, grid, noise, f"of {one.state}")
     found = _equation(system, one)
     if found.error is not None and not (system.ranges[found.error][0] <= -1 and system.ranges[found.error][1] >= 1):
         raise InputError(f"the range of {found.error} must hold [-1, 1], as certify fit writes it.")

@@ -17,7 +17,7 @@ class Unknown:
     ----------
     state : its name.
     variables : names of the states and inputs that g depends on, and of no others.
-    curvature : bounds of the absolute second derivatives of g on the domain and the input bounds, (d, d), symmetric.
+    curvature : bounds of the absolute second derivatives of g wherever the grid of samples reaches, (d, d), symmetric.
     """
 
     state: str

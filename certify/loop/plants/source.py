@@ -137,14 +137,18 @@ def number_at(file: PlantFile, value: Any, *keys: str) -> Fraction:
 
     Raises
     ------
-    InputError : it is none.
+    InputError : it is none, or beyond all floats.
     """
     if isinstance(value, bool) or not isinstance(value, int | str | Fraction):
         raise file.refuse(f"must be a number such as 0.15 or the text '3/20'; found {value!r}.", *keys)
     try:
-        return exact(value, keys[-1])
+        found = exact(value, keys[-1])
+        float(found)
     except InputError as error:
         raise file.refuse(str(error), *keys) from error
+    except OverflowError as error:
+        raise file.refuse(f"must be a number below 1.8e308 in size; found {value!s:.80}.", *keys) from error
+    return found
 
 
 def _hint(line: str) -> str:
