@@ -359,6 +359,9 @@ def test_files_of_numbers(tmp_path: Path) -> None:
         agree(import_policy(tmp_path / name, PLANT, replace(LAYERS, prefix=prefix)).policy, net)
     with pytest.raises(InputError, match=r"is a module that was pickled whole.* traced"):
         import_policy(tmp_path / "whole.pt", PLANT, LAYERS)
+    torch.export.save(torch.export.export(net.eval(), (torch.zeros(1, 2),)), tmp_path / "program.pt2")
+    with pytest.raises(InputError, match=r"is a program of torch\.export.*ONNX"):
+        import_policy(tmp_path / "program.pt2", PLANT, LAYERS)
     with pytest.raises(InputError, match=r"fc1 \(2 to 6\), mean \(6 to 1\).*--prefix fc1,fc2,fc3"):
         import_policy(tmp_path / "plain.pt", PLANT, LAYERS)
     with pytest.raises(InputError, match=r"name each layer once.*fc1 \(2 to 6\)"):
