@@ -102,8 +102,8 @@ def test_a_solver_s_word_is_not_weakened() -> None:
     assert _lowered(certificate, ON_RING, Problem(ClosedLoop(system, network), V), 0) is None
 
 
-def test_a_refused_leaf_is_split_once_without_any_effort(tmp_path: Path) -> None:
-    """A lower level takes a check as well; only then the level is lowered, below the leaf."""
+def test_refused_leaves_are_split_three_times_and_then_left_outside(tmp_path: Path) -> None:
+    """All that are named, at once; only then the level is lowered, below them."""
     system, network = scalar_tanh()
     problem, asked = Problem(ClosedLoop(system, network), V), list[tuple[int, float]]()
     evidence = PartitionTree(ONE, np.array([2.5]), bytes([0, 255, 255]), local=LocalBall(ONE, np.ones((3, 1)), ONE))
@@ -113,11 +113,13 @@ def test_a_refused_leaf_is_split_once_without_any_effort(tmp_path: Path) -> None
         said = json.loads(data)
         levels = {name: float.fromhex(level) for name, level in said["levels"].items()}
         asked.append((len(b64decode(said["evidence"]["tree"])), levels["roa"]))
-        result = "ACCEPTED" if len(asked) == 3 else "REJECTED"
-        return {"certificate_sha256": sha256(data).hexdigest(), "levels": levels, "result": result, **ON_RING}
+        result = "ACCEPTED" if len(asked) == 5 else "REJECTED"
+        every = {"every": ["leaf 0", "leaf 1"]}
+        return {"certificate_sha256": sha256(data).hexdigest(), "levels": levels, "result": result, **ON_RING, **every}
 
-    clerk = Clerk(tmp_path / "c.json", lambda: 0.0, lambda _: nullcontext(), lambda: None, lambda _: None, check)
+    clerk = Clerk(tmp_path / "c.json", lambda _: nullcontext(), lambda: None, lambda _: None, check)
     found = clerk.accepted(Certificate(system, network, V, Asymptotic(4.0, 1.0), evidence), problem)
-    (first, level), (split, same), (_, lower) = asked
-    assert split > first and same == level == 4.0 and lower < 4.0 == level
+    assert [size for size, _ in asked] == [3, 31, 59, 87, 87]
+    *levels, lower = (level for _, level in asked)
+    assert levels == [4.0] * 4 and lower < 4.0
     assert found.certificate.roa == lower and "the level is" in (found.mended or "")

@@ -650,12 +650,13 @@ def random_ring(generator: Generator, name: str, squash: Squash, centre: Centre)
 
 
 def vdot_bounds(ring: Ring, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
-    """Lower and upper bound of Vdot on boxes, and its upper bound on the part of each box that lies in the ring."""
+    """Lower and upper bound of Vdot on boxes, and its upper bound on the part of each box that lies in the ring. `rise`
+    is known from above alone: the lower bound is that of the negative F."""
     centre = 0.5 * lo + 0.5 * hi
     _, radius = middle(lo, hi)
     states, F, _ = on_boxes(ring, centre, radius)
-    model = ring.rise(states, F)
-    return -upper_bound(-model), upper_bound(model), ring.bound(model, centre, radius)
+    model, fall = ring.rise(states, F), ring.rise(states, [-f for f in F])
+    return -upper_bound(fall), upper_bound(model), ring.bound(model, centre, radius)
 
 
 def states_in_arb(T: Array, z: Array) -> list[list[arb]]:

@@ -50,10 +50,10 @@ def models(x: Array, error: Array) -> dict[Any, Taylor]:
 def played(e: Expression, x: Array, error: Array, way: Way) -> Taylor:
     steps = tape.recorded(2, lambda v, algebra: evaluate(e, dict(zip((X, Y), v, strict=True)), algebra).scaled(1.0))
     given = [x, error, np.zeros((0, BATCH)), np.zeros((0, 2, BATCH)), np.zeros((0, BATCH)), np.zeros((0, 3))]
-    found = [np.zeros((*shape, BATCH)) for shape in ((), (2,), (2, 2), ())]
+    found = [np.zeros((*shape, BATCH)) for shape in ((), (2,), (2, 2), (), (2,))]
     with bounded(way):
         compiled.loops(1).play(steps.steps, steps.k, steps.places, *given, *found)
-    return Taylor(*found)
+    return Taylor(*found[:-1])
 
 
 def misses(model: Taylor, e: Expression, x: Array, rng: np.random.Generator) -> Array:

@@ -161,7 +161,8 @@ from tests.support.loops import chain
 class Undecided(VdotBound):
     def __call__(self, lo, hi, inner, outer):
         none = np.zeros(lo.shape[1], dtype=np.bool_)
-        return BoxBounds(none, np.ones(lo.shape[1], dtype=lo.dtype), hi - lo, none, ~none)
+        one = np.ones(lo.shape[1], dtype=lo.dtype)
+        return BoxBounds(none, one, hi - lo, none, ~none, one)
 
 case = case_of(*chain(4, [-1, -2, -3, -4]))
 budget = Budget(boxes=10**9, seconds=3000.0, batch=32768, least_width=0.0)

@@ -53,15 +53,16 @@ _POINT = 2.0**-20  # share of a box that is left of it around its centre
 
 
 class BoxBounds(NamedTuple):
-    """Bounds of each box: `proved` (B,), `bound` of D' (B,), `score` (n, B): what each axis adds to the bound,
+    """Bounds of each box: `proved` (B,), `bound` of D' (B,), `score` (n, B): how much each axis matters to the bound,
     `violated` (B,): a condition fails at the centre, or cannot be proved there; `smooth` (B,): the conditions inside
-    the inner level hold."""
+    the inner level hold; `decay` (B,): -D' at the centre, but for the policy's error."""
 
     proved: Mask
     bound: Array
     score: Array
     violated: Mask
     smooth: Mask
+    decay: Array
 
 
 def operations_of_box(loop: ClosedLoop, order: int = 2) -> float:
@@ -183,7 +184,7 @@ class VdotBound:
                 score = np.where(held.inside, score, held.score[:n] + share * held.score[n:].sum(0))
         if self.inside and self.step:
             smooth = proved
-        return BoxBounds(proved, bound, score, violated, smooth)
+        return BoxBounds(proved, bound, score, violated, smooth, -decrease.c)
 
     def _decrease(
         self, x: Array, error: Array, mid: Array, slopes: Array, wide: Array, outer: float

@@ -295,17 +295,16 @@ class Pass:
 
 
 def _halvings(found: BoxBounds, n: int, before: float) -> float:
-    """The halvings that a box of a batch needs which is not proved, so that what its axes add to the bound is less than
-    the decay at its centre: a bound of second order falls fourfold when all n axes are halved once.
+    """The halvings that a box of a batch needs which is not proved, so that the bound exceeds the value at its centre
+    by less than the decay there: a bound's excess of second order falls fourfold when all n axes are halved once.
 
     `before` is the number by an earlier batch, for a batch that gives none.
     """
-    excess = np.maximum(found.score, 0.0).sum(0)
-    decay = excess - found.bound
-    wanted = ~found.proved & (decay > 0) & np.isfinite(decay)
+    excess = found.bound + found.decay
+    wanted = ~found.proved & (found.decay > 0) & np.isfinite(excess)
     if not wanted.any():
         return before
-    share = np.sort(excess[wanted] / decay[wanted])[(np.count_nonzero(wanted) - 1) // 2]
+    share = np.sort(excess[wanted] / found.decay[wanted])[(np.count_nonzero(wanted) - 1) // 2]
     return n / 2 * math.log2(max(1.0, float(share)))
 
 
