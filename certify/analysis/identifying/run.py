@@ -164,7 +164,7 @@ def sizes_in_json(each: Sequence[Least]) -> list[dict[str, Any]]:
 
 
 def residuals_of_refuted(measured: System) -> dict[str, list[dict[str, Any]]]:
-    """What the equations of a structure lack that its measurements refute, as plain values.
+    """The least residuals of a structure that its measurements refute, as plain values.
 
     `least_residual` has a factor of its bounds in the table `residual`; `least_constants` has constant bounds, of a
     structure without that table.
