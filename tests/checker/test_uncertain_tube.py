@@ -20,7 +20,8 @@ from certify import PolicyNetwork, certify_roa
 from certify.analysis.options import RoaOptions
 from certify.loop.plants import load_system
 from tests.checker.test_tube import ball, scalar, slab, verdicts
-from tests.support.certificates import Document, decode, edited
+from tests.support.balls import reached_from
+from tests.support.certificates import Document, decode, edited, encode
 
 NONE = 2.0**-60
 FLAT, BENT = [[0.0], [NONE], [0.0]], [[0.0], [0.0], [NONE]]
@@ -77,9 +78,15 @@ def test_a_residual_that_does_not_vanish_has_no_tube() -> None:
 
 
 def test_a_tube_along_a_path_has_none() -> None:
+    """The same file without the uncertain quantity is read, and refused under its rule."""
     data = decay("67/100", "1")
-    data["claim"] = {**data["claim"], "kind": "reached", "centre": data["claim"]["start"]}
+    data["claim"] = reached_from([0.25], [0.0])
+    path = {"centre": encode([0.0])} | {key: (0.5).hex() for key in ("share", "edge", "motion", "joint")}
+    for one in data["evidence"]["tube"]:
+        one |= {"path": path, "weight": encode(np.eye(2))}
     assert verdicts(data) == {"format"}
+    known = edited(edited(data, "plant.uncertain", []), "evidence.cells", [])
+    assert verdicts(edited(known, "plant.dynamics.0", ["-", "x"])) == {"tube"}
 
 
 # -------------------------------------------------------------------------------------------------- the command's own
