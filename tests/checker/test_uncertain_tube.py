@@ -42,6 +42,7 @@ LIMITS = [
     ("666667/1000000", "1000", 4, True),
     ("666666/1000000", "1", 1, False),
     ("2/3", "1", 1, False),
+    ("2/3", "1", 64, False),
     ("1/2", "1", 64, False),
     ("0", "1", 1, False),
     ("-1", "1", 1, False),
@@ -69,6 +70,13 @@ def test_a_residual_may_take_what_decay_is_left(equation: Any, ends: tuple[str, 
     """A third of the decay at 0, and of the cubic one 1/12 at x = 2, the start, where 1 - 4 q is 2/3."""
     rows = FLAT if equation[2][2] == "x" else BENT
     assert verdicts(decay(*ends, equation=equation, rows=rows)) == {"ACCEPTED" if holds else "tube"}
+
+
+@pytest.mark.parametrize("most", ["4/3", "133333/100000"])
+def test_the_last_cell_counts(most: str) -> None:
+    """x' = -(2 - q) x: its decay is slowest at the upper end."""
+    found = verdicts(decay("1", most, 64, ["-", ["*", ["+", "2", ["-", "q"]], "x"]]))
+    assert found == {"tube" if most == "4/3" else "ACCEPTED"}
 
 
 def test_a_residual_that_does_not_vanish_has_no_tube() -> None:
