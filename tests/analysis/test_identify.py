@@ -10,6 +10,7 @@ import math
 import re
 import runpy
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -26,9 +27,11 @@ from certify.certificates.checking import ask
 from certify.cli.main import _run
 from certify.errors import InputError
 from certify.loop.plants import Measurements, Run, System, get_system, load_system
+from certify.loop.policies import load_policy
 from certify.provers.data import Contradiction
 from certify.provers.data.identify import _Box, _Data
 from certify.provers.data.models import Flows
+from certify.reference import rules as second
 from tests.support.marks import slow_after
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -717,6 +720,37 @@ def test_python_takes_data_as_the_command_does(known: Path) -> None:
     ).system
     again = certify.certify_roa(plant, POLICY, candidate="lyapunov", level=1e-3)
     assert again.verdict == "PROVED" and again.to_dict()["data"]["sha256"] == found.to_dict()["data"]["sha256"]
+
+
+def test_a_tube_has_data_too(known: Path) -> None:
+    """Both checkers derive the ranges; without the evidence of one transition, or with other ends, they refuse it."""
+    network = load_policy(EXAMPLES / "policies" / "pendulum.pt").network
+    options: dict[str, Any] = {"candidate": "lyapunov", "level": 0.3, "enlarge": True, "effort": 0.6}
+    result = certify.certify_roa(known / "known.toml", network, known / "tube", data=known / "data.csv", **options)
+    assert (result.verdict.value, result.claim) == ("PROVED", "enlarged") and result.raw is not None
+    whole = json.loads(result.raw)
+    assert len(whole["evidence"]["tube"]) > 1 and whole["claim"]["data"]["runs"]
+    assert both(whole) == {"ACCEPTED"}
+    for change, rule in (
+        (lambda d: d["evidence"]["data"].update(rounds=[]), "data"),
+        (lambda d: d["claim"]["data"]["parameters"][0].update(range=["10", "31"]), "data"),
+        (lambda d: d["plant"]["uncertain"][0].update(range=["39/2", "59/3"]), "data"),
+        (lambda d: d["evidence"]["tube"].pop(0), "tube"),
+    ):
+        forged = json.loads(result.raw)
+        change(forged)
+        assert both(forged) == {rule}
+
+
+def both(data: Any) -> set[str]:
+    """The words of both checkers: ACCEPTED, or a rule."""
+    raw = json.dumps(data).encode()
+    with tempfile.NamedTemporaryFile(suffix=".json") as file:
+        file.write(raw)
+        file.flush()
+        _, answer = ask(Path(file.name))
+    judged = second.judge(raw)
+    return {str(answer.get("rule") or answer["result"]), judged.rule or judged.result}
 
 
 def test_what_fails_in_the_ranges_refutes_no_claim_about_data(known: Path) -> None:

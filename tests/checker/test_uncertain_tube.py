@@ -79,6 +79,24 @@ def test_the_last_cell_counts(most: str) -> None:
     assert found == {"tube" if most == "4/3" else "ACCEPTED"}
 
 
+@pytest.mark.parametrize(("most", "holds"), [("3", False), ("31/10", False), ("32/10", True)])
+def test_a_constraint_is_kept_for_every_value(most: str, holds: bool) -> None:
+    """x + q < a number in every cell, on balls that reach 2.125 and where q is at most 1."""
+    data = decay("67/100", "1", 4)
+    data["claim"]["keep"] = [["+", "x", "q", ["-", most]]]
+    assert verdicts(data) == {"ACCEPTED" if holds else "keep"}
+
+
+@pytest.mark.parametrize(("least", "holds"), [("7/10", True), ("2/3", False), ("1/2", False)])
+def test_more_quantities_than_have_corners(least: str, holds: bool) -> None:
+    """x' = -(q1 + ... + q8) x / 8."""
+    names = [f"q{k}" for k in range(1, 9)]
+    data = decay(least, "1", equation=["-", ["/", ["*", ["+", *names], "x"], "8"]])
+    data["plant"]["uncertain"] = [{"name": name, "range": [least, "1"]} for name in names]
+    data["evidence"]["cells"] = [1] * 8
+    assert verdicts(data) == {"ACCEPTED" if holds else "tube"}
+
+
 def test_a_residual_that_does_not_vanish_has_no_tube() -> None:
     """The origin is no equilibrium: refused before the tube, whatever its size."""
     found = verdicts(decay("-1/1000000", "1/1000000", equation=["+", ["-", "x"], "q"]))
