@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 
 
 def require_one_that_knows(system: System, options: RoaOptions) -> None:
-    """Refuse a solver of formulas and a tube, which need exact equations and Vdot, if something has a range or time has
-    steps.
+    """Refuse a solver of formulas and a tube along a path, which need exact equations, if something has a range, and
+    with tubes around the origin, which need Vdot, if time has steps.
 
     Raises
     ------
