@@ -34,7 +34,7 @@ _SPLITS, _LOWERINGS = 3, 9  # the most splits and lowerings for leaves that the 
 _BELOW_LEAVES, _LEVELS = 2, 5  # weaker certificates: below a refused leaf so long, and with a lower level at all
 _LONG = 1_000_000  # bytes of a certificate, from which on several processes check it
 _MOST_JOBS = 64
-_QUICK = 2**27  # operations of the reference, as FORMAT.md counts them: at most some five seconds
+_QUICK = 2**27  # operations of the reference, as docs/mathematics/limits.md counts: at most some five seconds
 _NEWEST = {b'"directions"': 2**31, b'"samples"': 2**33}  # the same of the newest rules: about a minute at most
 _HIGHER = 1.5  # the next floor, after one that is refused
 

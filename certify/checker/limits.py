@@ -1,7 +1,7 @@
 """The rule `limits`: count a file's demands from the sizes that it states, before any other computation.
 
-Each rule alone is cheap, and so is each size; their product is not. FORMAT.md has these sums, which count the work of
-this checker and the reference generously: a unit is about a nanosecond here. They read sizes only.
+Each rule alone is cheap, and so is each size; their product is not. docs/mathematics/limits.md has these sums, which
+count the work of this checker and the reference generously: a unit is about a nanosecond here. They read sizes only.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Net:
 
 
 class Sizes:
-    """Sizes of a certificate, in the letters of FORMAT.md."""
+    """Sizes of a certificate, in the letters of docs/mathematics/limits.md."""
 
     def __init__(self, c: Certificate) -> None:
         self.c, self.evidence = c, c.evidence

@@ -172,28 +172,52 @@ def forms(v: Sequence[Taylor]) -> Form:
 
 
 def upper_bound(model: Taylor) -> Array:
-    """An upper bound of the model over the box, (B,); the lesser of two."""
-    bound = _separately(model)
+    """An upper bound of the model over the box, (B,); the lesser of two. Each bounds the terms in two symbols by terms
+    in one."""
+    bound = _by_squares(model)
     left = np.flatnonzero(np.logical_not(bound < 0))
     if len(left):
         bound[left] = np.fmin(bound[left], _at_a_corner(model.at(left)))
     return bound
 
 
-def _separately(model: Taylor) -> Array:
-    """Each symbol's part is maximised exactly, and the mixed terms are taken at their largest.
+def _by_squares(model: Taylor) -> Array:
+    """`2 |d_i d_j| <= d_i^2 + d_j^2`."""
+    (i, j), q = pairs(model.symbols), model.q
+    squares = Near(q[i == j]) + Near(np.abs(q[i != j])).through(_half(model.symbols))
+    return _added(Near(model.c), size(model.g), squares, model.r)
 
-    max over |t| <= 1 of `g t + q t^2` is g^2 / (-4q) if |g| < -2q, and at most max(|g|, -2q) + q in any case.
-    """
-    i, j = pairs(model.symbols)
-    g, q = np.abs(model.g), model.q[i == j]
-    inside = g < -2 * q
-    peak = (size(g) * size(g)).over(np.where(inside, -4 * q, 1.0)).top
-    edge = (Near(np.maximum(g, -2 * q)) + Near(q)).ends[1]
-    axes = Near(np.where(inside, np.minimum(peak, edge), edge))
-    mixed = size(model.q[i != j]).sum()
-    found: Array = (Near(model.c) + axes.sum() + Near(0 * model.c, mixed + model.r)).ends[1]
+
+def _at_a_corner(model: Taylor) -> Array:
+    """For a corner s, of 1 and -1, and d_i = s_i e_i: `2 e_i e_j <= e_i^2 + e_j^2`, and `-e_i e_j <= 1 - e_i - e_j`
+    since (1 - e_i) (1 - e_j) >= 0. So a pair takes the first or the second as s_i s_j q_ij is positive or negative."""
+    (i, j), s, half = pairs(model.symbols), _corner(model), _half(model.symbols)
+    mixed = (s[i] * s[j] * model.q)[i != j]
+    up, down = np.maximum(mixed, 0.0), np.maximum(-mixed, 0.0)
+    along = Near(s * model.g) - Near(2 * down).through(half)
+    squares = Near(model.q[i == j]) + Near(up).through(half)
+    return _added(Near(model.c) + Near(down).sum(), along.size, squares, model.r)
+
+
+def _added(c: Near, along: Above, squares: Near, r: Above) -> Array:
+    """Upper bounds of `c + sum_i (a_i t_i + b_i t_i^2) + r` over |t_i| <= 1, for numbers a and b of at most the sizes
+    `along` and the values `squares`: each term is largest at t_i = a_i / (-2 b_i), or else at 1."""
+    a, b = along.top, squares.ends[1]
+    inside = a < -2 * b
+    peak = (size(a) * size(a)).over(np.where(inside, -4 * b, 1.0)).top
+    most = Near(np.where(inside, peak, (Near(a) + Near(b)).ends[1]))
+    found: Array = (c + most.sum() + Near(0 * c.value, r)).ends[1]
     return found
+
+
+@cache
+def _half(N: int) -> Array:
+    """1/2 for each symbol of a term in two: (N, N (N - 1) / 2)."""
+    i, j = pairs(N)
+    i, j = i[i != j], j[i != j]
+    half = np.zeros((N, len(i)))
+    half[i, np.arange(len(i))] = half[j, np.arange(len(i))] = 0.5
+    return half
 
 
 def _corner(model: Taylor) -> Array:
@@ -205,21 +229,3 @@ def _corner(model: Taylor) -> Array:
     np.add.at(slope, i, mixed * s[j])
     np.add.at(slope, j, mixed * s[i])
     return np.where(s == 0, np.where(slope < 0, -1.0, 1.0), s)
-
-
-def _at_a_corner(model: Taylor) -> Array:
-    """The value at a corner s, of 1 and -1, and what the other terms may add elsewhere.
-
-    With d_i = s_i (1 - w_i), 0 <= w_i <= 2, and R_ij = s_i s_j Q_ij, Q symmetric, `g.d + d'Q d` is
-    `s.g + s'Q s - sum_i w_i (s_i g_i + 2 sum_j R_ij) + w'R w`; and `w'R w <= 2 sum_i w_i sum_j max(R_ij, 0)`, since
-    `w_i w_j <= w_i + w_j`. So the two sums add at most `2 sum_i max(0, 2 sum_j max(-R_ij, 0) - s_i g_i)`.
-    """
-    (i, j), s = pairs(model.symbols), _corner(model)
-    R = s[i] * s[j] * model.q  # R_ii, and 2 R_ij
-    down = np.where((i == j)[:, None], 2.0, 1.0) * np.maximum(-R, 0.0)
-    meets = np.zeros((model.symbols, len(i)))
-    meets[i, np.arange(len(i))] = meets[j, np.arange(len(j))] = 1.0
-    more = Above(down).through(meets).less(s * model.g).sum() * 2
-    at = Near(model.c) + Near(s * model.g).sum() + Near(R).sum()
-    found: Array = (at + Near(0 * model.c, more + model.r)).ends[1]
-    return found

@@ -221,7 +221,7 @@ class Target:
 
     def holds(self, rows: Rows, at: str) -> bool:
         """True if all of the box is certainly in the target; a refusal where an expression has no finite model."""
-        return all(bool(v.by_pairs() <= 0) or bool(v.from_corner() <= 0) for v in self.values(rows, at))
+        return all(bool(v.by_squares() <= 0) or bool(v.from_corner() <= 0) for v in self.values(rows, at))
 
     def values(self, rows: Rows, at: str) -> list[Taylor]:
         """Models of numbers that are at most 0 in the target."""

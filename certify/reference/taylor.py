@@ -184,51 +184,61 @@ class Taylor:
 
     def is_negative(self) -> bool:
         """True if it certainly is, on all of the box."""
-        return bool(self.by_pairs() < 0) or bool(self.from_corner() < 0)
+        return bool(self.by_squares() < 0) or bool(self.from_corner() < 0)
 
     def bound(self) -> arb:
         """A bound from above: one of two, the lesser if that is certain."""
-        first, second = self.by_pairs(), self.from_corner()
+        first, second = self.by_squares(), self.from_corner()
         return second if second < first else first
 
-    def by_pairs(self) -> arb:
-        """c + r, a bound of each pair, and the exact maximum of g_i t + Q_ii t^2 over |t| <= 1 for each symbol."""
+    def by_squares(self) -> arb:
+        """The largest sum of terms in one symbol, after 2 |d_i d_j| <= d_i^2 + d_j^2."""
         result = self.c + self.r
         if self.g is None:
             return result
         if self.Q is None:
             return result + total(map(abs, self.g.entries()))  # exact, where `first` is rounded
-        for i, (g, row) in enumerate(zip(map(abs, self.g.entries()), self.Q.tolist(), strict=True)):
-            q = row[i]
-            if q < 0 and g <= -2 * q:
-                result += g * g / (-4 * q)  # at t = -g / 2q
-            elif q < 0 and g >= -2 * q:
-                result += g + q
-            else:
-                result += g + q.max(ZERO)
-            result += 2 * sum(map(abs, row[i + 1 :]), ZERO)
-        return result
+        squares = [row[i] for i, row in enumerate(self.Q.tolist())]
+        for i, j, q in self.mixed():
+            squares[i] += abs(q)
+            squares[j] += abs(q)
+        return result + total(peak(abs(g), q) for g, q in zip(self.g.entries(), squares, strict=True))
 
     def from_corner(self) -> arb:
-        """The value at the corner to which g points, and a bound of what a move away from it adds.
+        """The same around the corner to which g points, of 1 and -1: d_i = s_i e_i, where -e_i e_j <= 1 - e_i - e_j.
 
-        With M_ij = s_i s_j Q_ij for signs s_i, of which any will do, and d_i = s_i (1 - w_i), this is sum_i w_i (sum_j
-        -M_ij (2 - w_j) - s_i g_i), where w_i and 2 - w_j lie in [0, 2].
+        This is taken for the pairs whose term is certainly negative at the corner.
         """
         if self.g is None or self.Q is None:
-            return self.c + self.r + self.first
-        g, result, rows = self.g.entries(), self.c + self.r, self.Q.tolist()
-        negative = directions(g, rows)
-        for v, s, row in zip(g, negative, rows, strict=True):
-            lost = v if s else -v  # -s_i g_i, and what may be gained is added
-            result -= lost
-            for t, q in zip(negative, row, strict=True):
-                M = q if s == t else -q
-                result += M
-                if not M >= 0:
-                    lost += 2 * positive_part(-M)
-            result += 2 * positive_part(lost)
-        return result
+            return self.by_squares()
+        rows, result = self.Q.tolist(), self.c + self.r
+        down = directions(self.g.entries(), rows)
+        slopes = [-g if s else g for g, s in zip(self.g.entries(), down, strict=True)]
+        squares = [row[i] for i, row in enumerate(rows)]
+        for i, j, q in self.mixed():
+            M = q if down[i] == down[j] else -q
+            if M < 0:
+                result -= 2 * M
+                slopes[i] += 2 * M
+                slopes[j] += 2 * M
+            else:
+                squares[i] += abs(M)
+                squares[j] += abs(M)
+        return result + total(peak(abs(v), q) for v, q in zip(slopes, squares, strict=True))
+
+    def mixed(self) -> list[tuple[int, int, arb]]:
+        """(i, j, Q_ij) for i < j, of what is not 0."""
+        rows = [] if self.Q is None else self.Q.tolist()
+        each = ((i, j, q) for i, row in enumerate(rows) for j, q in enumerate(row[i + 1 :], i + 1))
+        return [(i, j, q) for i, j, q in each if not q.is_zero()]
+
+
+def peak(g: arb, q: arb) -> arb:
+    """A bound of g t + q t^2 over |t| <= 1, g >= 0: its value at 1 where it certainly rises until there. At -g / 2q it
+    is nowhere less, if q is negative."""
+    if g >= -2 * q:
+        return g + q
+    return g * g / (-4 * q) if q < 0 else g + q.max(ZERO)
 
 
 def directions(g: list[arb], rows: list[list[arb]]) -> list[bool]:
@@ -242,11 +252,6 @@ def directions(g: list[arb], rows: list[list[arb]]) -> list[bool]:
         else s
         for s, row in zip(told, rows, strict=True)
     ]
-
-
-def positive_part(v: arb) -> arb:
-    """A number at or above v and 0, and the greater of both if that is certain."""
-    return ZERO if v <= 0 else v if v >= 0 else abs(v)
 
 
 def constant(q: fmpq) -> Taylor:

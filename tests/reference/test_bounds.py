@@ -10,7 +10,7 @@ import pytest
 from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from certify.reference.balls import ON_LEAVES
-from certify.reference.taylor import Taylor, positive_part
+from certify.reference.taylor import Taylor, peak
 from tests.support.marks import slow_after
 from tests.support.oracle import ball
 
@@ -73,11 +73,11 @@ def test_no_bound_is_below_the_largest_value(n: int, kind: str) -> None:
         for _ in range(60):
             g, Q = drawn(generator, n, kind)
             most, bounded = largest(g, Q), model(g, Q)
-            pairwise, corner = bounded.by_pairs(), bounded.from_corner()
-            for bound in (pairwise, corner, bounded.bound()):
+            squares, corner = bounded.by_squares(), bounded.from_corner()
+            for bound in (squares, corner, bounded.bound()):
                 assert not bound < ball(most), (g, Q)
             exact += bool(abs(corner - ball(most)) <= arb(2) ** -40)
-            less += bool(corner < pairwise)
+            less += bool(corner < squares)
             assert not Taylor(-ball(most) + arb(2) ** -30, bounded.g, bounded.Q).is_negative()
     assert kind != "steep" or (exact > 10 and (less > 5 or n == 1))
 
@@ -114,6 +114,32 @@ def test_numbers_that_are_not_known_exactly(shift: int) -> None:
                 assert not model.is_negative() and not model.is_finite()
 
 
-def test_a_part_that_is_not_negative() -> None:
-    assert positive_part(arb(-2)) == 0 and positive_part(arb(3)) == 3 and not positive_part(arb(-1, 2)) < 1
-    assert not positive_part(arb("nan")).is_finite()
+def test_the_peak_of_a_parabola() -> None:
+    """Of g t + q t^2 for |t| <= 1, for all g and q in two balls: exact where they are points, at least all elsewhere."""
+    exact = {(2, 1): 3, (0, -1): 0, (1, -1): 0.25, (2, -1): 1, (3, -1): 2, (0, 0): 0, (1, 0): 1}
+    for (g, q), most in exact.items():
+        assert peak(arb(g), arb(q)) == most
+        for wide_g, wide_q in ((arb(g, 0.5), arb(q)), (arb(g), arb(q, 0.5)), (arb(g, 0.5), arb(q, 1.5))):
+            assert not peak(abs(wide_g), wide_q) < most
+    for g, q in ((arb("nan"), arb(-1)), (arb(1), arb("nan")), (arb("inf"), arb(-1)), (arb(1), arb("inf"))):
+        assert not peak(g, q) < 10**9
+
+
+@pytest.mark.parametrize("kind", ["steep", "level", "flat"])
+def test_no_bound_is_above_those_that_take_each_pair_at_its_largest(kind: str) -> None:
+    """The exact maximum of each axis and |Q_ij + Q_ji|; a corner's value and what may be gained for the way from it."""
+    generator, n, below = np.random.default_rng(len(kind)), 4, 0
+    with ctx.workprec(ON_LEAVES):
+        for _ in range(200):
+            g, Q = drawn(generator, n, kind)
+            axes = [peak(abs(ball(g[i])), ball(Q[i][i])) for i in range(n)]
+            apart = sum(axes, arb(0)) + ball(sum(2 * abs(Q[i][j]) for i, j in pairs(n) if i < j))
+            s = [1 if v >= 0 else -1 for v in g]
+            M = [[s[i] * s[j] * Q[i][j] for j in range(n)] for i in range(n)]
+            lost = [max(0, 2 * sum(max(0, -v) for v in M[i]) - abs(g[i])) for i in range(n)]
+            steep = ball(sum(abs(v) for v in g) + sum(map(sum, M)) + 2 * sum(lost))
+            bounded = model(g, Q)
+            assert bounded.by_squares() <= apart + arb(2) ** -40
+            assert 0 in g or bounded.from_corner() <= steep + arb(2) ** -40
+            below += bool(bounded.bound() < apart - arb(2) ** -40) and bool(bounded.bound() < steep - arb(2) ** -40)
+    assert below > 20

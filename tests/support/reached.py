@@ -1,7 +1,7 @@
 """Claims `reached` for the checker's tests: a hand-written document, and a tube that the engine finds around a path.
 
 The engine is a producer like any other: what it finds is a hint, and whether it is true is for the tests to say, by
-`rate_outwards`, which writes condition 7' of FORMAT.md down a second time, in ball arithmetic.
+`rate_outwards`, which writes condition 7' of docs/mathematics/tube.md down a second time, in ball arithmetic.
 """
 
 from __future__ import annotations

@@ -439,8 +439,8 @@ class _Along(Algebra[_Vector]):
 
 
 def shapes(network: Network) -> list[tuple[int, int, int]]:
-    """The rows of each step that takes time, the columns that it has of its own, and the units before it (FORMAT.md,
-    limits)."""
+    """The rows of each step that takes time, the columns that it has of its own, and the units before it
+    (docs/mathematics/limits.md)."""
     found, before = list[tuple[int, int, int]](), 0
     for k, step in enumerate(network.steps):
         rows = network.sizes[k + 1]

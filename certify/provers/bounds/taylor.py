@@ -22,6 +22,7 @@ EPS = 2.0**-50
 TINY = 2.0**-900
 CERTAIN = 1 + 2.0**-30  # share of its range by which a number must be away from 0 for its sign, beyond all rounding
 NOISE = 2.0**-30  # of all coefficients of first order
+_PAIRED = 3.0  # times what a symbol's terms in two symbols come to is what splitting it may take away, besides: measured
 EXP_END = 64.0  # the exponent beyond which the checker knows nothing of exp
 
 
@@ -188,38 +189,45 @@ class Models(ConstantsLast[Taylor]):
 
 
 def upper_bound(model: Taylor) -> tuple[Array, Array]:
-    """(bound (B,), excess (N, B)): an upper bound over the box, and what each symbol adds to it.
+    """(bound (B,), excess (N, B)): an upper bound over the box, and how much each symbol matters to it.
 
-    The lesser of two: in one the separable part `g t + q t^2` is maximised exactly over |t| <= 1, and cross terms are
-    bounded by magnitude, half to each of the two symbols; the other is `at_a_corner`.
+    The lesser of two: each bounds the terms in two symbols by terms in one. Here `2 |d_i d_j| <= d_i^2 + d_j^2`; the
+    other is `at_a_corner`.
     """
     g = np.abs(model.g)
     q = np.einsum("iib->ib", model.Q)
-    inside = (q < 0) & (g < -2 * q)
-    axes = np.where(inside, 0.25 * (g * (g / np.where(inside, -q, 1.0))), g + q)
-    symmetric = np.abs(model.Q + model.Q.swapaxes(0, 1)) / 2
-    cross = symmetric.sum(1) - np.abs(q)
-    size = np.abs(model.c) + g.sum(0) + np.abs(axes).sum(0) + cross.sum(0) + model.r
-    bound = model.c + axes.sum(0) + cross.sum(0) + model.r + 1e-11 * size + TINY
+    cross = (np.abs(model.Q + model.Q.swapaxes(0, 1)) / 2).sum(1) - np.abs(q)
+    axes = _largest(g, q + cross)
+    size = np.abs(model.c) + g.sum(0) + (np.abs(q) + cross).sum(0) + model.r
+    bound = model.c + axes.sum(0) + model.r + 1e-11 * size + TINY
     left = chosen(~(bound < 0))
     if len(left):
         bound[left] = np.fmin(bound[left], at_a_corner(model.at(left)))
-    return bound, axes + cross
+    return bound, axes + _PAIRED * cross
 
 
 def at_a_corner(model: Taylor) -> Array:
-    """Upper bounds (B,) from the corner s to which the gradient points, d_i = s_i (1 - w_i) with 0 <= w_i <= 2.
+    """Upper bounds (B,) around the corner s to which the gradient points, d_i = s_i e_i.
 
-    With R_ij = s_i s_j Q_ij the model is `c + s.g + s'Q s - sum_i w_i (s_i g_i + 2 sum_j R_ij) + w'R w`, and
-    `w'R w <= 2 sum_i w_i sum_j max(R_ij, 0)`, since `w_i w_j <= w_i + w_j`. Multipliers make coefficients of about 0,
-    whose signs are noise, and other ones in the checker: there the terms of second order decide, with the other signs.
+    A term in two symbols is bounded by `2 e_i e_j <= e_i^2 + e_j^2` where s_i s_j Q_ij is positive, and elsewhere by
+    `-e_i e_j <= 1 - e_i - e_j`, since (1 - e_i) (1 - e_j) >= 0. Multipliers make coefficients of about 0, whose signs
+    are noise, and other ones in the checker: there the terms of second order decide, with the other signs.
     """
     Q, g = model.Q + model.Q.swapaxes(0, 1), model.g
+    q = np.einsum("iib->ib", model.Q)
+    np.einsum("iib->ib", Q)[:] = 0.0
     s = np.where(np.abs(g) <= NOISE * np.abs(g).sum(0), 0.0, np.where(g < 0, -1.0, 1.0))
-    slope = np.einsum("ijb,jb->ib", Q, s)  # where s is 0, the diagonal adds nothing
+    slope = np.einsum("ijb,jb->ib", Q, s)
     s = np.where(s == 0, np.where(slope < 0, -1.0, 1.0), s)
-    g, R = s * g, Q * (s[:, None] * s)
-    more = np.maximum(np.maximum(-R, 0.0).sum(1) - g, 0.0).sum(0)
-    size = np.abs(model.c) + np.abs(g).sum(0) + np.abs(R).sum((0, 1)) + model.r
-    bound: Array = model.c + g.sum(0) + R.sum((0, 1)) / 2 + 2 * more + model.r + 1e-11 * size + TINY
+    Q *= s[:, None] * s
+    down, up = np.maximum(-Q, 0.0).sum(1), np.maximum(Q, 0.0).sum(1) / 2
+    size = np.abs(model.c) + np.abs(g).sum(0) + (np.abs(q) + down + up).sum(0) + model.r
+    most = down / 2 + _largest(np.abs(s * g - down), q + up)
+    bound: Array = model.c + most.sum(0) + model.r + 1e-11 * size + TINY
     return bound
+
+
+def _largest(g: Array, q: Array) -> Array:
+    """The largest value of g t + q t^2 over |t| <= 1, g >= 0."""
+    inside = g < -2 * q
+    return np.where(inside, 0.25 * (g * (g / np.where(inside, -q, 1.0))), g + q)
