@@ -22,7 +22,9 @@ EPS = 2.0**-50
 TINY = 2.0**-900
 CERTAIN = 1 + 2.0**-30  # share of its range by which a number must be away from 0 for its sign, beyond all rounding
 NOISE = 2.0**-30  # of all coefficients of first order
-_PAIRED = 3.0  # times what a symbol's terms in two symbols come to is what splitting it may take away, besides: measured
+_PAIRED = (
+    3.0  # times what a symbol's terms in two symbols come to is what splitting it may take away, besides: measured
+)
 EXP_END = 64.0  # the exponent beyond which the checker knows nothing of exp
 
 
