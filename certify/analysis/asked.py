@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 
 
 def require_one_that_knows(system: System, options: RoaOptions) -> None:
-    """Refuse a solver of formulas and a tube, which need exact equations and Vdot, if something has a range or time has
-    steps.
+    """Refuse a solver of formulas and a tube along a path, which need exact equations, if something has a range, and
+    with tubes around the origin, which need Vdot, if time has steps.
 
     Raises
     ------
@@ -60,11 +60,14 @@ def require_one_that_knows(system: System, options: RoaOptions) -> None:
     if not system.ranges:
         return
     found = f"found ranges of {', '.join(system.ranges)} in {system.name}"
-    if options.enlarges:
+    if options.reach_from is not None:
         raise InputError(
-            f"a tube must be of exact equations: there is no such claim yet for what is uncertain; {found}. Ask for "
-            "the set without a tube, or leave the ranges out (of a disturbance in the plant's file: the half-width 0)."
+            f"a tube around a path must be of exact equations: there is no such claim yet for what is uncertain; "
+            f"{found}. Ask for the set with --enlarge, or leave the ranges out (of a disturbance in the plant's file: "
+            "the half-width 0)."
         )
+    if options.engine == "bounds":
+        return
     raise OptionError(
         f"`engine` must be bounds where something is uncertain: dReal is asked about exact equations; {found}. Use the "
         "engine bounds, or leave the ranges out."

@@ -30,9 +30,8 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, require_equilibrium
 from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import domain_limit, extents, increment_matrix, slowest_decay, volume
-from certify.provers.ball.models import paths
 from certify.provers.base import FEW, Proof
-from certify.provers.tube.tube import find_tube
+from certify.provers.tube.tube import Around, find_tube
 from certify.report.timing import TimingInWords
 from certify.report.words import number, quantity, symbol
 
@@ -328,7 +327,7 @@ def _has_tube(result: RoaResult, effort: Effort) -> bool:
     goal = result.P / result.levels.roa
     return (
         find_tube(
-            paths(ClosedLoop(result.system, result.network)),
+            Around.of(ClosedLoop(result.system, result.network), ()),
             goal / _LONGER**2,
             goal,
             effort.part(_LOOK, even_if_over=True),

@@ -100,9 +100,13 @@ def of_tube(sizes: Sizes) -> int:
     tube = sizes.c.tube
     if tube is None:
         return 0
-    of_each = sizes.ball + sizes.equations + 3 * (sizes.inequality + sizes.decision(sizes.n))
+    cells = prod(sizes.evidence.cells) if isinstance(sizes.evidence, Partition) else 1
+    corners: int = 3 * cells * 2 ** min(sizes.y, AT_CORNERS)
+    of_each = sizes.inequality + sizes.decision(sizes.n) + 2**8 * sizes.y * sizes.n * (sizes.d + 1) ** 2
+    of_each = sizes.ball + cells * sizes.equations + corners * of_each
     nodes = [tube.start, *(P for slab in tube.slabs for P in (slab.middle, slab.end))]
-    return len(tube.slabs) * of_each + sum(sizes.inverse(sizes.bits(P)) for P in nodes)
+    found: int = len(tube.slabs) * of_each + sum(sizes.inverse(sizes.bits(P)) for P in nodes)
+    return found
 
 
 def of_balls(sizes: Sizes) -> int:

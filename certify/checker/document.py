@@ -29,7 +29,7 @@ PLAIN, WITH_TUBE, WITHOUT_V = ("asymptotic", "practical"), ("enlarged", "reached
 PRACTICAL = ("practical", "nearby")
 CLAIMS = {  # the keys of each claim, and those that may be missing
     **dict.fromkeys((*PLAIN, "nearby"), ("rate sample outer", "ranks keep data samples")),
-    "enlarged": ("rate sample outer start", "keep"),
+    "enlarged": ("rate sample outer start", "keep data"),
     "reached": ("rate sample outer start centre", "keep"),
     "reaches": ("sample target ranks", "keep"),
     "invariant": ("outer", "keep"),

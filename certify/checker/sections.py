@@ -278,7 +278,8 @@ def _ranks(claim: Value, evidence: Value, c: Certificate, order: int) -> Ranks:
 
 def _tube(said: Mapping[str, Value], value: Value, c: Certificate) -> Tube:
     n, moving = len(c.states), c.claim == "reached"
-    value.must(c.step == 0 and not c.uncertain, "of another claim where time goes in steps or quantities are uncertain")
+    value.must(c.step == 0, "of another claim where time goes in steps")
+    value.must(not (moving and c.uncertain), "of another claim where quantities are uncertain")
     slabs = value.listed(lambda slab: section(slab, Slab, n=n, k=n + moving), 1, MAX_SLABS)
     return Tube(said["start"].array(n, n), said["centre"].array(n) if moving else None, slabs)
 

@@ -176,13 +176,16 @@ def padded(A: fmpq_mat, rows: int, columns: int) -> fmpq_mat:
 
 def decreases(piece: Piece) -> Failures:
     """`tube`: x'P(t)x decreases on the ball without its centre; along a path e'P(t)e where it is 1."""
-    F = piece.F()
-    if not are_finite(F):
-        yield piece.at, "F has no finite model"
-    models = Models(piece.J, F, piece.slab.path is None, piece.velocity)
-    for P, rate in zip(piece.coefficients, piece.rates, strict=True):
-        if not inequality(models, P, rate, piece.slab.by, piece.slab.path).holds:
-            yield piece.at, "the decrease of x'P(t)x is not shown"
+    for cell in piece.case.cells:
+        F = piece.F(cell)
+        if not are_finite(F):
+            yield piece.at, "F has no finite model"
+            return 1
+        models = Models(piece.J, F, piece.slab.path is None, piece.velocity)
+        for corner in models.corners(piece.case.c.P):
+            for P, rate in zip(piece.coefficients, piece.rates, strict=True):
+                if not inequality(corner, P, rate, piece.slab.by, piece.slab.path).holds:
+                    yield piece.at, "the decrease of x'P(t)x is not shown"
     return 1
 
 
@@ -192,7 +195,10 @@ def keeps_constraints(piece: Piece) -> Failures:
         return 0
     from .keep import on_ball
 
-    return (yield from on_ball(piece, piece.states, ()))
+    count = 0
+    for cell in piece.case.cells:
+        count += yield from on_ball(piece, piece.states, piece.symbols(cell))
+    return count
 
 
 def examine(tally: Tally, case: Case) -> None:

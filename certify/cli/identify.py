@@ -132,6 +132,7 @@ def identify(
     try:
         result = identify_plant(measured, readings, source.name, structure, out)
     except Contradiction as error:
+        note("looking for what the equations lack")
         _refuted(error, measured, readings, source, as_json)
         raise typer.Exit(1) from None
     write(out.with_suffix(".html"), page(result.residuals(), result.to_dict()))
@@ -160,10 +161,12 @@ def _recorded(data: Path | None, environment: Mapping[str, Any], system: System,
 
 
 def _refuted(error: Contradiction, measured: System, readings: Readings, data: Path, as_json: bool) -> None:
-    """Print the finding that the measurements contradict the structure."""
-    from certify.analysis.identifying.run import SCHEMA, data_in_json
+    """Print the finding that the measurements contradict the structure, and what its equations may lack."""
+    from certify.analysis.identifying.run import SCHEMA, data_in_json, residuals_of_refuted
+    from certify.report.identified import constants_in_words, factors_in_words, table_of_constants
 
     places, what = [readings.places[t] for t in error.transitions], "these data refute this structure with this noise"
+    lacking = residuals_of_refuted(measured)
     if as_json:
         found = {
             "schema": SCHEMA,
@@ -173,14 +176,18 @@ def _refuted(error: Contradiction, measured: System, readings: Readings, data: P
             "reason": what,
             "transitions": places,
         }
-        say(json.dumps(found))
+        say(json.dumps(found | lacking))
         return
     shown = ", ".join(places[:8]) + (f" and {len(places) - 8} more" if len(places) > 8 else "")
+    lines = [*map(factors_in_words, lacking["least_residual"]), *map(constants_in_words, lacking["least_constants"])]
+    table = table_of_constants(lacking["least_constants"])
     say(
         f"REFUTED  {measured.name}: {what}, whatever the parameters within their ranges are\n\n"
         f"shown by    transitions from {shown} of {data.name}\n"
-        "next        look at these rows first; then a friction, a delay or a unit that the equations lack, ranges that "
-        "are too narrow,\n            a wrong period, or noise that is larger than was said"
+        + "".join(f"{'' if k else 'residual':<12}{line}\n" for k, line in enumerate(lines))
+        + "next        look at these rows first; then a friction, a delay or a unit that the equations lack, ranges "
+        "that are too narrow,\n            a wrong period, or noise that is larger than was said"
+        + (f"\ntry next    in the structure [residual] {table}, or bounds that depend on the state" if table else "")
     )
 
 
@@ -229,11 +236,14 @@ def _summary(result: IdentifyResult) -> RenderableType:
 
 
 def _rows(result: IdentifyResult) -> list[tuple[str, str]]:
-    from certify.report.identified import direction_in_words, noise_in_words
+    from certify.analysis.identifying.run import sizes_in_json
+    from certify.report.identified import direction_in_words, factors_in_words, noise_in_words
 
     data, axis = result.measurements, result.least_determined
     each = ", ".join(f"{s} {float(w):g}" for s, w in zip(result.system.states, data.noise, strict=True))
     rows = [("noise at most", each), ("data allow", noise_in_words(result.least_noise))]
+    heads = ["residual", *["of one equation"] * len(result.least_residual)]
+    rows += zip(heads, map(factors_in_words, sizes_in_json(result.least_residual)), strict=False)
     if data.period is not None:
         rows.append(("period", " to ".join(dict.fromkeys(f"{float(h):g}" for h in data.period))))
     if result.not_narrowed():

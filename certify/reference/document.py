@@ -221,7 +221,7 @@ def read_sections(value: Any, claims: tuple[str, ...]) -> Certificate:
     networks = read_networks(data["networks"], "networks")
     plant = read_plant(data["plant"], networks)
     n = len(plant.states)
-    fixed = claim not in WITH_TUBE or not plant.uncertain
+    fixed = claim != "reached" or not plant.uncertain
     require(fixed, "format", "plant.uncertain", f"nothing may be uncertain with claim '{claim}'")
     continuous = not (claim in WITH_TUBE and plant.discrete)
     require(continuous, "format", "plant.time", f"time must be continuous with claim '{claim}'")
@@ -288,7 +288,9 @@ def read_claim(value: Any) -> dict[str, Any]:
         said = keys(value, "claim", "kind", "sample", "target", "ranks", maybe=("keep",))
         return {**said, "rate": (0.0).hex(), "outer": None}
     more = {"enlarged": ("start",), "reached": ("start", "centre")}.get(value["kind"], ())
-    maybe = ("keep",) if more else ("ranks", "keep", "data", "samples")
+    maybe = {"enlarged": ("keep", "data"), "reached": ("keep",)}.get(
+        value["kind"], ("ranks", "keep", "data", "samples")
+    )
     return keys(value, "claim", "kind", "rate", "sample", "outer", *more, maybe=maybe)
 
 
@@ -319,7 +321,7 @@ def read_ranks(value: Any, states: tuple[str, ...]) -> Ranks:
 
 def read_data(value: Any, plant: Plant, claim: str) -> Data:
     at, n, m = "claim.data", len(plant.states), len(plant.inputs)
-    require(claim not in WITH_TUBE, "format", at, "it was not expected with a tube")
+    require(claim != "reached", "format", at, "it was not expected with a tube along a path")
     require(not plant.dynamics.calls, "format", at, "it was not expected where the equations call a network")
     data = keys(value, at, "sha256", "parameters", "period", "origin", "noise", "runs")
     sha256 = data["sha256"]

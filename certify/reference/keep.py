@@ -14,7 +14,6 @@ from typing import Any
 
 from .document import Interval
 from .flow import Steps
-from .loop import Known, Loop
 from .model import Model
 from .motion import Motion, Stage
 from .refusal import require, under
@@ -39,11 +38,6 @@ def kept(motion: Motion, at: Stage, within: Mapping[str, Taylor] | None, slacks:
     for i, g in enumerate(values):
         holds = g.is_finite() and is_negative(g, slacks)
         require(holds, RULE, at.place, f"expression {i} is not certain to be negative")
-
-
-def kept_in_slab(loop: Loop, known: Known, at: str) -> None:
-    """The rule on the ball of a slab, where nothing is uncertain."""
-    negative_on_ball(Steps(loop, known), known.names, at)
 
 
 def kept_on_ball(steps: Steps, cells: Iterable[Sequence[Interval]], at: str) -> None:

@@ -362,10 +362,13 @@ def on_cones(z: Sizes, directions: Sequence[bytes] | None, times: int, corners: 
 
 
 def in_tube(c: Certificate, z: Sizes, evidence: Tree) -> int:
-    each = networks_on_a_ball(z) + equations_on_a_ball(z) + 3 * (inequality(z) + deciding(z.n))
+    cells = math.prod(evidence.cells)
+    once = inequality(z) + deciding(z.n) + 2**8 * z.y * z.n * (z.d + 1) ** 2
+    each = networks_on_a_ball(z) + cells * (equations_on_a_ball(z) + 3 * 2 ** min(z.y, AT_CORNERS) * once)
     matrices = [P for slab in evidence.tube for P in (slab.middle, slab.end)]
     matrices += [] if c.start is None else [c.start]
-    return len(evidence.tube) * each + sum(inverting(z.n, bits(P)) for P in matrices)
+    work: int = len(evidence.tube) * each + sum(inverting(z.n, bits(P)) for P in matrices)
+    return work
 
 
 def beyond(c: Certificate, z: Sizes, covering: Covering | None) -> int:

@@ -84,10 +84,6 @@ class Loop:
         self.c, self.policy, self.bounded = c, Policy(c), bounded_by_form(c)
         self.symbols = c.k + c.varies
 
-    def on(self, J: fmpq_mat, rule: str, at: str, centre: fmpq_mat | None = None) -> Field:
-        """Models of F on a ball of a plant of which nothing is uncertain."""
-        return self.within(self.known(J, rule, at, centre), (), rule, at)
-
     def known(self, J: fmpq_mat, rule: str, at: str, centre: fmpq_mat | None = None, cone: Cone | None = None) -> Known:
         """States and inputs, or a refusal under `inputs` or under the rule that asks, at the place it names.
 

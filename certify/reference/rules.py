@@ -106,7 +106,7 @@ def check(c: Certificate, jobs: int) -> int | None:
     if c.claim in WITH_TUBE:
         if loop is None or c.start is None:
             raise Refused("format", "claim.start", "the claim needs a start")
-        tube(loop, c.start, c.centre, evidence.tube)
+        tube(loop, c.start, c.centre, evidence)
     if evidence.contraction is not None:
         contraction(loop or Loop(c), evidence.contraction, evidence.cells)
     if c.beyond is not None:

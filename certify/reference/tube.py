@@ -12,24 +12,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 from flint import arb, fmpq, fmpq_mat
 
-from .decrease import contains, decreases, decreases_along, sound_multipliers
-from .document import Certificate
-from .evidence import Path, Slab
+from .decrease import contains, decreases, decreases_along, sound_multipliers, whatever_y
+from .document import Certificate, Interval
+from .evidence import Path, Slab, Tree
 from .fields import exact
-from .keep import kept_in_slab
-from .loop import Field, Loop
+from .flow import Steps
+from .keep import kept_on_ball
+from .local import cells
+from .loop import Field, Known, Loop
 from .rational import beyond_domain, identity, inverse_diagonal, positive_definite, root_above
 from .refusal import require
 
+Cells = Sequence[Sequence[Interval]]
 Ends = tuple[fmpq_mat, fmpq_mat]  # of a slab: what belongs to the node before, and to the node after
 
 
-def tube(loop: Loop, start: fmpq_mat, centre: fmpq_mat | None, slabs: tuple[Slab, ...]) -> None:
+def tube(loop: Loop, start: fmpq_mat, centre: fmpq_mat | None, evidence: Tree) -> None:
     """Nodes first, numbered from 0, and middles, numbered as slabs are, from 1; then the slabs."""
+    slabs = evidence.tube
     c, nodes, origin = loop.c, [start, *(slab.end for slab in slabs)], fmpq_mat(loop.c.n, 1)
     centres = [origin if centre is None else centre]
     centres += [origin if slab.path is None else slab.path.centre for slab in slabs]
@@ -40,7 +45,7 @@ def tube(loop: Loop, start: fmpq_mat, centre: fmpq_mat | None, slabs: tuple[Slab
     inside = ends_inside(c, nodes[-1], centres[-1])
     require(inside, "tube", f"node {len(slabs)}", "the last node does not lie in {V <= c2}")
     for k, (slab, ends, path) in enumerate(zip(slabs, pairwise(nodes), pairwise(centres), strict=True), 1):
-        passes(loop, slab, ends, path, f"slab {k}")
+        passes(loop, slab, ends, path, f"slab {k}", evidence.cells)
 
 
 def node(c: Certificate, P: fmpq_mat, centres: Sequence[fmpq_mat], at: str) -> None:
@@ -64,8 +69,8 @@ def ends_inside(c: Certificate, P: fmpq_mat, centre: fmpq_mat) -> bool:
     return bool(r < 1) and positive_definite(P - c.P / (c2 * (1 - r) ** 2))
 
 
-def passes(loop: Loop, slab: Slab, nodes: Ends, centres: Ends, at: str) -> None:
-    """e'P(s)e falls on the ellipsoids of a slab, whose inputs are within their bounds."""
+def passes(loop: Loop, slab: Slab, nodes: Ends, centres: Ends, at: str, parts: Sequence[int]) -> None:
+    """e'P(s)e falls on the ellipsoids of a slab, whose inputs are within their bounds, whatever is uncertain does."""
     require(slab.duration > 0, "tube", at, f"the duration {slab.duration!r} is not positive")
     h, middle, (before, after) = exact(slab.duration), slab.middle, nodes
     pieces = (
@@ -79,18 +84,21 @@ def passes(loop: Loop, slab: Slab, nodes: Ends, centres: Ends, at: str) -> None:
         holds = contains(slab.ball, P, level * identity(loop.c.n))
         require(holds, "tube", at, f"its ball does not contain its {name} ellipsoid: {form} is not positive definite")
     sound_multipliers(slab.ball, "tube", at)
+    boxes = [*cells(loop.c.plant.ranges, parts)]
     if slab.path is not None:
         none_negative = slab.path.edge >= 0 and slab.path.motion >= 0
         require(none_negative, "tube", at, "a multiplier of the path is negative")
         F = relative(loop, slab, slab.path, centres, at)
-    else:
-        F = kept(loop, slab.ball.J, at)
-    for name, P, rate in pieces:
-        if slab.path is None:
-            falls = decreases(slab.ball, P, rate, F)
-        else:
+        for name, P, rate in pieces:
             falls = decreases_along(slab.ball, slab.path, P, rate, F)
-        require(falls, "tube", at, f"e'P(t)e does not certainly fall: the {name} coefficient")
+            require(falls, "tube", at, f"e'P(t)e does not certainly fall: the {name} coefficient")
+        return
+    known = kept(loop, slab.ball.J, at, boxes)
+    for cell in boxes:
+        F = loop.within(known, cell, "tube", at)
+        for name, P, rate in pieces:
+            falls = whatever_y(F, partial(decreases, slab.ball, P, rate), loop.c.P)
+            require(falls, "tube", at, f"x'P(t)x does not certainly fall: the {name} coefficient")
 
 
 def share_of(path: Path, at: str) -> fmpq:
@@ -99,11 +107,11 @@ def share_of(path: Path, at: str) -> fmpq:
     return exact(path.share)
 
 
-def kept(loop: Loop, J: fmpq_mat, at: str, centre: fmpq_mat | None = None) -> Field:
-    """Models of F on the ball of a slab, after rules `inputs` and `keep`."""
+def kept(loop: Loop, J: fmpq_mat, at: str, boxes: Cells, centre: fmpq_mat | None = None) -> Known:
+    """States and inputs on the ball of a slab, after rules `inputs` and `keep`."""
     known = loop.known(J, "tube", at, centre)
-    kept_in_slab(loop, known, at)
-    return loop.within(known, (), "tube", at)
+    kept_on_ball(Steps(loop, known), boxes, at)
+    return known
 
 
 def relative(loop: Loop, slab: Slab, path: Path, centres: Ends, at: str) -> Field:
@@ -111,6 +119,7 @@ def relative(loop: Loop, slab: Slab, path: Path, centres: Ends, at: str) -> Fiel
     before, after = centres
     step = after - before
     J = [[*row, w] for row, w in zip(slab.ball.J.tolist(), (step / (2 * exact(path.share))).entries(), strict=True)]
-    F = kept(loop, fmpq_mat(J), at, (before + after) / 2)
+    known = kept(loop, fmpq_mat(J), at, [()], (before + after) / 2)
+    F = loop.within(known, (), "tube", at)
     velocity = (step / exact(slab.duration)).entries()
     return replace(F, components=[f.shifted(arb(-v)) for f, v in zip(F.components, velocity, strict=True)])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -28,6 +28,7 @@ from certify.report.words import above, below, label, pretty_unit, symbol
 TEMPLATE = "certify.report", "identified.html"
 Array = NDArray[np.float64]
 _MOST_DOTS = 4000  # of a figure
+_UPWARDS = 1.005  # by which three digits are no smaller
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +65,35 @@ def noise_in_words(factor: float | None) -> str:
     return f"no noise smaller than {below(factor, 3)} times that, in all states at once: it is contradicted"
 
 
+def factors_in_words(one: Mapping[str, Any]) -> str:
+    """Factors of the bounds of residuals: one that is contradicted, and one that is not."""
+    names, refuted = ", ".join(map(symbol, one["refuted"])), max(one["refuted"].values())
+    least = None if one["open"] is None else max(one["open"].values())
+    if least is not None and not refuted:
+        what = "none is needed" if not least else f"no more than {above(least, 3)} times the bound is needed"
+        return f"{names}: {what}, as far as is shown here"
+    rest = "" if least is None else f"; {above(least, 3)} times is not, as far as is shown here"
+    return f"{names}: {below(refuted, 3)} times the bound is contradicted{rest}"
+
+
+def constants_in_words(one: Mapping[str, Any]) -> str:
+    """Residuals of constant bounds: some that are contradicted, and some that are not."""
+    if one["open"] is None:
+        return f"{_sizes(one['refuted'], below)} is contradicted as well"
+    rest = f"{_sizes(one['open'], above)} is not, as far as is shown here"
+    return f"{_sizes(one['refuted'], below)} is contradicted as well; {rest}" if any(one["refuted"].values()) else rest
+
+
+def table_of_constants(each: Sequence[Mapping[str, Any]]) -> str:
+    """Entries for a structure's table `residual`: the first constant bounds that are not contradicted, rounded up."""
+    first: Mapping[str, float] = next((one["open"] for one in each if one["open"]), {})
+    return ", ".join(f'{name} = "{_UPWARDS * size:.3g}"' for name, size in first.items())
+
+
+def _sizes(each: Mapping[str, float], rounded: Callable[[float, int], str]) -> str:
+    return "at most " + ", ".join(f"{rounded(size, 3)} in {symbol(name)}′" for name, size in each.items())
+
+
 def page(residuals: Residuals, data: Mapping[str, Any]) -> str:
     """The page as one HTML document, from the object that `certify identify --json` prints."""
     from matplotlib import rc_context
@@ -82,6 +112,7 @@ def page(residuals: Residuals, data: Mapping[str, Any]) -> str:
         axis=None if axis is None else direction_in_words(axis["direction"], axis["share_of_priors"]),
         telling=None if axis is None else axis["telling"],
         least=noise_in_words(data["least_noise"]),
+        lacking=[factors_in_words(one) for one in data["least_residual"]],
         missing=int(np.count_nonzero(~np.isfinite(residuals.difference).all(0))),
     )
 

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import argparse
 import csv
+from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
-from certify import get_system
+from certify import System, get_system
 
+Array = NDArray[np.float64]
 REACH = {  # of the states from which transitions begin
     "pendulum": [1.5, 2.0],
     "cartpole": [1.0, 0.5, 1.0, 1.0],
@@ -20,6 +23,12 @@ REACH = {  # of the states from which transitions begin
     "quadrotor3d": [1.0, 1.0, 1.0, 0.4, 0.4, 0.5, *[1.0] * 6],
 }
 PERIOD, STEPS = 0.02, 20
+
+
+def rubbing(plant: System, friction: float) -> Callable[[Array, Array], Array]:
+    """The plant's equations with nearly Coulomb's friction beside the force or torque u, which no structure has."""
+    f, rate = plant.function(), plant.n // 2  # the first velocity, along u in both
+    return lambda x, u: f(x, u - friction * np.tanh(10 * x[:, rate, None])) if friction else f(x, u)
 
 
 def main() -> None:
@@ -31,10 +40,11 @@ def main() -> None:
     parser.add_argument("--length", type=int, help="of runs, in transitions that follow each other; by default none do")
     parser.add_argument("--noise", type=float, default=1e-3)
     parser.add_argument("--reach", help="of states and then inputs, 1,0.1,2,2,10; by default far, and all inputs")
+    parser.add_argument("--friction", type=float, default=0.0, help="D tanh(10 v) less of u, of pendulum or cartpole")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     plant, draw = get_system(given.plant), np.random.default_rng(given.seed)
-    f, N, h = plant.function(), given.transitions, PERIOD / STEPS
+    f, N, h = rubbing(plant, given.friction), given.transitions, PERIOD / STEPS
     reach = [float(part) for part in given.reach.split(",")] if given.reach else REACH[given.plant]
     runs, length = (N, 1) if given.length is None else (N // given.length, given.length)
     lo, hi = np.array([[float(end) for end in pair] for pair in plant.input_bounds]).T

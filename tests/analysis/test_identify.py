@@ -7,8 +7,10 @@ import hashlib
 import io
 import json
 import math
+import re
 import runpy
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -25,9 +27,11 @@ from certify.certificates.checking import ask
 from certify.cli.main import _run
 from certify.errors import InputError
 from certify.loop.plants import Measurements, Run, System, get_system, load_system
+from certify.loop.policies import load_policy
 from certify.provers.data import Contradiction
 from certify.provers.data.identify import _Box, _Data
 from certify.provers.data.models import Flows
+from certify.reference import rules as second
 from tests.support.marks import slow_after
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -390,6 +394,64 @@ def test_what_the_equations_lack_is_a_residual(tmp_path: Path) -> None:
     assert holds(found) and found.system.ranges["residual_theta_dot"] == (-1, 1)
 
 
+RESIDUAL = STRUCTURE.replace("[u_eq]", '[residual]\ntheta_dot = "{}"\n\n[u_eq]')
+
+
+def test_the_least_factor_of_a_residual_is_no_larger_than_the_true_one(tmp_path: Path) -> None:
+    """The plant has half the bound that the structure allows; what is refuted is refuted as a bound by itself."""
+    rows = transitions(noise=1e-4, drag=0.2)
+    found = identified(tmp_path, rows, RESIDUAL.format("0.4*theta_dot**2"), noise="1e-4")
+    (least,) = found.least_residual
+    assert least.open is not None
+    refuted, open_ = least.refuted["theta_dot"], least.open["theta_dot"]
+    assert 0.2 < refuted < 0.5 and refuted < open_ < 1.1 * refuted
+    with pytest.raises(Contradiction):
+        identified(tmp_path, rows, RESIDUAL.format(f"{0.4 * refuted}*theta_dot**2"), noise="1e-4")
+    identified(tmp_path, rows, RESIDUAL.format(f"{0.4 * open_}*theta_dot**2"), noise="1e-4")
+    none = identified(tmp_path, transitions(noise=1e-4), RESIDUAL.format("0.4*theta_dot**2"), noise="1e-4")
+    assert [(one.refuted, one.open) for one in none.least_residual] == [({"theta_dot": 0}, {"theta_dot": 0})]
+    assert none.to_dict()["least_residual"] == [{"refuted": {"theta_dot": 0}, "open": {"theta_dot": 0}}]
+    assert identified(tmp_path, transitions()).least_residual == ()
+
+
+def test_factors_are_of_all_residuals_and_of_each_beside_the_others(tmp_path: Path) -> None:
+    rows = transitions(noise=1e-4, drag=0.2)
+    lacking = RESIDUAL.format('0.4*theta_dot**2"\ntheta = "0.1*theta_dot')
+    found = identified(tmp_path, rows, lacking, noise="1e-4")
+    assert [set(one.refuted) for one in found.least_residual] == [{"theta", "theta_dot"}, {"theta"}, {"theta_dot"}]
+    both, theta, rate = (max(one.refuted.values()) for one in found.least_residual)
+    assert theta == 0 and 0.2 < rate <= both * 1.1 < 0.55
+
+
+def test_a_refuted_structure_says_what_its_equations_lack(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The drag is at most 0.2 of the square of a rate of up to 6: less than it is refuted, and what is said to be tried
+    is not."""
+    rows = transitions(noise=1e-4, drag=0.2)
+    assert _run(command(tmp_path, "--noise", "1e-4", rows=rows), False) == 1
+    shown = capsys.readouterr().out
+    advice = re.search(r'try next +in the structure \[residual\] theta_dot = "(\S+)", or bounds', shown)
+    assert advice is not None and "in θ̇′ is contradicted as well" in shown and 0.2 < float(advice[1]) < 7.2
+    assert _run(command(tmp_path, "--noise", "1e-4", "--json", rows=rows), True) == 1
+    found = json.loads(capsys.readouterr().out)
+    least = next(one for one in found["least_constants"] if "theta_dot" in one["refuted"])
+    refuted = least["refuted"]["theta_dot"]
+    assert found["least_residual"] == [] and refuted < least["open"]["theta_dot"] <= float(advice[1]) < 1.2 * refuted
+    for size, status in ((refuted, 1), (float(advice[1]), 0)):
+        more = command(tmp_path, "--noise", "1e-4", "--json", rows=rows, text=RESIDUAL.format(size))
+        assert _run(more, True) == status
+    capsys.readouterr()
+
+
+def test_a_residual_that_is_too_small_is_refuted_with_the_factor_that_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows, text = transitions(noise=1e-4, drag=0.2), RESIDUAL.format("0.05*theta_dot**2")
+    assert _run(command(tmp_path, "--noise", "1e-4", rows=rows, text=text), False) == 1
+    shown = capsys.readouterr().out
+    factor = re.search(r"θ̇: (\S+) times the bound is contradicted; (\S+) times is not", shown)
+    assert factor is not None and 1 < float(factor[1]) < 4 and float(factor[1]) < float(factor[2])
+
+
 def test_a_wrong_period_is_refuted_and_one_in_a_range_is_not(tmp_path: Path) -> None:
     """A period that is 1 % off moves theta by 4e-4 at 2 rad/s, more than this noise."""
     rows = transitions(noise=1e-5)
@@ -658,6 +720,37 @@ def test_python_takes_data_as_the_command_does(known: Path) -> None:
     ).system
     again = certify.certify_roa(plant, POLICY, candidate="lyapunov", level=1e-3)
     assert again.verdict == "PROVED" and again.to_dict()["data"]["sha256"] == found.to_dict()["data"]["sha256"]
+
+
+def test_a_tube_has_data_too(known: Path) -> None:
+    """Both checkers derive the ranges; without the evidence of one transition, or with other ends, they refuse it."""
+    network = load_policy(EXAMPLES / "policies" / "pendulum.pt").network
+    options: dict[str, Any] = {"candidate": "lyapunov", "level": 0.3, "enlarge": True, "effort": 0.6}
+    result = certify.certify_roa(known / "known.toml", network, known / "tube", data=known / "data.csv", **options)
+    assert (result.verdict.value, result.claim) == ("PROVED", "enlarged") and result.raw is not None
+    whole = json.loads(result.raw)
+    assert len(whole["evidence"]["tube"]) > 1 and whole["claim"]["data"]["runs"]
+    assert both(whole) == {"ACCEPTED"}
+    for change, rule in (
+        (lambda d: d["evidence"]["data"].update(rounds=[]), "data"),
+        (lambda d: d["claim"]["data"]["parameters"][0].update(range=["10", "31"]), "data"),
+        (lambda d: d["plant"]["uncertain"][0].update(range=["39/2", "59/3"]), "data"),
+        (lambda d: d["evidence"]["tube"].pop(0), "tube"),
+    ):
+        forged = json.loads(result.raw)
+        change(forged)
+        assert both(forged) == {rule}
+
+
+def both(data: Any) -> set[str]:
+    """The words of both checkers: ACCEPTED, or a rule."""
+    raw = json.dumps(data).encode()
+    with tempfile.NamedTemporaryFile(suffix=".json") as file:
+        file.write(raw)
+        file.flush()
+        _, answer = ask(Path(file.name))
+    judged = second.judge(raw)
+    return {str(answer.get("rule") or answer["result"]), judged.rule or judged.result}
 
 
 def test_what_fails_in_the_ranges_refutes_no_claim_about_data(known: Path) -> None:

@@ -302,8 +302,7 @@ def test_a_witness_has_its_values(proved: RoaResult) -> None:
     [
         ({"engine": "dreal"}, "`engine` must be bounds where something is uncertain"),
         ({"engine": "both"}, "`engine` must be bounds where something is uncertain"),
-        ({"enlarge": True}, "a tube must be of exact equations"),
-        ({"box": {"p": 0.1}}, "a tube must be of exact equations"),
+        ({"reach_from": {"p": 0.1}}, "a tube around a path must be of exact equations"),
     ],
 )
 def test_what_is_about_exact_equations_is_refused(tmp_path: Path, options: dict[str, Any], part: str) -> None:

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from certify.reference import document as reference_document
 from certify.reference import limits as reference_limits
 from certify.reference import rules as reference_rules
 from tests.checker.test_networks import hash_of
+from tests.checker.test_uncertain_tube import decay
 from tests.support.certificates import LEAF, Document, dump, edited, encode, make
 from tests.support.earlier import newer
 
@@ -311,3 +313,24 @@ def test_patience_is_an_option(program: str, tmp_path: Path) -> None:
 if __name__ == "__main__":  # sizes of the bombs
     for name, (build, _) in BOMBS.items():
         sys.stdout.write(f"{name}: {len(dump(build())):,} bytes\n")
+
+
+@pytest.mark.parametrize("cells", [1, 5])
+def test_a_slab_counts_the_cells_and_corners_of_what_is_uncertain(cells: int, tmp_path: Path) -> None:
+    """By the page's line for a slab, in one state with one quantity, less what its matrices take."""
+    data = decay("67/100", "1", cells)
+    fewer = edited(data, "evidence.tube", data["evidence"]["tube"][:1])
+    sizes = limits.Sizes(document.read(str(_written(data, tmp_path))))
+    n = d = m = y = 1
+    t, bits = 2 + 1, (Fraction(3, 4).numerator.bit_length(), Fraction(17, 16).numerator.bit_length())
+    K, Z = 1 + 2**21, sizes.a * (2**17 + 64 * t + 16 * (m + y))
+    I, Y = 2**23 + 2**12 * 2**4 + 8 + 2**14 * 2**3, 2**14  # noqa: E741
+    slab = K + cells * Z + 3 * cells * 2 * (I + Y + 2**8 * y * n * (d + 1) ** 2)
+    slab += sum(b**2 // 2**13 + 2**10 for b in bits)
+    assert counts(data, tmp_path)[1] - counts(fewer, tmp_path)[1] == slab
+
+
+def _written(data: Document, folder: Path) -> Path:
+    path = folder / "written.json"
+    path.write_bytes(dump(data))
+    return path

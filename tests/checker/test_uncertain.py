@@ -22,7 +22,7 @@ from certify.checker.ball import Ball
 from certify.checker.case import Case
 from certify.checker.ring import Ring
 from tests.checker.test_ball import BITS, contains, points, states
-from tests.support.balls import enlarged_from, reached_from, with_ball
+from tests.support.balls import with_ball
 from tests.support.certificates import Document, edited, encode, grow, make, parse, rehash, verdict
 from tests.support.jets import Jet, changed, constant, given, seen, uncertain
 from tests.support.leaves import on_boxes
@@ -176,31 +176,12 @@ def _format() -> list[tuple[str, str, str, Edit]]:
         ("unused", "a trusted solver, unused", at("evidence", TRUSTED)),
         ("disturbed", "a trusted solver, practical", at("evidence", TRUSTED)),
         ("scaled", "an older schema", at("schema", "certify-certificate/4")),
-        ("scaled", "claim with a tube", with_tube("enlarged")),
-        ("unused", "claim with a tube, unused", with_tube("enlarged")),
-        ("scaled", "claim with a path", with_tube("reached")),
     ]
     return [("format", *one) for one in result]
 
 
 def without(data: Document, section: str, key: str) -> Document:
     return edited(data, section, {k: v for k, v in data[section].items() if k != key})
-
-
-def with_tube(kind: str) -> Edit:
-    """A tube that is of the right form."""
-
-    def change(data: Document) -> Document:
-        moves = kind == "reached"
-        path = {"centre": encode([0.0])} | {key: (0.5).hex() for key in ("share", "edge", "motion", "joint")}
-        slab = {
-            "middle": encode([25.0]), "end": encode([25.0]), "duration": (1.0).hex(), "J": encode([1.0]),
-            "multipliers": encode([1.0] * 3), "path": path if moves else None,
-        }  # fmt: skip
-        data = edited(data, "claim", reached_from([25.0], [0.0]) if moves else enlarged_from([25.0]))
-        return edited(data, "evidence.tube", [slab])
-
-    return change
 
 
 def widened(name: str, lo: str, hi: str, index: int = 0) -> tuple[str, Edit]:

@@ -28,7 +28,7 @@ from certify.provers.ball.decrease import Multipliers, best_multipliers, decay_o
 from certify.provers.ball.local import prove_local
 from certify.provers.ball.models import Models, paths
 from certify.provers.tube.enlarge import Found, enlarge
-from certify.provers.tube.tube import Tube, find_tube
+from certify.provers.tube.tube import Around, Tube, find_tube
 from tests.support.cases import case_of
 from tests.support.certificates import parse
 from tests.support.jets import remainders, seen, sides
@@ -182,7 +182,7 @@ def test_tubes_lead_where_they_say(name: str) -> None:
     level = prove_local(case.problem, case.T, domain_limit(case.P, case.loop.system.domain), known)
     assert level is not None
     goal = case.P / (level / 2)
-    tube = find_tube(known, goal / size**2, goal)
+    tube = find_tube(Around.of(case.loop, ()), goal / size**2, goal)
     assert tube is not None and (tube.start == goal / size**2).all()
     check_in_floats(name, tube, goal)
 
@@ -190,7 +190,7 @@ def test_tubes_lead_where_they_say(name: str) -> None:
 def test_no_tube_starts_beyond_the_region_of_attraction() -> None:
     """x' = x/2 - tanh(x): the origin attracts |x| < 1.915008."""
     case = case_of(*scalar_tanh())
-    known, goal = paths(case.loop), np.eye(1) / 0.25
+    known, goal = Around.of(case.loop, ()), np.eye(1) / 0.25
     assert find_tube(known, np.eye(1) / 1.92**2, goal) is None
     assert find_tube(known, np.eye(1) / 0.36, goal, Effort(0.0)) is None
 
@@ -200,10 +200,10 @@ def test_the_search_reports_ever_larger_starts() -> None:
     seen: list[Found] = []
     goal = np.eye(1) / 0.25
     best = enlarge(
-        paths(case.loop), goal, {"one": np.eye(1), "again": np.eye(1)}, Effort(20 * UNIT), report=seen.append
+        Around.of(case.loop, ()), goal, {"one": np.eye(1), "again": np.eye(1)}, Effort(20 * UNIT), report=seen.append
     )
     assert best is seen[-1] and best.volume > 2 * 0.5
     assert [s.volume for s in seen] == sorted(s.volume for s in seen)
     assert best.tube.start[0, 0] > 1.915009**-2  # inside of what the origin attracts
     check_in_floats("scalar", best.tube, goal)
-    assert enlarge(paths(case.loop), goal, {"one": np.eye(1)}, Effort(20 * UNIT), worth=2 * 1.9151) is None
+    assert enlarge(Around.of(case.loop, ()), goal, {"one": np.eye(1)}, Effort(20 * UNIT), worth=2 * 1.9151) is None

@@ -41,7 +41,7 @@ from certify.provers.ball.models import paths
 from certify.provers.tube import enlarge as enlarging
 from certify.provers.tube import tube as tubes
 from certify.provers.tube.enlarge import enlarge
-from certify.provers.tube.tube import Tube, find_tube
+from certify.provers.tube.tube import Around, Tube, find_tube
 from tests.support.cases import Case, case_of
 from tests.support.loops import pendulum_network, scalar_tanh
 
@@ -62,7 +62,7 @@ def pendulum() -> tuple[Case, Array]:
 @cache
 def enlarged() -> Tube:
     case, goal = pendulum()
-    tube = find_tube(paths(case.loop), goal / 1.3**2, goal)
+    tube = find_tube(Around.of(case.loop, ()), goal / 1.3**2, goal)
     assert tube is not None
     return tube
 
@@ -123,7 +123,7 @@ def test_none_is_found_from_beyond_what_settles() -> None:
     """xdot = x/2 - tanh(x) rests at 0 and at 1.915: a start beyond that has no tube, one inside has."""
     system, network = scalar_tanh()
     loop = ClosedLoop(system, network)
-    known = paths(loop)
+    known = Around.of(loop, ())
     goal = np.array([[1 / 0.3**2]])
     assert find_tube(known, np.array([[1 / 0.6**2]]), goal) is not None
     for size in (1.92, 2.5, 4.0):
@@ -133,12 +133,12 @@ def test_none_is_found_from_beyond_what_settles() -> None:
 def test_a_start_that_leaves_the_domain_has_none() -> None:
     case, goal = pendulum()
     limit = domain_limit(goal, case.loop.system.domain)
-    assert find_tube(paths(case.loop), goal / (1.01 * limit), goal) is None
+    assert find_tube(Around.of(case.loop, ()), goal / (1.01 * limit), goal) is None
 
 
 def test_no_effort_is_no_tube() -> None:
     case, goal = pendulum()
-    assert find_tube(paths(case.loop), goal / 1.3**2, goal, Effort(0.0)) is None
+    assert find_tube(Around.of(case.loop, ()), goal / 1.3**2, goal, Effort(0.0)) is None
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -230,14 +230,14 @@ def test_enlarge_keeps_the_largest_of_the_shapes() -> None:
     case, goal = pendulum()
     seen: list[float] = []
     shapes = {"round": np.diag([1.0, 0.02]), "goal": goal}
-    found = enlarge(paths(case.loop), goal, shapes, Effort(20.0 * UNIT), report=lambda e: seen.append(e.volume))
+    found = enlarge(Around.of(case.loop, ()), goal, shapes, Effort(20.0 * UNIT), report=lambda e: seen.append(e.volume))
     assert found is not None and found.shape in shapes
     assert seen == sorted(seen) and found.volume == seen[-1] > volume(goal, 1.0)
 
 
 def test_enlarge_asks_for_more_than_it_is_worth() -> None:
     case, goal = pendulum()
-    assert enlarge(paths(case.loop), goal, {"goal": goal}, Effort(20.0 * UNIT), worth=1e9) is None
+    assert enlarge(Around.of(case.loop, ()), goal, {"goal": goal}, Effort(20.0 * UNIT), worth=1e9) is None
 
 
 @pytest.mark.slow
@@ -458,7 +458,7 @@ def test_a_tube_is_no_longer_than_the_checker_takes(result: RoaResult, monkeypat
         check(c)
     case, goal = pendulum()
     monkeypatch.setattr(tubes, "MOST_WORK", 16 * (len(enlarged().slabs) - 1))
-    assert find_tube(paths(case.loop), goal / 1.3**2, goal) is None
+    assert find_tube(Around.of(case.loop, ()), goal / 1.3**2, goal) is None
 
 
 def test_errors_beyond_binary64_are_not_shown() -> None:

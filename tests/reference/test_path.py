@@ -410,7 +410,9 @@ def models_of(data: Document) -> list[tuple[list[Model], list[Model]]]:
         w = (after - before) / (2 * fmpq(*each.path.share.as_integer_ratio()))  # type: ignore[union-attr,operator]
         wide = fmpq_mat([[*a, b] for a, b in zip(each.ball.J.tolist(), w.entries(), strict=True)])
         m = (before + after) / 2  # type: ignore[operator]
-        result.append((inputs_on(c, wide, m), loop.on(wide, "tube", "slab", m).components))
+        result.append(
+            (inputs_on(c, wide, m), loop.within(loop.known(wide, "tube", "slab", m), (), "tube", "slab").components)
+        )
     return result
 
 
@@ -790,7 +792,7 @@ def one(_: Motion, __: str) -> fmpq:
 def unmoved(loop: Loop, slab: Any, path: Motion, centres: Any, at: str) -> Field:
     """As if the path stood at its end: no velocity, and no motion."""
     J = fmpq_mat([[*each, 0] for each in slab.ball.J.tolist()])
-    return loop.on(J, "tube", at, centres[1])
+    return loop.within(loop.known(J, "tube", at, centres[1]), (), "tube", at)
 
 
 CLAUSES: dict[str, tuple[Any, str, Callable[..., Any], Edit]] = {  # where, what it says instead, the forgery

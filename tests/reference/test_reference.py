@@ -658,7 +658,8 @@ def test_the_ball_encloses_F(name: str, rho: float) -> None:
     c, mine, generator = parse(data), read_certificate(dump(with_ball(data))), np.random.default_rng(1)
     with ctx.workprec(160):
         J = exact(rho) * tree_evidence(mine).T
-        F = Loop(mine).on(J, "local", "ball").components
+        loop = Loop(mine)
+        F = loop.within(loop.known(J, "local", "ball"), (), "local", "ball").components
         for direction in generator.standard_normal((40, mine.n)):
             d = (direction / np.linalg.norm(direction) * generator.uniform(0, 1 - 1e-12)).tolist()
             x = (arb_mat(J) * arb_mat([[arb(v)] for v in d])).entries()

@@ -65,7 +65,7 @@ def hints(
     wide = np.column_stack([J, step / (2 * share)])
     middle = fmpq_mat(n, 1, [fmpq(*float(v).as_integer_ratio()) for v in (centres[0] + centres[1]) / 2])
     try:
-        F = loop.on(exactly(wide), "tube", "slab", middle)
+        F = loop.within(loop.known(exactly(wide), "tube", "slab", middle), (), "tube", "slab")
     except Refused:
         return np.ones((3, n)), 1.0, 1.0
     f = np.array([float(each.v) for each in F.components]) - step / h

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
@@ -21,7 +21,7 @@ from certify.report.identified import Residuals
 
 if TYPE_CHECKING:
     from certify.analysis.identifying.determined import Direction
-    from certify.provers.data import Identified
+    from certify.provers.data import Identified, Least
 
 SCHEMA = "certify-identify/1"
 _NARROWED = 1.01  # least factor by which a prior that is narrowed becomes smaller
@@ -43,6 +43,7 @@ class IdentifyResult:
     least_determined : the direction in the space of parameters in which most is left; None if it was not found.
     least_noise : a factor: noise smaller than so many times the declared one contradicts the measurements; None
         without noise.
+    least_residual : factors of the bounds in the structure's table `residual`, of all and of each; none without it.
     found : all that the prover says.
     seconds : spent on it.
     plant : the file that was written, None without one.
@@ -55,6 +56,7 @@ class IdentifyResult:
     shown_by: Mapping[str, tuple[int, ...]]
     least_determined: Direction | None
     least_noise: float | None
+    least_residual: tuple[Least, ...]
     found: Identified = field(repr=False)
     seconds: float
     plant: Path | None = None
@@ -136,6 +138,7 @@ class IdentifyResult:
                 "telling": self.readings.places[axis.telling],
             },
             "least_noise": self.least_noise,
+            "least_residual": sizes_in_json(self.least_residual),
             "rounds": len(self.found.bounds.rounds),
             "order": self.found.bounds.order,
             "pieces": self.found.bounds.pieces,
@@ -153,6 +156,26 @@ def data_in_json(source: str, readings: Readings) -> dict[str, Any]:
         "runs": len(readings.runs),
         "transitions": len(readings.places),
     }
+
+
+def sizes_in_json(each: Sequence[Least]) -> list[dict[str, Any]]:
+    """Sizes of residuals as plain values."""
+    return [{"refuted": dict(one.refuted), "open": None if one.open is None else dict(one.open)} for one in each]
+
+
+def residuals_of_refuted(measured: System) -> dict[str, list[dict[str, Any]]]:
+    """The least residuals of a structure that its measurements refute, as plain values.
+
+    `least_residual` has a factor of its bounds in the table `residual`; `least_constants` has constant bounds, of a
+    structure without that table.
+    """
+    from certify.provers.data import least_of_refuted, residual_states
+
+    if measured.measurements is None:
+        raise InputError("a structure must have measurements that refute it.")
+    found = sizes_in_json(least_of_refuted(measured, measured.measurements))
+    factors = bool(residual_states(measured))
+    return {"least_residual": found if factors else [], "least_constants": [] if factors else found}
 
 
 def measured_plant(
@@ -210,7 +233,7 @@ def identify_plant(
     InputError : the flow has no enclosure, the measurements narrow no prior, or the file cannot be written.
     """
     from certify.analysis.identifying.determined import polytope_of, showing
-    from certify.provers.data import identify
+    from certify.provers.data import identify, least_factors
 
     start, data = time.perf_counter(), measured.measurements
     if data is None:
@@ -231,6 +254,7 @@ def identify_plant(
         shown_by=showing(found),
         least_determined=left.least_determined(),
         least_noise=left.least_noise(),
+        least_residual=least_factors(measured, data, found),
         found=found,
         seconds=time.perf_counter() - start,
         plant=out,

@@ -54,8 +54,8 @@ class Tube:
 
     def extend(self, state: State, effort: Effort) -> State:
         """Add the largest tube that the effort finds; a note says if there is none."""
-        from certify.provers.ball.models import paths
         from certify.provers.tube.enlarge import enlarge
+        from certify.provers.tube.tube import Around
 
         (claim, evidence), race = state.proved, state.contest
         trial, box = race.best.trial, state.options.box
@@ -65,7 +65,7 @@ class Tube:
         with self.tools.timing("tube"):
             self.tools.tell("tube")
             worth = volume(trial.P, claim.roa) if box is None else 0.0
-            known, goal = paths(trial.task.problem.loop), trial.P / claim.roa
+            known, goal = Around.of(trial.task.problem.loop, evidence.cells), trial.P / claim.roa
             found = enlarge(known, goal, _shapes(state, shapes), effort.share(_FOR_SEARCH), worth)
         if found is None:
             return state.noting("no tube leads into the proved set from a larger one that the effort could reach")

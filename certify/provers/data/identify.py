@@ -26,7 +26,7 @@ from certify.provers.data.models import Flows, Rows
 _LADDER = ((2, 1), (3, 1), (4, 1), (5, 2), (6, 4), (7, 8))  # orders of the series in time, and pieces
 _WORSE = 1.1  # slack of a cheaper pair, relative to the best
 _PROBES, _NARROW = 64, Fraction(1, 50)  # transitions, and the share of the priors, with which pairs are compared
-_ROUNDS, _JOINT_ROUNDS = 12, 4
+_ROUNDS, _JOINT_ROUNDS, _FEW = 12, 4, 2
 _SHRUNK = 0.97  # least shrinking of the best range in a round that pays for another
 _JOINT_ROWS = 1200  # of a program whose rows share errors
 _SLACK = Fraction(1, 10**6)  # of a range's half-width, by which a checker's may differ
@@ -228,6 +228,65 @@ def _width_counts(flows: Flows, box: Box, probes: Numbers, base: Array) -> float
     return min(_NO_ROWS, float(np.median(np.where(np.isfinite(slack), slack, np.inf).max(0))))
 
 
+@dataclass(frozen=True)
+class Search:
+    """The rounds in the parts of the priors, and those about the box around what is left of them."""
+
+    data: _Data
+    flows: Flows
+    tree: bytes
+    parts: list[_Box]
+    whole: _Box
+
+    @classmethod
+    def of(cls, system: System, measurements: Measurements) -> Search:
+        """Bound the parameters.
+
+        Raises
+        ------
+        Contradiction : no parameter within the priors is consistent with the measurements.
+        InputError : measurements are not of this plant, or the flow over them has no enclosure.
+        """
+        require_measurable(system, measurements)
+        data = _Data(system, measurements)
+        narrow = {name: _shrunk(pair) for name, pair in measurements.priors.items()}
+        flows = _fitting(data, narrow)
+        tree, parts = _parts(data, flows, narrow)
+        left = [part.box for part in parts if not part.empty]
+        if not left:
+            raise Contradiction(tuple(sorted(data.against)))
+        hull = {name: (min(box[name][0] for box in left), max(box[name][1] for box in left)) for name in narrow}
+        whole = _narrowed(data, flows, hull)
+        if whole.empty:
+            raise Contradiction(tuple(sorted(data.against)))
+        return cls(data, flows, tree, parts, whole)
+
+
+def _narrowed(data: _Data, flows: Flows, box: Box, most: int = _ROUNDS) -> _Box:
+    """The rounds about a box, of all transitions; at most so many in which every transition stands for itself."""
+    whole = _Box(data, flows, box)
+    whole.separately(np.arange(data.count), most)
+    if data.shares and not whole.empty:
+        whole.jointly(data.windows())
+    return whole
+
+
+def refuted_in(measurements: Measurements, flows: Flows, box: Box) -> bool:
+    """True if a few rounds show that the measurements contradict one another for all parameters in a box."""
+    return _narrowed(_Data(flows.system, measurements), flows, box, _FEW).empty
+
+
+def misses(system: System, measurements: Measurements) -> Array:
+    """By how much a transition misses what equations and errors explain at the middle of the priors, at most, (n,)."""
+    data, narrow = _Data(system, measurements), {name: _shrunk(pair) for name, pair in measurements.priors.items()}
+    flows = _fitting(data, narrow)
+    rows = flows.rows(narrow, np.arange(data.count))
+    rows = rows.at(np.flatnonzero(rows.exist))
+    miss = np.abs(rows.alpha) - rows.slack - np.abs(rows.slopes).sum(1) - flows.noise[:, None]
+    most: Array = miss.max(1, initial=0.0)
+    return most
+
+
 def identify(system: System, measurements: Measurements) -> Identified:
     """Bound the parameters of a plant by measurements.
 
@@ -236,27 +295,13 @@ def identify(system: System, measurements: Measurements) -> Identified:
     Contradiction : no parameter within the priors is consistent with the measurements.
     InputError : measurements are not of this plant, the flow over them has no enclosure, or they narrow no prior.
     """
-    require_measurable(system, measurements)
-    data = _Data(system, measurements)
-    narrow = {name: _shrunk(pair) for name, pair in measurements.priors.items()}
-    flows = _fitting(data, narrow)
-    tree, parts = _parts(data, flows, narrow)
-    left = [part.box for part in parts if not part.empty]
-    if not left:
-        raise Contradiction(tuple(sorted(data.against)))
-    hull = {name: (min(box[name][0] for box in left), max(box[name][1] for box in left)) for name in narrow}
-    whole = _Box(data, flows, hull)
-    whole.separately(np.arange(data.count), _ROUNDS)
-    if data.shares and not whole.empty:
-        whole.jointly(data.windows())
-    if whole.empty:
-        raise Contradiction(tuple(sorted(data.against)))
-    if all(_width(pair) >= _width(measurements.priors[name]) for name, pair in whole.box.items()):
+    search = Search.of(system, measurements)
+    if all(_width(pair) >= _width(measurements.priors[name]) for name, pair in search.whole.box.items()):
         raise InputError(
-            f"the measurements narrow no prior, in {len(parts)} parts of the priors: write the equations linear in the "
-            "parameters, a quotient of two as one, narrow the priors, or measure more often."
+            f"the measurements narrow no prior, in {len(search.parts)} parts of the priors: write the equations linear "
+            "in the parameters, a quotient of two as one, narrow the priors, or measure more often."
         )
-    return _found(data, flows, tree, parts, whole)
+    return _found(search)
 
 
 def require_measurable(system: System, measurements: Measurements) -> None:
@@ -279,8 +324,9 @@ def require_measurable(system: System, measurements: Measurements) -> None:
         raise InputError(f"equations of {system.name} must not call a network, where its parameters come from data.")
 
 
-def _found(data: _Data, flows: Flows, tree: bytes, parts: list[_Box], whole: _Box) -> Identified:
+def _found(search: Search) -> Identified:
     """All that the rounds have found, with the transitions alone that they use."""
+    data, flows, parts, whole = search.data, search.flows, search.parts, search.whole
     used = np.zeros(data.count, dtype=bool)
     for part in (*parts, whole):
         for chosen, weights, _ in part.rounds:
@@ -289,7 +335,7 @@ def _found(data: _Data, flows: Flows, tree: bytes, parts: list[_Box], whole: _Bo
     def stored(part: _Box) -> tuple[Round, ...]:
         return tuple(Round(_corners(box), _stored(chosen, weights, used)) for chosen, weights, box in part.rounds)
 
-    bounds = DataBounds(flows.order, flows.pieces, tree, tuple(map(stored, parts)), stored(whole))
+    bounds = DataBounds(flows.order, flows.pieces, search.tree, tuple(map(stored, parts)), stored(whole))
     rows, kept = flows.rows(whole.box, np.arange(data.count)), data.measurements.only(used)
     history = (dict(data.measurements.priors), *whole.history)
     return Identified(whole.box, history, kept, bounds, used, rows)

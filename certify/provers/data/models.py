@@ -53,7 +53,8 @@ class Flows:
         self.dynamics = system.uncertain_dynamics()
         self.names = tuple(measurements.priors)
         self.symbols = system.n + len(self.names)
-        states = [_less(run.states, system.exact_x_eq()) for run in measurements.runs]
+        at = system.exact_x_eq()
+        states = [_less(run.states, at) for run in measurements.runs]
         self.begins = np.concatenate([x[:-1] for x in states]).T
         self.ends = np.concatenate([x[1:] for x in states]).T
         self.inputs = np.concatenate([run.inputs for run in measurements.runs]).T

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from certify.effort import Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov import domain_limit, volume
-from certify.provers.ball.models import Paths
 from certify.provers.tube.path import find_path
-from certify.provers.tube.tube import Tube, find_tube
+from certify.provers.tube.tube import Around, Tube, find_tube
 
 Array = NDArray[np.float64]
 _FINE = 1.02  # ratio of sizes at which a search ends
@@ -41,7 +40,7 @@ class Found:
 
 
 def enlarge(
-    known: Paths,
+    known: Around,
     goal: Array,
     shapes: Mapping[str, Array],
     effort: Effort,
@@ -68,7 +67,7 @@ def enlarge(
     return best
 
 
-def _growing(known: Paths, goal: Array, shape: Array, worth: float, effort: Effort) -> Iterator[Tube]:
+def _growing(known: Around, goal: Array, shape: Array, worth: float, effort: Effort) -> Iterator[Tube]:
     """Tubes from larger and larger multiples of a shape, each of more volume than `worth`."""
     unit = shape * float(
         np.max(np.linalg.eigvals(np.linalg.solve(shape, goal)).real)

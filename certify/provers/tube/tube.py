@@ -9,7 +9,7 @@ the nonlinearity can widen it. The idea is set propagation with ellipsoids; no s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -18,9 +18,13 @@ from numpy.typing import NDArray
 
 from certify.certificates import Slab
 from certify.effort import UNLIMITED, Effort
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import kept_constraints
 from certify.lyapunov import leaves_domain
-from certify.provers.ball.decrease import Multipliers, decay_of, multipliers_for, rest_of
-from certify.provers.ball.models import Models, Paths
+from certify.provers.ball.cells import cut
+from certify.provers.ball.decrease import Multipliers, corners_of, multipliers_for, rests_of
+from certify.provers.ball.models import AT_CORNERS, Models, Paths, paths
+from certify.provers.ball.steps import Cell, Steps, steps_of
 
 Array = NDArray[np.float64]
 Growth = Callable[[Array], Array]
@@ -32,6 +36,7 @@ _CORRECTIONS, SHORTENINGS = 5, 12  # corrections of a slab's rate, shortenings o
 MOST_SLABS, MOST_WORK = 4000, 2**26  # the second over n^4: the checker refuses more
 _GROWTHS = 6  # growths of V that a slab asks for
 _GROWN = 8.0  # logarithm of a volume, relative to the start, at which a tube is given up
+KEPT = 1 - 1e-9  # share of a constraint's value at rest that it may gain on a ball
 INSIDE = 1 - 1e-6  # share of the goal, beyond all rounding
 
 
@@ -49,7 +54,46 @@ class Tube:
         return math.fsum(slab.duration for slab in self.slabs)
 
 
-def find_tube(known: Paths, start: Array, goal: Array, effort: Effort = UNLIMITED) -> Tube | None:
+@dataclass(frozen=True, slots=True)
+class Around:
+    """The closed loop on balls around the origin, in each cell of what is uncertain."""
+
+    steps: Steps
+    cells: Sequence[Cell]
+
+    @staticmethod
+    def of(loop: ClosedLoop, cuts: tuple[int, ...]) -> Around:
+        """The loop whose ranges are cut into so many parts each."""
+        return Around(steps_of(paths(loop), True, 1), cut(list(loop.system.ranges.values()), cuts))
+
+    @property
+    def loop(self) -> ClosedLoop:
+        """The loop."""
+        return self.steps.known.loop
+
+    @property
+    def operations(self) -> float:
+        """Operations of models on a ball, about, as an `Effort` counts them."""
+        return len(self.cells) * self.steps.known.operations
+
+    @property
+    def corners(self) -> int:
+        """The inequalities that a coefficient of P asks for, at most."""
+        return len(self.cells) << min(len(self.loop.system.ranges), AT_CORNERS)
+
+    def models(self, J: Array) -> list[Models] | None:
+        """F on the ball x = J d in each cell; None if one is not finite, or inputs are not certain to be in bounds."""
+        found = self.steps.models(J, self.cells, np.zeros(len(J)))
+        return found if all(one.finite and one.admitted for one in found) else None
+
+    def keeps(self, J: Array) -> bool:
+        """True if every constraint holds on such a ball."""
+        keep = tuple(kept_constraints(self.loop.system).values())
+        found = self.steps.largest(J[None], keep, self.cells) if keep else (np.zeros(0), np.zeros((1, 0)))
+        return found is not None and bool(np.all(found[1] < -KEPT * found[0]))
+
+
+def find_tube(known: Around, start: Array, goal: Array, effort: Effort = UNLIMITED) -> Tube | None:
     """A tube from {x'Px <= 1}, P = start, into that of `goal`; None if there is none to be had with the effort.
 
     Parameters
@@ -76,7 +120,7 @@ def find_tube(known: Paths, start: Array, goal: Array, effort: Effort = UNLIMITE
     return Tube(start, tuple(slabs))
 
 
-def _slab(known: Paths, P: Array, rate: Array | None, weight: Array, effort: Effort) -> Slab | None:
+def _slab(known: Around, P: Array, rate: Array | None, weight: Array, effort: Effort) -> Slab | None:
     """One slab from {x'Px <= 1} on; `rate` is a guess of that of P.
 
     The multipliers are best where it counts, in the directions in which `weight` (n, n) is large.
@@ -85,7 +129,7 @@ def _slab(known: Paths, P: Array, rate: Array | None, weight: Array, effort: Eff
         J = WIDER * root(P)
         effort.charge(look(known))
         models = known.models(J)
-        if not (models.finite and models.admitted):
+        if models is None:
             return None
         rate = _back(-_growth(models, J, _multipliers(models, J, P, weight), P), J)
     duration = first_duration(P, rate)
@@ -95,7 +139,7 @@ def _slab(known: Paths, P: Array, rate: Array | None, weight: Array, effort: Eff
             J = WIDER * root(middle)
             effort.charge(look(known))
             models = known.models(J)
-            if models.finite and models.admitted and known.keeps(J):
+            if models is not None and known.keeps(J):
                 multipliers = _multipliers(models, J, P, weight)
                 nodes = nodes_of(partial(_growth, models, J, multipliers), J, P, duration)
                 if nodes is not None:
@@ -136,13 +180,18 @@ def nodes_of(growth: Growth, J: Array, P: Array, duration: float, room: float = 
     return None
 
 
-def _growth(models: Models, J: Array, multipliers: Multipliers, P: Array) -> Array:
-    b = P @ J
-    return rest_of(models, b, multipliers) - decay_of(models, J, b)
+def _growth(models: Sequence[Models], J: Array, multipliers: Multipliers, P: Array) -> Array:
+    """No less than that of any corner, in the sense of matrices."""
+    corners = [corner for each in models for corner in corners_of(each, J, P)]
+    first, *others = (rest - corner.decay for corner, rest in zip(corners, rests_of(corners, multipliers), strict=True))
+    for growth in others:
+        values, vectors = np.linalg.eigh(growth - first)
+        first = first + (vectors * np.maximum(values, 0)) @ vectors.T
+    return first
 
 
-def _multipliers(models: Models, J: Array, P: Array, weight: Array) -> Multipliers:
-    return multipliers_for(models, P @ J, J.T @ weight @ J)
+def _multipliers(models: Sequence[Models], J: Array, P: Array, weight: Array) -> Multipliers:
+    return multipliers_for(models[0], P @ J, J.T @ weight @ J)
 
 
 def first_duration(P: Array, rate: Array) -> float:
@@ -168,10 +217,11 @@ def _contains(J: Array, P: Array, room: float) -> bool:
     return bool(np.linalg.eigvalsh(J.T @ P @ J)[0] > room / INSIDE)
 
 
-def look(known: Paths) -> float:
+def look(known: Paths | Around) -> float:
     """Operations to try one slab, about, as an `Effort` counts them."""
+    corners = known.corners if isinstance(known, Around) else 1
     n, units = known.loop.system.n, known.loop.network.network.units
-    return known.operations + _GROWTHS * (3e5 + 30.0 * units * n**2 + 15.0 * n**5)
+    return known.operations + corners * _GROWTHS * (3e5 + 30.0 * units * n**2 + 15.0 * n**5)
 
 
 def root(P: Array) -> Array:
