@@ -174,7 +174,7 @@ def inner_product(x: Sequence[Taylor], y: Sequence[Taylor]) -> Taylor:
 
 @cache
 def _triples(N: int) -> tuple[Array, Array, Array]:
-    """Of the K terms d_i d_j d_k, i <= j <= k: the places (3, K) in an array (N, pairs) of what d_i, d_j and d_k are
+    """The K terms d_i d_j d_k, i <= j <= k: the places (3, K) in an array (N, pairs) of what d_i, d_j and d_k are
     multiplied by there, 1 where such a place is another one, else 0, and a third, rounded up, for each index (N, K)."""
     pair = {at: p for p, at in enumerate(zip(*pairs(N), strict=True))}
     each = [(i, j, k) for i in range(N) for j in range(i, N) for k in range(j, N)]
