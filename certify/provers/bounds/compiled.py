@@ -17,7 +17,7 @@ from certify.provers.bounds import kernels, vectors
 _WORTH = 1e7  # work that takes as much longer without them as their start takes
 _FORMULAS = (
     *("smaller", "larger", "enclosed", "chord", "relaxed", "bent", "expansion"),
-    *("corner", "coefficients", "sizes", "cube", "third", "result"),
+    *("corner", "coefficients", "sizes", "cube", "third", "enter", "result"),
 )
 _LOOPS = ("ranges", "chords", "relax", "bend", "backwards", "play")
 _TYPES = {

@@ -405,6 +405,38 @@ def third(T: Plane, symbols: int, first: int, count: int, t: Plane) -> None:
                     t[k, first + b] += c
 
 
+def enter(
+    memory: Block,
+    x: Block,
+    x_error: Plane,
+    middle: Plane,
+    slopes: Block,
+    wide: Plane,
+    quantities: Plane,
+    first: int,
+    count: int,
+) -> None:
+    """Put the inputs of a tape, for `count` boxes from `first` on, in the first places; see `play`."""
+    n, inputs = x.shape[0], x.shape[0] + len(wide)
+    N = inputs + len(quantities)
+    R = 1 + N + N * (N + 1) // 2
+    for i in range(N):
+        w = memory[i]
+        w[:] = 0.0
+        for b in range(count):
+            if i < n:
+                w[0, b], w[R, b] = x[i, 0, first + b], x_error[i, first + b]
+            elif i < inputs:
+                w[0, b], w[1 + i, b] = middle[i - n, first + b], wide[i - n, first + b]
+            else:
+                w[0, b], w[1 + i, b] = quantities[i - inputs, 0], quantities[i - inputs, 1]
+                w[R, b] = quantities[i - inputs, 2]
+            if i < inputs:
+                for j in range(n):
+                    w[1 + j, b] = x[i, 1 + j, first + b] if i < n else slopes[i - n, j, first + b]
+        sizes(w, N)
+
+
 def play(
     steps: Steps,
     constants: Line,
@@ -429,8 +461,7 @@ def play(
     then by j, then r, sum |g_i| and the sum of the coefficients' magnitudes. Each operation is `alpha u + beta v`, with
     `gamma` times the product of the linear parts, and a remainder of its own.
     """
-    n, inputs, batch = x.shape[0], x.shape[0] + len(wide), len(c)
-    N = inputs + len(quantities)
+    N, batch = len(g), len(c)
     R = 1 + N + N * (N + 1) // 2
     G, S = R + 1, R + 2
     memory = np.zeros((places, R + 3, CHUNK))
@@ -441,21 +472,7 @@ def play(
     for first in range(0, batch, CHUNK):
         count = min(CHUNK, batch - first)
         T[:] = 0.0
-        for i in range(N):
-            w = memory[i]
-            w[:] = 0.0
-            for b in range(count):
-                if i < n:
-                    w[0, b], w[R, b] = x[i, 0, first + b], x_error[i, first + b]
-                elif i < inputs:
-                    w[0, b], w[1 + i, b] = middle[i - n, first + b], wide[i - n, first + b]
-                else:
-                    w[0, b], w[1 + i, b] = quantities[i - inputs, 0], quantities[i - inputs, 1]
-                    w[R, b] = quantities[i - inputs, 2]
-                if i < inputs:
-                    for j in range(n):
-                        w[1 + j, b] = x[i, 1 + j, first + b] if i < n else slopes[i - n, j, first + b]
-            sizes(w, N)
+        enter(memory, x, x_error, middle, slopes, wide, quantities, first, count)
         for at in range(len(steps)):
             operation, k = steps[at, 0], constants[at]
             u, v, w = memory[steps[at, 1]], memory[steps[at, 2]], memory[steps[at, 3]]
