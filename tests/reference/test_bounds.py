@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from itertools import product
 
 import numpy as np
 import pytest
@@ -118,6 +119,43 @@ def test_an_inner_product_is_nowhere_below(count: int) -> None:
                         bound.c + (bound.g * column)[0, 0] + (column.transpose() * (bound.Q * column))[0, 0] + bound.r
                     )
                     assert not most < ball(truth)
+
+
+def at(v: Taylor, d: tuple[int, ...]) -> arb:
+    """c + g.d + d'Qd + r."""
+    column, result = arb_mat([[x] for x in d]), v.c + v.r
+    if v.g is not None:
+        result += (v.g * column)[0, 0]
+    return result if v.Q is None else result + (column.transpose() * (v.Q * column))[0, 0]
+
+
+def test_an_inner_product_covers_remainders() -> None:
+    """Of models of which some parts are 0, at corners, whatever the members: nothing else has room for these."""
+    generator, n = np.random.default_rng(8), 2
+    with ctx.workprec(ON_LEAVES):
+        for _ in range(300):
+            both = list[tuple[int, int, list[Fraction], Rows]]()
+            for _ in range(2):
+                c, r, *rest = (int(v) for v in generator.integers(0, 4, 7) * generator.integers(0, 2, 7))
+                g, q, mixed, last = [Fraction(v) for v in rest[:2]], *map(Fraction, rest[2:])
+                both.append((c, r, g, [[q, mixed], [mixed, last]]))
+            v, w = (Taylor(arb(c), model(g, Q).g, model(g, Q).Q, arb(r)) for c, r, g, Q in both)
+            for d in product((-1, 1), repeat=n):
+                (x, r), (y, s) = ((c + value(g, Q, [Fraction(t) for t in d]), r) for c, r, g, Q in both)
+                most = max((x + i * r) * (y + k * s) for i, k in product((-1, 1), repeat=2))
+                assert not any(at(bound, d) < ball(most) for bound in (inner_product([v], [w]), v * w))
+
+
+def test_an_inner_product_is_exact_where_its_third_order_is_largest() -> None:
+    """x (2 y z), from either side, is 2 at (1, 1, 1), and x (x y) is 1 at (1, 1)."""
+    for g, Q, most in (
+        ([1, 0, 0], [[0, 0, 0], [0, 0, 2], [0, 2, 0]], 2),
+        ([1, 0, 0], [[0, 1, 0], [1, 0, 0], [0, 0, 0]], 1),
+        ([0, 0, 1], [[0, 0, 0], [0, 0, 0], [0, 0, 2]], 1),
+    ):
+        v, w = Taylor(arb(0), arb_mat([g])), model([Fraction(0)] * 3, [[Fraction(x, 2) for x in row] for row in Q])
+        for bound in (inner_product([v], [w]), inner_product([w], [v])):
+            assert at(bound, (1, 1, 1)).contains(most) and abs(at(bound, (1, 1, 1)) - most) < arb(2) ** -40
 
 
 def widened(g: list[Fraction], Q: Rows, by: float) -> Taylor:
