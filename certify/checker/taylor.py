@@ -175,7 +175,7 @@ def inner_product(x: Sequence[Taylor], y: Sequence[Taylor]) -> Taylor:
 
 @cache
 def _triples(N: int) -> tuple[Array, Array, list[Array]]:
-    """Of the K terms d_i d_j d_k, i <= j <= k: the places (3, K) in an array (N, pairs) of what d_i, d_j and d_k are
+    """The K terms d_i d_j d_k, i <= j <= k: the places (3, K) in an array (N, pairs) of what d_i, d_j and d_k are
     multiplied by there, 1 where such a place is another one, else 0; and for each index the terms that have it, as
     often as they do."""
     pair, index = np.zeros((N, N), dtype=np.intp), np.arange(N)

@@ -655,8 +655,7 @@ def vdot_bounds(ring: Ring, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
     _, radius = middle(lo, hi)
     states, F, _ = on_boxes(ring, centre, radius)
     model = ring.rise(states, F)
-    opposite = ring.rise(states, [-f for f in F])  # each is a bound from above alone
-    return -upper_bound(opposite), upper_bound(model), ring.bound(model, centre, radius)
+    return -upper_bound(-model), upper_bound(model), ring.bound(model, centre, radius)
 
 
 def states_in_arb(T: Array, z: Array) -> list[list[arb]]:
