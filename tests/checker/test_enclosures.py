@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import tracemalloc
 from collections.abc import Callable, Iterator
 from fractions import Fraction
 
@@ -19,8 +20,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from certify.checker import near
-from certify.checker.document import Policy
+from certify.checker.document import MAX_STATES, Policy
 from certify.checker.exact import contains_ball, gershgorin_lower, inverse_diagonal, is_definite, root_above
+from certify.checker.limits import MOST_NUMBERS
 from certify.checker.near import ZERO, Above, self_test
 from certify.checker.network import fold
 from certify.checker.networks import Network
@@ -520,6 +522,18 @@ def test_an_inner_product_rounds_its_squares_up() -> None:
         assert (
             most_at_1(inner_product([alone(0, 0, 1), alone(k, 0)], [alone(0, k), alone(0, k)])) >= k + Fraction(k) ** 2
         )
+
+
+def test_an_inner_product_in_many_symbols_fills_no_memory() -> None:
+    """As many as two states, and all inputs and uncertain quantities that a file may have, on one leaf."""
+    N = 2 + 2 * MAX_STATES
+    numbers = np.random.default_rng(0).standard_normal((N, N, 1))
+    model = Taylor(np.ones(1), numbers[0], numbers, np.ones(1))
+    tracemalloc.start()
+    inner_product([model] * 2, [model] * 2)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 8 * MOST_NUMBERS
 
 
 @pytest.mark.parametrize("spread", [-40, -6, -2, 0, 3])

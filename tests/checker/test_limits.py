@@ -7,7 +7,6 @@ import json
 import re
 import subprocess
 import sys
-import tracemalloc
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -20,8 +19,6 @@ from certify.certificates.checking import command
 from certify.checker import document, limits, rules
 from certify.checker.case import Case
 from certify.checker.errors import Rejected
-from certify.checker.near import Above
-from certify.checker.taylor import Taylor, inner_product
 from certify.reference import document as reference_document
 from certify.reference import limits as reference_limits
 from certify.reference import rules as reference_rules
@@ -314,15 +311,3 @@ def test_patience_is_an_option(program: str, tmp_path: Path) -> None:
 if __name__ == "__main__":  # sizes of the bombs
     for name, (build, _) in BOMBS.items():
         sys.stdout.write(f"{name}: {len(dump(build())):,} bytes\n")
-
-
-def test_what_is_of_third_order_in_many_symbols_fills_no_memory() -> None:
-    """Of two states, and of as many inputs and uncertain quantities as a file may have, on a leaf."""
-    N = 2 + 2 * document.MAX_STATES
-    p = np.random.default_rng(0).standard_normal((N + N * (N + 1) // 2, 1))
-    model = Taylor(p[0], p, Above(p[0] ** 2))
-    tracemalloc.start()
-    inner_product([model] * 2, [model] * 2)
-    _, most = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert most < 8 * limits.MOST_NUMBERS
