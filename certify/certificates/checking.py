@@ -49,7 +49,7 @@ def ask(
     jobs : number of processes that examine the leaves.
     patient : True to accept a file that needs hours, which its rule `limits` refuses otherwise.
     operations : the most that rule `limits` of the reference allows; None for its own limit.
-    every : True if the checker's refusal of leaves should have all of their places, as `every`.
+    every : True if the checker's refusal of leaves should have their places, as `every`: under rule `ring` of all.
 
     Raises
     ------

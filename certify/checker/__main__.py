@@ -25,7 +25,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--jobs", metavar="N", type=_jobs, default=1, help="examine the leaves in N processes")
     parser.add_argument("--patient", action="store_true", help="take a file that may need hours")
-    parser.add_argument("--every", action="store_true", help="name every leaf that is refused, in the JSON object")
+    parser.add_argument("--every", action="store_true", help="name each leaf that rule ring refuses (with --json)")
     try:
         options = parser.parse_args(arguments)
     except SystemExit as stop:

@@ -200,7 +200,7 @@ def check(c: Certificate, jobs: int = 1, patient: bool = False, every: bool = Fa
 
     Where evidence cannot be replayed, only the rules about what is stated are checked, and the caller must not say
     ACCEPTED; the tally then has no leaves. Rule `limits` takes files that need hours if the caller is `patient`.
-    If `every` leaf that fails is wanted, a refusal of leaves names them.
+    If `every` leaf that fails is wanted, a refusal names them: all under rule `ring`, else the first of each batch.
     """
     self_test()
     np.empty(_KEPT)  # given back at once: an allocator that adapts then keeps arrays, and need not ask for each anew

@@ -163,25 +163,27 @@ def inner_product(x: Sequence[Taylor], y: Sequence[Taylor]) -> Taylor:
     for v, w in zip(x, y, strict=True):
         T += v.g[:, None] * w.q + w.g[:, None] * v.q
     T = T.reshape(N * len(found.q), -1)
-    places, there, thirds = _triples(N)
+    places, there, own = _triples(N)
     cubic = sum(there[k][:, None] * T[places[k]] for k in range(3))
     all_terms = reduce(add, [v.third(w) for v, w in zip(x, y, strict=True)])
-    squares, p = size(cubic).through(thirds).top, found.p.copy()
+    third, p = size(cubic) * np.nextafter(1 / 3, 1), found.p.copy()
+    squares = np.array([third[terms].sum().top for terms in own])
     i, j = pairs(N)
     p[N:][i == j] = (Near(found.q[i == j]) + Near(squares)).ends[1]
     return Taylor(found.c, p, found.r + all_terms.ulps(2 * len(x) + 3))
 
 
 @cache
-def _triples(N: int) -> tuple[Array, Array, Array]:
+def _triples(N: int) -> tuple[Array, Array, list[Array]]:
     """The K terms d_i d_j d_k, i <= j <= k: the places (3, K) in an array (N, pairs) of what d_i, d_j and d_k are
-    multiplied by there, 1 where such a place is another one, else 0, and a third, rounded up, for each index (N, K)."""
-    pair = {at: p for p, at in enumerate(zip(*pairs(N), strict=True))}
-    each = [(i, j, k) for i in range(N) for j in range(i, N) for k in range(j, N)]
-    places = [[a * len(pair) + pair[b] for a, b in ((i, (j, k)), (j, (i, k)), (k, (i, j)))] for i, j, k in each]
-    there = [[1.0, float(i < j), float(j < k)] for i, j, k in each]
-    often = [[triple.count(i) for triple in each] for i in range(N)]
-    return np.array(places).T, np.array(there).T, np.array(often) * np.nextafter(1 / 3, 1)
+    multiplied by there, 1 where such a place is another one, else 0; and for each index the terms that have it, as
+    often as they do."""
+    pair, index = np.zeros((N, N), dtype=np.intp), np.arange(N)
+    pair[pairs(N)] = np.arange(len(pairs(N)[0]))
+    i, j, k = np.nonzero((index[:, None, None] <= index[:, None]) & (index[:, None] <= index))
+    places = np.array([(N * (N + 1) // 2) * a + pair[b, c] for a, b, c in ((i, j, k), (j, i, k), (k, i, j))])
+    own = [np.concatenate([np.flatnonzero(each == one) for each in (i, j, k)]) for one in range(N)]
+    return places, np.array([np.ones(len(i)), i < j, j < k]), own
 
 
 def affine(c: Array, g: Array, r: Above = ZERO) -> Taylor:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import tracemalloc
 from collections.abc import Callable, Iterator
 from fractions import Fraction
 
@@ -19,8 +20,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from certify.checker import near
-from certify.checker.document import Policy
+from certify.checker.document import MAX_STATES, Policy
 from certify.checker.exact import contains_ball, gershgorin_lower, inverse_diagonal, is_definite, root_above
+from certify.checker.limits import MOST_NUMBERS
 from certify.checker.near import ZERO, Above, self_test
 from certify.checker.network import fold
 from certify.checker.networks import Network
@@ -29,6 +31,8 @@ from tests.support.balls import is_bearable_on_a_ball
 from tests.support.jets import Jet, changed, curved, enclose_on_ball, members, plain
 from tests.support.jets import constant as constant_jet
 from tests.support.marks import slow_after
+from tests.support.maxima import drawn as drawn_model
+from tests.support.maxima import largest
 from tests.support.oracle import awkward, ball, certainly_within, policy_in_arb, quadratic
 from tests.support.plain import (
     Taylor,
@@ -36,6 +40,7 @@ from tests.support.plain import (
     arb_with_error,
     atan,
     atanh_with_error,
+    both_bounds,
     chain,
     elementary,
     enclose_on_boxes,
@@ -490,6 +495,47 @@ def test_an_inner_product_knows_what_cancels() -> None:
     assert 3 * Fraction(float(alone.Q[0, 0, 0])) >= 1 and 3 * Fraction(float(alone.Q[1, 1, 0])) >= 2
 
 
+def alone(g: float, Q: float, c: float = 0.0) -> Taylor:
+    """c + g d + Q d^2."""
+    return Taylor(np.array([c]), np.array([[g]]), np.array([[[Q]]]), np.zeros(1))
+
+
+def most_at_1(found: Taylor) -> Fraction:
+    """The largest value at d = 1."""
+    return sum((Fraction(float(part.ravel()[0])) for part in (found.c, found.g, found.Q, found.r)), Fraction(0))
+
+
+@pytest.mark.parametrize("count", [1, 40, 400])
+def test_an_inner_product_covers_its_roundings_in_third_order(count: int) -> None:
+    """Products that round to numbers which cancel; and many numbers, each of which is lost beside the first."""
+    x, y = [alone(1 + 2.0**-30, 0), alone(1, 0)], [alone(0, 1 + 2.0**-30), alone(0, -1 - 2.0**-29)]
+    assert most_at_1(inner_product(x, y)) >= Fraction(1, 2**60)
+    assert most_at_1(inner_product(y, x)) >= Fraction(1, 2**60)
+    lost = [alone(1, 0), *[alone(2.0**-54, 0)] * count, alone(1, 0)], [alone(0, 1)] * (count + 1) + [alone(0, -1)]
+    assert most_at_1(inner_product(*lost)) >= count * Fraction(1, 2**54)
+
+
+def test_an_inner_product_rounds_its_squares_up() -> None:
+    """A constant times a square, which is exact, and a sum of such products; a third is no binary64 number."""
+    for k in np.random.default_rng(5).uniform(1, 2, 50).tolist():
+        assert most_at_1(inner_product([alone(0, 0, 1)], [alone(0, k)])) >= Fraction(k)
+        assert (
+            most_at_1(inner_product([alone(0, 0, 1), alone(k, 0)], [alone(0, k), alone(0, k)])) >= k + Fraction(k) ** 2
+        )
+
+
+def test_an_inner_product_in_many_symbols_fills_no_memory() -> None:
+    """As many as two states, and all inputs and uncertain quantities that a file may have, on one leaf."""
+    N = 2 + 2 * MAX_STATES
+    numbers = np.random.default_rng(0).standard_normal((N, N, 1))
+    model = Taylor(np.ones(1), numbers[0], numbers, np.ones(1))
+    tracemalloc.start()
+    inner_product([model] * 2, [model] * 2)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 8 * MOST_NUMBERS
+
+
 @pytest.mark.parametrize("spread", [-40, -6, -2, 0, 3])
 @pytest.mark.parametrize("name", ["tanh", "exp", "atan", "sqrt"])
 def test_other_taylor_functions_contain(name: str, spread: int) -> None:
@@ -610,6 +656,32 @@ def stationary_points(generator: np.random.Generator, model: Taylor, b: int) -> 
         t = -g / (2 * q) if q else 0.0
         candidates.append([-1.0, 1.0, 0.0, min(1.0, max(-1.0, t))])
     return [*map(list, itertools.product(*candidates)), *generator.uniform(-1, 1, (20, 3)).tolist()]
+
+
+@pytest.mark.parametrize("kind", ["steep", "level", "flat"])
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_no_bound_is_below_the_exact_maximum(n: int, kind: str) -> None:
+    """Inside, on faces and at corners; each of the two alone, and the one that counts is the lesser."""
+    generator, exact = np.random.default_rng([n, len(kind)]), 0
+    each = [drawn_model(generator, n, kind) for _ in range(60)]
+    g, Q = (np.moveaxis(np.array(part, dtype=np.float64), 0, -1) for part in zip(*each, strict=True))
+    model = Taylor(np.zeros(60), g, Q, np.zeros(60))
+    squares, corner = both_bounds(model)
+    for b, most in enumerate(largest(*one) for one in each):
+        assert most <= min(Fraction(float(squares[b])), Fraction(float(corner[b])))
+        exact += Fraction(float(corner[b])) <= most + Fraction(1, 2**40)
+    assert kind != "steep" or exact > 10
+    assert np.all((upper_bound(model) == np.fmin(squares, corner)) | (squares < 0))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_upper_bound_of_a_sum_that_rounds_to_0(sign: float) -> None:
+    """Of what is x + y less x + y rounded at (1, 1, 1) and (1, -1, -1), with coefficients that cancel."""
+    for y in (2.0**-60, 2.0**-54, 2.0**-400, 5e-324):
+        Q = np.diag([-(1 + y), -1, -y])
+        Q[0, 1:] = Q[1:, 0] = sign, sign * y
+        model = Taylor(np.zeros(1), np.zeros((3, 1)), Q[:, :, None], np.zeros(1))
+        assert all(bound[0] >= y for bound in (*both_bounds(model), upper_bound(model)))
 
 
 def test_upper_bound_of_a_separable_model_is_its_maximum() -> None:

@@ -22,9 +22,10 @@ from certify.loop.rigorous import evaluate_arb, evaluate_policy
 from certify.provers.bounds import Models, Taylor, compiled, policy_enclosure, upper_bound
 from certify.provers.bounds.loop import played
 from certify.provers.bounds.tape import recorded
-from certify.provers.bounds.taylor import ConstantsLast, inner_product
+from certify.provers.bounds.taylor import ConstantsLast, at_a_corner, inner_product
 from tests.support.algebra import to_sympy
 from tests.support.loops import box, pendulum_network
+from tests.support.maxima import drawn, largest
 from tests.support.ways import WAYS, Way, bounded, relax_tanh
 
 
@@ -265,6 +266,21 @@ def test_upper_bound_is_exact_for_separable_quadratics() -> None:
         assert value <= bound <= value + 1e-6
 
 
+@pytest.mark.parametrize("kind", ["steep", "level", "flat"])
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_no_upper_bound_is_below_the_exact_maximum(n: int, kind: str) -> None:
+    """Inside, on faces and at corners, of the lesser of two bounds and of that at a corner alone."""
+    generator, exact = np.random.default_rng([n, len(kind)]), 0
+    each = [drawn(generator, n, kind) for _ in range(60)]
+    g, Q = (np.moveaxis(np.array(part, dtype=np.float64), 0, -1) for part in zip(*each, strict=True))
+    quadratic = Taylor(np.zeros(60), g, Q, np.zeros(60))
+    bound, corner = upper_bound(quadratic)[0], at_a_corner(quadratic)
+    for b, most in enumerate(largest(*one) for one in each):
+        assert most <= min(Fraction(float(bound[b])), Fraction(float(corner[b])))
+        exact += corner[b] <= float(most) + 1e-8
+    assert kind != "steep" or exact > 10
+
+
 def test_the_enclosure_is_invariant_under_the_oddness_of_tanh(pendulum: System) -> None:
     """Negating a hidden layer's incoming and outgoing weights leaves the function, and its bounds, as they are."""
     network = pendulum_network()
@@ -289,13 +305,14 @@ def test_an_inner_product_lies_within_its_third_order() -> None:
     def at(v: Taylor, d: Any) -> Any:
         return v.c + np.einsum("ib,ib->b", v.g, d) + np.einsum("ib,ijb,jb->b", d, v.Q, d)
 
-    x, y = [Taylor(v.c, v.g, 0 * v.Q, v.r) for v in models()], models()  # so nothing is of fourth order
-    found, t = inner_product(x, y)
+    first, second = [Taylor(v.c, v.g, 0 * v.Q, v.r) for v in models()], models()  # so nothing is of fourth order
     third = 0.0
-    for _ in range(200):
-        d = generator.uniform(-1, 1, (N, batch))
-        truth = sum((at(v, d) + 1e-6) * (at(w, d) - 1e-6) for v, w in zip(x, y, strict=True))
-        assert np.all(np.abs(truth - at(found, d)) <= (t * d * d).sum(0) + found.r)
-        third = max(third, float(np.max((np.abs(truth - at(found, d)) - found.r) / (t * d * d).sum(0))))
+    for x, y in ((first, second), (second, first)):
+        found, t = inner_product(x, y)
+        for _ in range(200):
+            d = generator.uniform(-1, 1, (N, batch))
+            truth = sum((at(v, d) + 1e-6) * (at(w, d) - 1e-6) for v, w in zip(x, y, strict=True))
+            assert np.all(np.abs(truth - at(found, d)) <= (t * d * d).sum(0) + found.r)
+            third = max(third, float(np.max((np.abs(truth - at(found, d)) - found.r) / (t * d * d).sum(0))))
     each = [v.norms()[1] * w.norms()[2] + v.norms()[2] * w.norms()[1] for v, w in zip(x, y, strict=True)]
     assert third > 0.2 and np.all(t.sum(0) < sum(each))

@@ -7,58 +7,13 @@ from itertools import product
 
 import numpy as np
 import pytest
-from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
+from flint import arb, arb_mat, ctx, fmpq
 
 from certify.reference.balls import ON_LEAVES
 from certify.reference.taylor import Taylor, inner_product, peak
 from tests.support.marks import slow_after
+from tests.support.maxima import Rows, drawn, largest, pairs, value
 from tests.support.oracle import ball
-
-Rows = list[list[Fraction]]
-
-
-def pairs(n: int) -> list[tuple[int, int]]:
-    return [(i, j) for i in range(n) for j in range(i, n)]
-
-
-def value(g: list[Fraction], Q: Rows, d: list[Fraction]) -> Fraction:
-    n = range(len(g))
-    return sum((g[i] * d[i] for i in n), Fraction(0)) + sum((Q[i][j] * d[i] * d[j] for i in n for j in n), Fraction(0))
-
-
-def largest(g: list[Fraction], Q: Rows) -> Fraction:
-    """The exact maximum of g.d + d'Qd on the box: on each face the stationary point, where there is a single one.
-
-    Where there are many on a face they reach its boundary with the same value.
-    """
-    found = []
-    for signs in product((-1, 0, 1), repeat=len(g)):
-        free = [i for i, s in enumerate(signs) if s == 0]
-        d = [Fraction(s) for s in signs]
-        if free:
-            A = fmpq_mat([[rational(2 * Q[i][j]) for j in free] for i in free])
-            right = [[rational(-g[i] - 2 * sum(Q[i][j] * d[j] for j in range(len(g))))] for i in free]
-            if A.det() == 0:
-                continue
-            for i, v in zip(free, A.solve(fmpq_mat(right)).entries(), strict=True):
-                d[i] = Fraction(int(v.p), int(v.q))
-        if all(abs(v) <= 1 for v in d):
-            found.append(value(g, Q, d))
-    return max(found)
-
-
-def rational(v: Fraction) -> fmpq:
-    return fmpq(v.numerator, v.denominator)
-
-
-def drawn(generator: np.random.Generator, n: int, kind: str) -> tuple[list[Fraction], Rows]:
-    """Models whose maximum is inside, on a face, at a corner, or at several corners at once."""
-    size = {"steep": 8, "level": 1, "flat": 0}[kind]
-    g = [Fraction(int(v), 4) for v in generator.integers(-4 * size, 4 * size + 1, n)]
-    Q = [[Fraction(0)] * n for _ in range(n)]
-    for i, j in pairs(n):
-        Q[i][j] = Q[j][i] = Fraction(int(generator.integers(-8, 9)), 4) * int(generator.integers(0, 2))
-    return g, Q
 
 
 def model(g: list[Fraction], Q: Rows) -> Taylor:
@@ -164,6 +119,43 @@ def test_an_inner_product_is_nowhere_below(count: int) -> None:
                         bound.c + (bound.g * column)[0, 0] + (column.transpose() * (bound.Q * column))[0, 0] + bound.r
                     )
                     assert not most < ball(truth)
+
+
+def at(v: Taylor, d: tuple[int, ...]) -> arb:
+    """c + g.d + d'Qd + r."""
+    column, result = arb_mat([[x] for x in d]), v.c + v.r
+    if v.g is not None:
+        result += (v.g * column)[0, 0]
+    return result if v.Q is None else result + (column.transpose() * (v.Q * column))[0, 0]
+
+
+def test_an_inner_product_covers_remainders() -> None:
+    """Of models of which some parts are 0, at corners, whatever the members: nothing else has room for these."""
+    generator, n = np.random.default_rng(8), 2
+    with ctx.workprec(ON_LEAVES):
+        for _ in range(300):
+            both = list[tuple[int, int, list[Fraction], Rows]]()
+            for _ in range(2):
+                c, r, *rest = (int(v) for v in generator.integers(0, 4, 7) * generator.integers(0, 2, 7))
+                g, q, mixed, last = [Fraction(v) for v in rest[:2]], *map(Fraction, rest[2:])
+                both.append((c, r, g, [[q, mixed], [mixed, last]]))
+            v, w = (Taylor(arb(c), model(g, Q).g, model(g, Q).Q, arb(r)) for c, r, g, Q in both)
+            for d in product((-1, 1), repeat=n):
+                (x, r), (y, s) = ((c + value(g, Q, [Fraction(t) for t in d]), r) for c, r, g, Q in both)
+                most = max((x + i * r) * (y + k * s) for i, k in product((-1, 1), repeat=2))
+                assert not any(at(bound, d) < ball(most) for bound in (inner_product([v], [w]), v * w))
+
+
+def test_an_inner_product_is_exact_where_its_third_order_is_largest() -> None:
+    """x (2 y z), from either side, is 2 at (1, 1, 1), and x (x y) is 1 at (1, 1)."""
+    for g, Q, most in (
+        ([1, 0, 0], [[0, 0, 0], [0, 0, 2], [0, 2, 0]], 2),
+        ([1, 0, 0], [[0, 1, 0], [1, 0, 0], [0, 0, 0]], 1),
+        ([0, 0, 1], [[0, 0, 0], [0, 0, 0], [0, 0, 2]], 1),
+    ):
+        v, w = Taylor(arb(0), arb_mat([g])), model([Fraction(0)] * 3, [[Fraction(x, 2) for x in row] for row in Q])
+        for bound in (inner_product([v], [w]), inner_product([w], [v])):
+            assert at(bound, (1, 1, 1)).contains(most) and abs(at(bound, (1, 1, 1)) - most) < arb(2) ** -40
 
 
 def widened(g: list[Fraction], Q: Rows, by: float) -> Taylor:

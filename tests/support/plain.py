@@ -177,6 +177,11 @@ def upper_bound(model: Taylor) -> Array:
     return taylor.upper_bound(model.model)
 
 
+def both_bounds(model: Taylor) -> tuple[Array, Array]:
+    """By squares, and at a corner."""
+    return taylor._by_squares(model.model), taylor._at_a_corner(model.model)
+
+
 def form(x: Array, error: Array) -> Form:
     """x (n, k, B) within error (n, B), as the checker has it: (k, n, B)."""
     return Form(np.moveaxis(x, 1, 0), Above(error))
