@@ -79,11 +79,20 @@ def test_the_last_cell_counts(most: str) -> None:
     assert found == {"tube" if most == "4/3" else "ACCEPTED"}
 
 
-@pytest.mark.parametrize(("most", "holds"), [("3", False), ("31/10", False), ("32/10", True)])
-def test_a_constraint_is_kept_for_every_value(most: str, holds: bool) -> None:
-    """x + q < a number in every cell, on balls that reach 2.125 and where q is at most 1."""
+KEPT = [
+    ("q", "3", False),
+    ("q", "31/10", False),
+    ("q", "32/10", True),
+    (["-", "q"], "7/5", False),
+    (["-", "q"], "3/2", True),
+]
+
+
+@pytest.mark.parametrize(("more", "most", "holds"), KEPT)
+def test_a_constraint_is_kept_for_every_value(more: Any, most: str, holds: bool) -> None:
+    """x + q or x - q below a number in every cell, on balls that reach 2.125: the last or the first cell decides."""
     data = decay("67/100", "1", 4)
-    data["claim"]["keep"] = [["+", "x", "q", ["-", most]]]
+    data["claim"]["keep"] = [["+", "x", more, ["-", most]]]
     assert verdicts(data) == {"ACCEPTED" if holds else "keep"}
 
 
