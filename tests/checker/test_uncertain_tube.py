@@ -124,6 +124,40 @@ def test_a_tube_along_a_path_has_none() -> None:
     assert verdicts(edited(known, "plant.dynamics.0", ["-", "x"])) == {"tube"}
 
 
+def measured() -> Document:
+    """The section `data` of a claim about q of `decay`, with one transition."""
+    run = {"steps": 1, "states": encode([1.0, 0.5]), "inputs": encode([0.0])}
+    prior = {"name": "q", "range": ["67/100", "1"]}
+    times = {"period": ["1", "1"], "origin": ["0"], "noise": ["1"]}
+    return {"sha256": "0" * 64, "parameters": [prior], **times, "runs": [run]}
+
+
+FOREIGN: dict[str, Edit] = {
+    "discrete time": lambda data: edited(data, "plant.time", "discrete"),
+    "a sample": lambda data: edited(data, "claim.sample", ["1/100", "1/100"]),
+    "a rate": lambda data: edited(data, "claim.rate", (0.25).hex()),
+    "ranks": lambda data: edited(data, "claim.ranks", {"angles": [], "steps": 5}),
+    "samples": lambda data: edited(data, "claim.samples", []),
+    "data without evidence": lambda data: edited(data, "claim.data", measured()),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_a_tube_has_no_steps_rate_ranks_or_samples(name: str) -> None:
+    assert verdicts(FOREIGN[name](decay("67/100", "1"))) == {"format"}
+
+
+@pytest.mark.parametrize("kind", ["enlarged", "reached"])
+def test_data_belong_to_a_tube_around_the_origin_alone(kind: str) -> None:
+    """The evidence is a round that narrows nothing; where data are allowed it is refused for what it does not show."""
+    data = decay("67/100", "1")
+    if kind == "reached":
+        data["claim"] = reached_from([0.25], [0.0])
+    data["claim"]["data"] = measured()
+    tree = {"order": 1, "pieces": 1, "tree": "/w==", "leaves": [[]], "rounds": []}
+    assert verdicts(edited(data, "evidence.data", tree)) == {"ACCEPTED" if kind == "enlarged" else "format"}
+
+
 # -------------------------------------------------------------------------------------------------- the command's own
 
 SPRING = """name = "soft_spring"
