@@ -202,7 +202,7 @@ def _next(
         return Step((("--candidate", "auto"),), f"only the candidate {options.only} was tried")
     knows = not (
         result.system.ranges or result.system.in_steps or result.constraints
-    )  # a tube says nothing of such things
+    )  # in steps there is no tube; with ranges or constraints none is looked for here
     if result.stop is Stop.STALLED and knows and not options.enlarges and _has_tube(result, effort):
         return Step((("--enlarge", ""),), f"a tube leads into this set from one {_LONGER:g} times as long, at least")
     if result.stop is Stop.STALLED:

@@ -121,14 +121,20 @@ def decreases_around(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq, le
 
 
 def doubts(
-    P: fmpq_mat, G: Field, h: fmpq, columns: Sequence[arb_mat], gamma: arb, moved: arb_mat | None = None
+    P: fmpq_mat,
+    G: Field,
+    h: fmpq,
+    columns: Sequence[arb_mat],
+    gamma: arb,
+    moved: arb_mat | None = None,
+    share: arb = ONE / 4,
 ) -> tuple[arb, arb]:
     """Parts of the form, those of 1 and of each entry of d, that cover what is not known of values and gradients.
 
     An error eps_i within e_i + s_i ||d|| adds 2 sum_i (h (P f)_i + b_i.d) eps_i + 2 h eps'P g + h eps'P eps, and
     2 ||d|| is at most share + ||d||^2 / share. `moved` is h P f; without it f is 0, exactly, and so is each e_i.
     """
-    share, components = ONE / 4, G.components
+    components = G.components
     turn = total(2 * norm(b.entries()) * g.slack for b, g in zip(columns, components, strict=True))
     roots = [arb(P[i, i]).sqrt() for i in range(P.nrows())] if h > 0 else []
     s = total(root * g.slack for root, g in zip(roots, components, strict=h > 0))
@@ -300,10 +306,10 @@ def decreases_along(ball: Ball, path: Path, P: fmpq_mat, R: fmpq_mat, F: Field) 
     linear = b * arb_mat(n, 1, [f.v for f in F.components])
     known = (J.transpose() * (R + edge * P) * J).tolist()
     bordered = arb_mat([*([*row, 0] for row in known), [0] * n + [-motion]])
-    sums = beyond_second(ball, columns, F)
-    below = -(bordered + B + B.transpose()) - sums
+    at_centre, along = doubts(P, F, NO_STEP, columns, ZERO, arb_mat(n, 1), ONE)
+    below = -(bordered + B + B.transpose()) - beyond_second(ball, columns, F) - along * identity(n + 1)
     below = (below + below.transpose()) / 2
-    first = [arb(edge - motion * exact(path.share) ** 2), *(-v for v in linear.entries())]
+    first = [arb(edge - motion * exact(path.share) ** 2) - at_centre, *(-v for v in linear.entries())]
     left = arb_mat([first, *([v, *row] for v, row in zip(first[1:], below.tolist(), strict=True))])
     return finite(left.entries()) and certainly_definite(left)
 

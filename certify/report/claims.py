@@ -192,8 +192,8 @@ CLAIMS = {
             ),
             (
                 "Along the tube",
-                "Each ellipsoid {x′P(t)x ≤ 1} lies strictly inside the domain; on it the closed loop is twice "
-                "continuously differentiable, no clip acts, and the input stays in its bounds.",
+                "Each ellipsoid {x′P(t)x ≤ 1} lies strictly inside the domain; on it the closed loop is locally "
+                "Lipschitz, no clip acts, and the input stays in its bounds.",
                 "",
             ),
         ),
@@ -233,8 +233,8 @@ CLAIMS = {
             ),
             (
                 "Along the tube",
-                "Each ellipsoid of the tube lies strictly inside the domain; on it the closed loop is twice "
-                "continuously differentiable, no clip acts, and the input stays in its bounds.",
+                "Each ellipsoid of the tube lies strictly inside the domain; on it the closed loop is locally "
+                "Lipschitz, no clip acts, and the input stays in its bounds.",
                 "",
             ),
         ),

@@ -310,27 +310,25 @@ def test_patience_is_an_option(program: str, tmp_path: Path) -> None:
     assert (status, answer["rule"]) == (1, "limits")
 
 
-if __name__ == "__main__":  # sizes of the bombs
-    for name, (build, _) in BOMBS.items():
-        sys.stdout.write(f"{name}: {len(dump(build())):,} bytes\n")
-
-
-@pytest.mark.parametrize("cells", [1, 5])
-def test_a_slab_counts_the_cells_and_corners_of_what_is_uncertain(cells: int, tmp_path: Path) -> None:
-    """By the page's line for a slab, in one state with one quantity, less what its matrices take."""
+@pytest.mark.parametrize(("cells", "y"), [(1, 1), (5, 1), (1, 5), (2, 6), (1, 8)])
+def test_a_slab_counts_the_cells_and_corners_of_what_is_uncertain(cells: int, y: int, tmp_path: Path) -> None:
+    """By the page's line for a slab, in one state, less what its matrices take."""
     data = decay("67/100", "1", cells)
+    names = ["q", *(f"q{k}" for k in range(1, y))]
+    data["plant"]["uncertain"] = [{"name": name, "range": ["67/100", "1"]} for name in names]
+    data["evidence"]["cells"] = [cells] + [1] * (y - 1)
     fewer = edited(data, "evidence.tube", data["evidence"]["tube"][:1])
-    sizes = limits.Sizes(document.read(str(_written(data, tmp_path))))
-    n = d = m = y = 1
+    path = tmp_path / "written.json"
+    path.write_bytes(dump(data))
+    a, n, d, m = limits.Sizes(document.read(str(path))).a, 1, 1, 1
     t, bits = 2 + 1, (Fraction(3, 4).numerator.bit_length(), Fraction(17, 16).numerator.bit_length())
-    K, Z = 1 + 2**21, sizes.a * (2**17 + 64 * t + 16 * (m + y))
+    K, Z = 1 + 2**21, a * (2**17 + 64 * t + 16 * (m + y))
     I, Y = 2**23 + 2**12 * 2**4 + 8 + 2**14 * 2**3, 2**14  # noqa: E741
-    slab = K + cells * Z + 3 * cells * 2 * (I + Y + 2**8 * y * n * (d + 1) ** 2)
+    slab = K + cells * Z + 3 * cells * 2 ** min(y, 6) * (I + Y + 2**8 * y * n * (d + 1) ** 2)
     slab += sum(b**2 // 2**13 + 2**10 for b in bits)
     assert counts(data, tmp_path)[1] - counts(fewer, tmp_path)[1] == slab
 
 
-def _written(data: Document, folder: Path) -> Path:
-    path = folder / "written.json"
-    path.write_bytes(dump(data))
-    return path
+if __name__ == "__main__":  # sizes of the bombs
+    for name, (build, _) in BOMBS.items():
+        sys.stdout.write(f"{name}: {len(dump(build())):,} bytes\n")

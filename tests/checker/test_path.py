@@ -168,6 +168,28 @@ HONEST: dict[str, Callable[[], Document]] = {
 }
 
 
+def kinked(size: float) -> Document:
+    """x' = -x + s |x - 1| - s from |x - 2.3125| <= 3/2, by one slab that has the kink in its middle, into |x| < 1.9.
+
+    With s = 10 states above 20/9 go off; the abs has no slope in the middle of the slab, and is an error there.
+    """
+    dynamics = ["+", ["-", "x"], ["*", str(Fraction(size)), ["abs", ["-", "x", "1"]]], str(-Fraction(size))]
+    before, after, radius, share = 2.3125, -0.3125, 1.5, 0.5
+    half = (before - after) / 2
+    line, motion = 2.0**-12, half / radius + 2.0**-12
+    J, P = radius * math.sqrt(1 / (1 - share**2)) * (1 + 2.0**-20), encode([1 / radius**2])
+    path = waypoint([after], share, line + motion, motion / share**2)
+    one = {"middle": P, "end": P, "duration": (2 * half / (1 + size)).hex(), "path": path}
+    one |= ball(J, NO_CURVATURE) | {"weight": encode(np.eye(2))}
+    local = ball(1.9, [[10.0 if size > 1 else 0.125], [NONE], [0.0]])
+    return following(dynamics, 3.6, local, 1 / radius**2, before, [one], root=[2.5])
+
+
+@pytest.mark.parametrize(("size", "said"), [(10, "tube"), (1 / 4, "tube"), (1 / 32, "ACCEPTED")])
+def test_a_kink_in_the_middle_of_a_slab_is_an_error_of_first_order(size: float, said: str) -> None:
+    assert verdicts(kinked(size)) == {said}
+
+
 @pytest.mark.parametrize("name", slow_after(4, HONEST))
 def test_honest_tubes_around_a_path_are_accepted(name: str) -> None:
     data = HONEST[name]()

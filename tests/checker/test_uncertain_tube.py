@@ -79,11 +79,20 @@ def test_the_last_cell_counts(most: str) -> None:
     assert found == {"tube" if most == "4/3" else "ACCEPTED"}
 
 
-@pytest.mark.parametrize(("most", "holds"), [("3", False), ("31/10", False), ("32/10", True)])
-def test_a_constraint_is_kept_for_every_value(most: str, holds: bool) -> None:
-    """x + q < a number in every cell, on balls that reach 2.125 and where q is at most 1."""
+KEPT = [
+    ("q", "3", False),
+    ("q", "31/10", False),
+    ("q", "32/10", True),
+    (["-", "q"], "7/5", False),
+    (["-", "q"], "3/2", True),
+]
+
+
+@pytest.mark.parametrize(("more", "most", "holds"), KEPT)
+def test_a_constraint_is_kept_for_every_value(more: Any, most: str, holds: bool) -> None:
+    """x + q or x - q below a number in every cell, on balls that reach 2.125: the last or the first cell decides."""
     data = decay("67/100", "1", 4)
-    data["claim"]["keep"] = [["+", "x", "q", ["-", most]]]
+    data["claim"]["keep"] = [["+", "x", more, ["-", most]]]
     assert verdicts(data) == {"ACCEPTED" if holds else "keep"}
 
 
@@ -113,6 +122,40 @@ def test_a_tube_along_a_path_has_none() -> None:
     assert verdicts(data) == {"format"}
     known = edited(edited(data, "plant.uncertain", []), "evidence.cells", [])
     assert verdicts(edited(known, "plant.dynamics.0", ["-", "x"])) == {"tube"}
+
+
+def measured() -> Document:
+    """The section `data` of a claim about q of `decay`, with one transition."""
+    run = {"steps": 1, "states": encode([1.0, 0.5]), "inputs": encode([0.0])}
+    prior = {"name": "q", "range": ["67/100", "1"]}
+    times = {"period": ["1", "1"], "origin": ["0"], "noise": ["1"]}
+    return {"sha256": "0" * 64, "parameters": [prior], **times, "runs": [run]}
+
+
+FOREIGN: dict[str, Edit] = {
+    "discrete time": lambda data: edited(data, "plant.time", "discrete"),
+    "a sample": lambda data: edited(data, "claim.sample", ["1/100", "1/100"]),
+    "a rate": lambda data: edited(data, "claim.rate", (0.25).hex()),
+    "ranks": lambda data: edited(data, "claim.ranks", {"angles": [], "steps": 5}),
+    "samples": lambda data: edited(data, "claim.samples", []),
+    "data without evidence": lambda data: edited(data, "claim.data", measured()),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_a_tube_has_no_steps_rate_ranks_or_samples(name: str) -> None:
+    assert verdicts(FOREIGN[name](decay("67/100", "1"))) == {"format"}
+
+
+@pytest.mark.parametrize("kind", ["enlarged", "reached"])
+def test_data_belong_to_a_tube_around_the_origin_alone(kind: str) -> None:
+    """The evidence is a round that narrows nothing; where data are allowed it is refused for what it does not show."""
+    data = decay("67/100", "1")
+    if kind == "reached":
+        data["claim"] = reached_from([0.25], [0.0])
+    data["claim"]["data"] = measured()
+    tree = {"order": 1, "pieces": 1, "tree": "/w==", "leaves": [[]], "rounds": []}
+    assert verdicts(edited(data, "evidence.data", tree)) == {"ACCEPTED" if kind == "enlarged" else "format"}
 
 
 # -------------------------------------------------------------------------------------------------- the command's own

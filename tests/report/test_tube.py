@@ -28,6 +28,7 @@ from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import extents, semi_axes, volume
 from certify.lyapunov.function import Quadratic
 from certify.report import render_html, simulated_roa_fraction, summary
+from certify.report.claims import CLAIMS
 from certify.report.figures import draw
 from certify.report.figures.paper import PaperOptions, paper_figure
 from certify.report.figures.portrait import keys
@@ -367,3 +368,10 @@ def test_the_summary_says_of_which_set_its_sizes_are(proved: RoaResult) -> None:
     smaller = {**data, "volume": 2 * data["volume"]}  # of {V <= c2}, were it the larger one
     assert "of {V <= c2}" in rendered(smaller) and "of the tube's start" not in rendered(smaller)
     assert "lengths" not in rendered({**data, "tube": None})
+
+
+@pytest.mark.parametrize("kind", ["enlarged", "reached"])
+def test_no_more_is_said_of_the_loop_along_the_tube_than_is_proved(kind: str) -> None:
+    """abs may have its corner in a tube, where the loop has no second derivative."""
+    said = next(condition for name, condition, _ in CLAIMS[kind].parts if name == "Along the tube")
+    assert "locally Lipschitz" in said and "differentiable" not in said
