@@ -117,4 +117,5 @@ def counts_of(job: bytes) -> tuple[int, int]:
 
 def row_of(n: int) -> np.dtype:
     """The row of a box of the ring."""
-    return np.dtype([("proved", "u1"), ("bound", "f8"), ("score", "f8", (n,)), ("violated", "u1"), ("smooth", "u1")])
+    truths = [("violated", "u1"), ("smooth", "u1")]
+    return np.dtype([("proved", "u1"), ("bound", "f8"), ("score", "f8", (n,)), *truths, ("decay", "f8")])
