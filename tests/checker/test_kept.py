@@ -69,7 +69,7 @@ def test_without_the_rule_these_would_be_accepted(kind: str, monkeypatch: pytest
     for module, table in ((outer, "ON_OUTER_LEAVES"), (tube, "ON_SLABS")):
         monkeypatch.setattr(module, table, tuple(row for row in getattr(module, table) if row[0] != "keep"))
     monkeypatch.setattr(reference_outer, "kept", lambda *_: None)
-    monkeypatch.setattr(reference_tube, "kept_in_slab", lambda *_: None)
+    monkeypatch.setattr(reference_tube, "kept_on_ball", lambda *_: None)
     assert {verdicts(one) for one in grazing} == {("ACCEPTED", None)}
 
 

@@ -750,8 +750,6 @@ def test_three_ways_in_make_one_plant(
         (("--input-error", "0"), "must be a positive bound for one of F"),
         (("--input-error", "G=1e-4"), "must be a positive bound for one of F"),
         (("--input-error", "some"), "--input-error must be a finite number"),
-        (("--param", "k=0.9..1.1", "--enlarge"), "a tube must be of exact equations"),
-        (("--param", "k=0.9..1.1", "--box", "p=0.1"), "a tube must be of exact equations"),
         (("--param", "k=0.9..1.1", "--engine", "dreal"), "--engine must be bounds where something is uncertain"),
         (("--disturbance", "wind=0.1", "--engine", "both"), "found ranges of wind in soft_spring"),
     ],
@@ -771,7 +769,7 @@ def test_ranges_that_cannot_be_used_exit_2(
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        (("reach", "--from", "p=1"), "a tube must be of exact equations"),
+        (("reach", "--from", "p=1"), "a tube around a path must be of exact equations"),
         (("export-smt2",), "export-smt2 needs a plant with exact equations"),
     ],
 )
@@ -786,6 +784,15 @@ def test_a_disturbance_that_always_acts_is_refused_where_it_would_be_left_out(
     status, out, err = run(capsys, command[0], *ranged, *command[1:])
     assert status == 2 and words in err and "found ranges of wind in soft_spring" in err and out == ""
     assert not (tmp_path / "o").exists() or not any((tmp_path / "o").glob("*.[js]*"))
+
+
+def test_a_tube_of_a_plant_with_a_range(
+    tmp_path: Path, ranged: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, _ = run(capsys, "roa", *ranged, "--param", "k=0.9..1.1", "--level", "0.05", "--enlarge")
+    assert status == 0 and "PROVED" in out
+    claim = json.loads((tmp_path / "o" / "certificate.json").read_text())
+    assert claim["claim"]["kind"] == "enlarged" and claim["plant"]["uncertain"][0]["range"] == ["9/10", "11/10"]
 
 
 def test_no_condition_is_exported_that_was_not_proved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
