@@ -133,9 +133,7 @@ class Clerk:
             data, answer = self.ask(certificate, final=True)
             if answer["result"] == _wanted(certificate):
                 return Accepted(certificate, self.path, data, answer, mended)
-            finer = None
-            if splits < _SPLITS:
-                finer = _finer(certificate, problem, answer)
+            finer = _finer(certificate, problem, answer) if splits < _SPLITS else None
             if finer is not None:
                 splits += 1
                 certificate = replace(certificate, evidence=finer)

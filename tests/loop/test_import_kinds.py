@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+import zipfile
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -362,6 +363,10 @@ def test_files_of_numbers(tmp_path: Path) -> None:
     torch.export.save(torch.export.export(net.eval(), (torch.zeros(1, 2),)), tmp_path / "program.pt2")
     with pytest.raises(InputError, match=r"is a program of torch\.export.*ONNX"):
         import_policy(tmp_path / "program.pt2", PLANT, LAYERS)
+    beside = saved(net.float().eval(), "trace", tmp_path / "beside.pt")
+    with zipfile.ZipFile(beside, "a") as archive:  # as _extra_files of torch.jit.save puts them there
+        archive.writestr(f"{archive.namelist()[0].split('/')[0]}/extra/models/model.json", "{}")
+    agree(import_policy(beside, PLANT, replace(LAYERS, activation=None, squash=None)).policy, net)
     with pytest.raises(InputError, match=r"fc1 \(2 to 6\), mean \(6 to 1\).*--prefix fc1,fc2,fc3"):
         import_policy(tmp_path / "plain.pt", PLANT, LAYERS)
     with pytest.raises(InputError, match=r"name each layer once.*fc1 \(2 to 6\)"):

@@ -56,7 +56,7 @@ class TorchFile:
             self.archive = Legacy(raw, what) if raw.startswith(BEGINNING) else Archive(raw, what)
         roots = [name.removesuffix("data.pkl") for name in self.archive.names if _depth(name) == 1]
         roots = [root for root in roots if f"{root}data.pkl" in self.archive]
-        if any(name.endswith("/models/model.json") for name in self.archive.names):
+        if not roots and any(name.endswith("/models/model.json") for name in self.archive.names):
             raise InputError(
                 f"{what} is a program of torch.export, which is not read. Write the module as ONNX: "
                 "torch.onnx.export(module.eval(), (torch.zeros(1, n),), FILE, dynamo=True)."
