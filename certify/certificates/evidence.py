@@ -120,6 +120,7 @@ class RankTree:
         steps at the latest, 0 within it, 65,535 where nothing is said.
     steps : (N,), of each leaf: after so many steps its image lies in leaves of lower ranks, or in the target.
     frame : N, (n, n), in whose coordinates N x errors of images are bounded; None: in those of the states.
+    memory : the steps for which errors of images stay symbols.
 
     Raises
     ------
@@ -132,6 +133,7 @@ class RankTree:
     ranks: NDArray[np.uint16]
     steps: NDArray[np.uint8]
     frame: Array | None = None
+    memory: int = 1
 
     def __post_init__(self) -> None:
         found = self.tree.count(LEAF)
@@ -290,20 +292,21 @@ def _read_outer_tree(data: Mapping[str, Any], n: int) -> OuterTree:
     return OuterTree(decode(data["T"], (n, n)), decode(data["root"], (n,)), tree, tuple(faces))
 
 
-def _rank_tree(evidence: RankTree) -> dict[str, str]:
+def _rank_tree(evidence: RankTree) -> dict[str, Any]:
     numbers = {"ranks": evidence.ranks.astype("<u2").tobytes(), "steps": evidence.steps.astype("u1").tobytes()}
     parts = {"tree": evidence.tree, **numbers}
-    frame = {} if evidence.frame is None else {"frame": encode(evidence.frame)}
-    corners = {"lo": encode(evidence.lo), "hi": encode(evidence.hi)} | frame
-    return corners | {name: base64.b64encode(part).decode("ascii") for name, part in parts.items()}
+    others = {} if evidence.frame is None else {"frame": encode(evidence.frame)}
+    others |= {} if evidence.memory == 1 else {"memory": evidence.memory}
+    corners = {"lo": encode(evidence.lo), "hi": encode(evidence.hi)}
+    return corners | others | {name: base64.b64encode(part).decode("ascii") for name, part in parts.items()}
 
 
-def _read_rank_tree(data: Mapping[str, str], n: int) -> RankTree:
+def _read_rank_tree(data: Mapping[str, Any], n: int) -> RankTree:
     tree, ranks, steps = (base64.b64decode(data[name]) for name in ("tree", "ranks", "steps"))
     corners = decode(data["lo"], (n,)), decode(data["hi"], (n,))
     frame = decode(data["frame"], (n, n)) if "frame" in data else None
     of_leaves = np.frombuffer(ranks, "<u2").astype(np.uint16), np.frombuffer(steps, np.uint8)
-    return RankTree(*corners, tree, *of_leaves, frame)
+    return RankTree(*corners, tree, *of_leaves, frame, data.get("memory", 1))
 
 
 def _ball(evidence: LocalBall | Slab) -> dict[str, str]:

@@ -34,7 +34,9 @@ def of_following(sizes: Sizes) -> int:
     """Numbers for leaves that are followed by steps."""
     if sizes.c.ranks is None:
         return 0
-    return 2**4 * len(sizes.c.ranks.tree) + sizes.on_leaves(sizes.c.ranks.order, sizes.s + sizes.n)
+    return 2**4 * len(sizes.c.ranks.tree) + sizes.on_leaves(
+        sizes.c.ranks.order, sizes.s + sizes.c.ranks.memory * sizes.n
+    )
 
 
 def of_measured(sizes: Sizes) -> int:
@@ -52,7 +54,7 @@ def of_ranks(sizes: Sizes) -> int:
     if ranks is None:
         return 0
     leaves = len(ranks.steps)
-    of_all = sizes.of_leaves(leaves + sum(ranks.steps), ranks.order, sizes.s + sizes.n)
+    of_all = sizes.of_leaves(leaves + sum(ranks.steps), ranks.order, sizes.s + ranks.memory * sizes.n)
     of_frame = 0 if ranks.frame is None else sizes.inverse(sizes.bits(ranks.frame))
     return 2**9 * len(ranks.tree) + 2**17 * leaves + of_frame + of_all
 

@@ -1,7 +1,8 @@
 """The rules for ranks: from each leaf of a finite rank a few steps lead to the target, or to leaves of lower ranks.
 
-A leaf is followed step by step: its image is affine in the symbols of the leaf and of n errors. Errors are bounded in
-coordinates N x, and are symbols of their own in the next step. `Cover` decides which leaves the last image meets.
+A leaf is followed step by step: its image is affine in the symbols of the leaf and of the errors of the last steps, n
+of each. New errors are bounded in coordinates N x, and so are the oldest ones, which have no symbols any more. `Cover`
+decides which leaves the last image meets.
 """
 
 from __future__ import annotations
@@ -141,8 +142,9 @@ class Steps(Moving):
     def __init__(self, case: Case) -> None:
         n, (lo, hi) = len(case.c.states), case.c.sample or (0, 0)
         identity = fmpq_mat([[int(i == j) for j in range(n)] for i in range(n)])
-        super().__init__(case, np.eye(n), identity, lo < hi, n)
-        self.widest, self.ranks = [np.inf] * n, given(case.c.ranks)
+        self.ranks = given(case.c.ranks)
+        super().__init__(case, np.eye(n), identity, lo < hi, self.ranks.memory * n)
+        self.widest = [np.inf] * n
         self.order = self.ranks.order
         self.frame = np.eye(n) if self.ranks.frame is None else self.ranks.frame
         self.back = all_near(fraction(v) for v in given(inverse(exactly(self.frame))).transpose().entries())
@@ -180,10 +182,13 @@ class Steps(Moving):
         """The boxes with these corners, in their symbols."""
         centre, radius = middle(lo, hi)
         slopes = np.eye(self.n)[:, :, None] * radius
-        return Form(np.concatenate([centre[None], slopes, np.zeros_like(slopes)]), Above(np.zeros_like(centre)))
+        errors = np.zeros((self.ranks.memory * self.n, *centre.shape))
+        return Form(np.concatenate([centre[None], slopes, errors]), Above(np.zeros_like(centre)))
 
     def step(self, x: Form, numbers: Array, course: Course) -> Form:
-        """The images of forms (2 n + 1, n, B) after a step, and what the rules say of it."""
+        """The images of forms after a step, and what the rules say of it. Of a form (1 + n + p n, n, B) the first n
+        coefficients are those of the leaf's symbols, then come those of errors, n for each step, the last step first.
+        """
         c = self.c
         u = enclose_on_boxes(self.net, x)
         if not self.case.bounded:
@@ -204,13 +209,14 @@ class Steps(Moving):
         return later
 
     def form(self, models: list[Taylor]) -> Form:
-        """Models in the symbols of the leaf, and in those of errors that have all else."""
-        n, batch = self.n, models[0].c.shape[-1]
-        first = np.stack([np.concatenate([v.c[None], v.g[:n]]) for v in models], 1)
-        others = Near(np.stack([v.p[n:] for v in models]).reshape(n, -1)).through(self.frame).size.shaped(n, -1, batch)
+        """Models in the symbols that they keep, and in new ones of errors that have all else."""
+        n, kept, batch = self.n, self.ranks.memory * self.n, models[0].c.shape[-1]
+        first = np.stack([np.concatenate([v.c[None], v.g[:kept]]) for v in models], 1)
+        rest = np.stack([v.p[kept:] for v in models]).reshape(n, -1)
+        others = Near(rest).through(self.frame).size.shaped(n, -1, batch)
         bound = others.sum(1) + Above(np.stack([v.r.top + 0 * v.c for v in models])).through(self.frame)
         errors = Near(bound.top[:, None]) * Near(self.back.value.reshape(n, n, 1), self.back.error.shaped(n, n, 1))
-        return Form(np.concatenate([first, errors.value]), errors.error.sum(0))
+        return Form(np.concatenate([first[: n + 1], errors.value, first[n + 1 :]]), errors.error.sum(0))
 
     def after(self, states: list[Taylor], G: list[Taylor]) -> list[Taylor]:
         """x + h G."""

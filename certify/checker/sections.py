@@ -29,7 +29,8 @@ from .schema import Array, Binary64, Matrix, Octets, Row, Value, section, shaped
 from .strict import MAX_VALUES
 
 MAX_SLABS = 10**4
-MAX_CONSTRAINTS, MAX_RANK = 64, 2**16 - 1  # that rank is none
+MAX_CONSTRAINTS, MAX_MEMORY = 64, 16
+MAX_RANK = 2**16 - 1  # that rank is none
 TAKING_OVER = ("asymptotic", "nearby")
 MAX_TRANSITIONS, MAX_ROUNDS, MAX_PARTS = 2**16, 64, 4096  # of data; rounds of a part of the priors
 
@@ -124,7 +125,7 @@ class Tube:
 @dataclass(frozen=True)
 class RankTree:
     """A partition tree of the box lo <= x <= hi, and of each leaf its rank and the number of its steps. `frame` is N of
-    the coordinates N x in which errors are bounded, None for the identity."""
+    the coordinates N x in which errors are bounded, None for the identity; errors stay symbols for `memory` steps."""
 
     lo: Row
     hi: Row
@@ -132,6 +133,7 @@ class RankTree:
     ranks: Octets
     steps: Octets
     frame: Annotated[Array | None, shaped("n", "n")] = field(default=None, kw_only=True)
+    memory: Annotated[int, lambda value, sizes: value.integer(1, MAX_MEMORY)] = field(default=1, kw_only=True)
 
 
 @dataclass(frozen=True)

@@ -65,10 +65,10 @@ class BoxBounds(NamedTuple):
     decay: Array
 
 
-def operations_of_box(loop: ClosedLoop, order: int = 2) -> float:
-    """Operations to bound a box, about, as an `Effort` counts them."""
+def operations_of_box(loop: ClosedLoop, order: int = 2, more: int = 0) -> float:
+    """Operations to bound a box, about, as an `Effort` counts them; with so many symbols more."""
     system = loop.system
-    symbols = system.n + system.m + len(system.uncertain) + (system.sample is not None)
+    symbols = system.n + system.m + len(system.uncertain) + (system.sample is not None) + more
     times = 1 if system.sample is None else 2 + 2 * order**2
     asked = kept_constraints(system).values() if system.constraints else ()
     equations = sum(1 for _ in nodes(*system.uncertain_dynamics(), *asked)) * times + system.n * (system.n + 3)

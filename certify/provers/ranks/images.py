@@ -1,9 +1,10 @@
-"""Images of boxes after several steps of a loop: affine in the coordinates of the box, with n errors.
+"""Images of boxes after several steps of a loop: affine in the coordinates of the box and in errors, zonotopes.
 
-An error is a symbol of its own in the next step, so that the policy's answer to it cancels it there, as it does in
-truth; after the step all that is not of first order in the box's coordinates is an error again. Errors are those of
-N x for a matrix N, the frame: where its rows are left eigenvectors of the step's map, errors shrink as fast as states
-do, while those of single states may grow by a factor with each step (the wrapping effect; Moore 1966, Lohner 1987).
+The n errors of a step are symbols of their own in the next steps, as many as the memory has, so that the policy's
+answer to them cancels them there, as it does in truth; what is not of first order in the symbols is a new error, and so
+are the oldest ones (Kuehn 1998; Girard 2005). Errors are those of N x for a matrix N, the frame: where its rows are left
+eigenvectors of the step's map, errors shrink as fast as states do, while those of single states may grow by a factor
+with each step (the wrapping effect; Moore 1966, Lohner 1987).
 FORMAT.md has the same in its chapter on ranks; boxes here are wider by more than rounding makes of them.
 """
 
@@ -56,8 +57,8 @@ class Images(NamedTuple):
 
 @dataclass(frozen=True)
 class Form:
-    """States `x[:, 0] + x[:, 1:] d`, the symbols d being n of a box, and n of errors from the second step on:
-    (n, 2 n + 1, B)."""
+    """States `x[:, 0] + x[:, 1:] d`, the symbols d being n of a box, and n of errors for each of the last p steps, the
+    last one first: (n, 1 + n + p n, B)."""
 
     x: Array
 
@@ -85,6 +86,7 @@ class Course:
     counts : the numbers of steps after which images are wanted, ascending.
     order : of the series in time, where inputs are held.
     frame : N, (n, n), in whose coordinates N x errors are bounded; None: in those of the states.
+    memory : p, the number of steps for which errors stay symbols.
     """
 
     piece = 512
@@ -99,6 +101,7 @@ class Course:
         counts: Sequence[int],
         order: int = 2,
         frame: Array | None = None,
+        memory: int = 1,
     ) -> None:
         self.system, self.target, self.keep = loop.system, target, tuple(keep)
         self.angles, self.root, self.counts, self.frame = tuple(angles), root, tuple(counts), frame
@@ -106,13 +109,14 @@ class Course:
         self.back = np.linalg.inv(self.into)
         self.doubt = 1e-12 + 16 * EPS * float(np.linalg.cond(self.into))  # relative, of errors: also of the inverse
         self.straight = [i for i in range(self.system.n) if i not in self.angles]
-        self.policy = policy_enclosure(loop, 2 * self.system.n)
+        self.memory, self.symbols = memory, self.system.n * (1 + memory)
+        self.policy = policy_enclosure(loop, self.symbols)
         self.dynamics = self.system.uncertain_dynamics()
         self.check_inputs = not bounded_by_form(loop.network, self.system.input_bounds)
         sample = self.system.sample
         self.flow = None if sample is None else Flow(self.dynamics, sample, order)
         self.ends = np.array([[float(end) for end in pair] for pair in self.system.domain]).T[:, :, None]
-        self.operations = _MORE * operations_of_box(loop, order)  # of a step
+        self.operations = _MORE * operations_of_box(loop, order, (memory - 1) * self.system.n)  # of a step
 
     @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
     def __call__(self, lo: Array, hi: Array, inner: float, outer: float) -> Images:
@@ -120,8 +124,8 @@ class Course:
         n, batch, K = *lo.shape, len(self.counts)
         centre = 0.5 * lo + 0.5 * hi
         radius = np.maximum(hi - centre, centre - lo) * (1 + EPS)
-        slopes = np.eye(n)[:, :, None] * radius
-        form = Form(np.concatenate([centre[:, None], slopes, np.zeros_like(slopes)], 1))
+        slopes, errors = np.eye(n)[:, :, None] * radius, np.zeros((n, self.symbols - n, batch))
+        form = Form(np.concatenate([centre[:, None], slopes, errors], 1))
         found = Images(
             np.full((K, n, batch), np.nan),
             np.full((K, n, batch), np.nan),
@@ -179,7 +183,7 @@ class Course:
             known: dict[Expression, Taylor] = {}
             after = [evaluate(expression, values, models, known) for expression in self.dynamics]
         else:
-            mean = self.flow(states, inputs, quantities, 2 * n + system.m)
+            mean = self.flow(states, inputs, quantities, self.symbols + system.m)
             after = [v + self.flow.times_period(rate) for v, rate in zip(here, mean.G, strict=True)]
             kept = kept & mean.exists & self.in_domain(below - mean.down, above + mean.up)
             values = dict(mean.during)
@@ -203,10 +207,10 @@ class Course:
         return self.target.holds(form.x, self.angles)
 
     def form(self, models: Sequence[Taylor]) -> Form:
-        """The part of models that is of first order in the box's n symbols; all else is an error."""
-        n = len(models)
-        first = np.stack([np.concatenate([v.c[None], v.g[:n]]) for v in models])
-        rest = np.stack([np.concatenate([v.g[n:], v.Q.reshape(-1, v.Q.shape[-1])]) for v in models])
+        """The part of models that is of first order in all symbols but the oldest; all else is an error."""
+        n, kept = len(models), self.symbols - len(models)
+        first = np.stack([np.concatenate([v.c[None], v.g[:kept]]) for v in models])
+        rest = np.stack([np.concatenate([v.g[kept:], v.Q.reshape(-1, v.Q.shape[-1])]) for v in models])
         e = np.abs(product(self.into, rest)).sum(1) + product(np.abs(self.into), np.stack([v.r for v in models]))
         e = e * (1 + self.doubt) + _MORE_THAN_ROUNDING * product(np.abs(self.into), np.abs(rest).sum(1))
-        return Form(np.concatenate([first, self.back[:, :, None] * e], 1))
+        return Form(np.concatenate([first[:, : n + 1], self.back[:, :, None] * e, first[:, n + 1 :]], 1))

@@ -44,6 +44,7 @@ class Question:
     root : corners lo and hi (n,) of the box, in deviations; of an angle more than a turn apart.
     order : of the series in time, where inputs are held.
     frame : N, (n, n), in whose coordinates N x errors of images are bounded; None: in those of the states.
+    memory : the number of steps for which errors of images stay symbols.
     """
 
     loop: ClosedLoop
@@ -52,11 +53,13 @@ class Question:
     root: tuple[Array, Array]
     order: int = 2
     frame: Array | None = None
+    memory: int = 1
 
     def course(self, counts: Sequence[int]) -> Course:
         """The course of boxes through the loop, with images after so many steps."""
-        lo, hi = self.root
-        return Course(self.loop, self.target, turning(self.loop), self.keep, hi - lo, counts, self.order, self.frame)
+        (lo, hi), angles = self.root, turning(self.loop)
+        by = self.order, self.frame, self.memory
+        return Course(self.loop, self.target, angles, self.keep, hi - lo, counts, *by)
 
 
 def with_order(question: Question, x: Array) -> Question:

@@ -150,4 +150,6 @@ class Search:
         rank = np.where(known[leaves], self.rank[leaves], UNPROVED)
         steps = np.where(known[leaves], self.steps[leaves], 0)
         lo, hi = (end[:, 0].copy() for end in self.cover.root)
-        return RankTree(lo, hi, tree, rank.astype(np.uint16), steps.astype(np.uint8), self.course.frame)
+        return RankTree(
+            lo, hi, tree, rank.astype(np.uint16), steps.astype(np.uint8), self.course.frame, self.course.memory
+        )
