@@ -295,7 +295,7 @@ def _read_outer_tree(data: Mapping[str, Any], n: int) -> OuterTree:
 def _rank_tree(evidence: RankTree) -> dict[str, Any]:
     numbers = {"ranks": evidence.ranks.astype("<u2").tobytes(), "steps": evidence.steps.astype("u1").tobytes()}
     parts = {"tree": evidence.tree, **numbers}
-    others = {} if evidence.frame is None else {"frame": encode(evidence.frame)}
+    others: dict[str, Any] = {} if evidence.frame is None else {"frame": encode(evidence.frame)}
     others |= {} if evidence.memory == 1 else {"memory": evidence.memory}
     corners = {"lo": encode(evidence.lo), "hi": encode(evidence.hi)}
     return corners | others | {name: base64.b64encode(part).decode("ascii") for name, part in parts.items()}

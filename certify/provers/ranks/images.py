@@ -1,10 +1,10 @@
 """Images of boxes after several steps of a loop: affine in the coordinates of the box and in errors, zonotopes.
 
 The n errors of a step are symbols of their own in the next steps, as many as the memory has, so that the policy's
-answer to them cancels them there, as it does in truth; what is not of first order in the symbols is a new error, and so
-are the oldest ones (Kuehn 1998; Girard 2005). Errors are those of N x for a matrix N, the frame: where its rows are left
-eigenvectors of the step's map, errors shrink as fast as states do, while those of single states may grow by a factor
-with each step (the wrapping effect; Moore 1966, Lohner 1987).
+answer to them cancels them there, as it does in truth; what is not of first order in the symbols is a new error, and
+so are the oldest ones (Kuehn 1998, Girard 2005). Errors are those of N x for a matrix N, the frame: where its rows are
+left eigenvectors of the step's map, errors shrink as fast as states do, while those of single states may grow by a
+factor with each step (the wrapping effect; Moore 1966, Lohner 1987).
 FORMAT.md has the same in its chapter on ranks; boxes here are wider by more than rounding makes of them.
 """
 
@@ -164,8 +164,7 @@ class Course:
     def step(self, form: Form) -> tuple[Form, Mask, Mask]:
         """The states after a step, where (B,) all that is asked for on the way holds, and where a constraint certainly
         does not."""
-        n, system = self.system.n, self.system
-        x = form.x
+        system, x = self.system, form.x
         error = 4 * EPS * np.abs(x).sum(1) + TINY
         mid, slopes, wide, _ = self.policy(x, error)
         below, above = form.box
