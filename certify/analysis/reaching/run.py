@@ -32,6 +32,7 @@ from certify.certificates import (
     sole_writer,
 )
 from certify.certificates.claims import UNPROVED, Ranks, Reaches
+from certify.certificates.ellipsoids import Box
 from certify.certificates.membership import angles_in
 from certify.certificates.ranked import Ranked, steps_from
 from certify.certificates.tree import LEAF
@@ -54,6 +55,7 @@ from certify.provers.ranks import (
     prove_ranks,
     root_box,
     with_frame,
+    with_memory,
     with_order,
     without_leaf,
 )
@@ -63,6 +65,7 @@ _PROBES = 30  # states at which the order of the series in time is chosen, and t
 _RUNS = 1e10  # operations for simulated runs, a few seconds, which no effort is charged with
 _FOR_SEARCH = 0.7  # share of the effort, the rest being for the check
 _DIRECT = 4000  # boxes that are looked at first where runs need few steps
+_PARTS = np.array([1.0, 3.0, 9.0])  # of a box in each direction, on which the memory of errors is tried
 _MENDED = 20  # leaves that the checker may refuse
 
 
@@ -164,13 +167,16 @@ def _proved(
     keep, root = tuple(kept_constraints(system).values()), root_box(loop)
     question = Question(loop, Region(target, system.states), keep, root)
     probes = begins(options.begin or tuple(zip(*map(_exactly, root), strict=True)))[:_PROBES].T
+    steps = MOST_STEPS if result.runs is None or result.runs.longest is None else result.runs.longest
     question = with_frame(with_order(question, probes), probes)
+    if options.begin is not None:
+        question = with_memory(question, *_parts(options.begin), steps)
     clerk = tools.clerk(path, options.jobs, True, options.cluster)
     _require_periodic(question, clerk)
     with tools.timing("ranks"), runner_at(options.cluster) as runner:
-        soon = result.runs is not None and (result.runs.longest or MOST_STEPS) < MOST_STEPS
-        direct = _DIRECT if soon else 0
-        found = _searched(question, options, direct, effort.share(_FOR_SEARCH), runner, tools)
+        found = _searched(
+            question, options, _DIRECT if steps < MOST_STEPS else 0, effort.share(_FOR_SEARCH), runner, tools
+        )
     evidence = None if found is None else _within(found.evidence, options.within)
     if found is None or evidence is None:
         return replace(result, reason="no box of the domain is proved to lead into the region")
@@ -207,6 +213,13 @@ def _searched(
     if runner.remark is not None:
         tools.remarks.append(runner.remark)
     return found
+
+
+def _parts(box: Box) -> tuple[Array, Array]:
+    """Corners (n, B) of a box and of smaller ones in its middle."""
+    lo, hi = (np.array([float(pair[k]) for pair in box])[:, None] for k in (0, 1))
+    middle, reach = 0.5 * (lo + hi), 0.5 * (hi - lo) / _PARTS
+    return middle - reach, middle + reach
 
 
 def _exactly(corner: Array) -> list[Fraction]:

@@ -3,7 +3,16 @@
 from __future__ import annotations
 
 from certify.provers.ranks.mend import without_leaf
-from certify.provers.ranks.prove import Question, RankProof, prove_ranks, root_box, turning, with_frame, with_order
+from certify.provers.ranks.prove import (
+    Question,
+    RankProof,
+    prove_ranks,
+    root_box,
+    turning,
+    with_frame,
+    with_memory,
+    with_order,
+)
 from certify.provers.ranks.targets import Region, Sublevel
 from certify.provers.ranks.wanted import MOST_STEPS, Wanted
 
@@ -18,6 +27,7 @@ __all__ = [
     "root_box",
     "turning",
     "with_frame",
+    "with_memory",
     "with_order",
     "without_leaf",
 ]

@@ -17,10 +17,10 @@ from certify.loop.expressions import Expression
 from certify.provers.bounds.arrays import Array
 from certify.provers.execution import Runner
 from certify.provers.execution.shared import shared
-from certify.provers.ranks.images import Course
+from certify.provers.ranks.images import Course, Images
 from certify.provers.ranks.search import COUNTS, Search
 from certify.provers.ranks.targets import TURN, Target
-from certify.provers.ranks.wanted import COUNTS_FROM, SearchFrom, Wanted
+from certify.provers.ranks.wanted import COUNTS_FROM, Direct, SearchFrom, Wanted
 
 _HALF_TURN = 3.1416  # and a little more
 _SLIVER, _SAMPLES = 1e-6, 64
@@ -30,6 +30,7 @@ _MOST_LEAVES, _MOST_PAIRS = 400_000, 10_000_000  # of an image and a leaf that i
 _OF_A_PAIR, _OF_A_LEAF = 500.0, 50_000.0  # operations, beside those of the steps
 _SMALL, _LOST = 0.002, 1e3  # half-width of a box, as a share of the root box's width; growth that counts for no image
 _DEPENDENT = 1e8  # condition of a frame that is of no use
+_MEMORIES, _THERE = (2, 4, 8), 1e-6  # steps; the width, relative to the root box, that an image in the target counts as
 _AT_FIRST = 0.1  # share of the effort for the first tree
 
 
@@ -96,6 +97,26 @@ def with_frame(question: Question, x: Array) -> Question:
 
     other = replace(question, frame=frame)
     return other if widths(other) < widths(question) else question
+
+
+def with_memory(question: Question, lo: Array, hi: Array, steps: int) -> Question:
+    """The question with the memory of errors that is worth most for boxes (n, B) over so many steps: with half the
+    logarithm of an image's width in each state go the boxes that are needed, and with each the operations."""
+    root, counts = (question.root[1] - question.root[0])[:, None], [k for k in COUNTS_FROM if k <= max(steps, 1)]
+
+    def price(memory: int) -> float:
+        course = replace(question, memory=memory).course(counts)
+        found = course(lo, hi, 0.0, 0.0)
+        widths = np.nan_to_num(((found.hi - found.lo) / root).max(1), nan=1.0)
+        there = np.maximum.accumulate(found.there, 0)
+        return float(np.log(np.where(there, _THERE, widths)).mean() * len(lo) / 2 + math.log(course.operations))
+
+    best, least = 1, price(1)
+    for memory in _MEMORIES:
+        if (found := price(memory)) >= least:
+            break
+        best, least = memory, found
+    return replace(question, memory=best)
 
 
 def _eigenframe(loop: ClosedLoop) -> Array | None:
@@ -178,30 +199,45 @@ def prove_ranks(
     RankProof | None : None if no leaf beyond the target has a rank, and no leaf of a box that was wanted.
     """
     course = question.course(COUNTS if wanted is None else COUNTS_FROM)
-    search = Search(course, *question.root) if wanted is None else SearchFrom(course, *question.root, wanted)
-    new, rounds, done = search.begin(_AT_FIRST * effort.left / (course.counts[-1] * course.operations)), 0, False
+    searches = [Search(course, *question.root) if wanted is None else SearchFrom(course, *question.root, wanted)]
+    if wanted is not None and wanted.direct:
+        searches.insert(0, Direct(course, *question.root, wanted))
+    boxes = rounds = 0
     with shared(runner, course) as bound:
-        while True:
-            found = bound(search.cover.low[:, new], search.cover.high[:, new], 0.0, 0.0)
-            effort.charge(float(found.taken.sum()) * course.operations)
-            search.take(new, found)
-            near, rounds = search.spread(), rounds + 1
-            effort.charge(_OF_A_PAIR * search.pairs + _OF_A_LEAF * len(new))
-            if report is not None:
-                report(search.share, search.boxes, len(search.unknown))
-            done = search.is_done(near)
-            if (
-                done
-                or search.share >= enough
-                or effort.over
-                or len(search.cover.leaves) > _MOST_LEAVES
-                or search.pairs > _MOST_PAIRS
-            ):
+        for search in searches:
+            more, done = _grow(search, bound, effort, report, enough)
+            boxes, rounds = boxes + search.boxes, rounds + more
+            if done or effort.over:
                 break
-            new = search.further(near)
     search.tighten()
     tree, states = search.evidence(), question.loop.system.states
     if not np.any(tree.steps if wanted is None else tree.proved):
         return None
     ranks = Ranks(tuple(states[i].name for i in course.angles), max(1, tree.most))
-    return RankProof(ranks, tree, search.share, int(tree.proved.sum()), search.boxes, rounds, done)
+    return RankProof(ranks, tree, search.share, int(tree.proved.sum()), boxes, rounds, done)
+
+
+def _grow(
+    search: Search,
+    bound: Callable[[Array, Array, float, float], Images],
+    effort: Effort,
+    report: Callable[[float, int, int], None] | None,
+    enough: float,
+) -> tuple[int, bool]:
+    """Grow a search's tree until nothing is left to gain, which is the second answer, or it has to end; the first is
+    the number of rounds."""
+    course = search.course
+    new, rounds = search.begin(_AT_FIRST * effort.left / (course.counts[-1] * course.operations)), 0
+    while True:
+        found = bound(search.cover.low[:, new], search.cover.high[:, new], 0.0, 0.0)
+        effort.charge(float(found.taken.sum()) * course.operations)
+        search.take(new, found)
+        near, rounds = search.spread(), rounds + 1
+        effort.charge(_OF_A_PAIR * search.pairs + _OF_A_LEAF * len(new))
+        if report is not None:
+            report(search.share, search.boxes, len(search.unknown))
+        done = search.is_done(near)
+        large = len(search.cover.leaves) > _MOST_LEAVES or search.pairs > _MOST_PAIRS
+        if done or search.share >= enough or effort.over or large or search.gives_up:
+            return rounds, done
+        new = search.further(near)

@@ -51,6 +51,11 @@ class Search:
         stalled = len(self.shares) > _ROUNDS and 0 < self.shares[-1] <= (1 + _GAIN) * self.shares[-1 - _ROUNDS]
         return not len(near) or stalled
 
+    @property
+    def gives_up(self) -> bool:
+        """True if another search has more hope now."""
+        return False
+
     def further(self, near: Index) -> Index:
         """The leaves to look at next."""
         return self.halve(*self.next(near))

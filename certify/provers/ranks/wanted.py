@@ -23,13 +23,14 @@ _GROWTH = 1.5  # of an image, relative to its leaf, that counts as none
 _NARROW = 1e-11  # share of the root box below which leaves are not halved
 _FALLS = 0.95  # of the volume without a rank from one round to the next, at most
 _SHARE = 0.7  # of the leaves that may be halved, the largest ones
+_OF_A_TURN = 0.01  # width of an angle below which it is not halved at first
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
     """A box lo <= x <= hi (n,) of places, each of whose leaves is to have a rank of `most` at most; `direct` says how
-    many boxes are looked at before leaves that do not meet it are, as where few steps suffice: so many, and more as
-    long as they prove more and more of the box."""
+    many boxes are looked at in the hope that images of parts of the box lie in the target, as where few steps suffice:
+    so many, and more as long as they prove more and more of it."""
 
     lo: Array
     hi: Array
@@ -42,7 +43,7 @@ class SearchFrom(Search):
 
     def __init__(self, course: Course, lo: Array, hi: Array, wanted: Wanted) -> None:
         super().__init__(course, lo, hi)
-        self.wanted, self.seen, self.left = wanted, np.zeros(1, dtype=bool), math.inf
+        self.wanted, self.seen = wanted, np.zeros(1, dtype=bool)
 
     def begin(self, most: float) -> Index:
         """The leaves of a first tree, all of one size, that meet the box: the others cost nothing."""
@@ -69,21 +70,11 @@ class SearchFrom(Search):
 
     def further(self, near: Index) -> Index:
         """The needed leaves that have not been seen; if all have, halves of those without a rank."""
-        own = self._own
-        open_ = own[self.rank[own] == UNPROVED]
-        if len(open_) and self._is_direct(open_):
-            self.halve(open_, self.steep[:, open_].argmax(0))
-            return self._unseen(self._own)
         new = self._unseen(self._needed())
         while not len(new):
             self._halve_some(near)
             new = self._unseen(self._needed())
         return new
-
-    def _is_direct(self, open_: Index) -> bool:
-        """True as long as halves of the box's own leaves without a rank are worth a look before all others."""
-        before, self.left = self.left, float(self.cover.widths(open_).prod(0).sum())
-        return self.boxes < self.wanted.direct or (self.wanted.direct > 0 and self.left < _FALLS * before)
 
     def _halve_some(self, near: Index) -> None:
         """Halve needed leaves without a rank: those whose images meet one with a rank, or that have none."""
@@ -139,4 +130,47 @@ class SearchFrom(Search):
         """The leaves that boxes meet."""
         _, _, leaves = self.cover.met_by(lo, hi)
         found: Index = np.unique(leaves)
+        return found
+
+
+class Direct(SearchFrom):
+    """Ranks of parts of a box whose own images lie in the target: its tree is one of the box itself, but for angles,
+    of which a tree has a turn."""
+
+    def __init__(self, course: Course, lo: Array, hi: Array, wanted: Wanted) -> None:
+        turning = np.isin(np.arange(len(lo)), course.angles)
+        super().__init__(course, np.where(turning, lo, wanted.lo), np.where(turning, hi, wanted.hi), wanted)
+        self.left, self.before = math.inf, math.inf
+
+    def begin(self, most: float) -> Index:
+        """The whole box; of angles the parts of a turn, as narrow as the box, that meet it."""
+        turn, new = self.cover.root[1] - self.cover.root[0], self._own
+        for axis in self.course.angles:
+            width = max(float(self.wanted.hi[axis] - self.wanted.lo[axis]), _OF_A_TURN) / float(turn[axis, 0])
+            while self.cover.widths(new)[axis].max() > width:
+                self.halve(new, np.full(len(new), axis))
+                new = self._own
+        return new
+
+    @property
+    def gives_up(self) -> bool:
+        """True once enough boxes were looked at, and halves prove hardly more of the box."""
+        return self.boxes >= self.wanted.direct and self.left >= _FALLS * self.before
+
+    def further(self, near: Index) -> Index:
+        """Halves of all parts without a rank."""
+        open_ = self._open
+        self.halve(open_, self.steep[:, open_].argmax(0))
+        return self._unseen(self._own)
+
+    def spread(self) -> Index:
+        """Give ranks, and see how much of the box is left without."""
+        near = super().spread()
+        self.before, self.left = self.left, float(self.cover.widths(self._open).prod(0).sum())
+        return near
+
+    @property
+    def _open(self) -> Index:
+        own = self._own
+        found: Index = own[self.rank[own] == UNPROVED]
         return found
