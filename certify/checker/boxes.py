@@ -139,8 +139,8 @@ class Boxes(ABC):
         return on_boxes(self, states, held, gaps)
 
     def number(self, pair: tuple[Fraction, Fraction], symbol: int, batch: int) -> Taylor:
-        """A number of a range, by its symbol."""
-        (lo, hi), g = pair, np.zeros((self.symbols, batch))
+        """A number of a range, by its symbol, which may be one beyond all others."""
+        (lo, hi), g = pair, np.zeros((max(self.symbols, symbol + 1), batch))
         middle, reach = near((lo + hi) / 2), near((hi - lo) / 2)
         g[symbol] = reach.value
         return affine(np.full(batch, middle.value), g, middle.error + reach.error)

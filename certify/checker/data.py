@@ -20,7 +20,7 @@ from .boxes import LEAF, is_whole
 from .case import Case, Failures, given
 from .document import Intervals
 from .expression import evaluate
-from .flow import enclosed, later
+from .flow import enclosed, later, risen
 from .near import Above, Near, all_near, combined, near, size
 from .schema import Array
 from .sections import Data, Round
@@ -117,8 +117,8 @@ class Flows:
             during, _ = enclosed(lambda v: evaluate(self.c.dynamics, number, [*v, *held]), x, longest)
             G = evaluate(self.c.dynamics, number, [*(during if order == 1 else x), *held])
             if order > 1:
-                rising, _ = later(self.c.dynamics, number, x, during, held, h, order, lambda v: v)
-                G = [g + h * more for g, more in zip(G, rising, strict=True)]
+                rows, _ = later(self.c.dynamics, number, x, during, held, order, lambda v: v)
+                G = [risen([g, *row], h) for g, row in zip(G, rows, strict=True)]
             x = [v + h * g for v, g in zip(x, G, strict=True)]
         return x
 

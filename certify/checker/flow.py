@@ -96,21 +96,20 @@ def later(
     states: Sequence[Any],
     during: Sequence[Any],
     held: Sequence[Any],
-    h: Any,
     order: int,
     rest: Callable[[Any], Any],
-) -> tuple[list[Any], list[Any]]:
-    """(G - x_1)/h, `order` being at least 2, and x_2 at any time: `states` are those at the period's beginning,
-    `during` where they may be during it, `held` inputs and ranges of what is uncertain."""
+) -> tuple[list[list[Any]], list[Any]]:
+    """x_2 to x_order for each state, `order` being at least 2, and x_2 at any time: `states` are those at the period's
+    beginning, `during` where they may be during it, `held` inputs and ranges of what is uncertain."""
     early = coefficients(dynamics, constant, states, held, order - 1, rest) if order > 2 else [[] for _ in states]
     late = coefficients(dynamics, constant, during, held, order, rest)
-    found = []
-    for known, last in zip(early, late, strict=True):
-        rising = last[order - 1]
-        for x in reversed(known[1:]):
-            rising = x + h * rising
-        found.append(rising)
-    return found, [last[1] for last in late]
+    rows = [[*known[1:], last[order - 1]] for known, last in zip(early, late, strict=True)]
+    return rows, [last[1] for last in late]
+
+
+def risen(row: Sequence[Any], h: Any) -> Any:
+    """row[0] + h row[1] + h^2 row[2] + ..."""
+    return reduce(lambda rising, x: x + h * rising, reversed(row))
 
 
 def enclosed(
@@ -199,7 +198,8 @@ class Held(Stepping):
             return []
         start, during = self.shared(self.states), self.shared(self.during(self.way))
         held, dynamics = [*self.inputs, *self.ranges], self.case.c.dynamics
-        return later(dynamics, self.constant, start, during, held, self.period, self.order, self.settled)[0]
+        rows, _ = later(dynamics, self.constant, start, during, held, self.order, self.settled)
+        return [risen(row, self.period) for row in rows]
 
     def G(self, cell: Intervals) -> list[Jet] | None:
         """Within a period uncertain quantities may leave the cell: the cell counts only for their mean, in which D is
@@ -248,19 +248,23 @@ def longest(c: Certificate) -> float:
 def motion(
     boxes: Moving, period: tuple[Fraction, Fraction], states: list[Taylor], inputs: list[Taylor], ranges: list[Taylor]
 ) -> Motion:
-    """G over a period, and where the state may be until it is over."""
+    """G over a period, and where the state may be until it is over: at x + s G, with s for h, for some s up to h."""
     c, most = boxes.c, longest(boxes.c)
     loose = [*inputs, *(affine(v.c, np.zeros_like(v.g), v.moved) for v in ranges)]  # by their ranges, without symbols
     during, F = enclosed(lambda x: boxes.f(x, loose), states, most)
     h = boxes.number(period, boxes.symbols - 1, len(inputs[0].c))
     first = boxes.f(during if boxes.order == 1 else states, [*inputs, *ranges])
-    G, way = [of_mean(boxes, f) for f in first], Above(np.maximum(outwards(F), 0.0)) * most
+    rows, way = [[of_mean(boxes, f)] for f in first], Above(np.maximum(outwards(F), 0.0)) * most
     if boxes.order > 1:
-        number = constants(inputs[0])
-        rising, bent = later(c.dynamics, number, states, during, loose, h, boxes.order, lambda v: v)
-        G = [x + h * more for x, more in zip(G, rising, strict=True)]
+        more, bent = later(c.dynamics, constants(inputs[0]), states, during, loose, boxes.order, lambda v: v)
+        rows = [[*row, *others] for row, others in zip(rows, more, strict=True)]
         way = way.least(highest(outwards(first), outwards(bent), most))
-    return Motion(G, during, loose, hull(states, way, boxes.widest))
+    G, ends = [risen(row, h) for row in rows], hull(states, way, boxes.widest)
+    if c.keep is not None:
+        s = boxes.number((Fraction(0), c.step), boxes.symbols, len(h.c))
+        states, loose, *rows = ([v.widened(boxes.symbols + 1) for v in some] for some in (states, loose, *rows))
+        states = [x + s * risen(row, s) for x, row in zip(states, rows, strict=True)]
+    return Motion(G, states, loose, ends)
 
 
 def outwards(models: list[Taylor]) -> Array:

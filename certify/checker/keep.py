@@ -25,7 +25,9 @@ def on_boxes(
     boxes: Boxes, states: list[Taylor], held: list[Taylor], gaps: Sequence[Callable[[Array], Taylor]]
 ) -> Array:
     """True for each constraint and box on which it is negative where no gap is."""
-    return np.array([boxes.least_bound(g, gaps) < 0 for g in constraints(boxes, states, held)])
+    found = constraints(boxes, states, held)
+    of_all = [lambda left, gap=gap: gap(left).widened(found[0].symbols) for gap in gaps]
+    return np.array([boxes.least_bound(g, of_all) < 0 for g in found])
 
 
 def on_leaves(leaves: Leaves) -> Failures:

@@ -29,8 +29,9 @@ class RingLeaves(Leaves):
 
 @dataclass(frozen=True)
 class Motion:
-    """On boxes G, which is F, or the increment in a step over its length; states and what else f reads, as they may be
-    at any time of the step; where inputs are held, between what a state lies during a period, (2, n, B)."""
+    """On boxes G, which is F, or the increment in a step over its length; states and what else f reads, as constraints
+    take them, where inputs are held at any time of a period, which is a symbol more; and between what a state lies
+    during a period, (2, n, B)."""
 
     G: list[Taylor]
     states: list[Taylor]

@@ -11,7 +11,8 @@ stands, so that only the first coefficient, in which it stands for its mean, may
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +29,8 @@ Values = Mapping[Symbol, Taylor]
 class Mean(NamedTuple):
     """`G`: models of the mean of f over the period, a component each; `down` and `up` (n, B): by how much the states
     fall and rise at most from its beginning to any time of the longest, at least 0; `exists` (B,): the solution does,
-    and these hold for it; `during`: all values at any time of the period, where it exists."""
+    and these hold for it; `during`: all values at any time of the period, where it exists, with a symbol more for that
+    time, the last of all; none if nobody asks."""
 
     G: list[Taylor]
     down: Array
@@ -45,10 +47,11 @@ class Flow:
     dynamics : f, in the order of the states.
     sample : the shortest and the longest period, in units of time.
     order : order of the series in time, at least 1.
+    throughout : True if values at any time of the period are wanted.
     """
 
-    def __init__(self, dynamics: Sequence[Expression], sample: Interval, order: int) -> None:
-        self.dynamics, self.order = dynamics, order
+    def __init__(self, dynamics: Sequence[Expression], sample: Interval, order: int, throughout: bool = False) -> None:
+        self.dynamics, self.order, self.throughout = dynamics, order, throughout
         self.shortest, self.longest = sample
         self.symbols = int(self.shortest < self.longest)  # the period's own, the last of all
         self.most = math.nextafter(float(self.longest), math.inf)
@@ -70,7 +73,20 @@ class Flow:
             inner = solution_series(self.dynamics, states, held, models, self.order - 1)
             rows = [[model, *row[1:], last[-1]] for model, row, last in zip(now, inner, along, strict=True)]
         down, up = self._moved(now, along)
-        return Mean([self._sum([_mean(row[0], alike), *row[1:]]) for row in rows], down, up, exists, {**around, **held})
+        rows = [[_mean(row[0], alike), *row[1:]] for row in rows]
+        during = self._during(states, held, rows) if self.throughout else {}
+        return Mean([_risen(row, self.times_period) for row in rows], down, up, exists, during)
+
+    def _during(self, states: Values, held: Values, rows: Sequence[Sequence[Taylor]]) -> Values:
+        """x + s G for any s up to the longest period, and what is held."""
+        wide = {symbol: _with_a_symbol(model) for symbol, model in {**states, **held}.items()}
+        like = next(iter(wide.values()))
+        half = np.full_like(like.c, 0.5 * self.most)
+        g = np.zeros_like(like.g)
+        g[-1] = half
+        s = Taylor(half, g, np.zeros_like(like.Q), EPS * half)
+        moved = [s * _risen(list(map(_with_a_symbol, row)), s.__mul__) for row in rows]
+        return wide | {symbol: wide[symbol] + way for symbol, way in zip(states, moved, strict=True)}
 
     def _moved(self, now: Sequence[Taylor], along: Sequence[Sequence[Taylor]]) -> tuple[Array, Array]:
         """By how much the states fall and rise at most: as fast as f along the solution or, where its order is at least
@@ -107,13 +123,6 @@ class Flow:
         exists[left] = False
         return {s: _widened(v, kappa[i]) for i, (s, v) in enumerate(states.items())}, exists
 
-    def _sum(self, row: Sequence[Taylor]) -> Taylor:
-        """`x_1 + h x_2 + ... + h^(r-1) x_r`."""
-        result = row[-1]
-        for model in reversed(row[:-1]):
-            result = model + self.times_period(result)
-        return result
-
     def times_period(self, model: Taylor) -> Taylor:
         """h v."""
         if not self.symbols:
@@ -124,6 +133,16 @@ class Flow:
         g[-1] = reach
         rounding = np.full_like(model.c, EPS * (middle + reach) + TINY)
         return model * Taylor(np.full_like(model.c, middle), g, np.zeros_like(model.Q), rounding)
+
+
+def _risen(row: Sequence[Taylor], times: Callable[[Taylor], Taylor]) -> Taylor:
+    """`x_1 + h x_2 + ... + h^(r-1) x_r`, given the product with h."""
+    return reduce(lambda rising, model: model + times(rising), reversed(row))
+
+
+def _with_a_symbol(model: Taylor) -> Taylor:
+    """The same among one symbol more, which does not matter to it."""
+    return Taylor(model.c, np.pad(model.g, ((0, 1), (0, 0))), np.pad(model.Q, ((0, 1), (0, 1), (0, 0))), model.r)
 
 
 def _sizes(models: Sequence[Taylor]) -> Array:

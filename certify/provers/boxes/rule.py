@@ -97,7 +97,7 @@ class VdotBound:
         self.dynamics: tuple[Expression, ...] = loop.system.uncertain_dynamics()
         self.check_inputs = not bounded_by_form(loop.network, loop.system.input_bounds)
         sample = loop.system.sample
-        self.flow = None if sample is None else Flow(self.dynamics, sample, order)
+        self.flow = None if sample is None else Flow(self.dynamics, sample, order, bool(problem.keep))
         self.order = 1 if self.flow is None else order
         self.step = loop.step
         self.tape: Tape | None = None  # the tape of D, recorded when it is first played

@@ -114,7 +114,7 @@ class Course:
         self.dynamics = self.system.uncertain_dynamics()
         self.check_inputs = not bounded_by_form(loop.network, self.system.input_bounds)
         sample = self.system.sample
-        self.flow = None if sample is None else Flow(self.dynamics, sample, order)
+        self.flow = None if sample is None else Flow(self.dynamics, sample, order, bool(self.keep))
         self.ends = np.array([[float(end) for end in pair] for pair in self.system.domain]).T[:, :, None]
         self.operations = _MORE * operations_of_box(loop, order, (memory - 1) * self.system.n)  # of a step
 

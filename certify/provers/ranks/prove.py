@@ -198,7 +198,7 @@ def prove_ranks(
     -------
     RankProof | None : None if no leaf beyond the target has a rank, and no leaf of a box that was wanted.
     """
-    course = question.course(COUNTS if wanted is None else COUNTS_FROM)
+    course = question.course(COUNTS if wanted is None else wanted.counts)
     searches = [Search(course, *question.root) if wanted is None else SearchFrom(course, *question.root, wanted)]
     if wanted is not None and wanted.direct:
         searches.insert(0, Direct(course, *question.root, wanted))

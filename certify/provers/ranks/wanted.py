@@ -18,7 +18,7 @@ from certify.provers.ranks.images import Course, Images
 from certify.provers.ranks.search import Search
 
 COUNTS_FROM = (*range(1, 13), 14, 16, 20, 24, 32, 40, 50, 64, 80, 100, 120)
-MOST_STEPS = COUNTS_FROM[-1]
+MOST_STEPS = 255  # of a leaf
 _GROWTH = 1.5  # of an image, relative to its leaf, that counts as none
 _NARROW = 1e-11  # share of the root box below which leaves are not halved
 _FALLS = 0.95  # of the volume without a rank from one round to the next, at most
@@ -30,12 +30,18 @@ _OF_A_TURN = 0.01  # width of an angle below which it is not halved at first
 class Wanted:
     """A box lo <= x <= hi (n,) of places, each of whose leaves is to have a rank of `most` at most; `direct` says how
     many boxes are looked at in the hope that images of parts of the box lie in the target, as where few steps suffice:
-    so many, and more as long as they prove more and more of it."""
+    so many, and more as long as they prove more and more of it. `longest`: the steps that simulated runs take."""
 
     lo: Array
     hi: Array
     most: int = UNPROVED - 1
     direct: int = 0
+    longest: int = 0
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """The steps after which images are looked at; a target may hold at one instant alone."""
+        return tuple(sorted({*COUNTS_FROM, *(k for k in (self.longest, self.longest + 1) if 0 < k <= MOST_STEPS)}))
 
 
 class SearchFrom(Search):
