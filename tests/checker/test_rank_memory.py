@@ -41,6 +41,7 @@ from tests.checker.test_rank_frames import (
     product,
     times,
 )
+from tests.checker.test_reference_ranks import PENDULUM, TANH, moved, policy, rates
 from tests.support.marks import slow_after
 from tests.support.rank_forgeries import Draw, Forger, edited, verdicts
 from tests.support.rank_truth import Truth
@@ -244,6 +245,40 @@ def test_images_hold_all_trajectories(seed: int, memory: int) -> None:
         for found in both:
             assert k >= len(found) or found[k].share(x, d, directions) <= 1
     assert min(map(len, both)) >= 3
+
+
+@pytest.mark.parametrize("memory", [1, 3])
+@pytest.mark.parametrize("order", [0, 1])
+@pytest.mark.parametrize("frame", [None, [[1.0, 0.5], [-3.0, 2.0]]])
+def test_images_hold_all_trajectories_where_equations_call_a_network(
+    order: int, memory: int, frame: list[list[float]] | None
+) -> None:
+    """Of a state and of what is uncertain; order 0 is discrete time."""
+    called: list[Any] = ["*", "1/3", ["network", "pi", 0, "y", "q"]]
+    dynamics, sample = [PENDULUM[0], [*PENDULUM[1], called]], ("1/20", "1/10") if order else None
+    uncertain, target = [("q", "-1/10", "1/5")], [["-", "x", "9"]]
+    loop = Loop(dynamics, TANH, target, ("x", "y"), sample, 1, uncertain, frame=frame, memory=memory)
+    lo, hi, chance = [0.5, -0.5], [0.6, -0.4], random.Random(order)
+    data = leading(loop, lo, hi, 4)
+    both = [images(data, lo, hi, 4) for images in (checkers_images, references_images)]
+    assert min(map(len, both)) >= 3
+    d = np.array([[chance.choice([-1.0, 1.0, chance.uniform(-1, 1)]) for _ in range(120)] for _ in lo])
+    x, nearest = np.array([[0.55], [-0.45]]) + 0.05 * d, 0.0
+    for k in range(max(map(len, both))):
+
+        def q() -> float:
+            return chance.choice([-0.1, 0.2])
+
+        states = [tuple(map(float, state)) for state in x.T]
+        if order:
+            x = np.array([moved(*state, chance.choice([0.05, 0.1]), q, 1) for state in states]).T
+        else:
+            x = np.array([rates(*state, policy(*state), q(), 1) for state in states]).T
+        for found in both:
+            share = found[k].share(x, d, np.array([[1, 0], [0, 1], [1, 2], [1, -2]])) if k < len(found) else 0.0
+            nearest = max(nearest, share)
+            assert share <= 1
+    assert nearest > 0.3
 
 
 # ------------------------------------------------------------------------------------------------------- at the edge
