@@ -36,6 +36,7 @@ MAX_TRANSITIONS, MAX_ROUNDS, MAX_PARTS = 2**16, 64, 4096  # of data; rounds of a
 
 
 Faces = Annotated[tuple[bytes, ...], lambda value, sizes: value.listed(Value.octets, 2 * sizes["n"])]
+Memory = Annotated[int, lambda value, _: value.integer(1, MAX_MEMORY)]  # in a class it would not find the name
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ class RankTree:
     ranks: Octets
     steps: Octets
     frame: Annotated[Array | None, shaped("n", "n")] = field(default=None, kw_only=True)
-    memory: Annotated[int, lambda value, sizes: value.integer(1, MAX_MEMORY)] = field(default=1, kw_only=True)
+    memory: Memory = field(default=1, kw_only=True)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from .refusal import require
 MAX_SLABS = 10**4
 MAX_PARTS, MAX_CELLS = 64, 4096  # of one range; of all of them together
 MAX_ORDER = 8  # of a series in time
+MAX_MEMORY = 16  # steps after which errors of images have no symbols any more
 MAX_PIECES, MAX_ROUNDS, MAX_LEAVES = 64, 64, 4096  # of a measured transition; of bounds from all of them; of priors
 WITH_TUBE = ("enlarged", "reached")  # claims about a set of starts that is no level set of V
 REACHES, INVARIANT = "reaches", "invariant"
@@ -99,11 +100,12 @@ class Covering:
 @dataclass(frozen=True)
 class Ranking:
     """A tree over the box from `lo` to `hi`, whose leaves have two bytes of `ranks` each and one of `steps`; errors of
-    images are bounded after the matrix `frame`."""
+    images are bounded after the matrix `frame`, and have symbols of their own for `memory` steps."""
 
     lo: array[float]
     hi: array[float]
     frame: fmpq_mat | None
+    memory: int
     tree: bytes
     ranks: bytes
     steps: bytes
@@ -244,10 +246,14 @@ def read_ranked(value: Any, n: int, sampled: bool) -> Ranked:
 
 def read_ranking(value: Any, n: int) -> Ranking:
     at = "evidence.ranks"
-    ranking = keys(value, at, "lo", "hi", "tree", "ranks", "steps", maybe=("frame",))
+    ranking = keys(value, at, "lo", "hi", "tree", "ranks", "steps", maybe=("frame", "memory"))
     lo, hi = (numbers(ranking[end], f"{at}.{end}", n) for end in ("lo", "hi"))
     frame = square(ranking["frame"], f"{at}.frame", n) if "frame" in ranking else None
-    return Ranking(lo, hi, frame, *(decoded(ranking[key], f"{at}.{key}") for key in ("tree", "ranks", "steps")))
+    memory = ranking.get("memory", 1)
+    good = type(memory) is int and 1 <= memory <= MAX_MEMORY  # True is an int to isinstance
+    require(good, "format", f"{at}.memory", f"an integer from 1 to {MAX_MEMORY} was expected")
+    tree, ranks, steps = (decoded(ranking[key], f"{at}.{key}") for key in ("tree", "ranks", "steps"))
+    return Ranking(lo, hi, frame, memory, tree, ranks, steps)
 
 
 def read_fit(value: Any, fitted: Fitted) -> Fit:

@@ -184,7 +184,7 @@ def numbers(c: Certificate) -> int:
     values = values_held(c, z, order)
     if not isinstance(evidence, Covering) and evidence.ranking is not None:
         count += 2**4 * len(evidence.ranking.tree)
-        count += held_on_leaves(with_errors(z), values_held(c, z, evidence.order))
+        count += held_on_leaves(with_errors(z, evidence.ranking.memory), values_held(c, z, evidence.order))
     if asked_of_leaves(c, evidence) or c.beyond is not None:
         count += held_on_leaves(z, values)
     if isinstance(evidence, Tree) and (ball or near or evidence.tube):
@@ -211,9 +211,9 @@ def held_on_leaves(z: Sizes, values: int) -> int:
     return values * (z.s + 1) ** 2 + 2**14 * (z.n + z.m + z.z + z.nets.read + 8 * z.nets.waiting * (z.s + z.m + z.z))
 
 
-def with_errors(z: Sizes) -> Sizes:
-    """The same with a symbol more for each state."""
-    return replace(z, s=z.s + z.n)
+def with_errors(z: Sizes, memory: int) -> Sizes:
+    """The same with a symbol more for each state and each step of the memory."""
+    return replace(z, s=z.s + memory * z.n)
 
 
 # ------------------------------------------------------------------------------------------------------ the operations
@@ -251,7 +251,7 @@ def in_ranks(c: Certificate, z: Sizes, evidence: Tree | Ranked) -> int:
     ranking = evidence.ranking
     if ranking is None:
         return 0
-    leaves, steps, wider = ranking.tree.count(LEAF), sum(ranking.steps), with_errors(z)
+    leaves, steps, wider = ranking.tree.count(LEAF), sum(ranking.steps), with_errors(z, ranking.memory)
     work = 2**9 * len(ranking.tree) + 2**17 * leaves
     work += 0 if ranking.frame is None else inverting(z.n, bits(ranking.frame))
     work += models_on_leaves(c, wider, steps + leaves, evidence.order)

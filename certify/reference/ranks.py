@@ -1,7 +1,8 @@
 """Rules `ranks`, `inputs`, `flow` and `keep` on boxes with ranks: each leads to lower ones, and so to the target.
 
-A leaf of rank r with k steps is followed for these steps as a box that is affine in the leaf's symbols, with an error
-for each state. Where it ends all of it is in the target, or every leaf that it meets has a rank of at most r - k.
+A leaf of rank r with k steps is followed for these steps as a box that is affine in the leaf's symbols and in those of
+the errors of its last steps. Where it ends all of it is in the target, or every leaf that it meets has a rank of at
+most r - k.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from .taylor import Taylor, constant
 
 RULE, UNRANKED = "ranks", 65_535
 MAX_MET = 2**14  # nodes of the tree that one image meets
-Rows = list[list[arb]]  # for each state the constant, the coefficients of the leaf's symbols, and those of the errors
+Rows = list[list[arb]]  # for each state the constant, the coefficients of the leaf's symbols, and those of errors
 Range = tuple[float, float]
 
 
@@ -35,7 +36,7 @@ def ranks(c: Certificate, evidence: Tree | Ranked, jobs: int) -> int:
     if c.ranks is None or ranking is None:
         raise Refused("format", "evidence.ranks", "the claim needs boxes with ranks")
     cover = Cover(c, c.ranks, ranking)
-    walk = Walk(c, evidence.order, ranking.frame)
+    walk = Walk(c, evidence.order, ranking)
     target = Target(c, c.ranks)
     asked = (box for box in cut(cover.lo, cover.hi, ranking.tree) if cover.ranks[box.number] != UNRANKED)
 
@@ -143,17 +144,18 @@ class Cover:
 
 
 class Walk(Motion):
-    """Steps of boxes: of the states' symbols the first n are the leaf's, the others those of errors, which are what is
-    beyond the leaf's symbols after the matrix `frame`."""
+    """Steps of boxes: of the states' symbols the first n are the leaf's, then come n for the errors of each of the last
+    steps, the last one first. What is not affine in those that stay is an error, bounded after the matrix `frame`."""
 
     rule = RULE
 
-    def __init__(self, c: Certificate, order: int, frame: fmpq_mat | None) -> None:
+    def __init__(self, c: Certificate, order: int, ranking: Ranking) -> None:
         angles = c.ranks.angles if c.ranks is not None else ()
-        super().__init__(c, 2 * c.n, order, None, angles)
+        self.stay = c.n * ranking.memory
+        super().__init__(c, c.n + self.stay, order, None, angles)
         self.domain = [(arb(lo), arb(hi)) for lo, hi in c.plant.domain]
         one = fmpq_mat([[int(i == k) for k in range(c.n)] for i in range(c.n)])
-        exact = one if frame is None else frame
+        exact = one if ranking.frame is None else ranking.frame
         require(exact.det() != 0, RULE, "frame", "the matrix has no inverse")
         self.frame, self.back = (arb_mat(M).tolist() for M in (exact, exact.inv()))
 
@@ -196,20 +198,24 @@ class Walk(Motion):
         return [self.affine(row) + g for row, g in zip(here.x, moved, strict=True)]
 
     def settled(self, models: list[Taylor], at: str) -> Rows:
-        """The states as rows of numbers: what is not affine in the leaf's symbols is an error, and so are the radii
-        of the balls, which would grow many times over with each step."""
+        """The states as rows of numbers: what is not affine in the symbols that stay, all but those of the oldest
+        errors, is an error, and so are the radii of the balls, which would grow many times over with each step."""
         require(all(v.is_finite() for v in models), RULE, at, "the next state has no finite model")
-        first = [[v.c, *v.slopes(self.symbols)[: self.n]] for v in models]
+        first = [[v.c, *v.slopes(self.symbols)[: self.stay]] for v in models]
         loose = [total(arb(b.rad()) for b in row) for row in first]
         errors = list[arb]()
         for turned in self.frame:
             v = Taylor(ZERO)
             for k, model in zip(turned, models, strict=True):
                 v += model.scaled(k)
+            others = total(map(abs, v.slopes(self.symbols)[self.stay :]))
             rounded = total(abs(k) * r for k, r in zip(turned, loose, strict=True))
-            errors.append(arb((total(map(abs, v.slopes(self.symbols)[self.n :])) + v.second + v.r + rounded).upper()))
-        rest = [[k * e for k, e in zip(row, errors, strict=True)] for row in self.back]
-        return [[*(b.mid() for b in row), *errs] for row, errs in zip(first, rest, strict=True)]
+            errors.append(arb((others + v.second + v.r + rounded).upper()))
+        rows, leaf = list[list[arb]](), self.n + 1
+        for row, back in zip(first, self.back, strict=True):
+            stay = [b.mid() for b in row]
+            rows.append([*stay[:leaf], *(k * e for k, e in zip(back, errors, strict=True)), *stay[leaf:]])
+        return rows
 
 
 class Target:

@@ -186,6 +186,9 @@ HONEST: dict[str, Callable[[], Document]] = {
     "ranks in a frame": lambda: edited(
         with_ranks(loop(leaves=3, time="discrete")), "evidence.ranks.frame", encode([1.0, 2.0**-90, -3e-20, 2.0])
     ),
+    "ranks with a memory": lambda: edited(
+        with_ranks(loop(leaves=3, sample=SAMPLE, order=2)), "evidence.ranks.memory", 5
+    ),
     "ranks beside a ball of another order": lambda: edited(
         with_ranks(loop(leaves=3, sample=SAMPLE, order=2, levels=(0.25, 0.5, 1.0))), "evidence.local.order", 4
     ),

@@ -147,7 +147,7 @@ def by_reference(data: Document, lo: list[float], hi: list[float], count: int) -
     c, found = read(dumped(data)), list[Ends]()
     assert isinstance(c.evidence, Ranked) and c.evidence.ranking is not None
     with ctx.workprec(64):
-        walk = Walk(c, c.evidence.order, c.evidence.ranking.frame)
+        walk = Walk(c, c.evidence.order, c.evidence.ranking)
         rows = walk.start(Box(0, lo, hi))
         for _ in range(count):
             rows = walk.step(rows, "here", *walk.inputs([rows]))

@@ -843,7 +843,7 @@ def test_boxes_hold_all_trajectories(order: int, calls: int, frame: list[list[fl
     loop = Loop(dynamics, TANH, target, ("x", "y"), sample, max(order, 1), uncertain, frame=frame)
     c = read(dumped(loop.document([0.5, -0.5], [0.6, -0.4], b"\xff", two_bytes([3]), b"\3")))
     assert isinstance(c.evidence, Ranked) and c.evidence.ranking is not None
-    chance, walk = random.Random(order), Walk(c, max(order, 1), c.evidence.ranking.frame)
+    chance, walk = random.Random(order), Walk(c, max(order, 1), c.evidence.ranking)
     N = frame or [[1.0, 0.0], [0.0, 1.0]]
     rows = [walk.start(Box(0, [0.5, -0.5], [0.6, -0.4]))]
     for _ in range(3):

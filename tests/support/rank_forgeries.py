@@ -98,7 +98,7 @@ class Ranked:
 class Draw:
     """A random loop of one to three states: steps or held inputs, angles, something uncertain, corners."""
 
-    def __init__(self, seed: int, sizes: Sequence[int] = (1, 1, 2, 2, 2, 3)) -> None:
+    def __init__(self, seed: int, sizes: Sequence[int] = (1, 1, 2, 2, 2, 3), memory: int | None = None) -> None:
         self.chance = np.random.default_rng(seed)
         self.n = int(self.chance.choice(sizes))
         self.states = ("x", "y", "z")[: self.n]
@@ -106,6 +106,7 @@ class Draw:
         self.angles = [i for i in range(self.n) if self.chance.random() < 0.35]
         self.straight = [i for i in range(self.n) if i not in self.angles]
         self.frames = np.random.default_rng([seed, 1])  # of its own: other draws stay as they are
+        self.memory = memory
 
     def frame(self) -> list[list[float]] | None:
         """None, or a matrix: turned, sheared, nearly singular, or of very different scales."""
@@ -175,6 +176,7 @@ class Draw:
             angles=tuple(self.states[i] for i in self.angles),
             domain=("-6", "6"),
             frame=self.frame(),
+            memory=self.memory,
         )
 
     def ranked(self, hair: float = HAIR, depths: Sequence[int] = (6, 8, 9)) -> Ranked:
@@ -307,6 +309,8 @@ class Forger:
         singular = encode(*[1.0] * n * n) if n > 1 else encode(0.0)
         for frame, rule in ((singular, "ranks"), (encode(*[1.0] * (n * n + 1)), "format"), (None, "format")):
             yield Forgery("another frame", edited(self.data, f"{ranking}.frame", frame), {rule})
+        for memory in (0, 17, 1.5, "2", True, None):
+            yield Forgery("a memory that is none", edited(self.data, f"{ranking}.memory", memory), {"format"})
         some = [i for i, byte in enumerate(made.tree) if byte != 255]
         for i in self.some(some, 1):
             cut = made.tree[:i] + b"\xff" + made.tree[i + 1 :]

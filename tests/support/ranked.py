@@ -81,6 +81,7 @@ class Loop:
     most: int = 1000
     squash: str = "identity"
     frame: list[list[float]] | None = None
+    memory: int | None = None
 
     def document(self, lo: Sequence[float], hi: Sequence[float], tree: bytes, ranks: bytes, steps: bytes) -> Document:
         n = len(self.states)
@@ -95,6 +96,7 @@ class Loop:
         }  # fmt: skip
         ranking = {"lo": encode(*lo), "hi": encode(*hi), "tree": raw(tree), "ranks": raw(ranks), "steps": raw(steps)}
         ranking |= {} if self.frame is None else {"frame": encode(*[v for row in self.frame for v in row])}
+        ranking |= {} if self.memory is None else {"memory": self.memory}
         return {
             "schema": "certify-certificate/9",
             "claim": claim | ({} if self.keep is None else {"keep": self.keep}),
