@@ -167,16 +167,14 @@ def _proved(
     keep, root = tuple(kept_constraints(system).values()), root_box(loop)
     question = Question(loop, Region(target, system.states), keep, root)
     probes = begins(options.begin or tuple(zip(*map(_exactly, root), strict=True)))[:_PROBES].T
-    steps = MOST_STEPS if result.runs is None or result.runs.longest is None else result.runs.longest
+    longest = 0 if result.runs is None or result.runs.longest is None else result.runs.longest
     question = with_frame(with_order(question, probes), probes)
     if options.begin is not None:
-        question = with_memory(question, *_parts(options.begin), steps)
+        question = with_memory(question, *_parts(options.begin), min(longest or MOST_STEPS, MOST_STEPS))
     clerk = tools.clerk(path, options.jobs, True, options.cluster)
     _require_periodic(question, clerk)
     with tools.timing("ranks"), runner_at(options.cluster) as runner:
-        found = _searched(
-            question, options, _DIRECT if steps < MOST_STEPS else 0, effort.share(_FOR_SEARCH), runner, tools
-        )
+        found = _searched(question, options, longest, effort.share(_FOR_SEARCH), runner, tools)
     evidence = None if found is None else _within(found.evidence, options.within)
     if found is None or evidence is None:
         return replace(result, reason="no box of the domain is proved to lead into the region")
@@ -196,10 +194,10 @@ def _proved(
 
 
 def _searched(
-    question: Question, options: ReachOptions, direct: int, effort: Effort, runner: Runner, tools: Tools
+    question: Question, options: ReachOptions, longest: int, effort: Effort, runner: Runner, tools: Tools
 ) -> RankProof | None:
-    """Leaves from which the region is reached: those that the box needs, or else all that the effort finds; `direct`
-    boxes are looked at in the hope of one jump."""
+    """Leaves from which the region is reached: those that the box needs, or else all that the effort finds. Where
+    simulated runs take few steps, `longest` at most, there is hope that images of parts of the box lie in it."""
 
     def report(share: float, boxes: int, waiting: int) -> None:
         tools.tell("ranks", Progress(0.0, 0.0, boxes, waiting, share, effort.left))
@@ -208,7 +206,8 @@ def _searched(
     if options.begin is not None:
         lo, hi = (np.array([float(pair[k]) for pair in options.begin]) for k in (0, 1))
         most = UNPROVED - 1 if options.within is None else options.within
-        wanted = Wanted(np.nextafter(lo, -np.inf), np.nextafter(hi, np.inf), most, direct)
+        direct = _DIRECT if 0 < longest <= MOST_STEPS else 0
+        wanted = Wanted(np.nextafter(lo, -np.inf), np.nextafter(hi, np.inf), most, direct, longest)
     found = prove_ranks(question, effort, runner, report, wanted)
     if runner.remark is not None:
         tools.remarks.append(runner.remark)
