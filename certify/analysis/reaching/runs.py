@@ -68,9 +68,10 @@ class Simulation:
         self.step = self.flow.fitting(_FINER * time_scales(self.flow)[0])
 
     @np.errstate(all="ignore")
-    def runs(self, within: int | None, effort: Effort) -> Runs:
-        """Runs from states of the box; `within` is the number of steps after which the target is to be reached."""
-        x, most = begins(self.begin), LONG if within is None else within
+    def runs(self, within: int | None, effort: Effort, some: slice = slice(None)) -> Runs:
+        """Runs from states of the box, or from some of these, of which the first is its middle; `within` is the number
+        of steps after which the target is to be reached."""
+        x, most = begins(self.begin)[some], LONG if within is None else within
         start, alive, longest, failing = x, np.arange(len(x)), None, list[Run]()
         for k in range(most + 1):
             there = self.beyond(x, self.flow.policy(x), ()).max(-1) <= _CLOSE
@@ -133,7 +134,7 @@ def begins(box: Box) -> Array:
         line = np.linspace(0, 1, _GRID)[:, None] if len(wide) == 1 else np.zeros((0, 1))
         found += list(lo + line * (hi - lo))
     inside = np.clip(np.array(found), lo, hi)
-    return np.unique(inside, axis=0)
+    return inside[np.sort(np.unique(inside, axis=0, return_index=True)[1])]
 
 
 def is_refuted(loop: ClosedLoop, target: Sequence[Expression], run: Run, within: int | None) -> bool:
