@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from certify.certificates import Certificate, parse_any
 from certify.cli.certifying import finished
 from certify.cli.shared import noting, page_of
 from certify.cli.terminal import ProgressLine
@@ -64,4 +65,10 @@ def concluded(
             note(line)
     if result.notice is not None:
         note(result.notice)
-    finished(result, result.to_dict(), page_of, folder, summary, as_json, asked)
+    finished(result, result.to_dict(), _page_of, folder, summary, as_json, asked)
+
+
+def _page_of(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[str, Any] | None) -> str:
+    """The report; the page of a claim with a V is about the certificate alone."""
+    has_v = isinstance(parse_any(raw, str(path)), Certificate)
+    return page_of(raw, path, answer, None if has_v else data)
