@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from certify.certificates import Certificate, parse_any
 from certify.cli.certifying import finished
 from certify.cli.shared import noting, page_of
 from certify.cli.terminal import ProgressLine
@@ -70,5 +69,7 @@ def concluded(
 
 def _page_of(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[str, Any] | None) -> str:
     """The report; the page of a claim with a V is about the certificate alone."""
+    from certify.certificates import Certificate, parse_any
+
     has_v = isinstance(parse_any(raw, str(path)), Certificate)
     return page_of(raw, path, answer, None if has_v else data)
