@@ -77,7 +77,7 @@ def _rows(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         )
         yield "steps", f"{steps_of(result, ranks['steps'])} at most from any of them"
     for name, words in result["constraints"].items():
-        yield "kept", f"{name}: {words}, until then"
+        yield "kept", f"{name}: {words}, {'at all times' if result['levels'] else 'until then'}"
     if result["uncertain"]:
         yield "for every", ", ".join(f"{name} in [{lo}, {hi}]" for name, (lo, hi) in result["uncertain"].items())
     if simulated is not None and simulated["longest"] is not None:
