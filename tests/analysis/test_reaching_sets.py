@@ -17,9 +17,11 @@ from certify.certificates import Certificate, parse_certificate, run_checker
 from certify.certificates.located import Containment
 from certify.certificates.membership import proved_set
 from certify.errors import InputError, OptionError
+from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, sin, symbols
 from certify.loop.plants import System, with_constraints
 from certify.loop.policies import PolicyNetwork
+from certify.provers.ranks import Question, Region, root_box, with_order
 from tests.support.loops import box
 from tests.support.ranks import hanging, linear_plant
 
@@ -117,6 +119,18 @@ def test_a_held_input_with_a_higher_order(tmp_path: Path) -> None:
     result = led(loop, target, tmp_path / "led", ((Fraction(1), Fraction(11, 10)), (Fraction(0), Fraction(0))))
     given, found = parse_certificate(target.read_bytes(), "set"), accepted_by_both(result)
     assert found.evidence.order > given.evidence.order  # type: ignore[union-attr]
+
+
+def test_ranks_beside_a_set_take_a_higher_order_if_the_ring_is_cheap(tmp_path: Path) -> None:
+    loop = swinging()
+    alone, ranked = (known(loop, tmp_path / name, level=0.05, ranks=name == "ranked") for name in ("alone", "ranked"))
+    orders = [parse_certificate(path.read_bytes(), "set").evidence.order for path in (alone, ranked)]  # type: ignore[union-attr]
+    assert orders[0] < orders[1]
+    closed = ClosedLoop(*loop)
+    question = Question(closed, Region((loop[0].states[0],), loop[0].states), (), root_box(closed), 3)
+    x = np.random.default_rng(0).uniform(*root_box(closed), (30, 2)).T
+    assert with_order(question, x, leaves=1000, most=1e3) == question
+    assert with_order(question, x, leaves=1000, most=1e9).order > 3
 
 
 def test_a_set_around_another_equilibrium(tmp_path: Path) -> None:
