@@ -67,7 +67,8 @@ def pushed() -> Loop:
 
 def known(loop: Loop, folder: Path, **options: object) -> Path:
     """The certificate of a run about this loop."""
-    result = certify_roa(*loop, out=folder, candidate="ellipsoid", effort=0.1, **options)  # type: ignore[arg-type]
+    options = {"candidate": "ellipsoid", "effort": 0.1} | options
+    result = certify_roa(*loop, out=folder, **options)  # type: ignore[arg-type]
     assert result.verdict == "PROVED" and result.certificate is not None
     return result.certificate
 
@@ -123,7 +124,9 @@ def test_a_held_input_with_a_higher_order(tmp_path: Path) -> None:
 
 def test_ranks_beside_a_set_take_a_higher_order_if_the_ring_is_cheap(tmp_path: Path) -> None:
     loop = swinging()
-    alone, ranked = (known(loop, tmp_path / name, level=0.05, ranks=name == "ranked") for name in ("alone", "ranked"))
+    alone, ranked = (
+        known(loop, tmp_path / name, level=0.05, effort=0.01, ranks=name == "ranked") for name in ("alone", "ranked")
+    )
     orders = [parse_certificate(path.read_bytes(), "set").evidence.order for path in (alone, ranked)]  # type: ignore[union-attr]
     assert orders[0] < orders[1]
     closed = ClosedLoop(*loop)
@@ -211,7 +214,7 @@ def test_a_tube_into_the_set(tmp_path: Path) -> None:
     """In continuous time the set is proved again, with the tube."""
     loop = swinging(None)
     target = known(loop, tmp_path / "set", level=0.05)
-    asked = into_set_of(target, *loop, RoaOptions(reach_from={"theta": 1.0}, effort=0.2))
+    asked = into_set_of(target, *loop, RoaOptions(reach_from={"theta": 1.0}, effort=0.05))
     result = certify_roa(*loop, out=tmp_path / "led", options=asked)
     assert result.verdict == "PROVED" and result.raw is not None
     given, found = parse_certificate(target.read_bytes(), "set"), parse_certificate(result.raw, "led")
