@@ -187,6 +187,12 @@ class Clerk:
             unchecked.unlink(missing_ok=True)
         return data, answer
 
+    def tried(self, certificate: AnyCertificate) -> Mapping[str, Any]:
+        """The checker's answer about a certificate that is not kept."""
+        _, answer = self.ask(certificate)
+        self.path.unlink(missing_ok=True)
+        return answer
+
 
 def _require_about(answer: Mapping[str, Any], data: bytes, certificate: AnyCertificate) -> None:
     """Raise SoundnessError unless an answer is about these bytes and levels."""

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from certify.analysis.acceptance import Clerk, Desk
 from certify.analysis.stages.state import Report, StageName, timed
-from certify.certificates import InvariantCertificate, ReachCertificate, parse_any
+from certify.certificates import AnyCertificate, parse_any
 from certify.certificates.drawn import nonlinearity_of
 from certify.certificates.verdict import Verdict
 from certify.errors import BackendError, InputError, SoundnessError
@@ -23,7 +23,7 @@ AS_THEY_STAND = (
     "the plant's ranges are taken as they stand: no claim of this kind has the measurements or samples on which they "
     "rest yet"
 )
-C = TypeVar("C", ReachCertificate, InvariantCertificate)
+C = TypeVar("C", bound=AnyCertificate)
 
 
 @dataclass(frozen=True, slots=True)

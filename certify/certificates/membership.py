@@ -196,8 +196,19 @@ class ProvedSet(Region):
 
 
 def proved_set(path: Path, patient: bool = False) -> ProvedSet:
-    """The set of a certificate, after a check of exactly the bytes that are read, as `certify check` does it;
-    `patient` takes one whose check may need hours.
+    """The set of a certificate that the checker accepts; `patient` takes one whose check may need hours.
+
+    Raises
+    ------
+    InputError : the checker does not accept it.
+    CertificateFormatError : the file cannot be read.
+    """
+    return set_of(accepted_bytes(path, patient), str(path))
+
+
+def accepted_bytes(path: Path, patient: bool = False) -> bytes:
+    """The bytes of a certificate, after a check of exactly them, as `certify check` does it; `patient` takes one whose
+    check may need hours.
 
     Raises
     ------
@@ -216,7 +227,7 @@ def proved_set(path: Path, patient: bool = False) -> ProvedSet:
             f"{path} must be a certificate that the checker accepts; it says {answer['result']}{why:.300}. "
             f"{old or 'Without that there is no proved set.'}"
         )
-    return set_of(raw, str(path))
+    return raw
 
 
 def set_of(raw: bytes, name: str) -> ProvedSet:

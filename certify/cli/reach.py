@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -41,10 +42,11 @@ def reach(
     target: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="COMPARISON",
+            metavar="COMPARISON|FILE",
             help="Prove that this region is reached, in discrete time or with a held input, from which boxes of the "
             "domain, and in how many steps at most: a comparison of the states' values, such as 'position >= 0.45'; "
-            "repeatable, for a region where all of them hold. --from may then be a box.",
+            "repeatable, for a region where all of them hold. Or FILE.json, a certificate about the same loop: its set "
+            "{V <= c2} is then to be reached, after which its claim holds. In steps, --from may be a box.",
             rich_help_panel=FIRST,
         ),
     ] = None,
@@ -57,30 +59,34 @@ def reach(
     quiet: Quiet = False,
     importing: ImportOptions,
 ) -> None:
-    """Prove that a state converges, by a tube around its trajectory, or with --target that a region is reached."""
+    """Prove that a state converges, by a tube around its trajectory, or with --target that a region is reached, or the
+    set of a certificate."""
     start, note, path = time.perf_counter(), noting(quiet), the_policy(context, file, policy)
-    _require_one(target, within, typed)
+    from certify.analysis.reaching import ReachOptions, certify_reach, into_set_of
+    from certify.report.reached import summary
+
     with kind_called(_KIND):
         stored = policy_in(path, importing, system, changes, note)
     plant = plant_of(stored, system, changes, note)
-    if target is None:
-        certified(context, path, stored, plant, options_of(typed, plant, note), out, start, quiet, as_json)
+    by_tube = target is None or (len(target) == 1 and target[0].endswith(".json") and not plant.in_steps)
+    _require_one(target, within, typed, by_tube)
+    if target is None or by_tube:
+        options = options_of(typed, plant, note)
+        options = options if target is None else into_set_of(Path(target[0]), plant, stored.network, options)
+        certified(context, path, stored, plant, options, out, start, quiet, as_json)
         return
-    from certify.analysis.reaching import ReachOptions, certify_reach
-    from certify.report.reached import summary
-
     asked = typed.pop("reach_from", None)
-    options = ReachOptions(
+    towards = ReachOptions(
         target=tuple(target),
         begin=None if asked is None else region(asked, plant, "--from"),
         within=within,
         **{name: read_option(name, text) for name, text in typed.items()},
     )
-    concluded(certify_reach, summary, path, stored, plant, options, out, start, quiet, as_json)
+    concluded(certify_reach, summary, path, stored, plant, towards, out, start, quiet, as_json)
 
 
-def _require_one(target: list[str] | None, within: int | None, typed: dict[str, Any]) -> None:
-    """Refuse options that do not go together.
+def _require_one(target: list[str] | None, within: int | None, typed: dict[str, Any], by_tube: bool) -> None:
+    """Refuse options that do not go together; `by_tube` says that a tube is looked for.
 
     Raises
     ------
@@ -88,7 +94,9 @@ def _require_one(target: list[str] | None, within: int | None, typed: dict[str, 
     """
     if target is None and "reach_from" not in typed:
         raise OptionError("`target` or `reach_from` must be given: a region that is to be reached, or a state.")
-    if target is None and within is not None:
-        raise OptionError("`within` needs a `target`: how many steps it may take.")
-    if target is not None and (odd := [name for name in ("box", "resume") if name in typed]):
+    if by_tube and "reach_from" not in typed:
+        raise OptionError("`reach_from` must be given, a state: in continuous time a tube leads from it into the set.")
+    if by_tube and within is not None:
+        raise OptionError("`within` needs a `target` that is reached in steps: how many it may take.")
+    if not by_tube and (odd := [name for name in ("box", "resume") if name in typed]):
         raise OptionError(f"`{odd[0]}` is about a tube; leave it out where a `target` is given.")

@@ -64,4 +64,12 @@ def concluded(
             note(line)
     if result.notice is not None:
         note(result.notice)
-    finished(result, result.to_dict(), page_of, folder, summary, as_json, asked)
+    finished(result, result.to_dict(), _page_of, folder, summary, as_json, asked)
+
+
+def _page_of(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[str, Any] | None) -> str:
+    """The report; the page of a claim with a V is about the certificate alone."""
+    from certify.certificates import Certificate, parse_any
+
+    has_v = isinstance(parse_any(raw, str(path)), Certificate)
+    return page_of(raw, path, answer, None if has_v else data)

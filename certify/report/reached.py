@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
+from certify.report.summary import in_a_line
 from certify.report.words import below, nonlinearity_in_words, pretty_unit
 
 if TYPE_CHECKING:
@@ -33,7 +34,9 @@ def summary(result: Mapping[str, Any]) -> RenderableType:
 
 
 def target_of(result: Mapping[str, Any]) -> str:
-    """The region as it was written."""
+    """The region as it was written, or the certificate's set."""
+    if result["levels"]:
+        return f"V <= {below(result['levels']['roa'])}"
     return " and ".join(" ".join(text.split()) for text in result["target"])
 
 
@@ -63,6 +66,9 @@ def _rows(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     ranks, simulated = result["ranks"], result["simulated"]
     if result["reason"] not in ("requested", "done"):
         yield "reason", result["reason"]
+    if result["levels"]:
+        yield "V of", result["target"][0]
+        yield "then", in_a_line({**result, "ranks": None, "constraints": {}})
     if ranks is not None:
         share = f"{below(100 * ranks['covered'], 4)} % of the box that was cut"
         yield (
@@ -71,7 +77,7 @@ def _rows(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         )
         yield "steps", f"{steps_of(result, ranks['steps'])} at most from any of them"
     for name, words in result["constraints"].items():
-        yield "kept", f"{name}: {words}, until then"
+        yield "kept", f"{name}: {words}, {'at all times' if result['levels'] else 'until then'}"
     if result["uncertain"]:
         yield "for every", ", ".join(f"{name} in [{lo}, {hi}]" for name, (lo, hi) in result["uncertain"].items())
     if simulated is not None and simulated["longest"] is not None:

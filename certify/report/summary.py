@@ -83,21 +83,10 @@ def _verdict(result: Mapping[str, Any]) -> str:
 
 
 def _headline(result: Mapping[str, Any], verdict: str) -> str:
-    name, level, kind = result["system"], result["levels"].get("roa"), kind_of(result)
+    name, level = result["system"], result["levels"].get("roa")
     if verdict in ("PROVED", "TRUSTED") and level is not None:
-        inner = inner_of(result)
-        stated = words_of(result).headline.format(
-            outer=below(level),
-            inner="?" if inner is None else inner_level(kind, inner),
-            speed=TimingInWords.of_result(result).headline_rate(),
-            beyond=below(result["outer"]["level"]) if result.get("outer") else "",
-            steps=f"{result['ranks']['steps']:,}" if result.get("ranks") else "",
-            constraints=listed(list(result.get("constraints") or ())),
-            constant="where what is uncertain is constant in time, " if result.get("uncertain") else "",
-        )
         word = ", if the solver is right: nothing checked its answers" if verdict == "TRUSTED" else ""
-        stated = stated.replace("the origin", _where_v_is_0(result))
-        return f"{name}: {_whatever(result)}{stated}{word}"
+        return f"{name}: {_whatever(result)}{in_a_line(result)}{word}"
     if verdict == "REFUTED" and result.get("stop") == "unstable":
         return f"{name}: the closed loop is unstable at {_where_v_is_0(result)}, so that no V can prove the claim"
     if verdict == "REFUTED":
@@ -109,6 +98,21 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
     if is_missed(result):
         return f"{name}: the state is NOT shown to converge; what is proved is {{V <= {below(level)}}}, without it"
     return f"{name}: nothing was proved"
+
+
+def in_a_line(result: Mapping[str, Any]) -> str:
+    """The claim of a result in a line, about its levels."""
+    inner = inner_of(result)
+    stated = words_of(result).headline.format(
+        outer=below(result["levels"]["roa"]),
+        inner="?" if inner is None else inner_level(kind_of(result), inner),
+        speed=TimingInWords.of_result(result).headline_rate(),
+        beyond=below(result["outer"]["level"]) if result.get("outer") else "",
+        steps=f"{result['ranks']['steps']:,}" if result.get("ranks") else "",
+        constraints=listed(list(result.get("constraints") or ())),
+        constant="where what is uncertain is constant in time, " if result.get("uncertain") else "",
+    )
+    return stated.replace("the origin", _where_v_is_0(result))
 
 
 def _where_v_is_0(result: Mapping[str, Any]) -> str:

@@ -77,6 +77,27 @@ def test_a_box_that_gets_there(asked: list[str], tmp_path: Path, capsys: pytest.
     assert "steps to the region" in (tmp_path / "set.svg").read_text("utf-8")
 
 
+def test_into_a_certified_set(asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    loop, known = asked[1:5], str(tmp_path / "known")
+    assert _run(["roa", *loop, "--quiet", "--level", "0.05", "--out", known, "--keep", "v >= -2.9"], False) == 0
+    led = ["reach", *loop, "--quiet", "--target", f"{known}/certificate.json", *asked[-4:], "--keep", "v >= -2.9"]
+    status, data = said(capsys, led)
+    assert status == 0 and (data["checked"], data["reference"]) == ("ACCEPTED", "ACCEPTED")
+    assert data["claim"] == {"kind": "asymptotic"} and data["levels"]["roa"] == 0.05
+    assert data["simulated"]["longest"] <= data["steps"] <= data["ranks"]["steps"]
+    assert _run(["contains", data["certificate"], "p=2.5..3", "v=0"], False) == 0
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Region of attraction of cart" in page and "PROVED · ACCEPTED" in page and "boxes with ranks" in page
+    capsys.readouterr()
+    assert _run(led, False) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert text.startswith("PROVED cart: from all of p = 2.5..3, v = 0, V <= 0.05 after")
+    assert "then {V <= 0.05} is invariant at every step and attracted by the operating point" in text
+    assert "-2.9 - v < 0, at all times" in text
+    assert _run(["reach", *loop, "--target", f"{known}/certificate.json", *asked[-4:]], False) == 2
+    assert "differs in constraints" in capsys.readouterr().err
+
+
 def test_what_is_not_so(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     status, data = said(capsys, [*asked, "--within", "3"])
     assert status == 1 and data["verdict"] == "REFUTED" and data["simulated"]["witness"]["end"] == "late"

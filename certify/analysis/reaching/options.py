@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from certify.certificates.claims import MOST_RANK, MOST_TARGETS
 from certify.certificates.ellipsoids import Box
@@ -20,7 +21,8 @@ class ReachOptions:
 
     Parameters
     ----------
-    target : comparisons of the states' values by <= or >=, all of which hold in the region.
+    target : comparisons of the states' values by <= or >=, all of which hold in the region; or one name of a file,
+        *.json, a certificate whose set {V <= c2} is to be reached.
     begin : a box of states, in deviations, about which the verdict is; None for no box in particular.
     within : the most steps that it may take.
     effort, time_limit, jobs, cluster : as of `certify roa`.
@@ -41,8 +43,20 @@ class ReachOptions:
     def __post_init__(self) -> None:
         if not 1 <= len(self.target) <= MOST_TARGETS:
             raise OptionError(f"`target` must be 1 to {MOST_TARGETS} comparisons; found {len(self.target)}.")
+        if len(self.target) > 1 and any(map(is_file, self.target)):
+            raise OptionError("`target` must be one certificate, or comparisons alone; found both, or several files.")
         if self.within is not None and not 1 <= self.within <= MOST_RANK:
             raise OptionError(f"`within` must be 1 to {MOST_RANK:,} steps; found {self.within}.")
+
+    @property
+    def certificate(self) -> Path | None:
+        """The file whose set is to be reached; None for comparisons."""
+        return Path(self.target[0]) if is_file(self.target[0]) else None
+
+
+def is_file(target: str) -> bool:
+    """True for a target that names a certificate."""
+    return target.endswith(".json")
 
 
 def target_of(system: System, texts: Sequence[str]) -> tuple[Expression, ...]:

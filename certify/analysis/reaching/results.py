@@ -11,6 +11,7 @@ from certify.analysis.facts import RankFacts
 from certify.analysis.reaching.options import ReachOptions, in_words
 from certify.analysis.reaching.runs import Run, Runs
 from certify.analysis.without_v import ResultWithoutV
+from certify.certificates import Certificate
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,12 +24,14 @@ class ReachResult(ResultWithoutV):
     steps : after so many every trajectory from the box `options.begin` has been in the region; None if that is not
         proved, or no box was named.
     runs : simulated, from that box.
+    given : the certificate whose set is the target; None for a region.
     """
 
     options: ReachOptions
     ranks: RankFacts | None = None
     steps: int | None = None
     runs: Runs | None = None
+    given: Certificate | None = None
 
     @property
     def begin(self) -> dict[str, tuple[Fraction, Fraction]] | None:
@@ -51,8 +54,11 @@ class ReachResult(ResultWithoutV):
             "schema": "certify-reach/1",
             "verdict": self.verdict.value,
             "reason": self.reason,
-            "claim": {"kind": "reaches"} | ({} if system.sample is None else {"sample": list(map(str, system.sample))}),
+            "claim": {"kind": "reaches" if self.given is None else self.given.kind}
+            | ({} if system.sample is None else {"sample": list(map(str, system.sample))}),
             "target": list(self.options.target),
+            "operating_point": {name: str(q) for name, q in system.operating_point().items()},
+            "levels": {} if self.given is None else dict(self.given.claim.levels),
             "from": None if begin is None else {name: [str(lo), str(hi)] for name, (lo, hi) in begin.items()},
             "within": self.options.within,
             "steps": self.steps,
@@ -76,7 +82,7 @@ class ReachResult(ResultWithoutV):
         state = ", ".join(f"{name} = {float(q):.6g}" for name, q in self.values(run.x).items())
         if run.end == "violates":
             return f"from {state} the constraint {run.constraint} is violated after {run.steps:,} steps"
-        where = in_words(self.options.target)
+        where = in_words(self.options.target) if self.given is None else f"V <= {self.given.roa:.6g}"
         if run.end == "left":
             return f"from {state} the domain is left after {run.steps:,} steps, before {where}"
         return f"from {state} {where} does not hold in any of the first {run.steps:,} steps"

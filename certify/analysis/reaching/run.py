@@ -18,22 +18,20 @@ from numpy.typing import NDArray
 
 from certify.analysis.acceptance import Clerk
 from certify.analysis.beyond import constraints_in_words, rank_facts
-from certify.analysis.reaching.options import ReachOptions, target_of
+from certify.analysis.reaching.goals import Goal, Stated, goal_of, leaves_of, with_ranks
+from certify.analysis.reaching.options import ReachOptions
 from certify.analysis.reaching.results import ReachResult
 from certify.analysis.reaching.runs import Simulation, begins, is_refuted
 from certify.analysis.stages.state import Report, effort_of
 from certify.analysis.without_v import Tools, accepted
 from certify.certificates import (
-    RanksAlone,
     RankTree,
-    ReachCertificate,
     earlier_aside,
     require_within_limits,
     sole_writer,
 )
-from certify.certificates.claims import UNPROVED, Ranks, Reaches
+from certify.certificates.claims import UNPROVED, Ranks
 from certify.certificates.ellipsoids import Box
-from certify.certificates.membership import angles_in
 from certify.certificates.ranked import Ranked, steps_from
 from certify.certificates.tree import LEAF
 from certify.certificates.verdict import Verdict
@@ -41,8 +39,7 @@ from certify.effort import Effort
 from certify.errors import InputError, OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.composition import composed
-from certify.loop.expressions import Expression
-from certify.loop.plants import System, kept_constraints
+from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
 from certify.provers.base import Progress
 from certify.provers.execution import Runner, runner_at
@@ -50,13 +47,10 @@ from certify.provers.ranks import (
     MOST_STEPS,
     Question,
     RankProof,
-    Region,
     Wanted,
     prove_ranks,
     root_box,
-    with_frame,
     with_memory,
-    with_order,
     without_leaf,
 )
 
@@ -80,7 +74,7 @@ def certify_reach(
     progress: Report | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> ReachResult:
-    """Prove from which boxes of a plant's domain every trajectory reaches a region.
+    """Prove from which boxes of a plant's domain every trajectory reaches a region, or the set of a certificate.
 
     Parameters
     ----------
@@ -93,7 +87,8 @@ def certify_reach(
 
     Raises
     ------
-    InputError : the closed loop or an option cannot be used, or `out` cannot be written or is another run's.
+    InputError : the closed loop or an option cannot be used, `out` cannot be written or is another run's, or the
+        checker does not accept the certificate whose set is the target.
     SoundnessError : the checker rejects what was proved.
     BackendError : the same with a cluster, or no scheduler answers.
     """
@@ -107,16 +102,30 @@ def certify_reach(
         raise OptionError(
             "`target` needs a loop whose time goes in steps: discrete time, or an input that is held (`sample_time`)."
         )
-    target = target_of(system, options.target)
-    _require_inside(system, options)
+    path = out / "certificate.json"
+    if options.certificate is not None and options.certificate.resolve() == path.resolve():
+        raise OptionError(f"`target` must lie in another folder than `out`, which gets such a file too; found {path}.")
+    with tools.timing("target"):
+        goal = goal_of(loop, options.target, options.certificate)
+    options = _seen_from(goal, options)
+    _require_inside(goal.loop.system, options)
     effort = effort_of(options.effort, options.time_limit, load_seconds)
     with one_thread(), sole_writer(out), earlier_aside(out, tell or (lambda _: None)):
-        result = ReachResult(Verdict.UNKNOWN, "", system, network, options)
-        result = _simulated(result, loop, target, tools)
+        result = ReachResult(Verdict.UNKNOWN, "", goal.loop.system, goal.loop.network, options, given=goal.given)
+        result = _simulated(result, goal, tools)
         if not result.reason:
-            result = _proved(result, loop, target, effort, tools, out / "certificate.json", provenance or {})
+            result = _proved(result, goal, effort, tools, path, provenance or {})
     seconds = {"load": load_seconds, **tools.seconds, "total": load_seconds + time.perf_counter() - start}
     return replace(result, seconds=seconds, notice=tools.notice(system))
+
+
+def _seen_from(goal: Goal, options: ReachOptions) -> ReachOptions:
+    """The options with the box in deviations from where the goal's loop has its origin."""
+    network = goal.loop.network
+    if options.begin is None or not network.is_moved:
+        return options
+    each = zip(options.begin, map(Fraction, network.origin.tolist()), strict=True)
+    return replace(options, begin=tuple((lo - q, hi - q) for (lo, hi), q in each))
 
 
 def _require_inside(system: System, options: ReachOptions) -> None:
@@ -135,13 +144,13 @@ def _require_inside(system: System, options: ReachOptions) -> None:
             )
 
 
-def _simulated(result: ReachResult, loop: ClosedLoop, target: tuple[Expression, ...], tools: Tools) -> ReachResult:
+def _simulated(result: ReachResult, goal: Goal, tools: Tools) -> ReachResult:
     """The result with simulated runs from the box; final if one of them does not get there."""
     options = result.options
     if options.begin is None:
         return result
     with tools.timing("simulate"):
-        simulation = Simulation(loop, target, options.begin)
+        simulation = Simulation(goal.loop, goal.expressions, options.begin, goal.turned)
         runs = simulation.runs(options.within, Effort(_RUNS))
         if runs.longest is None and runs.failing is None:  # they take long
             runs = simulation.runs(options.within, Effort(_RUNS), slice(1))
@@ -149,7 +158,7 @@ def _simulated(result: ReachResult, loop: ClosedLoop, target: tuple[Expression, 
     if runs.failing is None:
         return result
     with tools.timing("refute"):
-        refuted = is_refuted(loop, target, runs.failing, options.within)
+        refuted = not goal.turned and is_refuted(goal.loop, goal.expressions, runs.failing, options.within)
     told = result.told(runs.failing)
     if refuted:
         return replace(result, verdict=Verdict.REFUTED, reason=f"{told}, shown in Arb")
@@ -158,38 +167,36 @@ def _simulated(result: ReachResult, loop: ClosedLoop, target: tuple[Expression, 
 
 def _proved(
     result: ReachResult,
-    loop: ClosedLoop,
-    target: tuple[Expression, ...],
+    goal: Goal,
     effort: Effort,
     tools: Tools,
     path: Path,
     provenance: Mapping[str, Any],
 ) -> ReachResult:
     """The result of the search, and of the check of what it finds."""
-    options, system = result.options, loop.system
-    keep, root = tuple(kept_constraints(system).values()), root_box(loop)
-    question = Question(loop, Region(target, system.states), keep, root)
-    probes = begins(options.begin or tuple(zip(*map(_exactly, root), strict=True)))[:_PROBES].T
+    options, system = result.options, goal.loop.system
+    whole = tuple(zip(*map(_exactly, root_box(goal.loop)), strict=True))
     longest = 0 if result.runs is None or result.runs.longest is None else result.runs.longest
-    question = with_frame(with_order(question, probes), probes)
+    clerk = tools.clerk(path, options.jobs, True, options.cluster)
+    question = goal.question(begins(options.begin or whole)[:_PROBES].T, clerk.tried)
     if options.begin is not None:
         question = with_memory(question, *_parts(options.begin), min(longest or MOST_STEPS, MOST_STEPS))
-    clerk = tools.clerk(path, options.jobs, True, options.cluster)
-    _require_periodic(question, clerk)
+    _require_periodic(goal, question, clerk)
     with tools.timing("ranks"), runner_at(options.cluster) as runner:
         found = _searched(question, options, longest, effort.share(_FOR_SEARCH), runner, tools)
     evidence = None if found is None else _within(found.evidence, options.within)
     if found is None or evidence is None:
-        return replace(result, reason="no box of the domain is proved to lead into the region")
-    claim = Reaches(target, Ranks(found.ranks.angles, max(1, evidence.most)), keep)
-    certificate = ReachCertificate(system, loop.network, claim, RanksAlone(evidence, question.order), provenance)
+        return replace(result, reason="no box of the domain is proved to lead into the target")
+    ranks = Ranks(found.ranks.angles, max(1, evidence.most))
+    certificate = goal.certificate(question, evidence, ranks, provenance)
     certificate, raw, answer = accepted(certificate, clerk, _without_leaf, _MENDED)
     facts, kept = rank_facts(certificate, found), constraints_in_words(certificate)
     result = replace(result, ranks=facts, boxes=found.boxes, constraints=kept)
     result = replace(result, certificate=path, raw=raw, checker=answer)
     if options.begin is None:
         return replace(result, verdict=Verdict.PROVED, reason="effort" if effort.over or not found.done else "done")
-    steps = steps_from(Ranked(certificate.evidence.ranks, None, angles_in(system)), options.begin)
+    turned = tuple(i for i, s in enumerate(system.states) if s.name in found.ranks.angles)
+    steps = steps_from(Ranked(leaves_of(certificate), goal.ellipsoid, turned), options.begin)
     if steps is None:
         why = "the effort is over" if not found.done else "no leaf is left whose halves could gain anything"
         return replace(result, reason=f"of the box only a part is proved, or none: {why}")
@@ -235,34 +242,31 @@ def _within(evidence: RankTree, most: int | None) -> RankTree | None:
     return evidence if np.any(evidence.proved) else None
 
 
-def _require_periodic(question: Question, clerk: Clerk) -> None:
+def _require_periodic(goal: Goal, question: Question, clerk: Clerk) -> None:
     """Refuse a loop or a region that is not the same after a full turn of an angle, as the checker sees it.
 
     Raises
     ------
     InputError : it is not.
     """
-    system, (lo, hi), keep = question.loop.system, question.root, question.keep
-    if not system.angles or not isinstance(question.target, Region):
+    system, (lo, hi) = question.loop.system, question.root
+    angles = system.angles if goal.given is None else tuple(system.states[i].name for i in goal.turned)
+    if not angles:
         return
     nothing = RankTree(lo, hi, bytes([LEAF]), np.array([UNPROVED], np.uint16), np.zeros(1, np.uint8))
-    claim = Reaches(question.target.expressions, Ranks(system.angles, 1), keep)
-    asked = ReachCertificate(system, question.loop.network, claim, RanksAlone(nothing, question.order))
-    _, answer = clerk.ask(asked)
-    clerk.path.unlink(missing_ok=True)
+    answer = clerk.tried(goal.certificate(question, nothing, Ranks(angles, 1), {}))
     if answer.get("rule") == "angles":
         raise InputError(
-            f"the loop, the region and the constraints must be the same after a full turn of {', '.join(system.angles)}"
+            f"the loop, the region and the constraints must be the same after a full turn of {', '.join(angles)}"
             f", an angle of {system.name}: {answer['at']}, {answer['detail']}. Write them with sin and cos of it, or "
             "take the angle out of the plant's `angles`."
         )
 
 
-def _without_leaf(certificate: ReachCertificate, at: str) -> ReachCertificate | None:
+def _without_leaf(certificate: Stated, at: str) -> Stated | None:
     """The certificate without the rank of the leaf that the checker refuses, and of those that need it."""
     refused = re.fullmatch(r"rank leaf (\d+)", at)
-    lower = None if refused is None else without_leaf(certificate.evidence.ranks, int(refused[1]))
-    if lower is None:
+    lower = None if refused is None else without_leaf(leaves_of(certificate), int(refused[1]))
+    if lower is None or certificate.claim.ranks is None:
         return None
-    claim = replace(certificate.claim, ranks=Ranks(certificate.claim.ranks.angles, max(1, lower.most)))
-    return replace(certificate, claim=claim, evidence=replace(certificate.evidence, ranks=lower))
+    return with_ranks(certificate, Ranks(certificate.claim.ranks.angles, max(1, lower.most)), lower)

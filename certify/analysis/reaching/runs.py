@@ -6,6 +6,7 @@ the same run then shows it, or does not. Values of uncertain quantities are the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -55,10 +56,11 @@ class Runs:
 
 
 class Simulation:
-    """Runs of a closed loop towards a target, in floats; `begin` is the box from which they start."""
+    """Runs of a closed loop towards a target, in floats; `begin` is the box from which they start, and the target is
+    that of states less full turns of the angles whose numbers are `turned`."""
 
-    def __init__(self, loop: ClosedLoop, target: Sequence[Expression], begin: Box) -> None:
-        system = loop.system
+    def __init__(self, loop: ClosedLoop, target: Sequence[Expression], begin: Box, turned: Sequence[int] = ()) -> None:
+        system, self.turned = loop.system, list(turned)
         self.flow, self.begin, self.names = Flow.of(system, loop.network), begin, tuple(kept_constraints(system))
         quantities = [s for s, _ in system.uncertain]
         self.nominal = [float(system.parameters.get(s.name, Fraction(0))) for s in quantities]
@@ -74,7 +76,7 @@ class Simulation:
         x, most = begins(self.begin)[some], LONG if within is None else within
         start, alive, longest, failing = x, np.arange(len(x)), None, list[Run]()
         for k in range(most + 1):
-            there = self.beyond(x, self.flow.policy(x), ()).max(-1) <= _CLOSE
+            there = self.beyond(self._place(x), self.flow.policy(x), ()).max(-1) <= _CLOSE
             longest = k if np.any(there) else longest
             x, alive = x[~there], alive[~there]
             ended = self._ended(x, k)
@@ -100,6 +102,12 @@ class Simulation:
             g = self.kept(x, self.flow.policy(x), self.nominal)
             for i in np.flatnonzero((g > 0).any(-1)):
                 found[int(i)] = ("violates", k, self.names[int(g[i].argmax())])
+        return found
+
+    def _place(self, x: Array) -> Array:
+        """States x (N, n) less full turns of those angles, as near to 0 as they get."""
+        found = x.copy()
+        found[:, self.turned] -= 2 * math.pi * np.rint(x[:, self.turned] / (2 * math.pi))
         return found
 
     @property
@@ -134,7 +142,9 @@ def begins(box: Box) -> Array:
         line = np.linspace(0, 1, _GRID)[:, None] if len(wide) == 1 else np.zeros((0, 1))
         found += list(lo + line * (hi - lo))
     inside = np.clip(np.array(found), lo, hi)
-    return inside[np.sort(np.unique(inside, axis=0, return_index=True)[1])]
+    first: NDArray[np.intp] = np.unique(inside, axis=0, return_index=True)[1]
+    states: Array = inside[np.sort(first)]
+    return states
 
 
 def is_refuted(loop: ClosedLoop, target: Sequence[Expression], run: Run, within: int | None) -> bool:

@@ -15,6 +15,7 @@ from certify.analysis.asked import ellipsoid_in
 from certify.analysis.facts import TubeFacts
 from certify.analysis.stages.state import State, Tools
 from certify.certificates.claims import Claim, Problem
+from certify.certificates.tree import LEAF
 from certify.effort import Effort
 from certify.errors import OptionError
 from certify.lyapunov import Neural, Polynomial, are_inside, of_polynomial, volume
@@ -26,7 +27,9 @@ _FOR_SEARCH = 0.5  # share of the effort that is left, the rest being for the ch
 _FOR_CELLS = 0.7  # the same for a search of boxes with ranks, of which only those with one are checked
 _FOR_RANKS = 0.35  # share of the whole effort, even if the search has left less
 _FOR_LEARNING = 0.6  # share of the effort that is left, the rest being for the proof and its check
-_PROBES = 30  # states at which a frame of errors is chosen
+_PROBES = 30  # states at which the order of the series in time is chosen, and the frame of errors
+_LITTLE = 1e-4  # share of the root box that an error of the series may be
+_FOR_RING = 0.05  # share of the whole effort for the check of the ring, if it takes a series of a higher order
 
 
 @dataclass(frozen=True)
@@ -177,7 +180,7 @@ class ByRanks:
 
     def extend(self, state: State, effort: Effort) -> State:
         """Add the boxes; a note says why there are none."""
-        from certify.provers.ranks import Question, Sublevel, prove_ranks, root_box, with_frame
+        from certify.provers.ranks import Question, Sublevel, prove_ranks, root_box, with_frame, with_order
 
         tools, (claim, evidence), trial = self.tools, state.proved, state.contest.best.trial
         problem = trial.task.problem
@@ -196,7 +199,8 @@ class ByRanks:
             root = lo, hi = root_box(problem.loop)
             probes = np.random.default_rng(0).uniform(lo, hi, (_PROBES, len(lo))).T
             question = Question(problem.loop, target, claim.keep, root, evidence.order)
-            question = with_frame(question, probes)
+            ring, most = evidence.tree.count(LEAF), _FOR_RING * tools.whole
+            question = with_frame(with_order(question, probes, _LITTLE, ring, most), probes)
             found = prove_ranks(question, share, tools.runner, told, enough=enough)
         if found is None:
             return state.noting("no box of the domain beyond the set is proved to lead into it")
@@ -204,5 +208,5 @@ class ByRanks:
             state,
             ranked=found,
             claim=replace(claim, ranks=found.ranks),
-            evidence=replace(evidence, ranks=found.evidence),
+            evidence=replace(evidence, ranks=found.evidence, order=question.order),
         )

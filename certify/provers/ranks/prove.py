@@ -63,21 +63,27 @@ class Question:
         return Course(self.loop, self.target, angles, self.keep, hi - lo, counts, *by)
 
 
-def with_order(question: Question, x: Array) -> Question:
-    """The question with the lowest order of the series in time that leaves little error at states x (n, N), or with the
-    last one that still gained something; as it is where no input is held."""
+def with_order(
+    question: Question, x: Array, little: float = _LITTLE, leaves: int = 0, most: float = math.inf
+) -> Question:
+    """The question with the lowest order of the series in time, from its own on, that leaves an error of `little` of
+    the root box at states x (n, N), or with the last one that still gained something; as it is where no input is
+    held. So many other leaves, which take steps of the same order, may cost `most` operations."""
     system = question.loop.system
     if system.sample is None or system.calls:
         return replace(question, order=1)
     best, least = question, math.inf
-    for order in _ORDERS:
+    for order in (k for k in _ORDERS if k >= question.order):
         asked = replace(question, order=order)
-        found = asked.course((1,))(x, x, 0.0, 0.0)
+        course = asked.course((1,))
+        if leaves * course.operations > most:
+            break
+        found = course(x, x, 0.0, 0.0)
         widths = ((found.hi - found.lo)[0] / (question.root[1] - question.root[0])[:, None]).max(0)
         width = float(np.nanmedian(widths)) if np.any(np.isfinite(widths)) else math.inf
         if width < _GAIN * least or least == math.inf:
             best, least = asked, width
-        if least < _LITTLE:
+        if least < little:
             break
     return best
 
