@@ -76,6 +76,17 @@ def residual_name(state: str) -> str:
     return f"residual_{state}"
 
 
+def beyond_name(state: str, term: int) -> str:
+    """The name of the disturbance that is a share of one term of what an equation has beyond A x + B u, from 1."""
+    return f"beyond_{state}_{term}"
+
+
+def residual_names(state: str, disturbances: Mapping[str, Interval]) -> list[str]:
+    """Those of the disturbances, with these ranges, that are shares in [-1, 1] of what a state's equation lacks."""
+    own = [residual_name(state), *(beyond_name(state, k + 1) for k in range(len(disturbances)))]
+    return [name for name in own if disturbances.get(name) == (-1, 1)]
+
+
 def measurements_in(
     file: PlantFile, states: Sequence[str], ranges: Mapping[str, Interval], time: str
 ) -> Measurements | None:
