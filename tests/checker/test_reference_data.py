@@ -43,6 +43,14 @@ SCALAR = Experiment(
     ("1/1000",), ("0",),
 )  # fmt: skip
 STEPS = replace(SCALAR, f=lambda x, u, p: [p[0] * x[0] + u[0]], period=None, order=1, drift=0.01)
+TURNED = replace(
+    SPRING, f=lambda x, u, p: spring(x, u, (p[0] + p[1], p[0] / 2 - p[1] + 0.5)), names=("s", "d"), truth=(0.99, 0.03),
+    priors=(("9/10", "11/10"), ("-1/10", "1/10")), axes=(("m", "0", ("1", "1")), ("b", "1/2", ("1/2", "-1"))),
+)  # fmt: skip
+SUM = replace(
+    SCALAR, f=lambda x, u, p: [(p[0] + p[1]) * x[0] + u[0]], names=("a", "b"), truth=(0.35, 0.25),
+    priors=(("0", "1/2"), ("0", "1/2")), axes=(("q", "0", ("1", "1")),),
+)  # fmt: skip
 HALVES = bytes([0, 255, 0, 255, 255])
 
 
@@ -86,6 +94,12 @@ TRUE: dict[str, tuple[Experiment, Claim]] = {
     "with ranks": (replace(STEPS, priors=(("2/5", "13/20"),), drift=0.0), ranked),
     "held": (replace(SCALAR, rounds=1), held),
     "pieces": (replace(SCALAR, order=5, pieces=4), of_scalar),
+    "axes": (TURNED, of_spring),
+    "an axis of two parameters": (SUM, of_scalar),
+    "an axis in steps": (
+        replace(STEPS, f=SUM.f, names=SUM.names, truth=SUM.truth, priors=SUM.priors, axes=SUM.axes),
+        of_steps,
+    ),
 }
 
 

@@ -84,7 +84,7 @@ def beyond_name(state: str, term: int) -> str:
 def residual_names(state: str, disturbances: Mapping[str, Interval]) -> list[str]:
     """Those of the disturbances, with these ranges, that are shares in [-1, 1] of what a state's equation lacks."""
     own = [residual_name(state), *(beyond_name(state, k + 1) for k in range(len(disturbances)))]
-    return [name for name in own if disturbances.get(name) == (-1, 1)]
+    return [name for name in own if disturbances.get(name) == (Fraction(-1), Fraction(1))]
 
 
 def measurements_in(
