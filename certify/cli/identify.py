@@ -101,6 +101,10 @@ def identify(
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="Plant with the ranges that are left; a page lies beside it.")
     ] = Path("known.toml"),
+    rotate: Annotated[
+        bool,
+        typer.Option("--rotate", help="Write the plant in axes where data bound sums of parameters, and none alone."),
+    ] = False,
     environment: dict[str, Any],
     linear: Any,  # a LinearStructure or None
     as_json: Json = False,
@@ -130,7 +134,7 @@ def identify(
     for line in readings.notes:
         note(line)
     try:
-        result = identify_plant(measured, readings, source.name, structure, out)
+        result = identify_plant(measured, readings, source.name, structure, out, rotate)
     except Contradiction as error:
         note("looking for what the equations lack")
         _refuted(error, measured, readings, source, as_json)
@@ -222,7 +226,7 @@ def _summary(result: IdentifyResult) -> RenderableType:
             name,
             result.system.units.get(name, ""),
             _interval(prior),
-            _interval(result.system.ranges[name]),
+            _interval(result.known.ranges[name]),
             f"{result.shrink(name):.3g} x",
             by,
         )
@@ -248,6 +252,10 @@ def _rows(result: IdentifyResult) -> list[tuple[str, str]]:
         rows.append(("period", " to ".join(dict.fromkeys(f"{float(h):g}" for h in data.period))))
     if result.not_narrowed():
         rows.append(("not narrowed", f"{', '.join(result.not_narrowed())}: {result.next_step()}"))
+    if data.axes:
+        rows.append(
+            ("axes", f"{len(data.axes)}, whose box is {result.smaller:.3g} times smaller than that of the ranges")
+        )
     if axis is not None:
         rows.append(("least determined", direction_in_words(axis.entries, axis.share)))
         rows.append(("to narrow it", f"more like {result.readings.places[axis.telling]}: {result.at(axis.telling)}"))

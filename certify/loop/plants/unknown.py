@@ -7,12 +7,13 @@ from fractions import Fraction
 from typing import Any
 
 from certify.loop.expressions import Expression, Operation, Symbol
-from certify.loop.plants.measurements import Measurements
+from certify.loop.plants.axes import axes_of
+from certify.loop.plants.measurements import Axis, Measurements
 from certify.loop.plants.samples import Samples, Unknown
 from certify.loop.plants.source import PlantFile, interval_at, interval_in, number_at
 from certify.loop.plants.system import Interval
 
-_DATA = ("file", "sha256", "period", "noise", "priors")
+_DATA = ("file", "sha256", "period", "noise", "priors", "axes")
 _SAMPLES = ("file", "sha256", "noise")
 _DIGITS = frozenset("0123456789abcdef")
 
@@ -100,7 +101,8 @@ def measurements_in(
         return None
     table = file.table("data")
     file.require_known("data", list(_DATA), "entry of a plant's data")
-    wanted = [key for key in _DATA if key not in table and not (key == "period" and time == "discrete")]
+    free = ("axes", "period") if time == "discrete" else ("axes",)
+    wanted = [key for key in _DATA if key not in table and key not in free]
     if wanted:
         raise file.refuse(f"must have {', '.join(wanted)}. `certify identify` writes this table.", "data")
     if time == "discrete" and "period" in table:
@@ -117,7 +119,22 @@ def measurements_in(
     priors = {p: interval_in(file, value, "data", "priors", p) for p, value in stated.items()}
     if not priors:
         raise file.refuse("there must be a range for a parameter at least.", "data", "priors")
-    return Measurements(priors, _period(file) if time == "continuous" else None, bounds, (), sha256)
+    period = _period(file) if time == "continuous" else None
+    return Measurements(priors, period, bounds, (), sha256, _axes(file, list(priors)) if "axes" in table else ())
+
+
+def _axes(file: PlantFile, names: list[str]) -> tuple[Axis, ...]:
+    """The table `data.axes`, of each parameter its value in the middle and its slopes along the axes."""
+    stated = _inner(file, "data", "axes", names, "parameter with a prior")
+    rows = [stated.get(name) for name in names]
+    if not all(isinstance(row, list) and len(row) == len(names) + 1 for row in rows):
+        raise file.refuse(f"there must be a list of {len(names) + 1} numbers for each prior.", "data", "axes")
+    return axes_of(
+        [
+            tuple(number_at(file, q, "data", "axes", name) for q in row or ())
+            for name, row in zip(names, rows, strict=True)
+        ]
+    )
 
 
 def unknowns_in(file: PlantFile, names: Sequence[str], states: Sequence[str]) -> tuple[Unknown, ...]:
