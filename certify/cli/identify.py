@@ -77,6 +77,12 @@ def _without_a_model() -> Bundle:
     return Bundle({one.name: one for one in options}, linear_from)
 
 
+Rotate = Annotated[
+    bool,
+    typer.Option("--rotate", help="Write the plant in axes, where data bound sums of parameters closer than each."),
+]
+
+
 @takes(environment=_of_environment(), linear=_without_a_model())
 def identify(
     data: Annotated[
@@ -101,10 +107,7 @@ def identify(
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="Plant with the ranges that are left; a page lies beside it.")
     ] = Path("known.toml"),
-    rotate: Annotated[
-        bool,
-        typer.Option("--rotate", help="Write the plant in axes where data bound sums of parameters, and none alone."),
-    ] = False,
+    rotate: Rotate = False,
     environment: dict[str, Any],
     linear: Any,  # a LinearStructure or None
     as_json: Json = False,
@@ -123,10 +126,8 @@ def identify(
     note = noting(quiet)
     if out.suffix != ".toml":
         raise InputError(f"--out must be a .toml file; found {out}.")
-    period, bounds = (
-        None if sample_time is None else value_or_range(sample_time, "sample_time"),
-        bound_or_bounds(noise, "noise"),
-    )
+    period = None if sample_time is None else value_or_range(sample_time, "sample_time")
+    bounds = bound_or_bounds(noise, "noise")
     structure = structure_for(data, structure, linear, out, period, bounds)
     system = load_system(structure)
     source = _recorded(data, environment, system, out, note)

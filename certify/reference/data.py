@@ -231,7 +231,7 @@ def number_in(ends: Interval) -> Taylor:
 
 
 def on_axis(axis: Axis, box: Box) -> tuple[arb, dict[int, arb]]:
-    """What an axis is in the middle of a box, and its slopes by the symbols of the parameters there."""
+    """The value of an axis in the middle of a box, and its slopes by the symbols of the parameters there."""
     each = [(arb(by), (lo + hi) / 2, (hi - lo) / 2) for by, (lo, hi) in zip(axis.by, box, strict=True)]
     middle = arb(axis.at) + total(by * arb(centre) for by, centre, _ in each)
     return middle, {j: by * arb(half) for j, (by, _, half) in enumerate(each)}

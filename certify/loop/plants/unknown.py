@@ -82,10 +82,10 @@ def beyond_name(state: str, term: int) -> str:
     return f"beyond_{state}_{term}"
 
 
-def residual_names(state: str, disturbances: Mapping[str, Interval]) -> list[str]:
-    """Those of the disturbances, with these ranges, that are shares in [-1, 1] of what a state's equation lacks."""
-    own = [residual_name(state), *(beyond_name(state, k + 1) for k in range(len(disturbances)))]
-    return [name for name in own if disturbances.get(name) == (Fraction(-1), Fraction(1))]
+def residual_names(state: str, ranges: Mapping[str, Interval]) -> list[str]:
+    """The names of the disturbances with ranges around 0 that bound what a state's equation lacks."""
+    own = [residual_name(state), *(beyond_name(state, k + 1) for k in range(len(ranges)))]
+    return [name for name in own if name in ranges and ranges[name][0] == -ranges[name][1]]
 
 
 def measurements_in(

@@ -105,7 +105,7 @@ class Flows:
         return self._after(x, held, others)
 
     def on_axes(self, box: Box) -> dict[str, tuple[float, Array]]:
-        """Of each axis its value in the middle of a box, and its slopes by the parameters' symbols (K,)."""
+        """The value of each axis in the middle of a box, and its slopes by the parameters' symbols (K,)."""
         ends = list(box.values())
         return {
             axis.name: (
