@@ -43,16 +43,14 @@ def along_axes(system: System) -> System:
 
     Raises
     ------
-    InputError : the operating point or an observation depends on a parameter, or a name stands for two things.
+    InputError : an observation depends on a parameter, or a name stands for two things.
     """
     data = system.measurements
     if data is None or not data.axes:
         return system
-    odd = symbols_of(*system.x_eq, *system.observations) & {Symbol(p) for p in data.priors}
+    odd = symbols_of(*system.observations) & {Symbol(p) for p in data.priors}
     if odd:
-        raise InputError(
-            f"x_eq and observations of {system.name} must not depend on {odd.pop()}, where data have axes."
-        )
+        raise InputError(f"observations of {system.name} must not depend on {odd.pop()}, where data have axes.")
     names = [axis.name for axis in data.axes]
     taken = {s.name for s in (*system.states, *system.inputs, *system.disturbances)} | {*system.parameters}
     if taken & {*names}:
