@@ -131,8 +131,9 @@ def shape_that_lies(made: Any) -> Any:
     return made
 
 
-def own_operator(made: Any) -> Any:
-    made.opset_import.append(helper.make_opsetid("ai.onnx.contrib", 1))
+def own_operator(made: Any, used: bool = True) -> Any:
+    made.opset_import.append(helper.make_opsetid("ai.onnx.ml", 3))
+    made.graph.node[1].domain = "ai.onnx.ml" if used else ""
     return made
 
 
@@ -156,7 +157,7 @@ REFUSED = {
     "another file": (other_file(model(chain(*MLP))), "must lie in the file itself"),
     "two inputs": (two_inputs(model(chain(*MLP))), "one input"),
     "a shape that lies": (shape_that_lies(model(chain(*MLP))), "damaged"),
-    "an operator of its own": (own_operator(model(chain(*MLP))), "standard operators"),
+    "an operator of its own": (own_operator(model(chain(*MLP))), "found ai.onnx.ml.Tanh"),
     "a function that redefines tanh": (function(model(chain(*MLP))), "standard operators"),
     "no set of operators": (no_operator_set(model(chain(*MLP))), "evaluator of the onnx package"),
     "a tensor twice": (twice(model(chain(*MLP))), "once"),
@@ -195,6 +196,58 @@ def test_damaged_files_and_missing_packages(tmp_path: Path, monkeypatch: pytest.
     path.write_bytes(b"\x0a\xff\xff noise")
     with pytest.raises(InputError, match="no ONNX file"):
         import_policy(path, plant(), SAID)
+
+
+def test_a_set_of_operators_that_no_node_is_of(tmp_path: Path) -> None:
+    """tf2onnx writes one of machine learning beside the standard one."""
+    imported = import_policy(written(tmp_path, own_operator(model(chain(*MLP)), used=False)), plant(), SAID)
+    assert np.max(np.abs(imported.policy.network(X, (Fraction(0),)) - net(X))) < 1e-12
+
+
+# ------------------------------------------------------------------------------------------- layers as convolutions
+
+
+IMAGES = {  # layers as MATLAB writes them: a kernel as large as the image
+    "image": MEAN.reshape(1, 1, 1, 2), "K1": W1.T.reshape(6, 1, 1, 2), "K2": W2.T.reshape(1, 6, 1, 1),
+    "half": W1.T[:, :1].reshape(6, 1, 1, 1), "b": B1, "c": B2, "upright": W1.T.reshape(6, 1, 2, 1),
+    "two": MEAN.reshape(1, 2, 1, 1),
+}  # fmt: skip
+CONVOLVED = (("Sub", "*", "image"), ("Conv", "*", "K1", "b"), ("Tanh", "*"), ("Conv", "*", "K2", "c"), ("Flatten", "*"))
+
+
+def of_images(operations: tuple[Any, ...], shape: tuple[Any, ...] = (1, 1, 1, 2)) -> Any:
+    made = model(chain(*operations), IMAGES)
+    made.graph.input[0].CopyFrom(helper.make_tensor_value_info("x", TensorProto.FLOAT, shape))
+    return made
+
+
+def test_layers_as_convolutions(tmp_path: Path) -> None:
+    imported = import_policy(written(tmp_path, of_images(CONVOLVED)), plant(), SAID)
+    assert np.max(np.abs(imported.policy.network(X, (Fraction(0),)) - net(X - MEAN.astype(float)))) < 1e-12
+    assert imported.difference.in_double < 1e-12
+
+
+def changed(k: int, *operation: Any) -> tuple[Any, ...]:
+    return (*CONVOLVED[:k], operation, *CONVOLVED[k + 1 :])
+
+
+NO_LAYERS = {
+    "a kernel that moves over the image": (of_images(changed(1, "Conv", "*", "half", "b")), "as large as its image"),
+    "padding": (of_images(changed(1, "Conv", "*", "K1", "b", {"pads": [0, 1, 0, 1]})), "padding"),
+    "padding by itself": (of_images(changed(1, "Conv", "*", "K1", "b", {"auto_pad": "SAME_UPPER"})), "padding"),
+    "dilation": (of_images(changed(1, "Conv", "*", "K1", "b", {"dilations": [1, 2]})), "dilation"),
+    "groups": (of_images(changed(3, "Conv", "*", "K2", "c", {"group": 2})), "one group"),
+    "a kernel that stands upright": (of_images(changed(1, "Conv", "*", "upright", "b")), "evaluat"),
+    "an image of open size": (of_images(CONVOLVED, (1, 1, 1, "n")), "whose size the graph says"),
+    "a mean of channels": (of_images(changed(0, "Sub", "*", "two")), "shape"),
+}
+
+
+@pytest.mark.parametrize("name", NO_LAYERS)
+def test_convolutions_that_are_no_layers(name: str, tmp_path: Path) -> None:
+    made, message = NO_LAYERS[name]
+    with pytest.raises(InputError, match=message):
+        import_policy(written(tmp_path, made), plant(), SAID)
 
 
 # --------------------------------------------------------------------------------- what exporters write around layers

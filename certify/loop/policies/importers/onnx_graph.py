@@ -8,6 +8,7 @@ width that a value has already, which is removed before the graph runs.
 
 from __future__ import annotations
 
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ from certify.loop.policies.importers.reading import Observations, Reading, Value
 _STANDARD = ("", "ai.onnx")
 _FLAGS = {
     "Gemm": {"alpha", "beta", "transA", "transB"},
+    "Conv": {"auto_pad", "dilations", "group", "kernel_shape", "pads", "strides"},
     "Constant": {"value", "value_float", "value_floats", "value_int", "value_ints"},
     "Cast": {"to", "saturate"},
     "Flatten": {"axis"},
@@ -102,16 +104,17 @@ def read_onnx(raw: bytes, what: str, wanted: str | None = None, folder: Path | N
         model = onnx.load_model_from_string(raw)
     except (DecodeError, ValueError, RuntimeError) as error:
         raise InputError(f"{what} is no ONNX file or is damaged: {error}.") from error
-    if model.functions or any(opset.domain not in _STANDARD for opset in model.opset_import):
-        raise InputError(f"{what} must hold standard operators only; it defines or imports others.")
-    old = any(opset.version < 14 for opset in model.opset_import)
+    if model.functions:
+        raise InputError(f"{what} must hold standard operators only; it defines others.")
+    old = any(opset.version < 14 for opset in model.opset_import if opset.domain in _STANDARD)
     if old and any(node.op_type == "BatchNormalization" for node in model.graph.node):
         # onnx's own evaluator takes the moments of the batch there
         raise InputError(f"{what} has a BatchNormalization of an old opset; export it with opset_version=17 or later.")
     name, output = _ends(model.graph, wanted, what)
     unread = _prune(model, output, what)
     beside = load_weights(model.graph, folder, what)
-    steps = _walk(model.graph, name, output, what)
+    shape = _given_shape(model.graph, name, what)
+    steps = _walk(model.graph, name, output, shape, what)
     double = any(t.data_type == onnx.TensorProto.DOUBLE for t in model.graph.initializer)
     try:
         evaluators = {False: ReferenceEvaluator(model), True: ReferenceEvaluator(_doubled(model))}
@@ -119,9 +122,10 @@ def read_onnx(raw: bytes, what: str, wanted: str | None = None, folder: Path | N
         raise InputError(f"the evaluator of the onnx package cannot read {what}: {error}.") from error
 
     def evaluate(x: Observations, double: bool) -> Values:
-        given = x.astype(np.float64 if double else np.float32)
+        given = x.reshape(len(x), *shape[1:]) if len(shape) > 2 else x
+        given = given.astype(np.float64 if double else np.float32)
         values: Values = np.asarray(evaluators[double].run([output], {name: given})[0])
-        return values
+        return values.reshape(len(x), -1) if len(shape) > 2 else values
 
     kinds = [node.op_type for node in model.graph.node if node.op_type != "Constant"]
     return Reading(
@@ -232,8 +236,8 @@ def _ends(graph_: Any, wanted: str | None, what: str) -> tuple[str, str]:
     return inputs[0], wanted if wanted is not None else outputs[0]
 
 
-def _walk(graph_: Any, name: str, output: str, what: str) -> Chain:
-    """The steps that lead from the input to the output."""
+def _walk(graph_: Any, name: str, output: str, shape: tuple[int, ...], what: str) -> Chain:
+    """The steps that lead from the input, of such a shape, to the output."""
     if graph_.sparse_initializer:
         raise InputError(f"the tensors of {what} must be dense.")
     constants: dict[str, Numbers] = {}
@@ -242,7 +246,7 @@ def _walk(graph_: Any, name: str, output: str, what: str) -> Chain:
             raise InputError(f"{what} must name each tensor once; {tensor.name} stands there twice.")
         constants[tensor.name] = _constant(tensor, what)
     chains: dict[str, Made] = {name: ()}
-    wide = _given_width(graph_, name)
+    wide = prod(shape[1:]) if len(shape) > 2 else max(shape[-1:], default=0)
     said = [node for node in graph_.node if node.op_type == "Constant" and len(node.output) == 1]
     numbers = {node.output[0]: _attribute({a.name: a for a in node.attribute}, what) for node in said}
     for node in with_gelu(list(graph_.node), constants | numbers, output):
@@ -283,10 +287,13 @@ def _walk(graph_: Any, name: str, output: str, what: str) -> Chain:
     return found
 
 
-def _given_width(graph_: Any, name: str) -> int:
-    """The width of the graph's input; 0 if the graph leaves it open."""
+def _given_shape(graph_: Any, name: str, what: str) -> tuple[int, ...]:
+    """The shape of the graph's input, with 0 for what the graph leaves open: images of one size, or rows."""
     (dims,) = (value.type.tensor_type.shape.dim for value in graph_.input if value.name == name)
-    return max(0, int(dims[-1].dim_value)) if len(dims) else 0
+    shape = tuple(max(0, int(dim.dim_value)) for dim in dims)
+    if len(shape) > 2 and not all(shape[1:]):
+        raise InputError(f"the input of {what} must be rows, or images whose size the graph says; found {shape}.")
+    return shape
 
 
 def _attribute(flags: dict[str, Any], what: str) -> Numbers:

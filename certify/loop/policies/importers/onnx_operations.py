@@ -21,7 +21,7 @@ from certify.loop.policies.importers.steps import MOST_NORMALISED, Activate, Aff
 
 ACTIVATIONS = ("Tanh", "Elu", "Sigmoid", "Gelu", "Softplus", "Mish", "Softsign", "LeakyRelu", "Selu", "Celu")
 OPERATIONS = {
-    "Gemm", "MatMul", "Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", *ACTIVATIONS,
+    "Gemm", "MatMul", "Conv", "Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", *ACTIVATIONS,
     "Identity", "Cast", "Flatten", "Reshape", "Constant", "Concat", "LayerNormalization", "Pow",
     "Abs", "HardSigmoid", "HardSwish", "ReduceMean", "Sqrt", "Reciprocal", "Min", "Max", "PRelu", "Log", "Greater",
     "Where", "Slice", "Split", "BatchNormalization", "Shape", "Gather",
@@ -29,7 +29,8 @@ OPERATIONS = {
 KNOWN = (
     f"Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu, {', '.join(ACTIVATIONS)}, "
     "PRelu, HardSigmoid, HardSwish, Abs, Pow, Min, Max, LayerNormalization, ReduceMean and Sqrt as parts of one, "
-    "BatchNormalization, Concat, Slice, Split, Identity, Flatten and Constant"
+    "BatchNormalization, Concat, Slice, Split, Identity, Flatten, Constant, and Conv whose kernel is as large as its "
+    "image"
 )
 NORMALISATIONS = ("InstanceNormalization", "GroupNormalization")
 _SELU = {"gamma": float(np.float32(1.05070102214813)), "alpha": float(np.float32(1.67326319217681))}  # of the standard
@@ -99,6 +100,8 @@ def applied(kind: str, given: list[Any], flags: dict[str, Any], wide: int, count
         return _split(given, flags, wide, count, at)
     if kind == "ReduceMean":
         return [_averaged(given, flags, wide, at)]
+    if kind == "Conv":
+        return [_convolved(given, flags, wide, at)]
     return [_apply(kind, given, flags, at)]
 
 
@@ -162,6 +165,20 @@ def _averaged(given: list[Any], flags: dict[str, Any], wide: int, at: str) -> Ch
     if not 0 < width <= MOST_NORMALISED:
         raise InputError(f"{at} must be of 1 to {MOST_NORMALISED} numbers, by a layer or by the shape of the input.")
     return graph.averaged(given[0], width)
+
+
+def _convolved(given: list[Any], flags: dict[str, Any], wide: int, at: str) -> Chain:
+    """A layer as a convolution whose kernel is as large as the image, so that it has one position there."""
+    said = {name: flag.s if name == "auto_pad" else tuple(flag.ints) or flag.i for name, flag in flags.items()}
+    plain = {"auto_pad": (b"NOTSET", b"VALID"), "group": (1,)}
+    if len(given) not in (2, 3) or not isinstance(given[0], tuple):
+        raise InputError(f"{at} must join one value that depends on the observation with constants.")
+    weight = graph.real(given[1], at)
+    once = all(said[name] in may for name, may in plain.items() if name in said)
+    once = once and not any(said.get("pads", ())) and all(k == 1 for k in said.get("dilations", ()))
+    if weight.ndim < 3 or not once or weight[:1].size != gives(given[0], wide):
+        raise InputError(f"{at} must have a kernel as large as its image, one group, and neither padding nor dilation.")
+    return graph.affine(given[0], weight.reshape(len(weight), -1), (*given, None)[2], at)
 
 
 def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Made:
