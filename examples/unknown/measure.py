@@ -52,10 +52,11 @@ def main() -> None:
     lo, hi = ([-1, 1] * np.array(reach[plant.n :])[:, None]).T if given.reach else (lo, hi)
     x, u = [draw.uniform(-1, 1, (runs, plant.n)) * reach[: plant.n]], draw.uniform(lo, hi, (length, runs, plant.m))
     act = load_policy(given.policy).network if given.policy else None
-    for k, held in enumerate(u):
+    for k in range(length):
         y = x[-1]
         if act is not None:
-            u[k] = held = np.array([act(row, plant.exact_u_eq()) for row in y])
+            u[k] = np.array([act(row, plant.exact_u_eq()) for row in y])
+        held = u[k]
         for _ in range(STEPS):  # Runge and Kutta's method, whose error here is far below the noise
             k1 = f(y, held)
             k2 = f(y + h / 2 * k1, held)
