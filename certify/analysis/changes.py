@@ -31,7 +31,7 @@ class PlantChanges:
     parameters: Changes | None = option(
         None, "loop", "ranges", typed="--param", keyword="ranges", metavar="NAME=VALUE", first=True, help=(
         "Parameters of the plant; if one has a range, the claim holds for every function of time in it."),
-        written="A value, or a range NAME=LO..HI; repeatable.",
+        written="A value, in place of a range that the file has, or a range NAME=LO..HI; repeatable.",
         python="Pairs (lo, hi) by parameter; a parameter whose value is outside its range takes the middle.")
     domain: Changes | None = option(None, "loop", "ranges", keyword="", metavar="NAME=D", first=True, help=(
         "Domain of a state, outside of which nothing is proved."),
@@ -74,7 +74,7 @@ class PlantChanges:
         given = self.parameters or {}
         _require_known(plant, "parameter", given, plant.parameters)
         plant = plant.with_parameters({name: q for name, q in given.items() if not isinstance(q, tuple)})
-        plant = plant.with_ranges({name: ends for name, ends in given.items() if isinstance(ends, tuple)})
+        plant = plant.with_ranges({name: q if isinstance(q, tuple) else None for name, q in given.items()})
         plant = plant.with_domain(self._domain(plant)).with_ranges(self._acting(plant))
         if self.keep or self.avoid:
             from certify.loop.plants import with_constraints

@@ -83,7 +83,7 @@ def _data(system: System, data: Measurements) -> dict[str, Any] | None:
     """The measurements of the claim; None where only ranges are known to rest on some."""
     if not data.runs:
         return None
-    ranges = {name: [str(q) for q in system.ranges[name]] for name in data.priors}
+    ranges = {name: [str(q) for q in system.ranges[name]] for name in data.constants}
     return {
         "sha256": data.sha256,
         "transitions": data.transitions,

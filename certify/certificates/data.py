@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates.encoding import decode, encode
-from certify.loop.plants import Measurements, Run, System
+from certify.loop.plants import Axis, Measurements, Run, System
 
 Array = NDArray[np.float64]
 
@@ -35,6 +35,7 @@ class DataBounds:
     tree : a partition of the box of priors in preorder, one byte for each node.
     leaves : rounds of each of its leaves.
     rounds : those of the box that has what the leaves' rounds leave.
+    turned : weights (2, J, T, n) for the lower and the upper end of each axis in the last box; None without axes.
     """
 
     order: int
@@ -42,12 +43,14 @@ class DataBounds:
     tree: bytes
     leaves: tuple[tuple[Round, ...], ...]
     rounds: tuple[Round, ...]
+    turned: Array | None = None
 
 
 def data_claim(measurements: Measurements, system: System) -> dict[str, Any]:
     """The entry `data` of a claim."""
     ranges = measurements.priors.items()
-    return {
+    axes = [{"name": name, "at": str(at), "by": list(map(str, by))} for name, at, by in measurements.axes]
+    return ({"axes": axes} if axes else {}) | {
         "sha256": measurements.sha256,
         "parameters": [{"name": name, "range": [str(lo), str(hi)]} for name, (lo, hi) in ranges],
         "period": None if measurements.period is None else [str(h) for h in measurements.period],
@@ -68,7 +71,7 @@ def data_evidence(bounds: DataBounds) -> dict[str, Any]:
         "tree": base64.b64encode(bounds.tree).decode("ascii"),
         "leaves": [list(map(_stored, rounds)) for rounds in bounds.leaves],
         "rounds": list(map(_stored, bounds.rounds)),
-    }
+    } | ({} if bounds.turned is None else {"turned": encode(bounds.turned)})
 
 
 def read_measurements(stated: Mapping[str, Any], n: int, m: int) -> Measurements:
@@ -79,7 +82,10 @@ def read_measurements(stated: Mapping[str, Any], n: int, m: int) -> Measurements
         Run(decode(run["states"], (run["steps"] + 1, n)), decode(run["inputs"], (run["steps"], m)))
         for run in stated["runs"]
     )
-    return Measurements(priors, period, tuple(map(Fraction, stated["noise"])), runs, str(stated["sha256"]))
+    axes = tuple(
+        Axis(axis["name"], Fraction(axis["at"]), tuple(map(Fraction, axis["by"]))) for axis in stated.get("axes", ())
+    )
+    return Measurements(priors, period, tuple(map(Fraction, stated["noise"])), runs, str(stated["sha256"]), axes)
 
 
 def read_data_bounds(data: Mapping[str, Any], measurements: Measurements) -> DataBounds:
@@ -90,7 +96,9 @@ def read_data_bounds(data: Mapping[str, Any], measurements: Measurements) -> Dat
         return tuple(Round(decode(each["box"], (2, K)), decode(each["weights"], (2, K, T, n))) for each in stored)
 
     tree, leaves = base64.b64decode(data["tree"]), tuple(map(rounds, data["leaves"]))
-    return DataBounds(int(data["order"]), int(data["pieces"]), tree, leaves, rounds(data["rounds"]))
+    J = len(measurements.axes)
+    turned = decode(data["turned"], (2, J, T, n)) if J else None
+    return DataBounds(int(data["order"]), int(data["pieces"]), tree, leaves, rounds(data["rounds"]), turned)
 
 
 def _stored(each: Round) -> dict[str, str]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from . import words
 from .boxes import LEAF
 from .document import Certificate
-from .sections import MAX_RANK, Data, Outer, Ranks, Trusted
+from .sections import MAX_RANK, Axis, Data, Outer, Ranks, Trusted
 from .words import expression, interval, number
 
 if TYPE_CHECKING:
@@ -200,12 +200,17 @@ def consistent(c: Certificate, data: Data) -> str:
     noise = ", ".join(f"{name} within {number(w)}" for name, w in zip(c.states, data.noise, strict=True))
     moved = [f"{name} + {number(q)}" for name, q in zip(c.states, data.origin, strict=True) if q]
     of = f"; measured are {', '.join(moved)}" if moved else ""
+    such = "".join(f", {a.name} = {_sum(a, data.parameters)}" for a in data.axes)
     lasting = "" if data.period is None else f" of {_lasting(data.period)} units of time, with the input held"
     return (
-        f"and so for every plant with constant {priors} that is consistent with {data.transitions} measured transitions"
-        f"{lasting}, in {len(data.runs)} runs ({noise}{of}; from a file with sha256 {data.sha256}): their parameters "
-        "lie in the ranges above; of other plants nothing is claimed"
+        f"and so for every plant with constant {priors}{such} that is consistent with {data.transitions} measured "
+        f"transitions{lasting}, in {len(data.runs)} runs ({noise}{of}; from a file with sha256 {data.sha256}): "
+        "their parameters lie in the ranges above; of other plants nothing is claimed"
     )
+
+
+def _sum(axis: Axis, parameters: tuple[str, ...]) -> str:
+    return " + ".join([number(axis.at), *(f"({number(q)}) {p}" for q, p in zip(axis.by, parameters, strict=True))])
 
 
 def _lasting(period: tuple[Fraction, Fraction]) -> str:

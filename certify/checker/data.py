@@ -51,6 +51,7 @@ class Flows:
         lo, hi = data.period or (0, 0)
         self.symbols = self.n + self.k + int(lo < hi)  # the last is that of the period
         self.noise = all_near(data.noise)
+        self.axes = [(near(axis.at), all_near(axis.by)) for axis in data.axes]
         begins = np.concatenate([np.full(len(inputs), run) for run, (_, inputs) in enumerate(data.runs)])
         self.begin = np.arange(len(begins)) + begins  # the number of the measurement at which a transition begins
         self.y = np.concatenate([states for states, _ in data.runs])
@@ -90,9 +91,23 @@ class Flows:
         x = [self._symbol(self.measured(s, self.begin[chosen]), self.noise[s], s, batch) for s in range(self.n)]
         inputs = [affine(u, np.zeros((self.symbols, batch))) for u in self.u[chosen].T]
         ranges = [self._number(pair, None, batch) for pair in self.c.ranges]
-        for k, (name, pair) in enumerate(zip(self.data.parameters, box, strict=True)):
-            ranges[self.c.uncertain.index(name)] = self._number(pair, self.n + k, batch)
+        constants = [self._number(pair, self.n + k, batch) for k, pair in enumerate(box)]
+        if self.axes:
+            constants = [self._constant(centre, slopes, batch) for centre, slopes in self.on_axes(box)]
+        for name, model in zip(self.data.constants, constants, strict=True):
+            ranges[self.c.uncertain.index(name)] = model
         return self._after(x, [*inputs, *ranges], batch)
+
+    def on_axes(self, box: Intervals) -> list[tuple[Near, Near]]:
+        """For each axis its value in the middle of a box, and its slopes by the parameters' symbols (K,)."""
+        middles, reaches = all_near((lo + hi) / 2 for lo, hi in box), all_near((hi - lo) / 2 for lo, hi in box)
+        return [(at + (by * middles).sum(), by * reaches) for at, by in self.axes]
+
+    def _constant(self, centre: Near, slopes: Near, batch: int) -> Taylor:
+        """A number that has the parameters' symbols."""
+        g = np.zeros((self.symbols, batch))
+        g[self.n : self.n + self.k] = slopes.value[:, None]
+        return affine(centre.value + np.zeros(batch), g, centre.error + slopes.error.shaped(self.k).sum())
 
     def _symbol(self, centre: Near, reach: Near, symbol: int | None, batch: int) -> Taylor:
         """A number within `reach` of a centre, with a symbol of its own or without."""
@@ -122,13 +137,13 @@ class Flows:
             x = [v + h * g for v, g in zip(x, G, strict=True)]
         return x
 
-    def bounds(self, rows: Rows, chosen: NDArray[np.intp], weights: Array, k: int) -> tuple[float, float]:
-        """Between what the symbol of parameter k lies, by a sum of rows with weights (T, n): of rows within R of 0
-        `e_k.z = (e_k - sum w slopes).z - sum w alpha + sum w R`."""
+    def bounds(self, rows: Rows, chosen: NDArray[np.intp], weights: Array, a: Near) -> tuple[float, float]:
+        """Between what a sum a.d of the parameters' symbols lies, by a sum of rows with weights (T, n): of rows within
+        R of 0 `a.d = (a - sum w slopes).z - sum w alpha + sum w R`."""
         w, samples = Near(weights.T), np.arange(len(self.y))
         of_rows = w[:, None] * Near(rows.slopes)  # (n, n + K, T)
         of_each = of_rows.sum()
-        own = Near(-np.eye(self.k)[k]) + Near(of_each.value[self.n :].T, _turned(of_each.error[self.n :])).sum()
+        own = -a + Near(of_each.value[self.n :].T, _turned(of_each.error[self.n :])).sum()
         begins, ends = np.zeros((2, self.n, len(samples))), np.zeros((2, self.n, len(samples)))
         begins[:, :, self.begin[chosen]] = of_each.value[: self.n], (of_each.error[: self.n]).top
         leads = Near(weights.T) * Near(self.noise.value[:, None], self.noise.error.shaped(self.n, 1))
@@ -144,11 +159,32 @@ class Flows:
         rows, found = self.rows(box, chosen), []
         for k, (lo, hi) in enumerate(box):
             middle, reach = (lo + hi) / 2, (hi - lo) / 2
-            below, above = (self.bounds(rows, chosen, weights[side, k, chosen], k) for side in (0, 1))
+            a = Near(np.eye(self.k)[k])
+            below, above = (self.bounds(rows, chosen, weights[side, k, chosen], a) for side in (0, 1))
             least = middle + reach * Fraction(below[0]) if -1 < below[0] < np.inf else lo  # not where it is NaN
             most = middle + reach * Fraction(above[1]) if -np.inf < above[1] < 1 else hi
             found.append((least, most))
         return tuple(found)
+
+    def turned(self, box: Intervals, weights: Array) -> Intervals | None:
+        """Between what each of J axes lies for the consistent parameters in a box, by weights (2, J, T, n); None if
+        these show nothing of some."""
+        chosen, found = followed(weights), list[tuple[Fraction, Fraction]]()
+        if not len(chosen):
+            return None
+        rows = self.rows(box, chosen)
+        for j, (centre, a) in enumerate(self.on_axes(box)):
+            ends = [self.bounds(rows, chosen, weights[side, j, chosen], a)[side] for side in (0, 1)]
+            least, most = ((centre + Near(np.float64(end))).ends[side] for side, end in enumerate(ends))
+            if not np.all(np.isfinite([least, most])):
+                return None
+            found.append((Fraction(float(least)), Fraction(float(most))))
+        return tuple(found)
+
+
+def followed(weights: Array) -> NDArray[np.intp]:
+    """The transitions that have a weight."""
+    return np.flatnonzero(np.any(weights != 0, axis=(0, 1, 3)))
 
 
 def _turned(x: Above) -> Above:
@@ -160,7 +196,7 @@ def narrowed(flows: Flows, box: Intervals, rounds: Sequence[Round]) -> tuple[Int
     """The last of the boxes that rounds state, or None if that has nothing, and the number of rounds that show what
     they state: all, or those before the first that does not."""
     for number, stated in enumerate(rounds):
-        chosen = np.flatnonzero(np.any(stated.weights != 0, axis=(0, 1, 3)))
+        chosen = followed(stated.weights)
         if not (len(chosen) and all(map(_holds, stated.box, flows.after(box, stated.weights, chosen)))):
             return box, number
         if any(lo > hi for lo, hi in stated.box):
@@ -201,8 +237,9 @@ def in_ranges(case: Case) -> Failures:
         yield "claim.data", "no parameter is consistent with the measurements: nothing is claimed"
     else:
         ranges = dict(zip(case.c.uncertain, case.c.ranges, strict=True))
-        for name, pair in zip(data.parameters, whole, strict=True):
-            if not _holds(ranges[name], pair):
+        left_of = whole if data.turned is None else flows.turned(whole, data.turned)
+        for k, name in enumerate(data.constants):
+            if left_of is None or not _holds(ranges[name], left_of[k]):
                 yield name, "its range must hold all that the measurements leave of the prior"
     return sum(map(len, data.leaves)) + len(data.rounds)
 

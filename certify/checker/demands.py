@@ -65,11 +65,12 @@ def of_data(sizes: Sizes) -> int:
     if data is None:
         return 0
     rounds = len(data.rounds) + sum(map(len, data.leaves))
+    rounds += data.turned is not None
     k, followed, a = len(data.parameters), rounds * data.transitions, sizes.c.dynamics.size
     times = 2 * data.order**3 + 8 if data.period else 1
     models = data.pieces * (a * times + 4 * sizes.n)
     found = sizes.boxes(followed, models, a * (data.order + 1), sizes.n + k, 0)
-    found += 2**6 * k * followed * sizes.n * (sizes.n + k + 2**6)
+    found += 2**6 * max(k, len(data.axes)) * followed * sizes.n * (sizes.n + k + 2**6)
     return found + 2**17 * rounds * data.order * data.pieces * (a + 4 * sizes.n)  # however few transitions are left
 
 

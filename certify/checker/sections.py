@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Set
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from .document import (
     EMPTY,
@@ -33,6 +33,7 @@ MAX_CONSTRAINTS, MAX_MEMORY = 64, 16
 MAX_RANK = 2**16 - 1  # that rank is none
 TAKING_OVER = ("asymptotic", "nearby")
 MAX_TRANSITIONS, MAX_ROUNDS, MAX_PARTS = 2**16, 64, 4096  # of data; rounds of a part of the priors
+MAX_PARAMETERS = 64  # of axes
 
 
 Faces = Annotated[tuple[bytes, ...], lambda value, sizes: value.listed(Value.octets, 2 * sizes["n"])]
@@ -171,33 +172,50 @@ def _pieces(value: Value, sizes: Mapping[str, int]) -> int:
     return value.integer(1, sizes["pieces"])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Shown:
     """The evidence of data. A transition is followed in so many `pieces`, with a series in time of an `order`. The
-    priors are partitioned by a tree; each of its `leaves` has rounds, and so has what these leave of the priors."""
+    priors are partitioned by a tree; each of its `leaves` has rounds, and so has what these leave of the priors;
+    `turned` are weights for the axes, of which there may be none."""
 
     order: Order
     pieces: Annotated[int, _pieces]
     tree: Octets
     leaves: Annotated[tuple[tuple[Round, ...], ...], _leaves]
     rounds: Annotated[tuple[Round, ...], _rounds]
+    turned: Annotated[Array | None, shaped(2, "J", "T", "n")] = None
 
 
-@dataclass(frozen=True)
+class Axis(NamedTuple):
+    """A quantity `at + sum_k by_k p_k` of the parameters."""
+
+    name: str
+    at: Fraction
+    by: tuple[Fraction, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Data(Shown):
     """Measurements on which ranges of parameters rest, with the multipliers that show it.
 
     A run has states (T + 1, n), within `noise` of the true ones, and the inputs (T, m) that are held in between, for a
-    time in `period`, or for a step where that is None; measured is `origin` + x.
+    time in `period`, or for a step where that is None; measured is `origin` + x. Without `axes` the parameters are
+    uncertain quantities of the plant; else those are.
     """
 
     sha256: str  # of the file that they come from
     parameters: tuple[str, ...]
     priors: Intervals
+    axes: tuple[Axis, ...]
     period: tuple[Fraction, Fraction] | None
     origin: tuple[Fraction, ...]
     noise: tuple[Fraction, ...]
     runs: tuple[tuple[Array, Array], ...]
+
+    @property
+    def constants(self) -> tuple[str, ...]:
+        """The uncertain quantities that the parameters are, or that are sums of these."""
+        return tuple(axis.name for axis in self.axes) or self.parameters
 
     @property
     def transitions(self) -> int:
@@ -296,10 +314,17 @@ def _trusted(shown: Mapping[str, Value]) -> Trusted:
 def _data(claim: Value, evidence: Value, c: Certificate) -> Data:
     n, m = len(c.states), len(c.inputs)
     claim.must(not c.dynamics.calls, "missing where the equations call a network")
-    sha256, priors, period, origin, noise, runs = claim.keys("sha256 parameters period origin noise runs")
-    quantities = priors.listed(quantity, 1, len(c.uncertain))
+    said = claim.entries("sha256 parameters period origin noise runs", "axes")
+    sha256, priors, period, origin, noise, runs = list(said.values())[:6]
+    quantities = priors.listed(quantity, 1, MAX_PARAMETERS if "axes" in said else len(c.uncertain))
     names = tuple(name for name, _ in quantities)
-    priors.must({*names} <= {*c.uncertain} and len({*names}) == len(names), "different uncertain quantities")
+    axes = said["axes"].listed(lambda axis: _axis(axis, len(names)), 1, len(c.uncertain)) if "axes" in said else ()
+    if axes:
+        new = not {*names} & {*c.states, *c.inputs, *c.uncertain} and len({*names}) == len(names)
+        priors.must(new, "different names of nothing in the plant, where there are axes")
+    constant = tuple(axis.name for axis in axes) or names
+    known = {*constant} <= {*c.uncertain} and len({*constant}) == len(constant)
+    (said["axes"] if axes else priors).must(known, "different uncertain quantities")
     times = None if period.raw is None else _periods(period)
     positive = times is not None and times[0] > 0
     period.must(positive is not c.discrete and (times is None) is c.discrete, "null in discrete time, else positive")
@@ -309,9 +334,11 @@ def _data(claim: Value, evidence: Value, c: Certificate) -> Data:
     errors = noise.listed(Value.rational, n)
     noise.must(min(errors) >= 0, "at least 0")
     most = (1, 1) if c.discrete else (MAX_ORDER, MAX_CUTS)
-    by = section(evidence, Shown, n=n, K=len(names), T=count, order=most[0], pieces=most[1])
+    by = section(evidence, Shown, n=n, K=len(names), J=len(axes), T=count, order=most[0], pieces=most[1])
+    evidence.must((by.turned is not None) is bool(axes), "an object with `turned` if the claim has axes, and only then")
     return Data(
         **vars(by),
+        axes=axes,
         sha256=sha256.text("[0-9a-f]{64}", "64 hexadecimal digits"),
         parameters=names,
         priors=tuple(pair for _, pair in quantities),
@@ -320,6 +347,11 @@ def _data(claim: Value, evidence: Value, c: Certificate) -> Data:
         noise=errors,
         runs=measured,
     )
+
+
+def _axis(value: Value, count: int) -> Axis:
+    name, at, by = value.keys("name at by")
+    return Axis(name.name(), at.rational(), by.listed(Value.rational, count))
 
 
 def _run(value: Value, n: int, m: int) -> tuple[Array, Array]:

@@ -77,6 +77,12 @@ def _without_a_model() -> Bundle:
     return Bundle({one.name: one for one in options}, linear_from)
 
 
+Rotate = Annotated[
+    bool,
+    typer.Option("--rotate", help="Write the plant in axes, where data bound sums of parameters closer than each."),
+]
+
+
 @takes(environment=_of_environment(), linear=_without_a_model())
 def identify(
     data: Annotated[
@@ -101,6 +107,7 @@ def identify(
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="Plant with the ranges that are left; a page lies beside it.")
     ] = Path("known.toml"),
+    rotate: Rotate = False,
     environment: dict[str, Any],
     linear: Any,  # a LinearStructure or None
     as_json: Json = False,
@@ -119,10 +126,8 @@ def identify(
     note = noting(quiet)
     if out.suffix != ".toml":
         raise InputError(f"--out must be a .toml file; found {out}.")
-    period, bounds = (
-        None if sample_time is None else value_or_range(sample_time, "sample_time"),
-        bound_or_bounds(noise, "noise"),
-    )
+    period = None if sample_time is None else value_or_range(sample_time, "sample_time")
+    bounds = bound_or_bounds(noise, "noise")
     structure = structure_for(data, structure, linear, out, period, bounds)
     system = load_system(structure)
     source = _recorded(data, environment, system, out, note)
@@ -130,7 +135,7 @@ def identify(
     for line in readings.notes:
         note(line)
     try:
-        result = identify_plant(measured, readings, source.name, structure, out)
+        result = identify_plant(measured, readings, source.name, structure, out, rotate)
     except Contradiction as error:
         note("looking for what the equations lack")
         _refuted(error, measured, readings, source, as_json)
@@ -222,7 +227,7 @@ def _summary(result: IdentifyResult) -> RenderableType:
             name,
             result.system.units.get(name, ""),
             _interval(prior),
-            _interval(result.system.ranges[name]),
+            _interval(result.known.ranges[name]),
             f"{result.shrink(name):.3g} x",
             by,
         )
@@ -248,6 +253,10 @@ def _rows(result: IdentifyResult) -> list[tuple[str, str]]:
         rows.append(("period", " to ".join(dict.fromkeys(f"{float(h):g}" for h in data.period))))
     if result.not_narrowed():
         rows.append(("not narrowed", f"{', '.join(result.not_narrowed())}: {result.next_step()}"))
+    if data.axes:
+        rows.append(
+            ("axes", f"{len(data.axes)}, whose box is {result.smaller:.3g} times smaller than that of the ranges")
+        )
     if axis is not None:
         rows.append(("least determined", direction_in_words(axis.entries, axis.share)))
         rows.append(("to narrow it", f"more like {result.readings.places[axis.telling]}: {result.at(axis.telling)}"))

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any
 
-from .document import MAX_BYTES, Certificate
+from .document import MAX_BYTES, Certificate, Data
 from .evidence import INVARIANT, WITHOUT_V, Tree
 from .limits import MAX_IN_PATIENCE
 from .rules import Verdict, judge
@@ -152,8 +152,17 @@ def measured(c: Certificate) -> str:
     return (
         f"; and of all constants {constants} none is consistent with the {data.steps} transitions in {len(data.runs)} "
         f"runs that the certificate states (sha256 of their file {data.sha256}; measured {around}{when}), unless it "
-        f"lies in these ranges"
+        f"lies in these ranges{turned(data)}"
     )
+
+
+def turned(data: Data) -> str:
+    """The words for quantities that are sums of parameters."""
+    each = [
+        f"{axis.name} = {axis.at}" + "".join(f" + ({by}) {p}" for by, p in zip(axis.by, data.parameters, strict=True))
+        for axis in data.axes
+    ]
+    return f" with {', '.join(each)}" if each else ""
 
 
 def sampled(c: Certificate) -> str:

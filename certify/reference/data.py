@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from flint import arb, arb_mat
 
 from .balls import ONE, ZERO, total
-from .document import Certificate, Data, Interval
+from .document import Axis, Certificate, Data, Interval
 from .evidence import Fit, Round
 from .fields import exact
 from .flow import Moving, mean_on, moved_within
@@ -46,6 +46,15 @@ def data(c: Certificate, fit: Fit) -> None:
     if last is None:
         raise Refused(RULE, "data", "no parameters of the priors are consistent with what was measured")
     ranges = dict(zip(c.plant.uncertain, c.plant.ranges, strict=True))
+    if fit.turned is not None:
+        require(any(fit.turned), RULE, "data turned", "every multiplier is 0")
+        there = Measured(c, c.data, fit, last, "data turned")
+        bounds = there.bounds(fit.turned, [slopes for _, slopes in there.axes])
+        for axis, (middle, _), (below, above) in zip(c.data.axes, there.axes, bounds, strict=True):
+            least, most = map(arb, ranges[axis.name])
+            good = is_at_most(least, middle + below) and is_at_most(middle + above, most)
+            require(good, RULE, axis.name, "it is not certain to lie in its range")
+        return
     for name, (lo, hi) in zip(c.data.parameters, last, strict=True):
         least, most = ranges[name]
         require(bool(least <= lo) and bool(hi <= most), RULE, name, "it is not certain to lie in its range")
@@ -134,8 +143,13 @@ class Measured:
         self.symbols = self.n + self.K + self.varies
         self.noise, self.origin = [arb(q) for q in data.noise], [arb(q) for q in data.origin]
         self.quantities = {q: number_in(ends) for q, ends in zip(c.plant.uncertain, c.plant.ranges, strict=True)}
+        self.axes = [on_axis(axis, box) for axis in data.axes]
+        for axis, (middle, by) in zip(data.axes, self.axes, strict=True):
+            slopes = [by.get(k - self.n, ZERO) for k in range(self.symbols)]
+            self.quantities[axis.name] = Taylor(middle, arb_mat(1, self.symbols, slopes))
         for j, (name, (lo, hi)) in enumerate(zip(data.parameters, box, strict=True)):
-            self.quantities[name] = self.moving(arb((lo + hi) / 2), self.n + j, arb((hi - lo) / 2))
+            if not data.axes:
+                self.quantities[name] = self.moving(arb((lo + hi) / 2), self.n + j, arb((hi - lo) / 2))
 
     def moving(self, middle: arb, symbol: int, size: arb) -> Taylor:
         return Taylor(middle, arb_mat(1, self.symbols, [size if k == symbol else ZERO for k in range(self.symbols)]))
@@ -143,15 +157,17 @@ class Measured:
     def narrows(self, stated: Round) -> None:
         """By the multipliers no consistent parameters are beyond the stated box, or a refusal."""
         require(any(stated.weights), RULE, self.at, "every multiplier is 0")
-        each = zip(self.data.parameters, self.box, *halves(stated.box), self.bounds(stated.weights), strict=True)
+        bounds = self.bounds(stated.weights, [{j: ONE} for j in range(self.K)])
+        each = zip(self.data.parameters, self.box, *halves(stated.box), bounds, strict=True)
         for name, (lo, hi), least, most, (below, above) in each:
-            bounded = exact(least) <= lo or is_at_most(arb(least), below)
+            middle, half = arb((lo + hi) / 2), arb((hi - lo) / 2)
+            bounded = exact(least) <= lo or is_at_most(arb(least), middle + half * below)
             require(bounded, RULE, f"{self.at} {name}", "a consistent one may be below the lower end of the box")
-            bounded = hi <= exact(most) or is_at_most(above, arb(most))
+            bounded = hi <= exact(most) or is_at_most(middle + half * above, arb(most))
             require(bounded, RULE, f"{self.at} {name}", "a consistent one may be above the upper end of the box")
 
-    def bounds(self, weights: array[float]) -> Iterator[tuple[arb, arb]]:
-        """Numbers below and above all that are consistent, for each parameter, by a round's multipliers."""
+    def bounds(self, weights: array[float], sums: Sequence[Mapping[int, arb]]) -> Iterator[tuple[arb, arb]]:
+        """Numbers below and above sums of the parameters' symbols, for all that are consistent, by multipliers."""
         size, found = self.data.steps * self.n, dict[int, Residual]()
         rows = [weights[k : k + size] for k in range(0, len(weights), size)]
         for t in transitions(self.data):
@@ -161,11 +177,10 @@ class Measured:
                     found.update(enumerate(self.residuals(t), first))
                 except Refused:  # a bound with it is no number, and says nothing
                     found.update((first + i, NO_NUMBER) for i in range(self.n))
-        for j, ((lo, hi), below, above) in enumerate(zip(self.box, rows[: self.K], rows[self.K :], strict=True)):
-            middle, half = arb((lo + hi) / 2), arb((hi - lo) / 2)
-            reach, shift = combined(j, below, found)
-            further, other = combined(j, above, found)
-            yield middle + half * (-reach - shift), middle + half * (further - other)
+        for a, below, above in zip(sums, rows[: len(sums)], rows[len(sums) :], strict=True):
+            reach, shift = combined(a, below, found)
+            further, other = combined(a, above, found)
+            yield -reach - shift, further - other
 
     def residuals(self, t: Transition) -> Iterator[Residual]:
         """The residual of each state: its value at the end, less the measured one and the noise."""
@@ -215,9 +230,16 @@ def number_in(ends: Interval) -> Taylor:
     return Taylor(arb((lo + hi) / 2), r=arb((hi - lo) / 2))
 
 
-def combined(j: int, w: Sequence[float], found: Mapping[int, Residual]) -> tuple[arb, arb]:
-    """A reach and a shift: by the residuals with these multipliers d_j + shift lies within reach of 0."""
-    left, slack, shift = {j: ONE}, ZERO, ZERO
+def on_axis(axis: Axis, box: Box) -> tuple[arb, dict[int, arb]]:
+    """The value of an axis in the middle of a box, and its slopes by the symbols of the parameters there."""
+    each = [(arb(by), (lo + hi) / 2, (hi - lo) / 2) for by, (lo, hi) in zip(axis.by, box, strict=True)]
+    middle = arb(axis.at) + total(by * arb(centre) for by, centre, _ in each)
+    return middle, {j: by * arb(half) for j, (by, _, half) in enumerate(each)}
+
+
+def combined(a: Mapping[int, arb], w: Sequence[float], found: Mapping[int, Residual]) -> tuple[arb, arb]:
+    """A reach and a shift: by the residuals with these multipliers a.d + shift lies within reach of 0."""
+    left, slack, shift = dict(a), ZERO, ZERO
     for k, each in enumerate(w):
         if each == 0:
             continue

@@ -7,7 +7,7 @@ import json
 import math
 import re
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -106,8 +106,18 @@ class Run:
 
 
 @dataclass(frozen=True)
+class Axis:
+    """An uncertain quantity that is a number `at` and multiples `by` of the parameters."""
+
+    name: str
+    at: fmpq
+    by: tuple[fmpq, ...]
+
+
+@dataclass(frozen=True)
 class Data:
-    """Measurements from which the ranges of some uncertain quantities follow, that are constant and in their `priors`.
+    """Measurements from which the ranges of some uncertain quantities follow, that are constant: parameters in their
+    `priors`, or where there are `axes` these, of parameters that stand nowhere else.
 
     A measured state is within `noise` of `origin` + x, a transition takes a time in `period`, None in discrete time.
     """
@@ -119,6 +129,7 @@ class Data:
     origin: tuple[fmpq, ...]
     noise: tuple[fmpq, ...]
     runs: tuple[Run, ...]
+    axes: tuple[Axis, ...]
 
     @property
     def steps(self) -> int:
@@ -245,7 +256,11 @@ def read_sections(value: Any, claims: tuple[str, ...]) -> Certificate:
     least = floor[0] if floor else None
     further = beyond is not None
     longer = sample is not None and not plant.dynamics.calls  # a series goes through no network
-    fitted = None if measured is None else Fitted(len(measured.parameters), measured.steps * n, plant.discrete)
+    fitted = (
+        None
+        if measured is None
+        else Fitted(len(measured.parameters), measured.steps * n, plant.discrete, len(measured.axes))
+    )
     evidence = read_evidence(
         data["evidence"],
         n,
@@ -323,16 +338,22 @@ def read_data(value: Any, plant: Plant, claim: str) -> Data:
     at, n, m = "claim.data", len(plant.states), len(plant.inputs)
     require(claim != "reached", "format", at, "it was not expected with a tube along a path")
     require(not plant.dynamics.calls, "format", at, "it was not expected where the equations call a network")
-    data = keys(value, at, "sha256", "parameters", "period", "origin", "noise", "runs")
+    data = keys(value, at, "sha256", "parameters", "period", "origin", "noise", "runs", maybe=("axes",))
     sha256 = data["sha256"]
     named = isinstance(sha256, str) and SHA256.fullmatch(sha256) is not None
     require(named, "format", f"{at}.sha256", "64 hexadecimal digits were expected")
     stated = entries(data["parameters"], f"{at}.parameters")
     stated = [keys(each, f"{at}.parameters.{j}", "name", "range") for j, each in enumerate(stated)]
     names = tuple(each["name"] for each in stated)
-    known = len(names) >= 1 and all(isinstance(name, str) and name in plant.uncertain for name in names)
-    different = known and len(set(names)) == len(names)
-    require(different, "format", f"{at}.parameters", "different uncertain quantities were expected, at least one")
+    if "axes" in data:
+        free = all(isinstance(name, str) and IDENTIFIER.fullmatch(name) for name in names)
+        free = free and not {*plant.states, *plant.inputs, *plant.uncertain} & {*names} and len(names) <= MAX_NAMES
+        require(free, "format", f"{at}.parameters", "names that the plant has not were expected, as there are axes")
+        require(distinct(names, names), "format", f"{at}.parameters", "different names were expected")
+    else:
+        known = distinct(names, plant.uncertain)
+        require(known, "format", f"{at}.parameters", "different uncertain quantities were expected, at least one")
+    axes = read_axes(data["axes"], f"{at}.axes", plant, len(names)) if "axes" in data else ()
     priors = tuple(interval(each["range"], f"{at}.parameters.{j}.range") for j, each in enumerate(stated))
     period = read_period(data["period"], plant.discrete)
     origin = tuple(rational(q, f"{at}.origin.{i}") for i, q in enumerate(entries(data["origin"], f"{at}.origin", n)))
@@ -342,10 +363,27 @@ def read_data(value: Any, plant: Plant, claim: str) -> Data:
     require(1 <= len(runs) <= MAX_STEPS, "format", f"{at}.runs", f"1 to {MAX_STEPS} runs are allowed")
     read = Data(
         sha256, names, priors, period, origin, noise,
-        tuple(read_run(run, f"{at}.runs.{k}", n, m) for k, run in enumerate(runs)),
+        tuple(read_run(run, f"{at}.runs.{k}", n, m) for k, run in enumerate(runs)), axes,
     )  # fmt: skip
     require(read.steps <= MAX_STEPS, "format", f"{at}.runs", f"more than {MAX_STEPS} steps in all")
     return read
+
+
+def distinct(names: Sequence[Any], among: Sequence[str]) -> bool:
+    """True for one or more different strings, each of which is one of some."""
+    known = all(isinstance(name, str) and name in among for name in names)
+    return known and 1 <= len(names) == len(set(names))
+
+
+def read_axes(value: Any, at: str, plant: Plant, count: int) -> tuple[Axis, ...]:
+    found = list[Axis]()
+    for j, each in enumerate(entries(value, at)):
+        axis, place = keys(each, f"{at}.{j}", "name", "at", "by"), f"{at}.{j}.by"
+        by = tuple(rational(q, place) for q in entries(axis["by"], place, count))
+        found.append(Axis(axis["name"], rational(axis["at"], f"{at}.{j}.at"), by))
+    known = distinct([axis.name for axis in found], plant.uncertain)
+    require(known, "format", at, "different uncertain quantities were expected, at least one")
+    return tuple(found)
 
 
 def read_period(value: Any, discrete: bool) -> Interval | None:

@@ -121,7 +121,8 @@ class Round:
 
 @dataclass(frozen=True)
 class Fit:
-    """Rounds for each leaf of a tree over the priors, and for all that they leave.
+    """Rounds for each leaf of a tree over the priors, and for all that they leave; where there are axes, `turned` has
+    the multipliers of these.
 
     A transition is followed in `pieces` series of this order.
     """
@@ -131,6 +132,7 @@ class Fit:
     tree: bytes
     leaves: tuple[tuple[Round, ...], ...]
     rounds: tuple[Round, ...]
+    turned: array[float] | None
 
 
 @dataclass(frozen=True)
@@ -175,11 +177,12 @@ class Trusted:
 
 
 class Fitted(NamedTuple):
-    """Sizes of measurements: the number of `parameters`, that of `measured` states at the ends of transitions."""
+    """Numbers of `parameters`, of `measured` states at the ends of transitions, and of `axes`."""
 
     parameters: int
     measured: int
     discrete: bool
+    axes: int
 
 
 def read_evidence(
@@ -259,7 +262,7 @@ def read_ranking(value: Any, n: int) -> Ranking:
 def read_fit(value: Any, fitted: Fitted) -> Fit:
     """In discrete time there is no series."""
     at = "evidence.data"
-    data = keys(value, at, "order", "pieces", "tree", "leaves", "rounds")
+    data = keys(value, at, "order", "pieces", "tree", "leaves", "rounds", *(("turned",) if fitted.axes else ()))
     order, pieces = read_order(data["order"], f"{at}.order", not fitted.discrete), data["pieces"]
     most = 1 if fitted.discrete else MAX_PIECES
     good = type(pieces) is int and 1 <= pieces <= most  # True is an int to isinstance
@@ -267,7 +270,10 @@ def read_fit(value: Any, fitted: Fitted) -> Fit:
     tree, leaves = decoded(data["tree"], f"{at}.tree"), entries(data["leaves"], f"{at}.leaves")
     require(1 <= len(leaves) <= MAX_LEAVES, "format", f"{at}.leaves", f"1 to {MAX_LEAVES} leaves are allowed")
     each = tuple(read_rounds(rounds, f"{at}.leaves.{k}", fitted) for k, rounds in enumerate(leaves))
-    return Fit(order, pieces, tree, each, read_rounds(data["rounds"], f"{at}.rounds", fitted))
+    size, turned = 2 * fitted.axes * fitted.measured, None
+    if fitted.axes:
+        turned = numbers(data["turned"], f"{at}.turned", size)
+    return Fit(order, pieces, tree, each, read_rounds(data["rounds"], f"{at}.rounds", fitted), turned)
 
 
 def read_rounds(value: Any, at: str, fitted: Fitted) -> tuple[Round, ...]:

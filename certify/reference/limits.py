@@ -264,12 +264,12 @@ def of_data(c: Certificate, z: Sizes, evidence: Tree) -> int:
     if data is None or fit is None:
         return 0
     a, count = len(c.plant.dynamics.steps), len(data.parameters)
-    rounds = len(fit.rounds) + sum(map(len, fit.leaves))
+    rounds = len(fit.rounds) + sum(map(len, fit.leaves)) + bool(data.axes)
     transitions = data.steps * rounds
     series, symbols = 1 if c.plant.discrete else 2 * fit.order**3 + 8, z.n + count
     work = on_boxes(transitions, z.n, fit.pieces * (a * series + 4 * z.n), a * (fit.order + 1), symbols, 0)
     work += 2**17 * rounds * fit.order * fit.pieces * (a + 4 * z.n)
-    return work + 2**6 * count * transitions * z.n * (symbols + 2**6)
+    return work + 2**6 * max(count, len(data.axes)) * transitions * z.n * (symbols + 2**6)
 
 
 def of_samples(c: Certificate) -> int:

@@ -55,7 +55,7 @@ class Measured:
             return None
         return cls(
             priors=data.priors,
-            ranges={name: system.ranges[name] for name in data.priors if name in system.ranges},
+            ranges={name: system.ranges[name] for name in data.constants if name in system.ranges},
             units=system.units,
             noise={s.name: w for s, w in zip(system.states, data.noise, strict=True)},
             period=data.period,
@@ -114,7 +114,7 @@ class Measured:
 
     def others(self, quantities: Sequence[Varying]) -> list[Varying]:
         """The uncertain quantities that are no parameters of the data."""
-        return [q for q in quantities if q.name not in self.priors]
+        return [q for q in quantities if q.name not in self.ranges]
 
     def _named(self, name: str, ends: str) -> str:
         return f"{symbol(name)} in {ends} {pretty_unit(self.units.get(name, ''))}".rstrip()

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from certify import System, get_system
+from certify import System, get_system, load_policy
 
 Array = NDArray[np.float64]
 REACH = {  # of the states from which transitions begin
@@ -41,6 +41,7 @@ def main() -> None:
     parser.add_argument("--noise", type=float, default=1e-3)
     parser.add_argument("--reach", help="of states and then inputs, 1,0.1,2,2,10; by default far, and all inputs")
     parser.add_argument("--friction", type=float, default=0.0, help="D tanh(10 v) less of u, of pendulum or cartpole")
+    parser.add_argument("--policy", help="file of a policy that acts; by default inputs are random")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     plant, draw = get_system(given.plant), np.random.default_rng(given.seed)
@@ -50,8 +51,12 @@ def main() -> None:
     lo, hi = np.array([[float(end) for end in pair] for pair in plant.input_bounds]).T
     lo, hi = ([-1, 1] * np.array(reach[plant.n :])[:, None]).T if given.reach else (lo, hi)
     x, u = [draw.uniform(-1, 1, (runs, plant.n)) * reach[: plant.n]], draw.uniform(lo, hi, (length, runs, plant.m))
-    for held in u:
+    act = load_policy(given.policy).network if given.policy else None
+    for k in range(length):
         y = x[-1]
+        if act is not None:
+            u[k] = np.array([act(row, plant.exact_u_eq()) for row in y])
+        held = u[k]
         for _ in range(STEPS):  # Runge and Kutta's method, whose error here is far below the noise
             k1 = f(y, held)
             k2 = f(y + h / 2 * k1, held)

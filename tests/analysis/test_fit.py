@@ -17,6 +17,7 @@ from certify import RoaResult, certify_roa, compose
 from certify.analysis.fitting import linear
 from certify.analysis.fitting.linear import Contradicted, beyond, slopes
 from certify.analysis.fitting.polynomial import bounded, errors, fitted
+from certify.analysis.fitting.possible import require_possible
 from certify.analysis.fitting.run import fit_plant
 from certify.analysis.stated import stated
 from certify.certificates import Certificate, parse_certificate
@@ -273,11 +274,40 @@ def test_samples_may_bend_as_much_as_is_declared(M: Fraction, noise: Fraction) -
     axis = tuple(Fraction(k, 10) for k in (-10, -6, -5, 1, 2, 10))
     values = {(z,): M * z * z / 2 + noise * (-1) ** k for k, z in enumerate(axis)}
     grid, less = Grid((axis,), values), Fraction(1, 10**12)
-    linear.require_possible(Unknown("y", ("z",), ((M,),)), grid, noise)
+    require_possible(Unknown("y", ("z",), ((M,),)), grid, noise)
     for bent, off in ((M - less, noise), (M, noise - less)):
         if off >= 0:
             with pytest.raises(Contradicted, match="bends more along z"):
-                linear.require_possible(Unknown("y", ("z",), ((bent,),)), grid, off)
+                require_possible(Unknown("y", ("z",), ((bent,),)), grid, off)
+
+
+@pytest.mark.parametrize("M", [Fraction(2), Fraction(1, 3)])
+@pytest.mark.parametrize("noise", [Fraction(0), Fraction(1, 10)])
+def test_samples_may_bend_along_two_variables_as_much_as_is_declared(M: Fraction, noise: Fraction) -> None:
+    """M y z, and beside it 5 x, with all the noise at the corners of the whole grid against each other. Of noise no
+    rectangle but the largest shows that a bound is a bit too small."""
+    x, y, z = (
+        (Fraction(-1), Fraction(2)),
+        tuple(map(Fraction, (-3, -1, 0, 1, 4))),
+        tuple(map(Fraction, (-2, 0, 1, 5))),
+    )
+    values = {
+        (a, b, c): 5 * a + M * b * c + noise * ((b in (-3, 4)) and (c in (-2, 5))) * (1 if b * c > 0 else -1)
+        for a, b, c in product(x, y, z)
+    }
+    grid, less = Grid((x, y, z), values), Fraction(1, 10**6)
+
+    def asked(bent: Fraction, off: Fraction) -> None:
+        along = ((0, 0, 0), (0, 10, bent), (0, bent, 10))
+        one = Unknown("v", ("x", "y", "z"), tuple(tuple(map(Fraction, row)) for row in along))
+        require_possible(one, grid, off)
+
+    asked(M, noise)
+    for bent, off in ((M - less, noise), (M, noise - less)):
+        if off >= 0:
+            where = "x = -1, y = -3, z = -2 to x = -1, y = 4, z = 5" if noise else ""
+            with pytest.raises(Contradicted, match=f"v bends more along y and z from {where}"):
+                asked(bent, off)
 
 
 @pytest.mark.slow

@@ -55,6 +55,25 @@ def test_a_residual_that_is_too_small_is_refuted(tmp_path: Path) -> None:
         found(tmp_path, rows, LinearStructure(second={"theta_dot": "0.01*theta**2"}))
 
 
+def test_the_least_share_of_what_is_beyond_the_linear_part(tmp_path: Path) -> None:
+    """With two terms, scaled by one factor: the factor that is refuted is refuted as a bound by itself."""
+    draw, prior = np.random.default_rng(1), {"A21": (0, 40), "A22": (-9, 3), "B21": (10, 50)}
+    x, u = draw.uniform(-1, 1, (100, 2)) * [1.5, 0.4], draw.uniform(-2, 2, (100, 1))
+    rows, bound = np.hstack([x, u, simulated(x, u)]), "{}*theta**2 + {}*theta*u"
+
+    def of(factor: float) -> certify.IdentifyResult:
+        second = {"theta_dot": bound.format(10 * factor, 0.1 * factor)}
+        return found(tmp_path, rows, LinearStructure(second=second, prior=prior))  # type: ignore[arg-type]
+
+    (least,) = of(1).least_residual
+    assert least.open is not None
+    refuted, open_ = least.refuted["theta_dot"], least.open["theta_dot"]
+    assert 0.02 < refuted < open_ < 1.1 * refuted < 0.5
+    with pytest.raises(Contradiction):
+        of(refuted)
+    of(open_)
+
+
 def test_the_structure_is_a_plant_of_its_own(tmp_path: Path) -> None:
     linear = LinearStructure(
         second={"theta_dot": "10*theta**2 + 0.1*abs(theta)*u**2"}, prior={"theta_dot": Fraction(40), "A22": (-9, 3)},  # type: ignore[dict-item]

@@ -43,6 +43,14 @@ SCALAR = Experiment(
     ("1/1000",), ("0",),
 )  # fmt: skip
 STEPS = replace(SCALAR, f=lambda x, u, p: [p[0] * x[0] + u[0]], period=None, order=1, drift=0.01)
+TURNED = replace(
+    SPRING, f=lambda x, u, p: spring(x, u, (p[0] + p[1], p[0] / 2 - p[1] + 0.5)), names=("s", "d"), truth=(0.99, 0.03),
+    priors=(("9/10", "11/10"), ("-1/10", "1/10")), axes=(("m", "0", ("1", "1")), ("b", "1/2", ("1/2", "-1"))),
+)  # fmt: skip
+SUM = replace(
+    SCALAR, f=lambda x, u, p: [(p[0] + p[1]) * x[0] + u[0]], names=("a", "b"), truth=(0.35, 0.25),
+    priors=(("0", "1/2"), ("0", "1/2")), axes=(("q", "0", ("1", "1")),),
+)  # fmt: skip
 HALVES = bytes([0, 255, 0, 255, 255])
 
 
@@ -86,6 +94,12 @@ TRUE: dict[str, tuple[Experiment, Claim]] = {
     "with ranks": (replace(STEPS, priors=(("2/5", "13/20"),), drift=0.0), ranked),
     "held": (replace(SCALAR, rounds=1), held),
     "pieces": (replace(SCALAR, order=5, pieces=4), of_scalar),
+    "axes": (TURNED, of_spring),
+    "an axis of two parameters": (SUM, of_scalar),
+    "an axis in steps": (
+        replace(STEPS, f=SUM.f, names=SUM.names, truth=SUM.truth, priors=SUM.priors, axes=SUM.axes),
+        of_steps,
+    ),
 }
 
 
@@ -368,6 +382,125 @@ def test_forgeries_of_the_data(name: str) -> None:
     assert verdicts(OF_DATA[name](true("spring"))) == ("data", "data")
 
 
+# ---------------------------------------------------------------------------------------------------------------- axes
+
+WEIGHTS: dict[str, Callable[[np.random.Generator, Any], Any]] = {
+    "nearly": lambda chance, w: w * (1 + 1e-3 * chance.standard_normal(w.shape)),
+    "any": lambda chance, w: chance.standard_normal(w.shape) * chance.choice([1.0, 1e2, 1e4]),
+    "few": lambda chance, w: np.where(chance.random(w.shape) < 0.1, w, 0.0) + w[0] * 1e-300,
+    "huge": lambda chance, w: chance.choice([1.0, -1.0, 0.5, -0.5, 0.0], w.shape) * 1.7e308,
+    "huge, of both signs": lambda chance, w: np.sign(w) * chance.choice([1.7e308, 1e308, 1e150], w.shape),
+    "tiny": lambda chance, w: chance.choice([5e-324, -5e-324, 1e-310], w.shape),
+}
+AXES, TURN, BY = f"{SAID}.axes", f"{FIT}.turned", f"{SAID}.axes.0.by"
+OF_AXES_FORMAT: dict[str, Edit] = {
+    "no axes": without(SAID, "axes"),
+    "axes that are empty": put(AXES, []),
+    "axes that are null": put(AXES, None),
+    "no multipliers": without(FIT, "turned"),
+    "multipliers that are null": put(TURN, None),
+    "multipliers of one axis": array(TURN, lambda w: w[: len(w) // 2]),
+    "multipliers that are no numbers": array(TURN, lambda w: np.nan * w),
+    "an axis less": put(AXES, lambda axes: axes[:1]),
+    "an axis twice": put(f"{AXES}.1.name", "m"),
+    "an axis that the plant does not have": put(f"{AXES}.0.name", "s"),
+    "an axis that is a state": put(f"{AXES}.0.name", "x"),
+    "an axis that is a list": put(f"{AXES}.0.name", ["m"]),
+    "an axis of another key": put(f"{AXES}.0.from", "0"),
+    "an axis without a place": without(f"{AXES}.0", "at"),
+    "a place in decimals": put(f"{AXES}.0.at", "0.5"),
+    "a factor in decimals": put(f"{BY}.0", "1.5"),
+    "a factor that is divided by 0": put(f"{BY}.0", "1/0"),
+    "a factor less": put(BY, ["1"]),
+    "a factor more": put(BY, ["1", "1", "0"]),
+    "a parameter that is a quantity": put(f"{PRIOR}.0.name", "m"),
+    "a parameter that is a state": put(f"{PRIOR}.0.name", "x"),
+    "a parameter that is an input": put(f"{PRIOR}.0.name", "u"),
+    "a parameter twice": put(f"{PRIOR}.1.name", "s"),
+    "a parameter that is no name": put(f"{PRIOR}.1.name", "2 d"),
+    "a parameter that is a number": put(f"{PRIOR}.1.name", 2),
+    "no parameters": lambda data: put(f"{AXES}.1.by", [])(put(BY, [])(put(PRIOR, [])(data))),
+}
+
+
+def turned(change: Callable[[Any], Any]) -> Edit:
+    """An edit of the axes' multipliers, (2, 2, 20, 2)."""
+    return array(TURN, lambda w: change(w.reshape(2, 2, 20, 2)))
+
+
+OF_AXES: dict[str, Edit] = {
+    "a range narrower from below": ends(f"{M}.range", (TINY, 0.0)),
+    "a range narrower from above": ends(f"{M}.range", (0.0, -TINY)),
+    "another range narrower from below": ends(f"{B}.range", (TINY, 0.0)),
+    "another range narrower from above": ends(f"{B}.range", (0.0, -TINY)),
+    "ranges that go to each other": swapped(f"{M}.range", f"{B}.range"),
+    "axes that do": swapped(f"{AXES}.0.name", f"{AXES}.1.name"),
+    "an axis that is moved": moved(f"{AXES}.0.at", "1/1000000"),
+    "another that is moved": moved(f"{AXES}.1.at", "-1/1000000"),
+    "a larger factor": moved(f"{BY}.0", "1/10000"),
+    "a smaller factor": moved(f"{BY}.1", "-1/10"),
+    "a factor of the other sign": put(f"{AXES}.1.by.1", "1"),
+    "factors that go to each other": swapped(f"{AXES}.1.by.0", f"{AXES}.1.by.1"),
+    "factors of all that there is": put(BY, ["1" + "0" * 400] * 2),
+    "a place beyond all": put(f"{AXES}.0.at", "-1" + "0" * 400),
+    "wider priors": ends(f"{PRIOR}.0.range", (-1e-3, 1e-3)),
+    "multipliers that are 0": turned(lambda w: 0 * w),
+    "multipliers that are -0": turned(lambda w: -0.0 * w),
+    "those of lower bounds that are 0": turned(lambda w: w * [[[[0.0]]], [[[1.0]]]]),
+    "those of upper bounds that are 0": turned(lambda w: w * [[[[1.0]]], [[[0.0]]]]),
+    "lower for upper bounds": turned(lambda w: w[::-1]),
+    "multipliers of the other axis": turned(lambda w: w[:, ::-1]),
+    "multipliers of the next transition": turned(lambda w: np.roll(w, 1, 2)),
+    "multipliers of the other state": turned(lambda w: w[..., ::-1]),
+    "multipliers of the other sign": turned(lambda w: -w),
+    "multipliers twice as large": turned(lambda w: 2 * w),
+    "multipliers that are a little larger": turned(lambda w: 1.001 * w),
+    "huge multipliers": turned(lambda w: np.sign(w) * 1.7e308),
+    "tiny multipliers": turned(lambda w: np.sign(w) * 5e-324),
+    "no rounds": put(f"{FIT}.rounds", []),
+    "a wider box before": box(1, 0, (-0.1, 0.0)),
+    "more noise": moved(f"{SAID}.noise.0", "1/100000"),
+    "another input": array(f"{RUN}.inputs", lambda u: u + 1e-3),
+    "a plant that is another": put("plant.dynamics.1.2", lambda m: ["*", "1001/1000", m]),
+}
+
+
+@pytest.mark.parametrize("name", OF_AXES_FORMAT)
+def test_forgeries_of_the_form_of_axes(name: str) -> None:
+    assert verdicts(OF_AXES_FORMAT[name](true("axes"))) == ("format", "format")
+
+
+@pytest.mark.parametrize("name", OF_AXES)
+def test_forgeries_of_axes(name: str) -> None:
+    assert verdicts(OF_AXES[name](true("axes"))) == ("data", "data")
+
+
+def test_axes_where_the_claim_has_none() -> None:
+    assert verdicts(put(TURN, encode([1.0] * 160))(true("spring"))) == ("format", "format")
+    ranges = [q["range"] for q in true("spring")["plant"]["uncertain"]]
+    wide = put(AXES, [{"name": q, "at": "0", "by": by} for q, by in (("m", ["1", "0"]), ("b", ["0", "1"]))])
+    renamed = put(f"{PRIOR}.0.name", "m0")(put(f"{PRIOR}.1.name", "b0")(wide(true("spring"))))
+    assert verdicts(put(TURN, encode([1.0] + [0.0] * 159))(renamed)) == ("data", "data"), ranges
+
+
+@pytest.mark.parametrize("name", ["axes", "an axis of two parameters", "an axis in steps"])
+@pytest.mark.parametrize("kind", WEIGHTS)
+def test_no_multipliers_of_axes_exclude_the_truth(name: str, kind: str) -> None:
+    """The range of an axis ends just before its true value, and all other ranges are as wide as can be."""
+    data, tried, chance = true(name), TRUE[name][0], np.random.default_rng(len(name))
+    best = decode(data["evidence"]["data"]["turned"])
+    for axis, at, by in tried.axes:
+        value = float(Fraction(at)) + sum(float(Fraction(q)) * p for q, p in zip(by, tried.truth, strict=True))
+        for end in (0, 1):
+            forged = put(TURN, encode(WEIGHTS[kind](chance, best)))(data)
+            for k, quantity in enumerate(data["plant"]["uncertain"]):
+                pair = ["-1000", "1000"]
+                if quantity["name"] == axis:
+                    pair[end] = str(Fraction(value + (1 - 2 * end) * 1e-9))
+                forged = put(f"plant.uncertain.{k}.range", pair)(forged)
+            assert verdicts(forged) == ("data", "data")
+
+
 # -------------------------------------------------------------------------------------------------- parts of the priors
 
 NOTHING, LEAVES = encode([1.2, 0.9]), f"{FIT}.leaves"
@@ -425,16 +558,6 @@ def excluding(data: Document, j: int, end: int, value: float, weights: Any) -> D
         (k,) = [k for k, q in enumerate(data["plant"]["uncertain"]) if q["name"] == name]
         data = edited(data, f"plant.uncertain.{k}.range", [str(Fraction(a) - 1), str(Fraction(b) + 1)])
     return data
-
-
-WEIGHTS: dict[str, Callable[[np.random.Generator, Any], Any]] = {
-    "nearly": lambda chance, w: w * (1 + 1e-3 * chance.standard_normal(w.shape)),
-    "any": lambda chance, w: chance.standard_normal(w.shape) * chance.choice([1.0, 1e2, 1e4]),
-    "few": lambda chance, w: np.where(chance.random(w.shape) < 0.1, w, 0.0) + w[0] * 1e-300,
-    "huge": lambda chance, w: chance.choice([1.0, -1.0, 0.5, -0.5, 0.0], w.shape) * 1.7e308,
-    "huge, of both signs": lambda chance, w: np.sign(w) * chance.choice([1.7e308, 1e308, 1e150], w.shape),
-    "tiny": lambda chance, w: chance.choice([5e-324, -5e-324, 1e-310], w.shape),
-}
 
 
 @pytest.mark.parametrize(

@@ -854,6 +854,10 @@ def test_plants_list_disturbances_and_ranges(tmp_path: Path, capsys: pytest.Capt
     assert "uncertain wind, k: any value in their ranges, at any time; A, B at nominal ones" in said
     data = json.loads(run(capsys, "plant", tmp_path / "s.toml", "--json")[1])
     assert data["disturbances"] == ["wind"] and data["ranges"] == {"wind": ["-1/10", "1/5"]}
+    ranged = tmp_path / "ranged.toml"
+    ranged.write_text((tmp_path / "s.toml").read_text().replace("k = 1", "k = [0.5, 1.5]"))
+    exact = json.loads(run(capsys, "plant", ranged, "--param", "k=1.2", "--json")[1])
+    assert exact["parameters"]["k"] == "6/5" and list(exact["ranges"]) == ["wind"]
     exact = " ".join(run(capsys, "plant", "pendulum")[1].split())
     assert "torque N m 0 0" in exact and "uncertain" not in exact
     listed = run(capsys, "systems")[1]

@@ -53,6 +53,7 @@ class Experiment:
     drift: float = 0.0
     seed: int = 0
     tree: bytes = bytes([LEAF])
+    axes: tuple[tuple[str, str, tuple[str, ...]], ...] = ()
 
     def runs(self) -> list[Document]:
         chance, n = np.random.default_rng(self.seed), len(self.noise)
@@ -83,10 +84,11 @@ class Experiment:
     def stated(self) -> Document:
         """The claim's key."""
         parameters = [{"name": q, "range": list(ends)} for q, ends in zip(self.names, self.priors, strict=True)]
+        axes = [{"name": name, "at": at, "by": list(by)} for name, at, by in self.axes]
         return {
             "sha256": SHA256, "parameters": parameters, "period": self.period and list(self.period),
             "origin": list(self.origin), "noise": list(self.noise), "runs": self.runs(),
-        }  # fmt: skip
+        } | ({"axes": axes} if axes else {})  # fmt: skip
 
 
 def fmpq_of(text: str) -> fmpq:
@@ -95,11 +97,31 @@ def fmpq_of(text: str) -> fmpq:
 
 
 def claimed(experiment: Experiment, claim: Claim) -> Document:
-    """The claim for the ranges that the multipliers give."""
-    box, leaves, rounds = derived(with_data(claim(experiment.priors), experiment), experiment.rounds)
-    result = with_data(claim([(str(lo), str(hi)) for lo, hi in box]), experiment)
-    result["evidence"]["data"] |= {"leaves": leaves, "rounds": rounds}
+    """The claim for the ranges that the multipliers give, where there are axes of these."""
+    open_ = with_data(claim(experiment.priors), experiment)
+    box, leaves, rounds = derived(open_, experiment.rounds)
+    ranges, turned = on_axes(open_, box) if experiment.axes else (box, None)
+    result = with_data(claim([(str(lo), str(hi)) for lo, hi in ranges]), experiment)
+    result["evidence"]["data"] |= {"leaves": leaves, "rounds": rounds} | ({"turned": turned} if turned else {})
     return result
+
+
+def on_axes(data: Document, box: Box) -> tuple[Box, str]:
+    """Ranges of the axes for the parameters that are left in a box, and the multipliers that show them."""
+    with ctx.workprec(ON_LEAVES):
+        c = read(dump(data))
+        assert c.data is not None and isinstance(c.evidence, Tree) and c.evidence.fit is not None
+        now = Measured(c, c.data, c.evidence.fit, box, "tests")
+        residuals = [r for t in transitions(c.data) for r in residuals_of(now, t)]
+        symbols = now.K + c.n * sum(len(run.states) for run in c.data.runs)
+        aims = np.array([[float(by[j].mid()) for j in range(now.K)] for _, by in now.axes])
+        w = multipliers(residuals, aims, symbols)
+        bounds = now.bounds(array("d", w.ravel().tolist()), [by for _, by in now.axes])
+        found = []
+        for (middle, _), (below, above) in zip(now.axes, bounds, strict=True):
+            lo, hi = float((middle + below).mid()), float((middle + above).mid())
+            found.append(tuple(fmpq(*end.as_integer_ratio()) for end in (lo - HAIR * (hi - lo), hi + HAIR * (hi - lo))))
+        return found, encode(w)
 
 
 def with_data(data: Document, experiment: Experiment) -> Document:
@@ -111,6 +133,9 @@ def with_data(data: Document, experiment: Experiment) -> Document:
         "order": experiment.order, "pieces": experiment.pieces, "tree": base64.b64encode(tree).decode(),
         "leaves": [[] for byte in tree if byte == LEAF], "rounds": [],
     }  # fmt: skip
+    if experiment.axes:
+        size = 2 * len(experiment.axes) * experiment.steps * len(experiment.starts) * len(experiment.noise)
+        result["evidence"]["data"]["turned"] = encode([1.0] + [0.0] * (size - 1))
     return result
 
 
@@ -142,11 +167,11 @@ class Narrowing:
         for _ in range(rounds):
             now = Measured(self.c, self.data, self.fit, box, "tests")
             residuals = [r for t in transitions(self.data) for r in residuals_of(now, t)]
-            w = multipliers(residuals, now.K, now.K + self.c.n * sum(len(run.states) for run in self.data.runs))
+            w = multipliers(residuals, np.eye(now.K), now.K + self.c.n * sum(len(run.states) for run in self.data.runs))
             if not w.any():
                 break
-            each = zip(box, now.bounds(array("d", w.ravel().tolist())), strict=True)
-            ends = np.array([outward(*old, *bounds) for old, bounds in each])
+            units = now.bounds(array("d", w.ravel().tolist()), [{j: arb(1)} for j in range(now.K)])
+            ends = np.array([outward(*old, *scaled(old, pair)) for old, pair in zip(box, units, strict=True)])
             made.append({"box": encode(ends.T), "weights": encode(w)})
             box = [(fmpq(*lo.as_integer_ratio()), fmpq(*hi.as_integer_ratio())) for lo, hi in ends.tolist()]
             if any(lo > hi for lo, hi in box):
@@ -162,6 +187,12 @@ def residuals_of(now: Measured, t: Transition) -> list[Residual]:
         return [Residual(arb(0), {}, arb(0))] * now.n
 
 
+def scaled(old: tuple[fmpq, fmpq], pair: tuple[arb, arb]) -> list[arb]:
+    """Bounds of a symbol as those of the parameter."""
+    (lo, hi), (below, above) = old, pair
+    return [arb((lo + hi) / 2) + arb((hi - lo) / 2) * end for end in (below, above)]
+
+
 def outward(lo: fmpq, hi: fmpq, below: arb, above: arb) -> tuple[float, float]:
     """The part of an interval between two bounds, wider by a millionth of it."""
     ends = float(max(arb(lo).mid(), below.mid())), float(min(arb(hi).mid(), above.mid()))
@@ -169,19 +200,19 @@ def outward(lo: fmpq, hi: fmpq, below: arb, above: arb) -> tuple[float, float]:
     return ends[0] - more, ends[1] + more
 
 
-def multipliers(residuals: Sequence[Residual], parameters: int, symbols: int) -> Array:
-    """(2, K, T n): the duals of the least and of the largest d_j that the residuals allow."""
+def multipliers(residuals: Sequence[Residual], aims: Array, symbols: int) -> Array:
+    """(2, J, T n): the duals of the least and of the largest values of sums of d, (J, K), that the residuals allow."""
     A, alpha, slack = np.zeros((len(residuals), symbols)), np.zeros(len(residuals)), np.zeros(len(residuals))
     for k, residual in enumerate(residuals):
         alpha[k], slack[k] = float(residual.alpha.mid()), float(residual.slack.upper())
         for symbol, slope in residual.slopes.items():
             A[k, symbol] += float(slope.mid())
-    found = np.zeros((2, parameters, len(residuals)))
+    found = np.zeros((2, len(aims), len(residuals)))
     rows, bound = np.vstack([A, -A]), np.concatenate([slack - alpha, slack + alpha])
-    for j in range(parameters):
+    for j, aim in enumerate(aims):
         for end, sign in enumerate((1.0, -1.0)):
             cost = np.zeros(symbols)
-            cost[j] = sign
+            cost[: len(aim)] = sign * aim
             least = linprog(cost, rows, bound, bounds=[(-1, 1)] * symbols, method="highs")
             if least.status == 2:
                 return impossible(rows, bound, found)

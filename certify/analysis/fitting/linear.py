@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -44,29 +43,6 @@ class Slope(NamedTuple):
     hi: Fraction
     lower: Mapping[Point, Fraction]
     upper: Mapping[Point, Fraction]
-
-
-def require_possible(one: Unknown, grid: Grid, noise: Fraction) -> None:
-    """Reject samples that bend more along an axis than a function with these bounds, or that are not 0 at 0.
-
-    For a < b < c the slope of g from b to c is that from a to b within M_jj (c - a)/2, by the mean value theorem.
-
-    Raises
-    ------
-    Contradicted : no function with these bounds has such samples.
-    """
-    at_0 = abs(grid.values.get((Fraction(0),) * len(grid.axes), Fraction(0)))
-    if at_0 > noise:
-        raise Contradicted(f"{one.state} is {float(at_0):.6g} away from 0 at the origin")
-    for j, axis in enumerate(grid.axes):
-        for a, b, c in zip(axis, axis[1:], axis[2:], strict=False):
-            left, right = b - a, c - b
-            most = one.curvature[j][j] * (c - a) / 2 + 2 * noise * (1 / left + 1 / right)
-            for z in product(*grid.axes[:j], (b,), *grid.axes[j + 1 :]):
-                p, q, r = (grid.values[*z[:j], v, *z[j + 1 :]] for v in (a, b, c))
-                if abs((r - q) / right - (q - p) / left) > most:
-                    where = ", ".join(f"{v} = {float(w):g}" for v, w in zip(one.variables, z, strict=True))
-                    raise Contradicted(f"{one.state} bends more along {one.variables[j]} around {where}")
 
 
 def slopes(one: Unknown, grid: Grid, noise: Fraction) -> tuple[Slope, ...]:

@@ -17,8 +17,9 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from certify.analysis.fitting.linear import require_possible, residual_text, slopes
+from certify.analysis.fitting.linear import residual_text, slopes
 from certify.analysis.fitting.polynomial import Bound, Polynomial, bounded, errors, fitted
+from certify.analysis.fitting.possible import require_possible
 from certify.analysis.fitting.samples import bounds_of, read_samples, require_covered, suffix_of
 from certify.certificates import write_atomically
 from certify.errors import InputError

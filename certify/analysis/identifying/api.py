@@ -28,6 +28,7 @@ def identify(
     noise: Exact | Mapping[str, Exact],
     sample_time: Exact | Sequence[Exact] | None = None,
     out: str | os.PathLike[str] | None = None,
+    rotate: bool = False,
 ) -> IdentifyResult:
     """Bound a plant's unknown parameters by measured transitions.
 
@@ -38,6 +39,7 @@ def identify(
         `LinearStructure`, of which no equation is known.
     noise : a bound of the error of each measured state, in its units: one for all, or by state.
     sample_time : the time of a transition, or a pair (lo, hi) in which it lies; None in discrete time.
+    rotate : True for a plant in axes along which parameters are bounded closely, where sums of them are.
     out : a .toml file for the plant with the ranges that are left, with a page beside it; it needs a structure in a
         file.
 
@@ -62,7 +64,7 @@ def identify(
         raise InputError("`out` must be a .toml file, and needs the structure's file, whose text it takes over.")
     measured, readings = read_and_measure(path, system, period, bounds)
     source = None if isinstance(given, System) else Path(path_in(given, "structure"))
-    result = identify_plant(measured, readings, path.name, source, target)
+    result = identify_plant(measured, readings, path.name, source, target, rotate)
     if target is not None:
         write_atomically(target.with_suffix(".html"), page(result.residuals(), result.to_dict()).encode())
     return result

@@ -97,13 +97,29 @@ class Polytope:
             axis = difference / length
         return difference
 
+    def extreme(self, count: int) -> Array | None:
+        """So many points (count, K) farthest along random directions, in half-widths of the box; None if linear
+        programs do not find them."""
+        found = [self._least(a) for a in np.random.default_rng(0).standard_normal((count, len(self.names)))]
+        return np.array(found) if all(one is not None for one in found) else None
+
+    def least(self, a: Array) -> float | None:
+        """The least value of a.d; None if it was not found."""
+        found = self._least(a)
+        return None if found is None else float(a @ found)
+
     def _farthest(self, axis: Array) -> Array | None:
         """The point farthest along an axis, in half-widths of priors."""
+        found = self._least(-axis * self.scale)
+        return None if found is None else found * self.scale
+
+    def _least(self, a: Array) -> Array | None:
+        """A point d (K,) with the least a.d."""
         open_ = np.abs(self.alpha) + np.abs(self.g).sum(1) > 1  # others hold everywhere
         g, alpha = self.g[open_], self.alpha[open_]
         A, b = np.vstack([g, -g]), np.concatenate([1 - alpha, 1 + alpha])
-        answer = linprog(-axis * self.scale, A_ub=A, b_ub=b, bounds=(-1.0, 1.0), method="highs")
-        return answer.x * self.scale if answer.status == _DONE else None
+        answer = linprog(a, A_ub=A, b_ub=b, bounds=(-1.0, 1.0), method="highs")
+        return answer.x if answer.status == _DONE else None
 
 
 def polytope_of(found: Identified) -> Polytope:

@@ -28,6 +28,7 @@ from certify.loop.expressions import Expression, Operation, numerical, symbols
 from certify.loop.expressions.tree import text
 from certify.loop.plants.equations import parse_expression
 from certify.loop.plants.system import Interval
+from certify.loop.plants.unknown import beyond_name
 
 Array = NDArray[np.float64]
 _DOT = "_dot"
@@ -148,11 +149,11 @@ def _lines(
             prior = given.prior.get(name, given.prior.get(s, priors[name]))
             yield f"{name} = {pair_text(_interval(prior))} # of {s} by {by}"
     yield "\n[disturbances] # what is beyond A x + B u, as shares of its bound"
-    yield from (f"{_share(s, k)} = [-1, 1]" for s, of in terms.items() for k in range(len(of)))
+    yield from (f"{beyond_name(s, k)} = [-1, 1]" for s, of in terms.items() for k in range(1, len(of) + 1))
     yield "\n[dynamics]"
     for s in states:
         linear = [f"{name}*{by}" for name, by in entries.get(s, {}).items()]
-        beyond = [f"{_share(s, k)}*({text(e)})" for k, e in enumerate(terms.get(s, ()))]
+        beyond = [f"{beyond_name(s, k)}*({text(e)})" for k, e in enumerate(terms.get(s, ()), 1)]
         yield f"{s} = {_text(' + '.join([*linear, *beyond]) if s in entries else s + _DOT)}"
     yield "\n[u_eq]"
     yield from (f"{u} = 0" for u in inputs)
@@ -278,10 +279,6 @@ def _above(size: float) -> Fraction:
 
 def _interval(value: Range) -> Interval:
     return value if isinstance(value, tuple) else (-value, value)
-
-
-def _share(state: str, k: int) -> str:
-    return f"beyond_{state}_{k + 1}"
 
 
 def _text(of: str) -> str:

@@ -35,7 +35,9 @@ class IdentifyResult:
     Parameters
     ----------
     system : the plant, with ranges rounded outwards, and with all measurements, which `certify_roa` makes a part of its
-        claim.
+        claim; along axes where these were asked for and are closer.
+    known : the same without axes.
+    smaller : the factor by which the axes' box is smaller than the ranges'; 1 without axes.
     ranges : of the parameters that had a prior range, before they were rounded.
     readings : the file's runs.
     source : the file's name.
@@ -50,6 +52,8 @@ class IdentifyResult:
     """
 
     system: System
+    known: System
+    smaller: float
     ranges: Mapping[str, Interval]
     readings: Readings
     source: str
@@ -70,7 +74,7 @@ class IdentifyResult:
 
     def shrink(self, name: str) -> float:
         """The factor by which a parameter's range is smaller than its prior."""
-        (a, b), (lo, hi) = self.measurements.priors[name], self.system.ranges[name]
+        (a, b), (lo, hi) = self.measurements.priors[name], self.known.ranges[name]
         return float((b - a) / (hi - lo))
 
     def not_narrowed(self) -> tuple[str, ...]:
@@ -80,7 +84,7 @@ class IdentifyResult:
     def next_step(self) -> str:
         """The advice where some priors are not narrowed, by whether the equations are linear in the parameters."""
         parameters = [Symbol(name) for name in self.measurements.priors]
-        slopes = [differentiate(e, p) for e in self.system.dynamics for p in parameters]
+        slopes = [differentiate(e, p) for e in self.known.dynamics for p in parameters]
         if symbols_of(*slopes) & {*parameters}:
             return (
                 "the equations are not linear in the parameters: write each quotient or product of some as one "
@@ -109,7 +113,7 @@ class IdentifyResult:
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON object of `certify identify --json`."""
-        system, data, axis = self.system, self.measurements, self.least_determined
+        system, data, axis = self.known, self.measurements, self.least_determined
         return {
             "schema": SCHEMA,
             "verdict": "IDENTIFIED",
@@ -136,6 +140,10 @@ class IdentifyResult:
                 "direction": dict(axis.entries),
                 "share_of_priors": axis.share,
                 "telling": self.readings.places[axis.telling],
+            },
+            "axes": {
+                "smaller": self.smaller,
+                "sums": {each.name: [str(q) for q in (each.at, *each.by)] for each in data.axes},
             },
             "least_noise": self.least_noise,
             "least_residual": sizes_in_json(self.least_residual),
@@ -217,9 +225,15 @@ def measured_plant(
 
 
 def identify_plant(
-    measured: System, readings: Readings, source: str, structure: Path | None = None, out: Path | None = None
+    measured: System,
+    readings: Readings,
+    source: str,
+    structure: Path | None = None,
+    out: Path | None = None,
+    rotate: bool = False,
 ) -> IdentifyResult:
-    """The ranges that measurements leave, and with a file `out` the plant that has them.
+    """The ranges that measurements leave, and with a file `out` the plant that has them; with `rotate` along axes where
+    their box is smaller.
 
     Parameters
     ----------
@@ -233,21 +247,28 @@ def identify_plant(
     InputError : the flow has no enclosure, the measurements narrow no prior, or the file cannot be written.
     """
     from certify.analysis.identifying.determined import polytope_of, showing
+    from certify.analysis.identifying.rotated import axes_for
+    from certify.loop.plants.axes import along_axes
     from certify.provers.data import identify, least_factors
 
     start, data = time.perf_counter(), measured.measurements
     if data is None:
         raise InputError("a structure must have measurements to be identified.")
-    found = identify(measured, data)
+    found = identify(measured, data, narrows=not rotate)
     ranges = rounded(found.ranges, data.priors)
     plant = measured.with_parameters({name: (lo + hi) / 2 for name, (lo, hi) in ranges.items()}).with_ranges(ranges)
     if list(plant.ranges) != list(measured.ranges):
         plant = replace(plant, ranges={name: plant.ranges[name] for name in measured.ranges})
-    left = polytope_of(found)
+    left, (axes, smaller) = polytope_of(found), axes_for(found) if rotate else ((), 1.0)
+    known, plant = plant, along_axes(replace(plant, measurements=replace(data, axes=axes)))
+    if axes:
+        _require_inside(plant)
     if out is not None and structure is not None:
-        write_known(out, structure, plant, source)
+        write_known(out, structure, replace(known, measurements=plant.measurements), source)
     return IdentifyResult(
         system=plant,
+        known=known,
+        smaller=smaller,
         ranges=dict(found.ranges),
         readings=readings,
         source=source,
@@ -259,6 +280,17 @@ def identify_plant(
         seconds=time.perf_counter() - start,
         plant=out,
     )
+
+
+def _require_inside(plant: System) -> None:
+    """Reject a plant of which the measurements, in another run, leave more than the axes' ranges."""
+    from certify.provers.data import identify
+
+    data = plant.measurements
+    found = {} if data is None else identify(plant, data).turned
+    odd = [name for name, (lo, hi) in found.items() if not -1 <= lo <= hi <= 1]
+    if odd:
+        raise InputError(f"no axes hold what the data leave of {odd[0]}; leave out `rotate`.")
 
 
 def with_data(system: System, path: Path, tell: Tell = lambda _: None) -> System:

@@ -15,6 +15,7 @@ from pathlib import Path
 from certify.certificates import write_atomically
 from certify.errors import InputError
 from certify.loop.plants import Measurements, System, load_system
+from certify.loop.plants.axes import along_axes, sums_of
 from certify.loop.plants.source import PlantFile, read_plant_file
 from certify.loop.plants.system import Interval
 
@@ -67,7 +68,7 @@ def write_known(path: Path, structure: Path, known: System, source: str) -> None
         copy = Path(folder) / structure.name
         copy.write_text(text, encoding="utf-8")
         found = load_system(copy)
-    odd = [name for name in _differing(found, known) if name]
+    odd = [name for name in _differing(found, along_axes(known)) if name]
     if odd:
         raise InputError(
             f"{structure} cannot be written with new ranges: {', '.join(odd)} would be others. Write each range of "
@@ -104,6 +105,11 @@ def _table(known: System, data: Measurements, source: str) -> Iterator[str]:
     yield ""
     yield "[data.priors] # ranges that were assumed"
     yield from (f"{p} = {pair_text(pair)}" for p, pair in data.priors.items())
+    if data.axes:
+        names = ", ".join(axis.name for axis in data.axes)
+        yield f"\n[data.axes] # the value in the middle, and times {names}, each in [-1, 1]"
+        for p, row in zip(data.priors, sums_of(data.axes), strict=True):
+            yield f"{p} = [{', '.join(map(decimal_text, row))}]"
 
 
 def pair_text(pair: Interval) -> str:
@@ -130,7 +136,7 @@ def _differing(found: System, known: System) -> Iterator[str]:
     if left is None or right is None:
         yield "data"
         return
-    for name in ("priors", "period", "noise", "sha256"):
+    for name in ("priors", "period", "noise", "sha256", "axes"):
         mine, yours = getattr(left, name), getattr(right, name)
         if (list(mine.items()) if name == "priors" else mine) != (list(yours.items()) if name == "priors" else yours):
             yield f"data.{name}"

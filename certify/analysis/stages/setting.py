@@ -130,7 +130,7 @@ def _identified(state: State, measurements: Measurements) -> State:
 
     system = state.loop.system
     found = identify(system, measurements)
-    for name, (lo, hi) in found.ranges.items():
+    for name, (lo, hi) in (found.turned or found.ranges).items():
         least, most = system.ranges[name]
         if not least <= lo <= hi <= most:
             raise InputError(

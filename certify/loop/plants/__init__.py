@@ -12,7 +12,7 @@ from certify.loop.plants.deviations import (
 )
 from certify.loop.plants.floating_point import mean_rate
 from certify.loop.plants.linear import Controllability, Matrix, controllability, corners_at_rest, in_floats, linearise
-from certify.loop.plants.measurements import Measurements, Run
+from certify.loop.plants.measurements import Axis, Measurements, Run
 from certify.loop.plants.operating_point import require_equilibrium, residuals, rests_where
 from certify.loop.plants.registry import available_systems, chosen_system, get_system, shipped_system
 from certify.loop.plants.samples import Grid, Samples, Unknown
@@ -21,6 +21,7 @@ from certify.loop.plants.toml import load_system
 from certify.loop.plants.uncertainty import at_values, corners, input_errors, kind_of, with_input_errors
 
 __all__ = [
+    "Axis",
     "Controllability",
     "Grid",
     "Matrix",

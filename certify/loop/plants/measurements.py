@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -14,6 +14,14 @@ from certify.errors import InputError
 
 Array = NDArray[np.float64]
 Interval = tuple[Fraction, Fraction]
+
+
+class Axis(NamedTuple):
+    """A quantity `at + sum_k by_k p_k` of the parameters, in the order of their priors."""
+
+    name: str
+    at: Fraction
+    by: tuple[Fraction, ...]
 
 
 class Run(NamedTuple):
@@ -34,6 +42,8 @@ class Measurements:
     noise : n numbers; each measured state is within these of the true one, in the states' units.
     runs : what was measured, in the states' own values, not in deviations; none where only the file is known.
     sha256 : of the file that they come from, 64 hexadecimal digits.
+    axes : where there are some, these are uncertain quantities of the plant, in which it is written in place of the
+        parameters.
 
     Raises
     ------
@@ -45,6 +55,7 @@ class Measurements:
     noise: tuple[Fraction, ...]
     runs: tuple[Run, ...]
     sha256: str
+    axes: tuple[Axis, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.priors:
@@ -73,7 +84,12 @@ class Measurements:
             own = used[first : first + len(inputs)]
             found += [Run(states[a : b + 1], inputs[a:b]) for a, b in _stretches(own)]
             first += len(inputs)
-        return Measurements(self.priors, self.period, self.noise, tuple(found), self.sha256)
+        return replace(self, runs=tuple(found))
+
+    @property
+    def constants(self) -> tuple[str, ...]:
+        """The uncertain quantities of the plant that are constant: the axes, or the parameters themselves."""
+        return tuple(axis.name for axis in self.axes) or tuple(self.priors)
 
 
 def _stretches(marked: Sequence[bool] | NDArray[np.bool_]) -> Iterator[tuple[int, int]]:

@@ -23,6 +23,7 @@ from certify.loop.expressions import (
     symbols_of,
     value_if_rational,
 )
+from certify.loop.plants.axes import along_axes
 from certify.loop.plants.calls import Call, Named
 from certify.loop.plants.deviations import in_deviations
 from certify.loop.plants.equations import nearest, parse_constraint, parse_expression
@@ -121,6 +122,7 @@ def build_system(file: PlantFile) -> System:
         if str(file.path) in str(error):
             raise
         raise file.refuse(str(error)) from error
+    system = along_axes(system)
     if "x_eq" in file.data:
         require_equilibrium(system, lambda message: file.refuse(message, "x_eq"))
     return system

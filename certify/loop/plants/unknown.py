@@ -7,12 +7,13 @@ from fractions import Fraction
 from typing import Any
 
 from certify.loop.expressions import Expression, Operation, Symbol
-from certify.loop.plants.measurements import Measurements
+from certify.loop.plants.axes import axes_of
+from certify.loop.plants.measurements import Axis, Measurements
 from certify.loop.plants.samples import Samples, Unknown
 from certify.loop.plants.source import PlantFile, interval_at, interval_in, number_at
 from certify.loop.plants.system import Interval
 
-_DATA = ("file", "sha256", "period", "noise", "priors")
+_DATA = ("file", "sha256", "period", "noise", "priors", "axes")
 _SAMPLES = ("file", "sha256", "noise")
 _DIGITS = frozenset("0123456789abcdef")
 
@@ -76,6 +77,17 @@ def residual_name(state: str) -> str:
     return f"residual_{state}"
 
 
+def beyond_name(state: str, term: int) -> str:
+    """The name of the disturbance that is a share of one term of what an equation has beyond A x + B u, from 1."""
+    return f"beyond_{state}_{term}"
+
+
+def residual_names(state: str, ranges: Mapping[str, Interval]) -> list[str]:
+    """The names of the disturbances with ranges around 0 that bound what a state's equation lacks."""
+    own = [residual_name(state), *(beyond_name(state, k + 1) for k in range(len(ranges)))]
+    return [name for name in own if name in ranges and ranges[name][0] == -ranges[name][1]]
+
+
 def measurements_in(
     file: PlantFile, states: Sequence[str], ranges: Mapping[str, Interval], time: str
 ) -> Measurements | None:
@@ -89,7 +101,8 @@ def measurements_in(
         return None
     table = file.table("data")
     file.require_known("data", list(_DATA), "entry of a plant's data")
-    wanted = [key for key in _DATA if key not in table and not (key == "period" and time == "discrete")]
+    free = ("axes", "period") if time == "discrete" else ("axes",)
+    wanted = [key for key in _DATA if key not in table and key not in free]
     if wanted:
         raise file.refuse(f"must have {', '.join(wanted)}. `certify identify` writes this table.", "data")
     if time == "discrete" and "period" in table:
@@ -106,7 +119,22 @@ def measurements_in(
     priors = {p: interval_in(file, value, "data", "priors", p) for p, value in stated.items()}
     if not priors:
         raise file.refuse("there must be a range for a parameter at least.", "data", "priors")
-    return Measurements(priors, _period(file) if time == "continuous" else None, bounds, (), sha256)
+    period = _period(file) if time == "continuous" else None
+    return Measurements(priors, period, bounds, (), sha256, _axes(file, list(priors)) if "axes" in table else ())
+
+
+def _axes(file: PlantFile, names: list[str]) -> tuple[Axis, ...]:
+    """The table `data.axes`, of each parameter its value in the middle and its slopes along the axes."""
+    stated = _inner(file, "data", "axes", names, "parameter with a prior")
+    rows = [stated.get(name) for name in names]
+    if not all(isinstance(row, list) and len(row) == len(names) + 1 for row in rows):
+        raise file.refuse(f"there must be a list of {len(names) + 1} numbers for each prior.", "data", "axes")
+    return axes_of(
+        [
+            tuple(number_at(file, q, "data", "axes", name) for q in row or ())
+            for name, row in zip(names, rows, strict=True)
+        ]
+    )
 
 
 def unknowns_in(file: PlantFile, names: Sequence[str], states: Sequence[str]) -> tuple[Unknown, ...]:

@@ -32,11 +32,11 @@ class Program:
     offset: Array
     slack: Array
 
-    def extremes(self, axis: int, sign: float) -> Array | None:
-        """Weights (M,) of rows with which weak duality bounds parameter `axis`, from below for sign 1 and from above
-        for sign -1; None if no z obeys all rows."""
+    def extremes(self, a: Array, sign: float) -> Array | None:
+        """Weights (M,) of rows with which weak duality bounds the sum a.d of the parameters' symbols, a (K,) of a size
+        around 1, from below for sign 1 and from above for sign -1; None if no z obeys all rows."""
         cost = np.zeros(self.matrix.shape[1])
-        cost[axis] = sign
+        cost[: len(a)] = sign * a
         reach = np.asarray(abs(self.matrix).sum(1)).ravel()
         above = np.flatnonzero(self.offset + reach > 1)  # others hold for all z
         below = np.flatnonzero(reach - self.offset > 1)
@@ -101,11 +101,11 @@ def _in_units(matrix: csr_matrix, offset: Array, slack: Array) -> Program:
     return Program(sparse.csr_matrix(sparse.diags(1 / slack) @ matrix), offset / slack, slack)
 
 
-def bound(rows: Rows, noise: Array, begins: NDArray[np.intp], weights: Array, axis: int) -> tuple[float, float]:
-    """Between what parameter `axis`'s symbol lies, by rows with weights (n, T), as the checkers bound it."""
+def bound(rows: Rows, noise: Array, begins: NDArray[np.intp], weights: Array, a: Array) -> tuple[float, float]:
+    """Between what a sum a.d of the parameters' symbols lies, by rows with weights (n, T), as the checkers bound it."""
     n = rows.alpha.shape[0]
     own = np.einsum("it,ist->s", weights, rows.slopes[:, n:])
-    own[axis] -= 1.0
+    own -= a
     errors = np.zeros((n, int(begins.max()) + 2))
     errors[:, begins] += np.einsum("it,ijt->jt", weights, rows.slopes[:, :n])
     errors[:, begins + 1] -= noise[:, None] * weights

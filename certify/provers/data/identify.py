@@ -51,6 +51,7 @@ class Identified:
     bounds : multipliers that show it.
     used : those transitions of all that were given, (T,).
     rows : what all transitions say in the last box, and in its units.
+    turned : the intervals of the axes, where the measurements have some.
     """
 
     ranges: Mapping[str, Interval]
@@ -59,6 +60,7 @@ class Identified:
     bounds: DataBounds
     used: NDArray[np.bool_]
     rows: Rows
+    turned: Mapping[str, Interval]
 
 
 class Contradiction(InputError):
@@ -95,6 +97,23 @@ class _Box:
             if not len(some) or not self._round(rows, some, joint(rows, self.flows.noise, self.data.begins[some])):
                 break
 
+    def turned(self, chosen: Numbers) -> tuple[Numbers, Array, dict[str, Interval]]:
+        """Transitions and weights (2, J, n, T) with which they bound each axis, and between what it then lies."""
+        noise = self.flows.noise
+        some, rows = self._rows(chosen)
+        program = joint(rows, noise, self.data.begins[some]) if self.data.shares else separate(rows, noise)
+        axes = self.flows.on_axes(self.box)
+        weights, left = np.zeros((2, len(axes), *rows.alpha.shape)), dict[str, Interval]()
+        for j, (name, (middle, a)) in enumerate(axes.items()):
+            size = np.abs(a).sum()
+            for side, sign in enumerate((1.0, -1.0)):
+                found = program.extremes(a / size, sign)
+                weights[side, j] = 0.0 if found is None else size * found.reshape(rows.alpha.shape)
+            ends = [bound(rows, noise, self.data.begins[some], weights[side, j], a)[side] for side in (0, 1)]
+            more = float(_SLACK) * (ends[1] - ends[0])
+            left[name] = Fraction(middle + ends[0] - more), Fraction(middle + ends[1] + more)
+        return some, weights, left
+
     def _rows(self, chosen: Numbers) -> tuple[Numbers, Rows]:
         """Transitions of those that have an enclosure, and what they say."""
         rows = self.flows.rows(self.box, chosen)
@@ -107,7 +126,7 @@ class _Box:
         weights = np.zeros((2, len(names), *shape))
         for k in range(len(names)):
             for side, sign in enumerate((1.0, -1.0)):
-                found = program.extremes(k, sign)
+                found = program.extremes(np.eye(len(names))[k], sign)
                 if found is None:
                     self._end(rows, chosen, program)
                     return False
@@ -144,7 +163,8 @@ class _Box:
         noise, begins = self.flows.noise, self.data.begins[chosen]
         lo, hi = self.box[list(self.box)[k]]
         middle, reach = (lo + hi) / 2, (hi - lo) / 2
-        least, most = bound(rows, noise, begins, weights[0], k)[0], bound(rows, noise, begins, weights[1], k)[1]
+        unit = np.eye(len(self.box))[k]
+        least, most = (bound(rows, noise, begins, weights[side], unit)[side] for side in (0, 1))
         low = middle + reach * (Fraction(least) - _SLACK) if -1 < least < np.inf else lo
         high = middle + reach * (Fraction(most) + _SLACK) if -np.inf < most < 1 else hi
         return _outward((max(lo, low), min(hi, high)))
@@ -287,8 +307,10 @@ def misses(system: System, measurements: Measurements) -> Array:
     return most
 
 
-def identify(system: System, measurements: Measurements) -> Identified:
-    """Bound the parameters of a plant by measurements.
+def identify(system: System, measurements: Measurements, narrows: bool = True) -> Identified:
+    """Bound the parameters of a plant by measurements, and their axes where the measurements have some.
+
+    With `narrows` it is an error that no prior becomes smaller.
 
     Raises
     ------
@@ -296,7 +318,8 @@ def identify(system: System, measurements: Measurements) -> Identified:
     InputError : measurements are not of this plant, the flow over them has no enclosure, or they narrow no prior.
     """
     search = Search.of(system, measurements)
-    if all(_width(pair) >= _width(measurements.priors[name]) for name, pair in search.whole.box.items()):
+    same = all(_width(pair) >= _width(measurements.priors[name]) for name, pair in search.whole.box.items())
+    if narrows and same and not measurements.axes:
         raise InputError(
             f"the measurements narrow no prior, in {len(search.parts)} parts of the priors: write the equations linear "
             "in the parameters, a quotient of two as one, narrow the priors, or measure more often."
@@ -312,7 +335,7 @@ def require_measurable(system: System, measurements: Measurements) -> None:
     InputError : a parameter has no range in the plant, states or inputs are not as many, there is no transition, one
         has no time in continuous time or one in discrete time, or equations call a network.
     """
-    odd = [name for name in measurements.priors if name not in system.ranges]
+    odd = [name for name in measurements.constants if name not in system.ranges]
     if odd:
         raise InputError(f"{system.name} must have a range for {', '.join(odd)}, which measurements are to determine.")
     shapes = {run.inputs.shape[1:] for run in measurements.runs}
@@ -328,17 +351,19 @@ def _found(search: Search) -> Identified:
     """All that the rounds have found, with the transitions alone that they use."""
     data, flows, parts, whole = search.data, search.flows, search.parts, search.whole
     used = np.zeros(data.count, dtype=bool)
-    for part in (*parts, whole):
-        for chosen, weights, _ in part.rounds:
-            used[chosen[np.any(weights != 0, axis=(0, 1, 2))]] = True
+    along = whole.turned(data.windows() if data.shares else np.arange(data.count)) if data.measurements.axes else None
+    of_axes = [] if along is None else [along]
+    for chosen, weights, _ in (*of_axes, *(each for part in (*parts, whole) for each in part.rounds)):
+        used[chosen[np.any(weights != 0, axis=(0, 1, 2))]] = True
 
     def stored(part: _Box) -> tuple[Round, ...]:
         return tuple(Round(_corners(box), _stored(chosen, weights, used)) for chosen, weights, box in part.rounds)
 
-    bounds = DataBounds(flows.order, flows.pieces, search.tree, tuple(map(stored, parts)), stored(whole))
+    turned = None if along is None else _stored(along[0], along[1], used)
+    bounds = DataBounds(flows.order, flows.pieces, search.tree, tuple(map(stored, parts)), stored(whole), turned)
     rows, kept = flows.rows(whole.box, np.arange(data.count)), data.measurements.only(used)
     history = (dict(data.measurements.priors), *whole.history)
-    return Identified(whole.box, history, kept, bounds, used, rows)
+    return Identified(whole.box, history, kept, bounds, used, rows, {} if along is None else along[2])
 
 
 def _stored(chosen: Numbers, weights: Array, used: NDArray[np.bool_]) -> Array:

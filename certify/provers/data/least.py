@@ -14,7 +14,7 @@ from math import sqrt
 from certify.errors import InputError
 from certify.loop.expressions import Operation, Symbol
 from certify.loop.plants import Measurements, System
-from certify.loop.plants.unknown import residual_name
+from certify.loop.plants.unknown import residual_name, residual_names
 from certify.provers.data.identify import Contradiction, Identified, Search, misses, refuted_in
 from certify.provers.data.models import Flows
 
@@ -38,11 +38,11 @@ class Least:
 
 def residual_states(system: System) -> list[str]:
     """The states whose equations have a residual."""
-    return [s.name for s in system.states if residual_name(s.name) in system.ranges]
+    return [s.name for s in system.states if residual_names(s.name, system.ranges)]
 
 
 def least_factors(system: System, measurements: Measurements, found: Identified) -> tuple[Least, ...]:
-    """Factors of the bounds in the table `residual`, with which the measurements leave the ranges `found`: one of all,
+    """Factors of the bounds of residuals, with which the measurements leave the ranges `found`: one of all,
     then of each beside the others as they stand."""
     names, series = residual_states(system), (found.bounds.order, found.bounds.pieces)
 
@@ -121,9 +121,9 @@ def _least(sizes: Sizes, refutes: Callable[[float], bool], most: float) -> Least
 
 def _scaled(system: System, names: Collection[str], factor: float) -> System:
     """The same plant with the residuals of some states so many times as large."""
+    own = {name: system.ranges[name] for state in names for name in residual_names(state, system.ranges)}
     if not factor:
-        return system.with_ranges({residual_name(name): None for name in names})
-    own = {name: system.ranges[name] for name in map(residual_name, names)}
+        return system.with_ranges(dict.fromkeys(own))
     return system.with_ranges({name: (lo * Fraction(factor), hi * Fraction(factor)) for name, (lo, hi) in own.items()})
 
 

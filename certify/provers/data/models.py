@@ -51,7 +51,7 @@ class Flows:
     def __init__(self, system: System, measurements: Measurements, order: int, pieces: int) -> None:
         self.system, self.order, self.pieces = system, order, pieces
         self.dynamics = system.uncertain_dynamics()
-        self.names = tuple(measurements.priors)
+        self.names, self.axes = tuple(measurements.priors), {axis.name: axis for axis in measurements.axes}
         self.symbols = system.n + len(self.names)
         at = system.exact_x_eq()
         states = [_less(run.states, at) for run in measurements.runs]
@@ -92,13 +92,35 @@ class Flows:
         x = {s: self._number(self.begins[i, chosen], self.noise[i], i) for i, s in enumerate(system.states)}
         held = {s: self._number(self.inputs[j, chosen], 0.0, None) for j, s in enumerate(system.inputs)}
         others = dict[Symbol, Taylor]()
+        along = self.on_axes(box)
         for symbol, pair in system.uncertain:
+            if symbol.name in along:
+                held[symbol] = self._constant(*along[symbol.name], batch)
+                continue
             known = symbol.name in self.names
             lo, hi = box[symbol.name] if known else pair
             middle, reach = float((lo + hi) / 2), float((hi - lo) / 2)
             place = system.n + self.names.index(symbol.name) if known else None
             (held if known else others)[symbol] = self._number(np.full(batch, middle), reach, place)
         return self._after(x, held, others)
+
+    def on_axes(self, box: Box) -> dict[str, tuple[float, Array]]:
+        """The value of each axis in the middle of a box, and its slopes by the parameters' symbols (K,)."""
+        ends = list(box.values())
+        return {
+            axis.name: (
+                float(axis.at + sum(by * (lo + hi) / 2 for by, (lo, hi) in zip(axis.by, ends, strict=True))),
+                np.array([float(by * (hi - lo) / 2) for by, (lo, hi) in zip(axis.by, ends, strict=True)]),
+            )
+            for axis in self.axes.values()
+        }
+
+    def _constant(self, centre: float, slopes: Array, batch: int) -> Taylor:
+        """A number that has the parameters' symbols."""
+        N = self.symbols
+        g, r = np.zeros((N, batch)), np.full(batch, 4 * EPS * (abs(centre) + np.abs(slopes).sum()) + TINY)
+        g[self.system.n : self.system.n + len(slopes)] = slopes[:, None]
+        return Taylor(np.full(batch, centre), g, np.zeros((N, N, batch)), r)
 
     def _number(self, centre: Array, reach: float, symbol: int | None) -> Taylor:
         """A number within `reach` of a centre (B,), with a symbol of its own or without."""

@@ -1,0 +1,173 @@
+"""`certify identify --rotate`: data of a closed loop bound sums of parameters, and axes along these are claimed of."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import certify
+from certify.certificates.checking import ask
+from certify.certificates.reading import read_certificate
+from certify.cli.main import _run
+from certify.errors import InputError
+from certify.loop.plants import load_system
+from certify.loop.plants.axes import axes_of, sums_of
+from certify.loop.policies import load_policy
+from tests.analysis.test_identify import POLICY, STRUCTURE, TRUE, Array, command, holds, identified, simulated, write
+
+WIDE = STRUCTURE.replace("[10, 30]", "[2, 100]").replace("[1, 4]", "[0.1, 20]").replace("[10, 50]", "[5, 200]")
+ROW = tuple[Fraction, ...]
+
+
+def under_the_policy(count: int = 120, noise: float = 1e-3, seed: int = 0) -> Array:
+    """Transitions of the shipped loop near the origin, (N, 5): u is nearly -K x in all of them."""
+    draw, network = np.random.default_rng(seed), load_policy(POLICY).network
+    x = draw.uniform(-1, 1, (count, 2)) * [0.1, 0.3]
+    u = np.array([np.ravel(network(row, [Fraction(0)])) for row in x])
+    errors = draw.uniform(-noise, noise, (2, count, 2))
+    return np.hstack([x + errors[0], u, simulated(x, u) + errors[1]])
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a plant along axes, the same without, and their data."""
+    folder = tmp_path_factory.mktemp("rotated")
+    (folder / "structure.toml").write_text(WIDE)
+    data = write(folder / "data.csv", under_the_policy())
+    for name, rotate in (("known", True), ("boxed", False)):
+        certify.identify(
+            data,
+            folder / "structure.toml",
+            noise="1e-3",
+            sample_time="0.02",
+            out=folder / f"{name}.toml",
+            rotate=rotate,
+        )
+    return folder
+
+
+def proved(folder: Path, name: str) -> certify.RoaResult:
+    return certify.certify_roa(
+        folder / f"{name}.toml", POLICY, folder / name, data=folder / "data.csv", candidate="lyapunov"
+    )
+
+
+def test_axes_prove_what_ranges_do_not(known: Path) -> None:
+    assert proved(known, "boxed").verdict == "UNKNOWN"
+    found = proved(known, "known")
+    assert found.verdict == "PROVED" and found.volume is not None and found.volume > 190
+    certificate = known / "known" / "certificate.json"
+    for program in ("checker", "reference"):
+        assert ask(certificate, program)[1]["result"] == "ACCEPTED"
+    assert "constant a in [2, 100], b in [0.1, 20] and c in [5, 200] with which" in found._repr_html_()
+    again = read_certificate(certificate).system
+    assert (
+        again.measurements is not None
+        and again.measurements.axes == load_system(known / "known.toml").measurements.axes
+    )  # type: ignore[union-attr]
+
+
+def test_the_plant_along_axes_is_the_plant(known: Path) -> None:
+    """At any parameters, the axes that belong to them give the same equations; the truth lies within [-1, 1]."""
+    turned, plain = load_system(known / "known.toml"), load_system(known / "boxed.toml")
+    data = turned.measurements
+    assert data is not None and list(turned.ranges) == ["axis_1", "axis_2", "axis_3"] == list(data.constants)
+    assert not {*turned.parameters} & {*data.priors} and not turned.positive
+    x, u = np.array([[0.3, -1.0], [2.0, 5.0]]), np.array([[1.0], [-2.0]])
+    for p in (list(map(Fraction, TRUE.values())), [Fraction(7), Fraction(1, 3), Fraction(90)]):
+        q = [axis.at + sum(s * v for s, v in zip(axis.by, p, strict=True)) for axis in data.axes]
+        f, g = turned.uncertain_function(), plain.uncertain_function()
+        assert np.allclose(f(x, u, list(map(float, q))), g(x, u, list(map(float, p))), rtol=1e-9)
+        assert all(abs(v) <= 1 for v in q) is (p[0] > 10)
+    assert axes_of(sums_of(data.axes)) == data.axes
+
+
+def test_axes_are_much_closer_than_ranges(tmp_path: Path) -> None:
+    found = identified(tmp_path, under_the_policy(), WIDE, rotate=True)
+    assert found.smaller > 10 and holds(found)
+    assert found.to_dict()["axes"]["smaller"] == found.smaller and len(found.to_dict()["axes"]["sums"]) == 3
+    plain = identified(tmp_path, under_the_policy(), WIDE)
+    assert plain.smaller == 1 and plain.to_dict()["axes"]["sums"] == {} and plain.system.ranges == plain.known.ranges
+    assert plain.ranges == found.ranges
+
+
+def test_one_parameter_has_no_other_axis(tmp_path: Path) -> None:
+    text = STRUCTURE.replace("a = [10, 30]", "a = 19.62").replace("b = [1, 4]", 'b = "8/3"')
+    found = identified(tmp_path, under_the_policy(), text, rotate=True)
+    assert found.smaller == 1 and list(found.system.ranges) == ["c"]
+
+
+def test_runs_have_axes_too(tmp_path: Path) -> None:
+    """Rows in time order, whose errors are shared."""
+    draw, network = np.random.default_rng(1), load_policy(POLICY).network
+    rows = []
+    for run in range(6):
+        x = draw.uniform(-1, 1, (1, 2)) * [0.2, 0.5]
+        for _ in range(8):
+            u = np.array([np.ravel(network(x[0], [Fraction(0)]))])
+            rows.append(np.concatenate([x[0] + draw.uniform(-1e-3, 1e-3, 2), u[0], [run]]))
+            x = simulated(x, u)
+    path = write(tmp_path / "runs.csv", np.array(rows), "theta,theta_dot,u,run")
+    (tmp_path / "s.toml").write_text(WIDE)
+    found = certify.identify(path, tmp_path / "s.toml", noise="1e-3", sample_time="0.02", rotate=True)
+    assert found.smaller > 3
+    data = found.system.measurements
+    assert data is not None
+    truth = [axis.at + sum(s * Fraction(v) for s, v in zip(axis.by, TRUE.values(), strict=True)) for axis in data.axes]
+    assert all(abs(q) <= 1 for q in truth)
+    result = certify.certify_roa(found.system, POLICY, candidate="lyapunov", level=1e-3)
+    assert result.verdict == "PROVED", result.reason
+
+
+def test_ranges_of_axes_that_are_too_narrow_are_refused(known: Path, tmp_path: Path) -> None:
+    text = (known / "known.toml").read_text()
+    table = text.index("[data.axes]")
+    lines = text[table:].splitlines()
+    narrow = [line.replace(line.split(", ")[1], str(float(line.split(", ")[1]) / 2)) for line in lines[1:]]
+    (tmp_path / "known.toml").write_text("\n".join([text[:table], lines[0], *narrow]))
+    with pytest.raises(InputError, match="the range of axis_1 must hold all that the data leave"):
+        certify.certify_roa(tmp_path / "known.toml", POLICY, data=known / "data.csv", candidate="lyapunov")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("a = [", "a = [1, ", "a list of 4 numbers for each prior"),
+        ("c = [", "d = [", "'d' is no parameter with a prior"),
+        ("all", "b = [0, 0, 0, 0]", "must span all"),
+        ("axis", "", "must have no axis_1 of its own"),
+        ("rest", "", "must not depend on"),
+    ],
+)
+def test_tables_of_axes_that_are_none(known: Path, tmp_path: Path, old: str, new: str, said: str) -> None:
+    text = (known / "known.toml").read_text()
+    head, table = text[: text.index("[data.axes]")], text[text.index("[data.axes]") :]
+    if old == "axis":
+        head = head.replace("[parameters]", "[parameters]\naxis_1 = 2")
+    elif old == "rest":
+        head = head.replace("[u_eq]", '[observations]\nseen = "a*theta"\n\n[u_eq]')
+    elif old == "all":
+        table = "\n".join(new if line.startswith("b = ") else line for line in table.splitlines())
+    else:
+        table = table.replace(old, new)
+    (tmp_path / "known.toml").write_text(head + table)
+    with pytest.raises(InputError, match=said):
+        load_system(tmp_path / "known.toml")
+
+
+def test_the_command_turns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = under_the_policy()
+    assert _run(command(tmp_path, "--rotate", rows=rows, text=WIDE), False) == 0
+    assert "times smaller than that of the ranges" in capsys.readouterr().out
+    assert _run(command(tmp_path, "--rotate", "--json", rows=rows, text=WIDE), True) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert found["axes"]["smaller"] > 10
+    known = load_system(tmp_path / "known.toml")
+    assert replace(known, measurements=None).ranges == dict.fromkeys(["axis_1", "axis_2", "axis_3"], (-1, 1))
+    assert _run(["plant", str(tmp_path / "known.toml")], False) == 0
