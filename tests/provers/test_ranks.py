@@ -15,6 +15,7 @@ from flint import fmpq, fmpq_mat
 from certify import certify_roa
 from certify.certificates import RankTree, run_checker
 from certify.certificates.claims import UNPROVED
+from certify.certificates.ranked import Ranked, steps_from
 from certify.certificates.verdict import Verdict
 from certify.effort import UNIT, Effort
 from certify.errors import OptionError
@@ -25,10 +26,20 @@ from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
 from certify.provers.bounds import Taylor
 from certify.provers.execution import Runner, ThreadRunner, rows
-from certify.provers.ranks import Question, RankProof, Sublevel, prove_ranks, root_box, with_frame, without_leaf
+from certify.provers.ranks import (
+    Question,
+    RankProof,
+    Sublevel,
+    prove_ranks,
+    root_box,
+    with_frame,
+    with_memory,
+    without_leaf,
+)
 from certify.provers.ranks.cover import Cover
 from certify.provers.ranks.images import Course, Form
 from certify.provers.ranks.search import COUNTS
+from certify.provers.ranks.wanted import Wanted
 from tests.support.jobs import PlayedRunner, Troupe
 from tests.support.loops import box
 from tests.support.marks import slow_after
@@ -133,22 +144,24 @@ def test_ranks_are_the_same_whoever_follows_the_boxes(
 FRAMES = {1: np.array([[-3.0]]), 2: np.array([[1.0, 0.5], [-3.0, 2.0]])}
 
 
-def followed(loop: tuple[System, PolicyNetwork], frame: np.ndarray | None) -> Course:
+def followed(loop: tuple[System, PolicyNetwork], frame: np.ndarray | None, memory: int = 1) -> Course:
     """Boxes of a wide root box, whose errors are bounded in this frame."""
     n = loop[0].n
-    return replace(question(loop, 0.01), root=(np.full(n, -2.0), np.full(n, 2.0)), frame=frame).course(COUNTS)
+    root = np.full(n, -2.0), np.full(n, 2.0)
+    return replace(question(loop, 0.01), root=root, frame=frame, memory=memory).course(COUNTS)
 
 
+@pytest.mark.parametrize("memory", [1, 3])
 @pytest.mark.parametrize("framed", [False, True])
 @pytest.mark.parametrize("loop", [bistable(), bistable("held"), hanging(), swinging()])
-def test_images_hold_trajectories(loop: tuple[System, PolicyNetwork], framed: bool) -> None:
+def test_images_hold_trajectories(loop: tuple[System, PolicyNetwork], framed: bool, memory: int) -> None:
     system, _ = loop
     generator, n = np.random.default_rng(3), system.n
-    course = followed(loop, FRAMES[n] if framed else None)
+    course = followed(loop, FRAMES[n] if framed else None, memory)
     centre = generator.uniform(-0.7, 0.7, (n, 200))
     radius = generator.uniform(1e-4, 0.05, (n, 200))
     slopes = np.eye(n)[:, :, None] * radius
-    form = Form(np.concatenate([centre[:, None], slopes, 0 * slopes], 1))
+    form = Form(np.concatenate([centre[:, None], slopes, *memory * [0 * slopes]], 1))
     d = np.sign(generator.normal(size=(n, 200))) * generator.random((n, 200)) ** 0.2
     x, f = (centre + radius * d).T, system.function()
     for _ in range(12):
@@ -162,7 +175,7 @@ def test_images_hold_trajectories(loop: tuple[System, PolicyNetwork], framed: bo
         assert np.all(kept)
         assert np.all((lo <= x.T + 1e-12) & (hi + 1e-12 >= x.T))
         away = course.into @ (x.T - form.x[:, 0] - (form.x[:, 1 : n + 1] * d).sum(1))
-        bounds = np.einsum("ij,jib->ib", course.into, form.x[:, n + 1 :])
+        bounds = np.abs(np.einsum("ij,jkb->ikb", course.into, form.x[:, n + 1 :])).sum(1)
         assert np.all(np.abs(away) <= bounds + 1e-12)
 
 
@@ -209,6 +222,49 @@ def test_a_frame_is_taken_where_images_are_narrower_in_it() -> None:
     turned = found.frame @ M @ np.linalg.inv(found.frame)
     assert max(np.abs(np.linalg.eigvals(np.abs(M)))) > 0.99 > 0.6 > max(np.abs(np.linalg.eigvals(np.abs(turned))))
     assert with_frame(steep(10**6, Fraction(5)), probes).frame is None
+
+
+def turning_slowly() -> Question:
+    """x+ = 0.95 R x + small terms of second order, R a rotation by 0.3: what boxes make of it, a rotation at a time."""
+    x, y, u = symbols("x y u")
+    c, s = (Fraction(round(v * 10**6), 10**6) for v in (0.95 * np.cos(0.3), 0.95 * np.sin(0.3)))
+    system = System(
+        name="turning",
+        states=(x, y),
+        inputs=(u,),
+        parameters={},
+        dynamics=(Number(c) * x - Number(s) * y + x * y / 4, Number(s) * x + Number(c) * y + x * x / 8 + u),
+        u_eq=(Number(0),),
+        domain=box(2, 2),
+        input_bounds=box(1),
+        time="discrete",
+    )
+    network = PolicyNetwork.of_layers((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    return question((system, network), 0.01)
+
+
+def test_memory_is_taken_where_it_is_worth_its_price() -> None:
+    turning, straight = turning_slowly(), question(bistable(), 0.01)
+    begin = np.array([[0.5], [0.2]])
+    assert with_memory(turning, begin - 0.05, begin + 0.05, 45).memory > 1
+    assert with_memory(straight, np.array([[0.1]]), np.array([[0.11]]), 10).memory == 1
+
+
+def test_a_box_whose_parts_lead_straight_there_has_a_tree_of_its_own() -> None:
+    """One that is looked at in vain, or not at all, has one of the domain; both have ranks for all of the box."""
+    asked = replace(turning_slowly(), memory=4)
+    lo, hi = np.array([0.5, 0.2]), np.array([0.6, 0.3])
+    for direct, own in ((100, True), (0, False)):
+        wanted = Wanted(lo, hi, direct=direct, longest=45)
+        found = prove_ranks(asked, Effort(UNIT), ThreadRunner(), wanted=wanted)
+        assert found is not None and found.done
+        corners = found.evidence.lo.tolist(), found.evidence.hi.tolist()
+        assert (corners == (lo.tolist(), hi.tolist())) is own
+        box_ = tuple((Fraction(a), Fraction(b)) for a, b in zip(lo.tolist(), hi.tolist(), strict=True))
+        assert steps_from(Ranked(found.evidence, None, ()), box_) is not None
+    short = Wanted(np.array([-1.5, -1.5]), np.array([1.5, 1.5]), direct=3, longest=1)
+    other = prove_ranks(asked, Effort(UNIT / 100), ThreadRunner(), wanted=short)
+    assert other is None or other.evidence.lo.tolist() != [-1.5, -1.5]
 
 
 def held(f: Any, x: np.ndarray, u: np.ndarray, h: np.ndarray, steps: int = 50) -> np.ndarray:

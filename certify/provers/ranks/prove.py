@@ -30,7 +30,10 @@ _MOST_LEAVES, _MOST_PAIRS = 400_000, 10_000_000  # of an image and a leaf that i
 _OF_A_PAIR, _OF_A_LEAF = 500.0, 50_000.0  # operations, beside those of the steps
 _SMALL, _LOST = 0.002, 1e3  # half-width of a box, as a share of the root box's width; growth that counts for no image
 _DEPENDENT = 1e8  # condition of a frame that is of no use
-_MEMORIES, _THERE = (2, 4, 8), 1e-6  # steps; the width, relative to the root box, that an image in the target counts as
+_MEMORIES, _THERE = (
+    (1, 2, 4, 8),
+    1e-6,
+)  # steps; the width, relative to the root box, that an image in the target counts as
 _AT_FIRST = 0.1  # share of the effort for the first tree
 
 
@@ -106,23 +109,18 @@ def with_frame(question: Question, x: Array) -> Question:
 
 
 def with_memory(question: Question, lo: Array, hi: Array, steps: int) -> Question:
-    """The question with the memory of errors that is worth most for boxes (n, B) over so many steps: with half the
-    logarithm of an image's width in each state go the boxes that are needed, and with each the operations."""
-    root, counts = (question.root[1] - question.root[0])[:, None], [k for k in COUNTS_FROM if k <= max(steps, 1)]
+    """The question with the memory of errors that is worth most for boxes (n, B) that are to be in the target after so
+    many steps: the boxes that are needed grow with the root of an image's width in each state, and each has its
+    operations."""
+    root = (question.root[1] - question.root[0])[:, None]
 
     def price(memory: int) -> float:
-        course = replace(question, memory=memory).course(counts)
+        course = replace(question, memory=memory).course((steps,))
         found = course(lo, hi, 0.0, 0.0)
         widths = np.nan_to_num(((found.hi - found.lo) / root).max(1), nan=1.0)
-        there = np.maximum.accumulate(found.there, 0)
-        return float(np.log(np.where(there, _THERE, widths)).mean() * len(lo) / 2 + math.log(course.operations))
+        return float(np.log(np.where(found.there, _THERE, widths)).mean() * len(lo) / 2 + math.log(course.operations))
 
-    best, least = 1, price(1)
-    for memory in _MEMORIES:
-        if (found := price(memory)) >= least:
-            break
-        best, least = memory, found
-    return replace(question, memory=best)
+    return replace(question, memory=min(_MEMORIES, key=price))
 
 
 def _eigenframe(loop: ClosedLoop) -> Array | None:
