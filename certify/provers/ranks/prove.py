@@ -20,7 +20,7 @@ from certify.provers.execution.shared import shared
 from certify.provers.ranks.images import Course, Images
 from certify.provers.ranks.search import COUNTS, Search
 from certify.provers.ranks.targets import TURN, Target
-from certify.provers.ranks.wanted import COUNTS_FROM, Direct, SearchFrom, Wanted
+from certify.provers.ranks.wanted import Direct, SearchFrom, Wanted
 
 _HALF_TURN = 3.1416  # and a little more
 _SLIVER, _SAMPLES = 1e-6, 64
