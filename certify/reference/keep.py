@@ -3,8 +3,10 @@
 That is in {V <= c2} by its ball and its leaves, in a second function's set by the leaves of its tree on which states
 may be beyond {V <= c2}, and in a tube by the ball of each slab, for no ellipsoid between two nodes leaves it.
 
-With a sample they are so at all times of a period, in which the inputs are held: then they are taken at the states of
-the whole period, and what is uncertain may be any number of its range at each place.
+With a sample they are so at all times of a period, in which the inputs are held, and what is uncertain may be any
+number of its range at each place. On a box the state after a time s is x + s G, G the mean of f until then. The
+coefficients of G up to the last are those at x, and the last is taken at all states of the longest period: so it holds
+for every s. A ball has all of those states at once.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ RULE = "keep"
 
 
 def kept(motion: Motion, at: Stage, within: Mapping[str, Taylor] | None, slacks: Sequence[Taylor]) -> None:
-    """The rule on a box, or where on it each of some slacks is not negative.
+    """The rule on a box, or where on it each of some slacks is not negative at the start of a period.
 
     With a sample `within` are the states of the whole period.
     """
@@ -32,7 +34,9 @@ def kept(motion: Motion, at: Stage, within: Mapping[str, Taylor] | None, slacks:
         return
     names = {**known.states, **known.inputs, **known.uncertain}
     if within is not None:
-        names |= {**within, **known.anything}
+        s = motion.within_period()
+        moved = zip(known.states.items(), motion.mean(at, within, s), strict=True)
+        names |= {**known.anything, **{name: x + s * g for (name, x), g in moved}}
     with under(RULE, at.place):
         values: list[Taylor] = expressions.evaluate(names, constant)
     for i, g in enumerate(values):

@@ -159,7 +159,7 @@ class Leaves(Motion):
             if not self.c.plant.discrete:
                 return F
             return [f + -self.affine(row) for f, row in zip(F, leaf.x, strict=True)]
-        return self.mean(leaf, within)
+        return self.mean(leaf, within, self.period())
 
     def D(self, leaf: Leaf, within: dict[str, Taylor] | None = None) -> Taylor:
         """(2 P x + h P G)'G from above: Vdot in continuous time. What V changes by over a step, by its length.

@@ -6,10 +6,10 @@ for all of it that is not affine in those of the leaf.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from flint import arb, arb_mat
+from flint import arb, arb_mat, fmpq
 
 from .affine import Form, OnBoxes, called, clip
 from .balls import ZERO, beta, bounded_by_form, total, within_bounds
@@ -37,7 +37,7 @@ class Stage:
 
 class Motion:
     """Models in `d` symbols of the states, with one more for each input's error, uncertain quantity, entry of a call,
-    and for a period that may be one of many, in this order.
+    and for a time: of a period that may be one of many, or within a period, in this order.
 
     Refusals are of the rule `rule`, where it is not `inputs` or `flow`. With a sample `free` are states whose domain is
     not asked, and of the others no |x_i| counts beyond its bound, where there are `bounds`.
@@ -51,7 +51,8 @@ class Motion:
         self.c, self.n, self.d, self.bounded = c, c.n, d, bounded_by_form(c)
         self.quantities = d + c.m
         self.calls = self.quantities + c.k
-        self.symbols = self.calls + c.plant.dynamics.entries + c.varies
+        timed = c.varies or (c.sample is not None and c.keep is not None)
+        self.symbols = self.calls + c.plant.dynamics.entries + timed
         self.order, self.bounds, self.free = order, bounds, free
         self.shifts, self.offset = centred(c)
 
@@ -117,15 +118,21 @@ class Motion:
         """Rule `flow`: the states of a whole period."""
         return reached_from(self.c, self.numbers(at), self.order, at.place)
 
-    def mean(self, at: Stage, within: dict[str, Taylor]) -> list[Taylor]:
-        """The mean of f over a period in which the states are `within`."""
-        return mean_on(self.c, self.numbers(at), within, self.order, self.period(), at.place)
+    def mean(self, at: Stage, within: Mapping[str, Taylor], time: Taylor) -> list[Taylor]:
+        """The mean of f over so much time of a period in which the states are `within`."""
+        return mean_on(self.c, self.numbers(at), within, self.order, time, at.place)
 
     def period(self) -> Taylor:
+        return self.between(*(self.c.sample or (self.c.step, self.c.step)))
+
+    def within_period(self) -> Taylor:
+        """Any time from the start of a period to the end of the longest."""
+        return self.between(fmpq(0), self.c.step)
+
+    def between(self, lo: fmpq, hi: fmpq) -> Taylor:
         """With the last symbol, where it may be one of many."""
-        lo, hi = self.c.sample or (self.c.step, self.c.step)
         middle = arb((lo + hi) / 2)
-        if not self.c.varies:
+        if lo == hi:
             return Taylor(middle)
         return self.moving(middle, [ZERO] * self.d, self.symbols - 1, arb((hi - lo) / 2))
 

@@ -193,7 +193,8 @@ class Walk(Motion):
         """Models of the next state: F in discrete time, else x + h G."""
         if within is None:
             return self.F(here)
-        G, h = self.mean(here, within), self.period()
+        h = self.period()
+        G = self.mean(here, within, h)
         moved = [h * g if self.c.varies else g.scaled(h.c) for g in G]
         return [self.affine(row) + g for row, g in zip(here.x, moved, strict=True)]
 

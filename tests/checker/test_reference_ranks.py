@@ -411,10 +411,10 @@ def test_constraints_in_the_middle_of_several_steps() -> None:
 
 
 def test_constraints_between_instants() -> None:
-    """x' = u, u = -x: what holds at instants may not hold between them. x' = 4 goes past 2 before it is at 5."""
-    data, *_ = certificate(Loop(**{**HELD.__dict__, "keep": [["-", "x", "201/100"]]}), repeated(held), within(0.25), (-2.0, 2.0), 6, 3)  # fmt: skip  # noqa: E501
-    assert verdict(data) == "keep"  # xi is within kappa
-    assert verdict(edited(data, "claim.keep", [["-", "x", "7/2"]])) is None
+    """x' = u, u = -x: no state passes 2, where some start. x' = 4 goes past 2 before it is at 5."""
+    data, *_ = certificate(Loop(**{**HELD.__dict__, "keep": [["-", "x", "2000001/1000000"]]}), repeated(held), within(0.25), (-2.0, 2.0), 6, 3)  # fmt: skip  # noqa: E501
+    assert verdict(data) is None
+    assert verdict(edited(data, "claim.keep", [["-", "x", "1999999/1000000"]])) == "keep"
     rising = Loop(
         [["+", "4", ["*", "0", "u"]]],
         HALF,
