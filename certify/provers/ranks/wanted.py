@@ -23,6 +23,7 @@ _GROWTH = 1.5  # of an image, relative to its leaf, that counts as none
 _NARROW = 1e-11  # share of the root box below which leaves are not halved
 _FALLS = 0.95  # of the volume without a rank from one round to the next, at most
 _SHARE = 0.7  # of the leaves that may be halved, the largest ones
+_MOST_LEFT = 0.5  # share of the box without which a search of its own parts is worth all effort
 _OF_A_TURN = 0.01  # width of an angle below which it is not halved at first
 
 
@@ -160,8 +161,9 @@ class Direct(SearchFrom):
 
     @property
     def gives_up(self) -> bool:
-        """True once enough boxes were looked at, and halves prove hardly more of the box."""
-        return self.boxes >= self.wanted.direct and self.left >= _FALLS * self.before
+        """True once enough boxes were looked at, little of the box is proved, and halves prove hardly more."""
+        stalled = self.left > _MOST_LEFT and self.left >= _FALLS * self.before
+        return self.boxes >= self.wanted.direct and stalled
 
     def further(self, near: Index) -> Index:
         """Halves of all parts without a rank."""
