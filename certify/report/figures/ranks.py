@@ -31,6 +31,7 @@ _BOX = (PAPER, 3.0), (START, 2.0)
 _RUNS = (PAPER, 1.4), (INK, 0.6)
 _POINTS = 480  # of a map along each side
 _SAMPLES = 100_000  # states that tell where a region is
+_ROOM = 1.1  # of a set's reach, in its picture
 _STARTS, _LONGEST = 6, 4000  # simulated runs, and their steps
 _COLOURS = "viridis_r"  # light is near, and no colour is white
 
@@ -80,8 +81,8 @@ def rank_maps(scene: Scene) -> list[Picture]:
         scene.labels,
         [s.name for s in scene.system.states],
         np.zeros(scene.n),
-        ranked.tree.lo,
-        ranked.tree.hi,
+        np.minimum(ranked.tree.lo, -_ROOM * scene.reach),
+        np.maximum(ranked.tree.hi, _ROOM * scene.reach),
         "{V ≤ c₂}",
         lambda axes, pair: _level_set(axes, scene, ranked, pair),
         scene.timing.sample is not None,
@@ -119,12 +120,13 @@ def reach_ground(
         None if box is None else _runs(certificate, box, lambda x: beyond(x, np.zeros((*x.shape[:-1], system.m)), ()))
     )
 
-    lo, hi = ranked.tree.lo, ranked.tree.hi
+    domain = np.array([[float(end) for end in pair] for pair in system.domain]).T
+    lo, hi = ends = np.minimum(ranked.tree.lo, domain[0]), np.maximum(ranked.tree.hi, domain[1])
     if box is not None and path is not None:
-        lo, hi = _view(ranked.tree, np.concatenate([np.stack(box), path.reshape(-1, system.n)]))
+        lo, hi = _view(ranked.tree, np.concatenate([np.stack(box), path.reshape(-1, system.n)]), ends)
     elif close:
         x = np.random.default_rng(0).uniform(lo, hi, (_SAMPLES, system.n))
-        lo, hi = _view(ranked.tree, x[beyond(x, np.zeros((len(x), system.m)), ()).max(-1) <= 0])
+        lo, hi = _view(ranked.tree, x[beyond(x, np.zeros((len(x), system.m)), ()).max(-1) <= 0], ends)
 
     def outline(axes: Any, pair: Pair) -> None:
         a, b, states = _plane(lo, hi, middle, pair)
@@ -199,14 +201,14 @@ def draw_map(axes: Any, ground: Ground, pair: Pair) -> dict[str, Any]:
     return show
 
 
-def _view(tree: RankTree, states: Array) -> tuple[Array, Array]:
-    """The part of the root box that has leaves with a rank, and these states (N, n), with some room."""
+def _view(tree: RankTree, states: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+    """The box of leaves with a rank and of these states (N, n), with some room, between corners (n,)."""
     lower, upper = leaves_within(tree.tree, tree.lo, tree.hi)
     known, states = tree.proved, states[np.isfinite(states).all(-1)]
     lo = np.concatenate([states, lower[known]]).min(0)
     hi = np.concatenate([states, upper[known]]).max(0)
     room = 0.2 * (hi - lo)
-    return np.maximum(lo - room, tree.lo), np.minimum(hi + room, tree.hi)
+    return np.maximum(lo - room, ends[0]), np.minimum(hi + room, ends[1])
 
 
 def _plane(lo: Array, hi: Array, middle: Array, pair: Pair) -> tuple[Array, Array, Array]:
