@@ -536,6 +536,7 @@ def test_the_end_of_an_axis_is_rounded_outwards() -> None:
     """q reaches up to 2^53 + 11/24, which binary64 rounds to 2^53."""
     assert "data" not in verdicts(unknown_axis(str(2**53 + 100), 1e-9))
     assert verdicts(unknown_axis(f"{10 * 2**53 + 3}/10", 1e-9)) == ("data", "data")
+    assert verdicts(unknown_axis(str(2**53 + Fraction(11, 24) - Fraction(1, 10**30)), 1e-9)) == ("data", "data")
 
 
 def test_multipliers_of_axes_are_not_all_0() -> None:
