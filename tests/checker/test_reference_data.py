@@ -501,6 +501,49 @@ def test_no_multipliers_of_axes_exclude_the_truth(name: str, kind: str) -> None:
             assert verdicts(forged) == ("data", "data")
 
 
+@pytest.mark.parametrize("size", ["huge", "tiny"])
+def test_axes_without_rounds_and_a_bound_that_is_no_number(size: str) -> None:
+    """Sums of multipliers and noise exceed binary64; or they say nothing of any axis."""
+    alone = put(f"{FIT}.rounds", [])(put(f"{SAID}.noise.0", "1000")(true("an axis in steps")))
+    value = {"huge": 1.7e308, "tiny": 5e-324}[size]
+    assert verdicts(array(TURN, lambda w: np.full_like(w, value))(alone)) == ("data", "data")
+
+
+def test_a_factor_of_an_axis_that_is_rounded_much() -> None:
+    """q = 3/2^1075 p, a factor that binary64 rounds up by a third; x+ = 2^74 q x from 1 to 3/4 has p = 2^999."""
+    most = 2**1000
+    once = replace(STEPS, f=lambda x, u, p: [x[0]], names=("p",), noise=("0",), size=0.0, steps=1, starts=((1.0,),),
+                   drift=0.0, priors=((str(-most), str(most)),), axes=(("q", "0", (f"3/{2**1075}",)),))  # fmt: skip
+    data = edited(
+        with_data(of_steps([(f"-{10**30}", str(10**30))]), once), "plant.dynamics", [["*", str(2**74), ["*", "q", "x"]]]
+    )
+    data = edited(data, f"{SAID}.runs.0.states", encode([1.0, 0.75]))
+    box = encode([0.3 * 2.0**1000, 0.4 * 2.0**1000])
+    wrong = edited(data, f"{FIT}.rounds", [{"box": box, "weights": encode([0.5, 0.5])}])
+    assert verdicts(wrong) == ("data", "data")
+
+
+def unknown_axis(most: str, weight: float) -> Document:
+    """x+ = x/2 with q = 2^53 + p, of which data say nothing: p in [5/24, 11/24], q in [0, most]."""
+    once = replace(STEPS, f=lambda x, u, p: [x[0] / 2], names=("p",), truth=(0.3,), noise=("1/1000",), size=0.0,
+                   steps=1, starts=((1.0,),), drift=0.0, priors=(("5/24", "11/24"),),
+                   axes=(("q", str(2**53), ("1",)),))  # fmt: skip
+    data = edited(with_data(of_steps([("0", "1")]), once), "plant.dynamics", [["/", "x", "2"]])
+    return put(TURN, encode([weight] * 2))(put("plant.uncertain.1.range", ["0", most])(data))
+
+
+def test_the_end_of_an_axis_is_rounded_outwards() -> None:
+    """q reaches up to 2^53 + 11/24, which binary64 rounds to 2^53."""
+    assert "data" not in verdicts(unknown_axis(str(2**53 + 100), 1e-9))
+    assert verdicts(unknown_axis(f"{10 * 2**53 + 3}/10", 1e-9)) == ("data", "data")
+    assert verdicts(unknown_axis(str(2**53 + Fraction(11, 24) - Fraction(1, 10**30)), 1e-9)) == ("data", "data")
+
+
+def test_multipliers_of_axes_are_not_all_0() -> None:
+    """In ranges that hold all that the priors allow, too."""
+    assert verdicts(unknown_axis(str(2**53 + 100), 0.0)) == ("data", "data")
+
+
 # -------------------------------------------------------------------------------------------------- parts of the priors
 
 NOTHING, LEAVES = encode([1.2, 0.9]), f"{FIT}.leaves"
