@@ -154,7 +154,8 @@ def test_nothing_is_accepted_beyond_the_truth(name: str) -> None:
 
 
 def in_steps_of_euler(dynamics: Any, constant: Any, states: Any, *rest: Any) -> Any:
-    return ([constant(Fraction(0)) for _ in states],) * 2
+    nothing = [constant(Fraction(0)) for _ in states]
+    return [[v] for v in nothing], nothing
 
 
 def without_the_square(ball: Any, models: Any) -> Any:
