@@ -90,6 +90,8 @@ class Taylor:
 
     def widened(self, symbols: int) -> Taylor:
         """The same among so many symbols, of which those that come after its own do not matter to it."""
+        if symbols == self.symbols:
+            return self
         i, j = pairs(symbols)
         p = np.zeros((symbols + len(i), *self.p.shape[1:]))
         p[: self.symbols] = self.g

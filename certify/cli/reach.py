@@ -63,12 +63,13 @@ def reach(
     set of a certificate."""
     start, note, path = time.perf_counter(), noting(quiet), the_policy(context, file, policy)
     from certify.analysis.reaching import ReachOptions, certify_reach, into_set_of
+    from certify.analysis.reaching.options import is_file
     from certify.report.reached import summary
 
     with kind_called(_KIND):
         stored = policy_in(path, importing, system, changes, note)
     plant = plant_of(stored, system, changes, note)
-    by_tube = target is None or (len(target) == 1 and target[0].endswith(".json") and not plant.in_steps)
+    by_tube = target is None or (len(target) == 1 and is_file(target[0]) and not plant.in_steps)
     _require_one(target, within, typed, by_tube)
     if target is None or by_tube:
         options = options_of(typed, plant, note)

@@ -180,7 +180,8 @@ def _proved(
     clerk = tools.clerk(path, options.jobs, True, options.cluster)
     question = goal.question(begins(options.begin or whole)[:_PROBES].T, clerk.tried)
     if options.begin is not None:
-        question = with_memory(question, *_parts(options.begin), min(longest or MOST_STEPS, MOST_STEPS))
+        with tools.timing("ranks"):
+            question = with_memory(question, *_parts(options.begin), min(longest or MOST_STEPS, MOST_STEPS))
     _require_periodic(goal, question, clerk)
     with tools.timing("ranks"), runner_at(options.cluster) as runner:
         found = _searched(question, options, longest, effort.share(_FOR_SEARCH), runner, tools)

@@ -30,10 +30,8 @@ _MOST_LEAVES, _MOST_PAIRS = 400_000, 10_000_000  # of an image and a leaf that i
 _OF_A_PAIR, _OF_A_LEAF = 500.0, 50_000.0  # operations, beside those of the steps
 _SMALL, _LOST = 0.002, 1e3  # half-width of a box, as a share of the root box's width; growth that counts for no image
 _DEPENDENT = 1e8  # condition of a frame that is of no use
-_MEMORIES, _THERE = (
-    (1, 2, 4, 8),
-    1e-6,
-)  # steps; the width, relative to the root box, that an image in the target counts as
+_MEMORIES = (1, 2, 4, 8)
+_THERE = 1e-6  # width of an image in the target, as a share of the root box's
 _AT_FIRST = 0.1  # share of the effort for the first tree
 
 
@@ -114,13 +112,18 @@ def with_memory(question: Question, lo: Array, hi: Array, steps: int) -> Questio
     operations."""
     root = (question.root[1] - question.root[0])[:, None]
 
-    def price(memory: int) -> float:
-        course = replace(question, memory=memory).course((steps,))
+    best, least = question, math.inf
+    for memory in _MEMORIES:
+        asked = replace(question, memory=memory)
+        course = asked.course((steps,))
         found = course(lo, hi, 0.0, 0.0)
         widths = np.nan_to_num(((found.hi - found.lo) / root).max(1), nan=1.0)
-        return float(np.log(np.where(found.there, _THERE, widths)).mean() * len(lo) / 2 + math.log(course.operations))
-
-    return replace(question, memory=min(_MEMORIES, key=price))
+        boxes = np.log(np.where(found.there, _THERE, widths)).mean() * len(lo) / 2
+        if boxes + math.log(course.operations) < least:
+            best, least = asked, boxes + math.log(course.operations)
+        if np.all(found.there):  # more memory has more operations, and no fewer boxes
+            break
+    return best
 
 
 def _eigenframe(loop: ClosedLoop) -> Array | None:
