@@ -100,6 +100,10 @@ KNOWN: dict[str, tuple[dict[str, Any], str]] = {
     "two critics": ({f"{q}.{k}": v for q in ("q1", "qf2_target") for k, v in CRITIC.items()}, "another network"),
     "a value": ({f"ac.v_net.{k}": v for k, v in CRITIC.items()}, "another network"),
     "a target policy": ({f"target_actor.net.{k}": v for k, v in CRITIC.items()}, "another network"),
+    "a target policy in short": (
+        {f"ac_targ.net.{k}": v for k, v in CRITIC.items()},
+        "another network",
+    ),
     "a Lyapunov network": ({f"lyapunov.layers.{k}": v for k, v in CRITIC.items()}, "another network"),
     "Adam": ({"opt": {"state": {0: {"step": torch.tensor(1.0), "exp_avg": torch.ones(7, 2)}}}}, "optimiser"),
     "an optimiser": ({"optimizer": {"moments": torch.ones(3)}}, "optimiser"),

@@ -90,8 +90,9 @@ def unread(
         listed = ", ".join(f"{name} {tensors[name].shape}" for name in could[:8])
         more = f" and {len(could) - 8} more" if len(could) > 8 else ""
         options = " ".join(f"--ignore {_quoted(name)}" for name in _patterns(could, set(tensors) - set(could)))
+        layers = prefix if " " in prefix else f"layers {_dot(prefix)}NUMBER"  # those listed have no common prefix
         raise InputError(
-            f"the layers {_dot(prefix)}NUMBER must be all of the {whole}, and the file holds what could belong to it: "
+            f"the {layers} must be all of the {whole}, and the file holds what could belong to it: "
             f"{listed}{more}. If the layers are all of it, say so: {options}. "
             f"If they are not, export the {whole} as TorchScript or ONNX, which say what becomes of each number."
         )
@@ -128,7 +129,7 @@ def _names_another(part: str, words: set[str], leaf: str) -> bool:
     """True if a part of a name says that it is a critic, a value, a Lyapunov or a target network."""
     if words & _OTHER:
         return True
-    if "target" in words:  # which a state to be reached is called too
+    if words & {"target", "targ"}:  # which a state to be reached is called too
         return bool(words & _NETWORKS) or leaf in ("weight", "bias")
     return part not in ("q", "v") and bool(words & {"q", "v"}) and words <= _OF  # positions and velocities are q and v
 
