@@ -10,14 +10,15 @@ FORMAT.md has the same in its chapter on ranks; boxes here are wider by more tha
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import Expression, evaluate
+from certify.loop.expressions import Expression, Symbol, evaluate
 from certify.loop.policies import bounded_by_form
 from certify.provers.bounds import Flow, Models, Taylor, loop_models, policy_enclosure, upper_bound
 from certify.provers.bounds.arrays import Array, Index, Mask, joined, pieces, product
@@ -185,18 +186,18 @@ class Course:
         )
         values = {**states, **inputs, **quantities}
         here = list(states.values())
-        models = Models(here[0])
+        during: Sequence[Mapping[Symbol, Taylor]] = [values]
         if self.flow is None:
             known: dict[Expression, Taylor] = {}
-            after = [evaluate(expression, values, models, known) for expression in self.dynamics]
+            after = [evaluate(expression, values, Models(here[0]), known) for expression in self.dynamics]
         else:
             mean = self.flow(states, inputs, quantities, self.symbols + system.m)
             after = [v + self.flow.times_period(rate) for v, rate in zip(here, mean.G, strict=True)]
             kept = kept & mean.exists & self.in_domain(below - mean.down, above + mean.up)
-            values = dict(mean.during)
+            during = mean.during
         lost = np.zeros_like(kept)
-        for expression in self.keep:
-            g = evaluate(expression, values, models, {})
+        for expression, then in itertools.product(self.keep, during):
+            g = evaluate(expression, then, Models(next(iter(then.values()))), {})
             kept, lost = kept & (upper_bound(g)[0] < 0), lost | (upper_bound(g.scaled(-1.0))[0] < 0)
         return self.form(after), kept & np.all([np.isfinite(v.c + v.radius()) for v in after], axis=0), lost
 
