@@ -107,7 +107,10 @@ def halved(monkeypatch: pytest.MonkeyPatch) -> None:
     as_stated: Callable[..., Any] = Boxes.number
 
     def number(self: Any, pair: Any, symbol: int, batch: int) -> Any:
-        return as_stated(self, (pair[0], pair[1] / (2 if symbol == self.symbols else 1)), symbol, batch)
+        most = self.c.step / 2
+        return as_stated(
+            self, (min(pair[0], most), min(pair[1], most)) if symbol == self.symbols else pair, symbol, batch
+        )
 
     monkeypatch.setattr(Boxes, "number", number)
 
@@ -117,7 +120,7 @@ def ended(monkeypatch: pytest.MonkeyPatch) -> None:
     as_stated: Callable[..., Any] = Boxes.number
 
     def number(self: Any, pair: Any, symbol: int, batch: int) -> Any:
-        return as_stated(self, (pair[1], pair[1]) if symbol == self.symbols else pair, symbol, batch)
+        return as_stated(self, (self.c.step, self.c.step) if symbol == self.symbols else pair, symbol, batch)
 
     monkeypatch.setattr(Boxes, "number", number)
 
@@ -133,9 +136,9 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Motion, "numbers", numbers)
     kept: Callable[..., Any] = Boxes.kept
 
-    def with_symbols(self: Any, states: Any, held: Any, gaps: Any) -> Any:
-        own = [v.widened(states[0].symbols) for v in self.quantities(len(held[0].c))]
-        return kept(self, states, [*held[: self.m], *own], gaps)
+    def with_symbols(self: Any, courses: Any, held: Any, gaps: Any) -> Any:
+        own = [v.widened(held[0].symbols) for v in self.quantities(len(held[0].c))]
+        return kept(self, courses, [*held[: self.m], *own], gaps)
 
     monkeypatch.setattr(Boxes, "kept", with_symbols)
 
