@@ -103,7 +103,7 @@ VIOLATED = {
 
 
 def halved(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Motion, "within_period", lambda self: self.between(self.c.step * 0, self.c.step / 2))
+    monkeypatch.setattr(Motion, "quarters", lambda self: [self.between(self.c.step * 0, self.c.step / 2)])
     as_stated: Callable[..., Any] = Boxes.number
 
     def number(self: Any, pair: Any, symbol: int, batch: int) -> Any:
@@ -116,7 +116,7 @@ def halved(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Motion, "within_period", lambda self: self.between(self.c.step, self.c.step))
+    monkeypatch.setattr(Motion, "quarters", lambda self: [self.between(self.c.step, self.c.step)])
     as_stated: Callable[..., Any] = Boxes.number
 
     def number(self: Any, pair: Any, symbol: int, batch: int) -> Any:
