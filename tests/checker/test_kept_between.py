@@ -164,3 +164,22 @@ def test_each_part_of_the_rule_is_needed(name: str, monkeypatch: pytest.MonkeyPa
     assert verdicts(case.document(by)) == REFUSED
     MUTANTS[name](monkeypatch)
     assert verdicts(case.document(by)) == KEPT
+
+
+@pytest.mark.parametrize("k", range(4))
+def test_the_checker_asks_each_quarter(k: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """x is the time: within 1e-3 of the middle of one quarter alone g is not negative."""
+    bump = Case(["u"], (0.0,), ["-", ["**", ["-", "x", str(Fraction(2 * k + 1, 8))], 2]], Fraction(0))
+    violated = bump.document(-Fraction(1, 10**6))
+    assert verdicts(violated) == REFUSED
+    as_stated: Callable[..., Any] = Boxes.number
+    for left_out in range(4):
+
+        def number(self: Any, pair: Any, symbol: int, batch: int, left_out: int = left_out) -> Any:
+            other = Fraction((left_out + 2) % 4, 4)
+            missing = symbol == self.symbols and pair[0] == Fraction(left_out, 4)
+            return as_stated(self, (other, other) if missing else pair, symbol, batch)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(Boxes, "number", number)
+            assert verdicts(violated) == ((None if left_out == k else "keep"), "keep")
