@@ -9,14 +9,24 @@ from fractions import Fraction
 from typing import Any
 
 import mpmath
+import numpy as np
 import pytest
+from flint import arb
 
 from certify.checker import flow as checker_flow
+from certify.checker import keep as checker_keep
 from certify.checker.boxes import Boxes
+from certify.checker.taylor import combination, constants
+from certify.reference import leaves as reference_leaves
 from certify.reference import motion as reference_motion
 from certify.reference.motion import Motion
+from certify.reference.taylor import Taylor
+from tests.support.certificates import decode, edited, make, verdict, with_tree
+from tests.support.certificates import halved as cut
 from tests.support.rank_forgeries import verdicts
 from tests.support.ranked import Document, Loop, affine, two_bytes
+from tests.support.reference import judge
+from tests.support.stepped_loops import WIDE as FAR
 
 KEPT, REFUSED = (None, None), ("keep", "keep")
 WIDE = 2.0**-40  # half of the leaf's width
@@ -161,3 +171,86 @@ def test_each_part_of_the_rule_is_needed(name: str, monkeypatch: pytest.MonkeyPa
     assert verdicts(case.document(by)) == REFUSED
     MUTANTS[name](monkeypatch)
     assert verdicts(case.document(by)) == KEPT
+
+
+# ------------------------------------------------------------------------------------------------- beyond the level set
+
+P, GAINS, ALONG = np.array([[80.0, -0.75], [-0.75, 1.0]]), np.array([1 / 16, 45 / 64]), np.array([1.0, -1 / 25])
+RISE = 29 / 32  # of x by u
+
+
+def later(s: float) -> Any:
+    """x - v/25 after a time s of a period, by x and v at its start: polynomials of s, for u is held."""
+    moved = np.array([[1.0, s], [0.0, 1.0]]) - np.outer([RISE * s + s * s / 2, s], GAINS)
+    return ALONG @ moved
+
+
+def most(s: float) -> float:
+    """The largest of it from {V <= 1}."""
+    return float(np.sqrt(later(s) @ np.linalg.solve(P, later(s))))
+
+
+def near_the_top(lo: Any, hi: Any) -> Any:
+    """True on boxes (2, B) from which it may become as large as that, nearly."""
+    rows = np.array([later(s) for s in np.linspace(0, 1, 9)])
+    return np.max(rows @ (lo + hi) / 2 + np.abs(rows) @ (hi - lo) / 2, axis=0) > 0.9 * TOP
+
+
+def overshooting(bound: float, depth: int = 12) -> Document:
+    """x' = v + 29/32 u, v' = u: V falls from each sampling instant to the next and in between rises above its level;
+    the claim that x - v/25 stays below a bound, by a tree of 2^6 leaves or, where that is near, as many as 2^depth."""
+    data = make(
+        [["+", "v", ["*", str(Fraction(RISE)), "u"]], "u"], [(-GAINS[None], [0.0])], P, (0.25, 1.0),
+        states=["x", "v"], domain=FAR * 2, input_bounds=[("-99", "99")], squash="identity", centre="none",
+        scale=(1.0,), claim="practical", sample=("1", "1"), order=3,
+    )  # fmt: skip
+    root = decode(data["evidence"]["root"])
+
+    def small(lo: Any, hi: Any) -> Any:
+        return (np.prod((hi - lo).T / (2 * root), axis=1) <= 2.0**-6) & ~near_the_top(lo, hi)
+
+    tree = cut(root, small, 10**4, depth)
+    keep = [["-", ["-", "x", ["*", "1/25", "v"]], str(Fraction(bound))]]
+    return edited(with_tree(data, tree), "claim", lambda claim: claim | {"keep": keep})
+
+
+TOP = max(most(s) for s in np.linspace(0, 1, 1001))
+
+
+def both(data: Document) -> tuple[str, str | None]:
+    return verdict(data), judge(data)
+
+
+def test_a_loop_overshoots_its_level_within_a_period() -> None:
+    """So what is true of all states of {V <= c2} may be false in between, and all that it is more is counted."""
+    assert most(0.0) < 0.9 * TOP
+    for bound in (most(0.0) + 1e-6, TOP - 1e-6):
+        for depth in (6, 12):
+            assert both(overshooting(bound, depth)) == ("keep", "keep")
+    assert both(overshooting(1.1 * TOP)) == ("ACCEPTED", None)
+
+
+def test_v_in_a_gap_is_that_of_the_sampling_instant(monkeypatch: pytest.MonkeyPatch) -> None:
+    """V <= c2 is known there alone: if V in the gap were that of the moved states, both would accept what is false."""
+    data = overshooting(0.99 * TOP)
+    assert both(data) == ("keep", "keep")
+    on_boxes: Any = checker_keep.on_boxes
+    kept: Any = vars(reference_leaves)["kept"]
+
+    def checkers(boxes: Any, states: Any, held: Any, _: Any) -> Any:
+        x, v = states
+        of_P = [combination(*zip(row, (x, v), strict=True)) for row in P.tolist()]
+        above = x * of_P[0] + v * of_P[1]
+        gap = constants(above)(Fraction(1)) + -above
+        return on_boxes(boxes, states, held, [gap.at])
+
+    def references(motion: Any, at: Any, within: Any, _: Any) -> None:
+        s, known = motion.within_period(), motion.numbers(at)
+        moved = zip(known.states.values(), motion.mean(at, within, s), strict=True)
+        x, v = (state + s * g for state, g in moved)
+        above = (x * x).scaled(arb(80)) + (x * v).scaled(arb(-1.5)) + v * v
+        kept(motion, at, within, [Taylor(arb(1)) + -above])
+
+    monkeypatch.setattr(checker_keep, "on_boxes", checkers)
+    monkeypatch.setattr(reference_leaves, "kept", references)
+    assert both(data) == ("ACCEPTED", None)
