@@ -3,6 +3,7 @@ both sides, and mutants of the rule that each let one of them pass."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -11,20 +12,30 @@ from typing import Any
 import mpmath
 import numpy as np
 import pytest
-from flint import arb
+from flint import arb, ctx
 
+from certify.checker import document
 from certify.checker import flow as checker_flow
 from certify.checker import keep as checker_keep
 from certify.checker.boxes import Boxes
+from certify.checker.case import Case as Of
+from certify.checker.network import enclose_on_boxes
+from certify.checker.ranks import Steps
 from certify.checker.taylor import combination, constants
 from certify.reference import leaves as reference_leaves
 from certify.reference import motion as reference_motion
-from certify.reference.motion import Motion
+from certify.reference.document import read
+from certify.reference.evidence import Ranked
+from certify.reference.leaves import Box
+from certify.reference.motion import Motion, Stage
+from certify.reference.ranks import Walk
 from certify.reference.taylor import Taylor
 from tests.support.certificates import decode, edited, make, verdict, with_tree
 from tests.support.certificates import halved as cut
-from tests.support.rank_forgeries import verdicts
-from tests.support.ranked import Document, Loop, affine, two_bytes
+from tests.support.marks import slow_after
+from tests.support.rank_forgeries import Draw, verdicts
+from tests.support.rank_truth import Truth
+from tests.support.ranked import Document, Loop, affine, dumped, two_bytes
 from tests.support.reference import judge
 from tests.support.stepped_loops import WIDE as FAR
 
@@ -171,6 +182,82 @@ def test_each_part_of_the_rule_is_needed(name: str, monkeypatch: pytest.MonkeyPa
     assert verdicts(case.document(by)) == REFUSED
     MUTANTS[name](monkeypatch)
     assert verdicts(case.document(by)) == KEPT
+
+
+# --------------------------------------------------------------------------------------------------- states in between
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A state's model x + s G: c, g (N,), the coefficients q (N, N) of d_i d_j, i <= j, and r; the first symbols are
+    those of the leaf, the last one is that of s."""
+
+    c: float
+    g: Any
+    q: Any
+    r: float
+
+    def share(self, x: Any, d: Any, s: Any) -> float:
+        """How far states (B,) are from the model at their d (n, B) and s in [-1, 1], of what other symbols allow."""
+        own = [*range(len(d)), len(self.g) - 1]
+        e, q = np.concatenate([d, [s]]), self.q[np.ix_(own, own)]
+        away = x - self.c - self.g[own] @ e - np.sum(e * (q @ e), axis=0)
+        left = np.sum(np.abs(self.g)) - np.sum(np.abs(self.g[own])) + np.sum(np.abs(self.q)) - np.sum(np.abs(q))
+        return float(np.max((np.abs(away) - 1e-9) / (left + self.r + 1e-30)))
+
+
+def checkers(data: Document, lo: Any, hi: Any) -> list[Moved]:
+    with np.errstate(all="ignore"):
+        steps = Steps(Of(document.certificate(json.loads(dumped(data)), "0" * 64)))
+        x = steps.start(lo[:, None], hi[:, None])
+        found = list[Moved]()
+        for v in steps.motion(*steps.models(x, enclose_on_boxes(steps.net, x))).states:
+            q = np.zeros((v.symbols, v.symbols))
+            q[np.triu_indices(v.symbols)] = v.q[:, 0]
+            found.append(Moved(float(v.c[0]), v.g[:, 0], q, float((v.r.top + 0 * v.c)[0])))
+    return found
+
+
+def references(data: Document, lo: Any, hi: Any) -> list[Moved]:
+    c, found = read(dumped(data)), list[Moved]()
+    assert isinstance(c.evidence, Ranked)
+    with ctx.workprec(64):
+        walk = Walk(c, c.evidence.order, c.evidence.ranking)
+        rows = walk.start(Box(0, lo.tolist(), hi.tolist()))
+        (inputs,), s = walk.inputs([rows]), walk.within_period()
+        here = Stage("here", rows, inputs)
+        for x, g in zip(walk.numbers(here).states.values(), walk.mean(here, walk.reached(here), s), strict=True):
+            v, N = x + s * g, walk.symbols
+            q = np.zeros((N, N)) if v.Q is None else np.array([[float(k.mid()) for k in row] for row in v.Q.tolist()])
+            more = 0.0 if v.Q is None else sum(float(k.rad()) for k in v.Q.entries())
+            g_of = np.array([float(k.mid()) for k in v.slopes(N)])
+            found.append(Moved(float(v.c.mid()), g_of, q, float(v.r.upper()) + more))
+    return found
+
+
+@pytest.mark.parametrize("seed", slow_after(6, range(40)))
+def test_states_of_a_period_lie_in_what_constraints_are_taken_of(seed: int) -> None:
+    """Of random loops: at the same d and s, with quantities that jump."""
+    drawn = next(draw for k in range(99) if (draw := Draw(100 * seed + k)).sampled)
+    loop, chance = replace(drawn.loop(), keep=["-1"], sample=("1/16", "1/8")), np.random.default_rng(seed)
+    lo = chance.uniform(-1, 1, drawn.n)
+    hi = lo + chance.choice([0.01, 0.1])
+    data = loop.document(lo.tolist(), hi.tolist(), b"\xff", two_bytes([1]), b"\1")
+    truth, count, largest = Truth(data), 400, float(Fraction(data["claim"]["sample"][1]))
+    d, s = chance.uniform(-1, 1, (drawn.n, count)), chance.choice([-1.0, 1.0, 0.0, 0.7, -0.3], count)
+    x = ((lo + hi) / 2)[:, None] + ((hi - lo) / 2)[:, None] * d
+    u, h = truth.policy(x), (1 + s) * largest / 12
+    for _ in range(6):
+        q = truth.quantities(chance, count)
+        for _ in range(3):
+            a = truth.f(x, u, q)
+            b = truth.f(x + h / 6 * a, u, q)
+            c = truth.f(x + h / 6 * b, u, q)
+            e = truth.f(x + h / 3 * c, u, q)
+            x = x + h / 18 * (a + 2 * b + 2 * c + e)
+    for models in (checkers(data, lo, hi), references(data, lo, hi)):
+        shares = [v.share(row, d, s) for v, row in zip(models, x, strict=True)]
+        assert 0.1 < max(shares) <= 1
 
 
 # ------------------------------------------------------------------------------------------------- beyond the level set
