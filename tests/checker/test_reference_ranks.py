@@ -365,6 +365,24 @@ def test_inputs_and_domain_before_each_step() -> None:
     assert verdict(wide.document([0.03], [0.3], tree, steps, b"\2\0")) is None
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_both_ask_the_domain_before_each_step_to_the_last_digit(sign: int) -> None:
+    """x+ = -3 x takes [1/32, 1/4] to [-3/4, -3/32], then to [9/32, 9/4] and the target; there nothing is asked."""
+    loop = Loop(["u"], [affine([[-3.0]])], [["-", ["*", str(-sign), "x"], "-1/4"]], bound="99")
+    ends = [sign / 32, sign / 4]
+    for first, last, rule in (
+        ("-3/4", "9/4", "ranks"),
+        ("-750000001/1000000000", "1/4", "ranks"),
+        ("-750000001/1000000000", "250000001/1000000000", None),
+    ):
+        loop.domain = (first, last) if sign > 0 else (negative(last), negative(first))
+        assert verdicts(loop.document([min(ends)], [max(ends)], b"\xff", two_bytes([2]), b"\2")) == (rule, rule)
+
+
+def negative(q: str) -> str:
+    return q[1:] if q.startswith("-") else f"-{q}"
+
+
 def test_the_domain_is_not_asked_of_angles() -> None:
     loop = Loop([["+", "x", "1/2", "u"]], [affine([[0.0]])], TURNING, angles=("x",), domain=("-1", "1"))
     assert verdict(certificate(loop, scaled(1.0, 0.5), cosine, (-3.25, 3.25), 6)[0]) is None
