@@ -197,10 +197,10 @@ class Moved:
     q: Any
     r: float
 
-    def share(self, x: Any, d: Any, s: Any) -> float:
-        """How far states (B,) are from the model at their d (n, B) and s in [-1, 1], of what other symbols allow."""
-        own = [*range(len(d)), len(self.g) - 1]
-        e, q = np.concatenate([d, [s]]), self.q[np.ix_(own, own)]
+    def share(self, x: Any, e: dict[int, Any]) -> float:
+        """How far states (B,) are from the model at these symbols, by their numbers, of what others allow."""
+        own = list(e)
+        e, q = np.array([*e.values()]), self.q[np.ix_(own, own)]
         away = x - self.c - self.g[own] @ e - np.sum(e * (q @ e), axis=0)
         left = np.sum(np.abs(self.g)) - np.sum(np.abs(self.g[own])) + np.sum(np.abs(self.q)) - np.sum(np.abs(q))
         return float(np.max((np.abs(away) - 1e-9) / (left + self.r + 1e-30)))
@@ -256,8 +256,27 @@ def test_states_of_a_period_lie_in_what_constraints_are_taken_of(seed: int) -> N
             e = truth.f(x + h / 3 * c, u, q)
             x = x + h / 18 * (a + 2 * b + 2 * c + e)
     for models in (checkers(data, lo, hi), references(data, lo, hi)):
-        shares = [v.share(row, d, s) for v, row in zip(models, x, strict=True)]
+        symbols = {**dict(enumerate(d)), len(models[0].g) - 1: s}
+        shares = [v.share(row, symbols) for v, row in zip(models, x, strict=True)]
         assert 0.1 < max(shares) <= 1
+
+
+def test_the_symbol_of_a_quantity_stands_for_its_mean() -> None:
+    """Of products of two the mean is another one than the product of means; of q w it is the product of theirs."""
+    rows: list[Any] = [["*", "0", "u"], ["*", "q", "q"], ["*", "q", "p"], ["*", "q", "w"]]
+    ranges = [("q", "-1", "1"), ("p", "-1", "1")]
+    names, network = ("w", "x", "y", "z"), [affine([[0.0] * 4])]
+    loop = Loop(rows, network, [["-", "-8", "x"]], names, ("1/2", "1"), 1, ranges, keep=["-1"])
+    lo, hi, chance = np.array([-1.0, 0.0, 0.0, 0.0]), np.array([1.0, 0.25, 0.25, 0.25]), np.random.default_rng(0)
+    data = loop.document(lo.tolist(), hi.tolist(), b"\xff", two_bytes([1]), b"\1")
+    d, s = chance.choice([-1.0, 1.0, 0.2], (4, 300)), chance.choice([-1.0, 1.0, 1.0, 0.0], 300)
+    q, p = chance.choice([-1.0, 1.0, 0.0], (2, 4, 300))  # in four parts of the time
+    moved = np.array([0 * s, np.mean(q * q, axis=0), np.mean(q * p, axis=0), d[0] * q.mean(0)])
+    x = (lo + hi)[:, None] / 2 + (hi - lo)[:, None] / 2 * d + (1 + s) / 2 * moved
+    for models in (checkers(data, lo, hi), references(data, lo, hi)):
+        symbols = {**dict(enumerate(d)), 9: q.mean(0), 10: p.mean(0), len(models[0].g) - 1: s}
+        shares = [v.share(row, symbols) for v, row in zip(models, x, strict=True)]
+        assert 0.9 < max(shares) <= 1
 
 
 # ------------------------------------------------------------------------------------------------- beyond the level set
@@ -341,3 +360,18 @@ def test_v_in_a_gap_is_that_of_the_sampling_instant(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(checker_keep, "on_boxes", checkers)
     monkeypatch.setattr(reference_leaves, "kept", references)
     assert both(data) == ("ACCEPTED", None)
+
+
+def test_a_gap_counts_with_one_sign() -> None:
+    """1/2 - V is positive near the origin, and with -1 times the gap 1 - V more it would be -1/2."""
+    data = make(
+        ["u"], [([[-1.0]], [0.0])], [[1.0]], (0.25, 1.0), domain=FAR, input_bounds=[("-99", "99")],
+        squash="identity", centre="none", scale=(1.0,), claim="practical",
+    )  # fmt: skip
+    data = with_tree(data, cut(decode(data["evidence"]["root"]), lambda lo, hi: hi[0] - lo[0] <= 0.25, 99, 9))
+    for g, said in (
+        (["-", ["*", "x", "x"], "9/8"], ("ACCEPTED", None)),
+        (["-", ["*", "x", "x"], "7/8"], ("keep", "keep")),
+        (["-", "1/2", ["*", "x", "x"]], ("keep", "keep")),
+    ):
+        assert both(edited(data, "claim", lambda claim, g=g: claim | {"keep": [g]})) == said

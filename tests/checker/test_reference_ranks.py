@@ -383,6 +383,18 @@ def negative(q: str) -> str:
     return q[1:] if q.startswith("-") else f"-{q}"
 
 
+@pytest.mark.parametrize("bounds", [("1", "3"), ("3", "1"), ("3", "3")])
+def test_both_ask_each_of_two_inputs(bounds: tuple[str, str]) -> None:
+    """x+ = (u + v)/8 from [1, 2] with u = x and v = -x."""
+    loop = Loop([["*", "1/8", ["+", "u", "v"]]], [affine([[1.0], [-1.0]])], [["-", "x", "1"]])
+    data = loop.document([1.0], [2.0], b"\xff", two_bytes([1]), b"\1")
+    plant = {"inputs": ["u", "v"], "u_eq": ["0", "0"], "input_bounds": [[f"-{b}", b] for b in bounds]}
+    policy = data["policy"] | {"scale": encode(1.0, 1.0), "offset": encode(0.0, 0.0)}
+    policy["sha256"] = hashed(policy, loop.network)
+    said = None if bounds == ("3", "3") else "inputs"
+    assert verdicts(data | {"plant": data["plant"] | plant, "policy": policy}) == (said, said)
+
+
 def test_the_domain_is_not_asked_of_angles() -> None:
     loop = Loop([["+", "x", "1/2", "u"]], [affine([[0.0]])], TURNING, angles=("x",), domain=("-1", "1"))
     assert verdict(certificate(loop, scaled(1.0, 0.5), cosine, (-3.25, 3.25), 6)[0]) is None
