@@ -35,7 +35,7 @@ from tests.support.certificates import halved as cut
 from tests.support.marks import slow_after
 from tests.support.rank_forgeries import Draw, verdicts
 from tests.support.rank_truth import Truth
-from tests.support.ranked import Document, Loop, affine, dumped, two_bytes
+from tests.support.ranked import Document, Loop, affine, dumped, encode, two_bytes
 from tests.support.reference import judge
 from tests.support.stepped_loops import WIDE as FAR
 
@@ -277,6 +277,27 @@ def test_the_symbol_of_a_quantity_stands_for_its_mean() -> None:
         symbols = {**dict(enumerate(d)), 9: q.mean(0), 10: p.mean(0), len(models[0].g) - 1: s}
         shares = [v.share(row, symbols) for v, row in zip(models, x, strict=True)]
         assert 0.9 < max(shares) <= 1
+
+
+@pytest.mark.parametrize("lo", ["1/2", "1"])
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("doubt", ["q", "u", "a call"])
+def test_a_time_within_a_period_has_a_symbol_that_nothing_else_has(doubt: str, sign: int, lo: str) -> None:
+    """s (sign + doubt) is 5/4 at most in size, or for a clip, of which a line is twice as far away, 3/2 by the format;
+    with one symbol for both s sign and s doubt would cancel."""
+    corner = {"kind": "clip", "of": [1], "lo": encode(-0.25), "hi": encode(0.25)}
+    doubts: dict[str, Any] = {"q": "q", "u": "u", "a call": ["network", "cut", 0, "v"]}
+    network = [affine([[0.0, 2.0**20]]), corner] if doubt == "u" else [affine([[0.0, 0.0]])]
+    loop = Loop(
+        [["+", str(sign), doubts[doubt]], ["*", "0", "u"]], network, EVERYWHERE, ("x", "v"), (lo, "1"),
+        uncertain=[("q", "-1/4", "1/4")] if doubt == "q" else [],
+    )  # fmt: skip
+    for bound, said in (("1249/1000", REFUSED), ("1251/1000" if doubt == "q" else "1501/1000", KEPT)):
+        loop.keep = [["-", ["*", str(sign), "x"], bound]]
+        data = loop.document([-WIDE, -1.0], [WIDE, 1.0], b"\xff", two_bytes([1]), b"\1")
+        named = {"name": "cut", "reads": 1, "steps": [affine([[2.0**20]]), corner]}
+        data["networks"] += [named] * (doubt == "a call")
+        assert verdicts(data) == said
 
 
 # ------------------------------------------------------------------------------------------------- beyond the level set
