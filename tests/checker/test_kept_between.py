@@ -384,7 +384,7 @@ def test_v_in_a_gap_is_that_of_the_sampling_instant(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_gap_counts_with_one_sign_and_leaves_inside_are_asked() -> None:
-    """1/2 - V is positive near the origin, and with -1 times the gap 1 - V more it would be -1/2; 1/16 - V is so where
+    """1/2 - V is positive near the origin, and with -1 times the gap 1 - V more it would be -1/2; 1/64 - V is so where
     V is below c0 alone."""
     data = make(
         ["u"], [([[-1.0]], [0.0])], [[1.0]], (0.25, 1.0), domain=FAR, input_bounds=[("-99", "99")],
@@ -395,6 +395,6 @@ def test_a_gap_counts_with_one_sign_and_leaves_inside_are_asked() -> None:
         (["-", ["*", "x", "x"], "9/8"], ("ACCEPTED", None)),
         (["-", ["*", "x", "x"], "7/8"], ("keep", "keep")),
         (["-", "1/2", ["*", "x", "x"]], ("keep", "keep")),
-        (["-", "1/16", ["*", "x", "x"]], ("keep", "keep")),
+        (["-", "1/64", ["*", "x", "x"]], ("keep", "keep")),
     ):
         assert both(edited(data, "claim", lambda claim, g=g: claim | {"keep": [g]})) == said
