@@ -395,6 +395,22 @@ def test_both_ask_each_of_two_inputs(bounds: tuple[str, str]) -> None:
     assert verdicts(data | {"plant": data["plant"] | plant, "policy": policy}) == (said, said)
 
 
+@pytest.mark.parametrize("sign", ["1", "-1"])
+def test_errors_of_two_inputs_do_not_cancel(sign: str) -> None:
+    """u is a hat of y and v one of z, between 0 and 1, of which the forms know nothing but errors: u - v is up to 1."""
+    hat, none = [1.0, -2.0, 1.0], [0.0] * 3
+    rows = [[0.0, 1.0, 0.0]] * 3 + [[0.0, 0.0, 1.0]] * 3
+    network = [affine(rows, [1.0, 0.0, -1.0] * 2), mapped("relu", 1), affine([hat + none, none + hat], of=2)]
+    loop = Loop([["*", sign, ["-", "u", "v"]], "y", "z"], network, [], ("x", "y", "z"))
+    for bound, said in (("999/1000", "ranks"), ("1001/1000", None)):
+        loop.target = [["-", "x", bound]]
+        data = loop.document([0.0, -1.0, -1.0], [0.5, 1.0, 1.0], b"\xff", two_bytes([1]), b"\1")
+        plant = {"inputs": ["u", "v"], "u_eq": ["0", "0"], "input_bounds": [["-9", "9"]] * 2}
+        policy = data["policy"] | {"scale": encode(1.0, 1.0), "offset": encode(0.0, 0.0)}
+        policy["sha256"] = hashed(policy, network)
+        assert verdicts(data | {"plant": data["plant"] | plant, "policy": policy}) == (said, said)
+
+
 def test_the_domain_is_not_asked_of_angles() -> None:
     loop = Loop([["+", "x", "1/2", "u"]], [affine([[0.0]])], TURNING, angles=("x",), domain=("-1", "1"))
     assert verdict(certificate(loop, scaled(1.0, 0.5), cosine, (-3.25, 3.25), 6)[0]) is None
