@@ -3,20 +3,41 @@ both sides, and mutants of the rule that each let one of them pass."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
 import mpmath
+import numpy as np
 import pytest
+from flint import arb, ctx
 
+from certify.checker import document
 from certify.checker import flow as checker_flow
+from certify.checker import keep as checker_keep
 from certify.checker.boxes import Boxes
+from certify.checker.case import Case as Of
+from certify.checker.network import enclose_on_boxes
+from certify.checker.ranks import Steps
+from certify.checker.taylor import combination, constants
+from certify.reference import leaves as reference_leaves
 from certify.reference import motion as reference_motion
-from certify.reference.motion import Motion
-from tests.support.rank_forgeries import verdicts
-from tests.support.ranked import Document, Loop, affine, two_bytes
+from certify.reference.document import read
+from certify.reference.evidence import Ranked
+from certify.reference.leaves import Box
+from certify.reference.motion import Motion, Stage
+from certify.reference.ranks import Walk
+from certify.reference.taylor import Taylor
+from tests.support.certificates import decode, edited, make, verdict, with_tree
+from tests.support.certificates import halved as cut
+from tests.support.marks import slow_after
+from tests.support.rank_forgeries import Draw, verdicts
+from tests.support.rank_truth import Truth
+from tests.support.ranked import Document, Loop, affine, dumped, encode, two_bytes
+from tests.support.reference import judge
+from tests.support.stepped_loops import WIDE as FAR
 
 KEPT, REFUSED = (None, None), ("keep", "keep")
 WIDE = 2.0**-40  # half of the leaf's width
@@ -183,3 +204,225 @@ def test_the_checker_asks_each_quarter(k: int, monkeypatch: pytest.MonkeyPatch) 
         with monkeypatch.context() as patched:
             patched.setattr(Boxes, "number", number)
             assert verdicts(violated) == ((None if left_out == k else "keep"), "keep")
+
+
+# --------------------------------------------------------------------------------------------------- states in between
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A state's model x + s G in a quarter: c, g (N,), the coefficients q (N, N) of d_i d_j, i <= j, and r; the first
+    symbols are those of the leaf, the last one is that of s."""
+
+    c: float
+    g: Any
+    q: Any
+    r: float
+
+    def share(self, x: Any, e: dict[int, Any]) -> float:
+        """How far states (B,) are from the model at these symbols, by their numbers, of what others allow."""
+        own = list(e)
+        e, q = np.array([*e.values()]), self.q[np.ix_(own, own)]
+        away = x - self.c - self.g[own] @ e - np.sum(e * (q @ e), axis=0)
+        left = np.sum(np.abs(self.g)) - np.sum(np.abs(self.g[own])) + np.sum(np.abs(self.q)) - np.sum(np.abs(q))
+        return float(np.max((np.abs(away) - 1e-9) / (left + self.r + 1e-30)))
+
+
+def checkers(data: Document, lo: Any, hi: Any, quarter: int) -> list[Moved]:
+    with np.errstate(all="ignore"):
+        steps = Steps(Of(document.certificate(json.loads(dumped(data)), "0" * 64)))
+        x = steps.start(lo[:, None], hi[:, None])
+        found = list[Moved]()
+        for v in steps.motion(*steps.models(x, enclose_on_boxes(steps.net, x))).courses[quarter]:
+            q = np.zeros((v.symbols, v.symbols))
+            q[np.triu_indices(v.symbols)] = v.q[:, 0]
+            found.append(Moved(float(v.c[0]), v.g[:, 0], q, float((v.r.top + 0 * v.c)[0])))
+    return found
+
+
+def references(data: Document, lo: Any, hi: Any, quarter: int) -> list[Moved]:
+    c, found = read(dumped(data)), list[Moved]()
+    assert isinstance(c.evidence, Ranked)
+    with ctx.workprec(64):
+        walk = Walk(c, c.evidence.order, c.evidence.ranking)
+        rows = walk.start(Box(0, lo.tolist(), hi.tolist()))
+        (inputs,), s = walk.inputs([rows]), walk.quarters()[quarter]
+        here = Stage("here", rows, inputs)
+        for x, g in zip(walk.numbers(here).states.values(), walk.mean(here, walk.reached(here), s), strict=True):
+            v, N = x + s * g, walk.symbols
+            q = np.zeros((N, N)) if v.Q is None else np.array([[float(k.mid()) for k in row] for row in v.Q.tolist()])
+            more = 0.0 if v.Q is None else sum(float(k.rad()) for k in v.Q.entries())
+            g_of = np.array([float(k.mid()) for k in v.slopes(N)])
+            found.append(Moved(float(v.c.mid()), g_of, q, float(v.r.upper()) + more))
+    return found
+
+
+@pytest.mark.parametrize("seed", slow_after(8, range(40)))
+def test_states_of_a_period_lie_in_what_constraints_are_taken_of(seed: int) -> None:
+    """Of random loops: at the same d and s, with quantities that jump."""
+    drawn = next(draw for k in range(99) if (draw := Draw(100 * seed + k)).sampled)
+    loop, chance = replace(drawn.loop(), keep=["-1"], sample=("1/16", "1/8")), np.random.default_rng(seed)
+    lo = chance.uniform(-1, 1, drawn.n)
+    hi = lo + chance.choice([0.01, 0.1])
+    data = loop.document(lo.tolist(), hi.tolist(), b"\xff", two_bytes([1]), b"\1")
+    truth, count, largest = Truth(data), 400, float(Fraction(data["claim"]["sample"][1]))
+    d, s = chance.uniform(-1, 1, (drawn.n, count)), chance.choice([-1.0, 1.0, 0.0, 0.7, -0.3], count)
+    x, quarter = ((lo + hi) / 2)[:, None] + ((hi - lo) / 2)[:, None] * d, seed % 4
+    u, h = truth.policy(x), (2 * quarter + 1 + s) * largest / 48
+    for _ in range(6):
+        q = truth.quantities(chance, count)
+        for _ in range(3):
+            a = truth.f(x, u, q)
+            b = truth.f(x + h / 6 * a, u, q)
+            c = truth.f(x + h / 6 * b, u, q)
+            e = truth.f(x + h / 3 * c, u, q)
+            x = x + h / 18 * (a + 2 * b + 2 * c + e)
+    for models in (checkers(data, lo, hi, quarter), references(data, lo, hi, quarter)):
+        symbols = {**dict(enumerate(d)), len(models[0].g) - 1: s}
+        shares = [v.share(row, symbols) for v, row in zip(models, x, strict=True)]
+        assert 0.02 < max(shares) <= 1
+
+
+@pytest.mark.parametrize("quarter", range(4))
+def test_the_symbol_of_a_quantity_stands_for_its_mean(quarter: int) -> None:
+    """Of products of two the mean is another one than the product of means; of q w it is the product of theirs."""
+    rows: list[Any] = [["*", "0", "u"], ["*", "q", "q"], ["*", "q", "p"], ["*", "q", "w"]]
+    ranges = [("q", "-1", "1"), ("p", "-1", "1")]
+    names, network = ("w", "x", "y", "z"), [affine([[0.0] * 4])]
+    loop = Loop(rows, network, [["-", "-8", "x"]], names, ("1/2", "1"), 1, ranges, keep=["-1"])
+    lo, hi, chance = np.array([-1.0, 0.0, 0.0, 0.0]), np.array([1.0, 0.25, 0.25, 0.25]), np.random.default_rng(0)
+    data = loop.document(lo.tolist(), hi.tolist(), b"\xff", two_bytes([1]), b"\1")
+    d, s = chance.choice([-1.0, 1.0, 0.2], (4, 300)), chance.choice([-1.0, 1.0, 1.0, 0.0], 300)
+    q, p = chance.choice([-1.0, 1.0, 0.0], (2, 4, 300))  # in four parts of the time
+    moved = np.array([0 * s, np.mean(q * q, axis=0), np.mean(q * p, axis=0), d[0] * q.mean(0)])
+    x = (lo + hi)[:, None] / 2 + (hi - lo)[:, None] / 2 * d + (2 * quarter + 1 + s) / 8 * moved
+    for models in (checkers(data, lo, hi, quarter), references(data, lo, hi, quarter)):
+        symbols = {**dict(enumerate(d)), 9: q.mean(0), 10: p.mean(0), len(models[0].g) - 1: s}
+        shares = [v.share(row, symbols) for v, row in zip(models, x, strict=True)]
+        assert 0.9 < max(shares) <= 1
+
+
+@pytest.mark.parametrize("lo", ["1/2", "1"])
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("doubt", ["q", "u", "a call"])
+def test_a_time_within_a_period_has_a_symbol_that_nothing_else_has(doubt: str, sign: int, lo: str) -> None:
+    """s (sign + doubt) is 5/4 at most in size, or for a clip, of which a line is twice as far away, 3/2 by the format;
+    with one symbol for both s sign and s doubt would cancel."""
+    corner = {"kind": "clip", "of": [1], "lo": encode(-0.25), "hi": encode(0.25)}
+    doubts: dict[str, Any] = {"q": "q", "u": "u", "a call": ["network", "cut", 0, "v"]}
+    network = [affine([[0.0, 2.0**20]]), corner] if doubt == "u" else [affine([[0.0, 0.0]])]
+    loop = Loop(
+        [["+", str(sign), doubts[doubt]], ["*", "0", "u"]], network, EVERYWHERE, ("x", "v"), (lo, "1"),
+        uncertain=[("q", "-1/4", "1/4")] if doubt == "q" else [],
+    )  # fmt: skip
+    for bound, said in (("1249/1000", REFUSED), ("1251/1000" if doubt == "q" else "1501/1000", KEPT)):
+        loop.keep = [["-", ["*", str(sign), "x"], bound]]
+        data = loop.document([-WIDE, -1.0], [WIDE, 1.0], b"\xff", two_bytes([1]), b"\1")
+        named = {"name": "cut", "reads": 1, "steps": [affine([[2.0**20]]), corner]}
+        data["networks"] += [named] * (doubt == "a call")
+        assert verdicts(data) == said
+
+
+# ------------------------------------------------------------------------------------------------- beyond the level set
+
+P, GAINS, ALONG = np.array([[80.0, -0.75], [-0.75, 1.0]]), np.array([1 / 16, 45 / 64]), np.array([1.0, -1 / 25])
+RISE = 29 / 32  # of x by u
+
+
+def later(s: float) -> Any:
+    """x - v/25 after a time s of a period, by x and v at its start: polynomials of s, for u is held."""
+    moved = np.array([[1.0, s], [0.0, 1.0]]) - np.outer([RISE * s + s * s / 2, s], GAINS)
+    return ALONG @ moved
+
+
+def most(s: float) -> float:
+    """The largest of it from {V <= 1}."""
+    return float(np.sqrt(later(s) @ np.linalg.solve(P, later(s))))
+
+
+def near_the_top(lo: Any, hi: Any) -> Any:
+    """True on boxes (2, B) from which it may become as large as that, nearly."""
+    rows = np.array([later(s) for s in np.linspace(0, 1, 9)])
+    return np.max(rows @ (lo + hi) / 2 + np.abs(rows) @ (hi - lo) / 2, axis=0) > 0.9 * TOP
+
+
+def overshooting(bound: float, depth: int = 12) -> Document:
+    """x' = v + 29/32 u, v' = u: V falls from each sampling instant to the next and in between rises above its level;
+    the claim that x - v/25 stays below a bound, by a tree of 2^6 leaves or, where that is near, as many as 2^depth."""
+    data = make(
+        [["+", "v", ["*", str(Fraction(RISE)), "u"]], "u"], [(-GAINS[None], [0.0])], P, (0.25, 1.0),
+        states=["x", "v"], domain=FAR * 2, input_bounds=[("-99", "99")], squash="identity", centre="none",
+        scale=(1.0,), claim="practical", sample=("1", "1"), order=3,
+    )  # fmt: skip
+    root = decode(data["evidence"]["root"])
+
+    def small(lo: Any, hi: Any) -> Any:
+        return (np.prod((hi - lo).T / (2 * root), axis=1) <= 2.0**-6) & ~near_the_top(lo, hi)
+
+    tree = cut(root, small, 10**4, depth)
+    keep = [["-", ["-", "x", ["*", "1/25", "v"]], str(Fraction(bound))]]
+    return edited(with_tree(data, tree), "claim", lambda claim: claim | {"keep": keep})
+
+
+TOP = max(most(s) for s in np.linspace(0, 1, 1001))
+
+
+def both(data: Document) -> tuple[str, str | None]:
+    return verdict(data), judge(data)
+
+
+def test_a_loop_overshoots_its_level_within_a_period() -> None:
+    """So what is true of all states of {V <= c2} may be false in between, and all that it is more is counted."""
+    assert most(0.0) < 0.9 * TOP
+    for bound in (most(0.0) + 1e-6, TOP - 1e-6):
+        for depth in (6, 12):
+            assert both(overshooting(bound, depth)) == ("keep", "keep")
+    assert both(overshooting(1.1 * TOP)) == ("ACCEPTED", None)
+
+
+def test_v_in_a_gap_is_that_of_the_sampling_instant(monkeypatch: pytest.MonkeyPatch) -> None:
+    """V <= c2 is known there alone: if V in the gap were that of the moved states, both would accept what is false."""
+    data = overshooting(0.99 * TOP)
+    assert both(data) == ("keep", "keep")
+    on_boxes: Any = checker_keep.on_boxes
+    kept: Any = vars(reference_leaves)["kept"]
+
+    def checkers(boxes: Any, courses: Any, held: Any, _: Any) -> Any:
+        found = []
+        for x, v in courses:
+            of_P = [combination(*zip(row, (x, v), strict=True)) for row in P.tolist()]
+            above = x * of_P[0] + v * of_P[1]
+            gap = constants(above)(Fraction(1)) + -above
+            found.append(on_boxes(boxes, [[x, v]], held, [gap.at]))
+        return np.all(found, axis=0)
+
+    def references(motion: Any, at: Any, within: Any, _: Any) -> None:
+        known = motion.numbers(at)
+        for s in motion.quarters():
+            moved = zip(known.states.values(), motion.mean(at, within, s), strict=True)
+            x, v = (state + s * g for state, g in moved)
+            above = (x * x).scaled(arb(80)) + (x * v).scaled(arb(-1.5)) + v * v
+            with monkeypatch.context() as alone:
+                alone.setattr(Motion, "quarters", lambda _, s=s: [s])
+                kept(motion, at, within, [Taylor(arb(1)) + -above])
+
+    monkeypatch.setattr(checker_keep, "on_boxes", checkers)
+    monkeypatch.setattr(reference_leaves, "kept", references)
+    assert both(data) == ("ACCEPTED", None)
+
+
+def test_a_gap_counts_with_one_sign_and_leaves_inside_are_asked() -> None:
+    """1/2 - V is positive near the origin, and with -1 times the gap 1 - V more it would be -1/2; 1/64 - V is so where
+    V is below c0 alone."""
+    data = make(
+        ["u"], [([[-1.0]], [0.0])], [[1.0]], (0.25, 1.0), domain=FAR, input_bounds=[("-99", "99")],
+        squash="identity", centre="none", scale=(1.0,), claim="practical",
+    )  # fmt: skip
+    data = with_tree(data, cut(decode(data["evidence"]["root"]), lambda lo, hi: hi[0] - lo[0] <= 0.25, 99, 9))
+    for g, said in (
+        (["-", ["*", "x", "x"], "9/8"], ("ACCEPTED", None)),
+        (["-", ["*", "x", "x"], "7/8"], ("keep", "keep")),
+        (["-", "1/2", ["*", "x", "x"]], ("keep", "keep")),
+        (["-", "1/64", ["*", "x", "x"]], ("keep", "keep")),
+    ):
+        assert both(edited(data, "claim", lambda claim, g=g: claim | {"keep": [g]})) == said

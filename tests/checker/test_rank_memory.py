@@ -45,7 +45,7 @@ from tests.checker.test_reference_ranks import PENDULUM, TANH, moved, policy, ra
 from tests.support.marks import slow_after
 from tests.support.rank_forgeries import Draw, Forger, edited, verdicts
 from tests.support.rank_truth import Truth
-from tests.support.ranked import Document, Loop, affine, dumped
+from tests.support.ranked import Document, Loop, affine, dumped, encode
 
 Array = Any
 BILLIONTH = Fraction(1, 10**9)
@@ -333,6 +333,36 @@ def test_remainders_are_errors_with_all_memories(memory: int, turned: bool, step
     for bound, rule in ((1 - BILLIONTH, "ranks"), (most - BILLIONTH, "ranks"), (most + hair, None)):
         loop.target = [["-", "x", str(bound)]]
         assert verdicts(leading(loop, [0.0, 0.0], [0.5, 0.5], steps)) == (rule, rule)
+
+
+@pytest.mark.parametrize("memory", [1, 3])
+@pytest.mark.parametrize("speed", ["1", "-1"])
+@pytest.mark.parametrize("doubt", ["q", "u", "a call"])
+def test_a_period_has_a_symbol_that_nothing_else_has(doubt: str, speed: str, memory: int) -> None:
+    """h (speed + doubt) is from 3/8 to 5/4 where both may be anything. With one symbol for both h speed and h doubt
+    would cancel for one sign of the speed. A doubt is a range, or a clip's, of which a line is twice as far away."""
+    cut = {"kind": "clip", "of": [1], "lo": encode(-0.25), "hi": encode(0.25)}
+    doubts: dict[str, Any] = {"q": "q", "u": "u", "a call": ["network", "cut", 0, "y"]}
+    loop = Loop(
+        [["+", speed, doubts[doubt]], ["*", "0", "u"]],
+        [affine([[0.0, 2.0**20]]), cut] if doubt == "u" else [affine([[0.0, 0.0]])],
+        [],
+        ("x", "y"),
+        ("1/2", "1"),
+        uncertain=[("q", "-1/4", "1/4")] if doubt == "q" else [],
+        memory=memory,
+    )
+    sign, far = 1 if speed == "1" else -1, "-249/1000" if doubt == "q" else "1/1000"
+    for along, bound, rule in (
+        (sign, "1249/1000", "ranks"),
+        (sign, "1251/1000" if doubt == "q" else "1501/1000", None),
+        (-sign, "-376/1000", "ranks"),
+        (-sign, far, None),
+    ):
+        loop.target = [["-", ["*", str(along), "x"], bound]]
+        data = leading(loop, [-(2.0**-40), -1.0], [2.0**-40, 1.0], 1)
+        data["networks"] += [{"name": "cut", "reads": 1, "steps": [affine([[2.0**20]]), cut]}] * (doubt == "a call")
+        assert verdicts(data) == (rule, rule)
 
 
 # ---------------------------------------------------------------------------------------------------------- forgeries

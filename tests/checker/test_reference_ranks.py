@@ -365,6 +365,52 @@ def test_inputs_and_domain_before_each_step() -> None:
     assert verdict(wide.document([0.03], [0.3], tree, steps, b"\2\0")) is None
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_both_ask_the_domain_before_each_step_to_the_last_digit(sign: int) -> None:
+    """x+ = -3 x takes [1/32, 1/4] to [-3/4, -3/32], then to [9/32, 9/4] and the target; there nothing is asked."""
+    loop = Loop(["u"], [affine([[-3.0]])], [["-", ["*", str(-sign), "x"], "-1/4"]], bound="99")
+    ends = [sign / 32, sign / 4]
+    for first, last, rule in (
+        ("-3/4", "9/4", "ranks"),
+        ("-750000001/1000000000", "1/4", "ranks"),
+        ("-750000001/1000000000", "250000001/1000000000", None),
+    ):
+        loop.domain = (first, last) if sign > 0 else (negative(last), negative(first))
+        assert verdicts(loop.document([min(ends)], [max(ends)], b"\xff", two_bytes([2]), b"\2")) == (rule, rule)
+
+
+def negative(q: str) -> str:
+    return q[1:] if q.startswith("-") else f"-{q}"
+
+
+@pytest.mark.parametrize("bounds", [("1", "3"), ("3", "1"), ("3", "3")])
+def test_both_ask_each_of_two_inputs(bounds: tuple[str, str]) -> None:
+    """x+ = (u + v)/8 from [1, 2] with u = x and v = -x."""
+    loop = Loop([["*", "1/8", ["+", "u", "v"]]], [affine([[1.0], [-1.0]])], [["-", "x", "1"]])
+    data = loop.document([1.0], [2.0], b"\xff", two_bytes([1]), b"\1")
+    plant = {"inputs": ["u", "v"], "u_eq": ["0", "0"], "input_bounds": [[f"-{b}", b] for b in bounds]}
+    policy = data["policy"] | {"scale": encode(1.0, 1.0), "offset": encode(0.0, 0.0)}
+    policy["sha256"] = hashed(policy, loop.network)
+    said = None if bounds == ("3", "3") else "inputs"
+    assert verdicts(data | {"plant": data["plant"] | plant, "policy": policy}) == (said, said)
+
+
+@pytest.mark.parametrize("sign", ["1", "-1"])
+def test_errors_of_two_inputs_do_not_cancel(sign: str) -> None:
+    """u is a hat of y and v one of z, between 0 and 1, of which the forms know nothing but errors: u - v is up to 1."""
+    hat, none = [1.0, -2.0, 1.0], [0.0] * 3
+    rows = [[0.0, 1.0, 0.0]] * 3 + [[0.0, 0.0, 1.0]] * 3
+    network = [affine(rows, [1.0, 0.0, -1.0] * 2), mapped("relu", 1), affine([hat + none, none + hat], of=2)]
+    loop = Loop([["*", sign, ["-", "u", "v"]], "y", "z"], network, [], ("x", "y", "z"))
+    for bound, said in (("999/1000", "ranks"), ("1001/1000", None)):
+        loop.target = [["-", "x", bound]]
+        data = loop.document([0.0, -1.0, -1.0], [0.5, 1.0, 1.0], b"\xff", two_bytes([1]), b"\1")
+        plant = {"inputs": ["u", "v"], "u_eq": ["0", "0"], "input_bounds": [["-9", "9"]] * 2}
+        policy = data["policy"] | {"scale": encode(1.0, 1.0), "offset": encode(0.0, 0.0)}
+        policy["sha256"] = hashed(policy, network)
+        assert verdicts(data | {"plant": data["plant"] | plant, "policy": policy}) == (said, said)
+
+
 def test_the_domain_is_not_asked_of_angles() -> None:
     loop = Loop([["+", "x", "1/2", "u"]], [affine([[0.0]])], TURNING, angles=("x",), domain=("-1", "1"))
     assert verdict(certificate(loop, scaled(1.0, 0.5), cosine, (-3.25, 3.25), 6)[0]) is None
