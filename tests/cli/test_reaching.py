@@ -116,6 +116,19 @@ def test_constraints_are_kept_until_then(asked: list[str], capsys: pytest.Captur
     assert "(kept along every trajectory from there until the region is reached: " in capsys.readouterr().out
 
 
+def test_pictures_show_where_a_constraint_is_violated(
+    asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Only where one is, in the part of the plane that is drawn; the figure for a paper says it in its legend."""
+    grey, page = "Grey: a constraint is violated there", tmp_path / "out" / "report.html"
+    for keep, shown in (("v >= -1.1", True), ("v >= -2.5", False), ("abs(F) <= 4.1", True)):
+        assert said(capsys, [*asked, "--keep", keep])[0] == 0
+        assert (grey in page.read_text()) is shown
+    figure = tmp_path / "set.svg"
+    assert _run(["plot", str(tmp_path / "out" / "certificate.json"), "--out", str(figure)], False) == 0
+    assert "where a constraint is violated, on a grid" in figure.read_text()
+
+
 def test_a_share_is_rounded_down(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     """A share of 0.99996 is not 100 %, and is one of the box that was cut, which is smaller than the domain."""
     _, data = said(capsys, asked)

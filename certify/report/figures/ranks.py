@@ -18,6 +18,7 @@ from certify.certificates import RankTree, ReachCertificate, leaves_within
 from certify.certificates.membership import angles_in
 from certify.certificates.ranked import Ranked
 from certify.loop.plants.floating_point import function_of
+from certify.report.figures.edges import draw_edges, worst_of
 from certify.report.figures.geometry import ellipse
 from certify.report.figures.pairs import MOST, Pair
 from certify.report.figures.scene import Scene
@@ -49,6 +50,7 @@ class Ground:
     target, outline : the target's name, and the function that draws its outline in a plane.
     sampled : the steps are sampling instants.
     word : "proved", or "claimed".
+    worst : the largest g of a constraint at states (..., n), which violates it from 0 on; None without constraints.
     """
 
     ranked: Ranked
@@ -62,6 +64,7 @@ class Ground:
     outline: Callable[[Any, Pair], None]
     sampled: bool
     word: str
+    worst: Callable[[Array], Array] | None
     beside: str = ", all other states at rest"
 
     @property
@@ -87,6 +90,7 @@ def rank_maps(scene: Scene) -> list[Picture]:
         lambda axes, pair: _level_set(axes, scene, ranked, pair),
         scene.timing.sample is not None,
         scene.word,
+        worst_of(scene.certificate),
     )
     return [_picture(ground, pair) for pair in (scene.pairs if scene.n > 1 else [(0, 0)])]
 
@@ -155,6 +159,7 @@ def reach_ground(
         outline,
         system.sample is not None,
         "proved" if accepted else "claimed",
+        worst_of(certificate),
         ", all other states at 0"
         if box is None
         else ", all other states in the middle of the box that was asked about",
@@ -164,7 +169,9 @@ def reach_ground(
 def _picture(ground: Ground, pair: Pair, more: str = "") -> Picture:
     """The map of one plane, with the outline of the target on top."""
     figure, axes = figure_of(4.4, 3.6 if ground.n > 1 else 1.6, left=0.86, right=0.8)
-    _scale(figure, axes, ground.most, draw_map(axes, ground, pair))
+    show, broken = draw_map(axes, ground, pair)
+    _scale(figure, axes, ground.most, show)
+    grey = " Grey: a constraint is violated there, on a grid." if broken else ""
     steps = "sampling instants" if ground.sampled else "steps"
     other = ground.beside if ground.n > 2 else ""
     turned = [symbol(ground.names[k]) for k in ground.ranked.angles]
@@ -175,17 +182,18 @@ def _picture(ground: Ground, pair: Pair, more: str = "") -> Picture:
     return Picture(
         title if ground.n <= 2 else f"{title}: {ground.labels[i]}, {ground.labels[j]}",
         f"Colour: the number of {steps} after which every trajectory from there is in {ground.target}, the blue "
-        f"outline, at the latest{unless}{other}. White: nothing is {ground.word}.{place}{more}",
+        f"outline, at the latest{unless}{other}. White: nothing is {ground.word}.{grey}{place}{more}",
         to_svg(figure),
         simulated=bool(more),
     )
 
 
-def draw_map(axes: Any, ground: Ground, pair: Pair) -> dict[str, Any]:
-    """Draw the ranks and the target's outline in a plane; returns how numbers become colours."""
+def draw_map(axes: Any, ground: Ground, pair: Pair) -> tuple[dict[str, Any], bool]:
+    """Draw the ranks, violated constraints and the target's outline in a plane; returns how numbers become colours, and
+    whether a constraint is violated somewhere in the plane."""
     i, j = pair
     lo, hi = ground.lo, ground.hi
-    _, _, states = _plane(lo, hi, ground.middle, pair)
+    a, b, states = _plane(lo, hi, ground.middle, pair)
     values = ground.ranked.ranks_at(states.reshape(-1, ground.n)).reshape(states.shape[:-1])
     box = (lo[i], hi[i], lo[j], hi[j]) if ground.n > 1 else (lo[0], hi[0], 0.0, 1.0)
     show = {"cmap": _COLOURS, "vmin": 0.0, "vmax": ground.most, "origin": "lower", "interpolation": "nearest"}
@@ -194,11 +202,12 @@ def draw_map(axes: Any, ground: Ground, pair: Pair) -> dict[str, Any]:
         axes.set_ylabel(ground.labels[j])
     else:
         axes.set_yticks([])
+    broken = ground.worst is not None and draw_edges(axes, a, b, ground.worst(states), 1.5)
     ground.outline(axes, pair)
     axes.set_xlim(*box[:2])
     axes.set_ylim(*box[2:])
     axes.set_xlabel(ground.labels[i])
-    return show
+    return show, broken
 
 
 def _view(tree: RankTree, states: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
