@@ -31,9 +31,13 @@ def worst_of(certificate: AnyCertificate) -> Callable[[Array], Array] | None:
     return worst
 
 
-def draw_edges(axes: Any, a: Array, b: Array, worst: Array, order: float) -> bool:
-    """Draw where a constraint is violated, with this `zorder`, on a grid (rows, columns) or, if there is one row, on a
-    line; True if it is somewhere."""
+def draw_edges(axes: Any, certificate: AnyCertificate, a: Array, b: Array, states: Array, order: float) -> bool:
+    """Draw where a constraint is violated, with this `zorder`, at states (rows, columns, n) of a grid or, if there is
+    one row, of a line; True if it is somewhere."""
+    function = worst_of(certificate)
+    if function is None:
+        return False
+    worst = function(states)
     broken = worst >= 0
     if len(worst) == 1:
         axes.fill_between(a, 0.0, 1.0, where=broken[0], color=EDGE_FILL, lw=0, zorder=order)

@@ -212,8 +212,7 @@ def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region |
     section = ellipse(scene.P, pair, scene.outer)
     axes.fill(*section, color=SET_FILL, lw=0, zorder=1)
     _draw_outline(axes, scene, pair)
-    if (worst := worst_of(scene.certificate)) is not None:
-        draw_edges(axes, a, b, worst(x), 0.7)
+    draw_edges(axes, scene.certificate, a, b, x, 0.7)
     growing = (change >= 0) & np.any(x != 0, axis=-1) & _shows_sign(scene)
     if np.any(growing):
         axes.contourf(a, b, change, levels=[0, np.inf], colors=[GROWTH_FILL], zorder=0)

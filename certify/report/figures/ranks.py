@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates import RankTree, ReachCertificate, leaves_within
+from certify.certificates import AnyCertificate, RankTree, ReachCertificate, leaves_within
 from certify.certificates.membership import angles_in
 from certify.certificates.ranked import Ranked
 from certify.loop.plants.floating_point import function_of
-from certify.report.figures.edges import draw_edges, worst_of
+from certify.report.figures.edges import draw_edges
 from certify.report.figures.geometry import ellipse
 from certify.report.figures.pairs import MOST, Pair
 from certify.report.figures.scene import Scene
@@ -43,6 +43,7 @@ class Ground:
 
     Parameters
     ----------
+    certificate : of the claim.
     ranked, most : the leaves, and the most steps from one.
     labels, names : of the states.
     middle : the state (n,) through which planes go.
@@ -50,9 +51,9 @@ class Ground:
     target, outline : the target's name, and the function that draws its outline in a plane.
     sampled : the steps are sampling instants.
     word : "proved", or "claimed".
-    worst : the largest g of a constraint at states (..., n), which violates it from 0 on; None without constraints.
     """
 
+    certificate: AnyCertificate
     ranked: Ranked
     most: float
     labels: Sequence[str]
@@ -64,7 +65,6 @@ class Ground:
     outline: Callable[[Any, Pair], None]
     sampled: bool
     word: str
-    worst: Callable[[Array], Array] | None
     beside: str = ", all other states at rest"
 
     @property
@@ -79,6 +79,7 @@ def rank_maps(scene: Scene) -> list[Picture]:
     if ranked is None or claim.ranks is None:
         return []
     ground = Ground(
+        scene.certificate,
         ranked,
         float(claim.ranks.steps),
         scene.labels,
@@ -90,7 +91,6 @@ def rank_maps(scene: Scene) -> list[Picture]:
         lambda axes, pair: _level_set(axes, scene, ranked, pair),
         scene.timing.sample is not None,
         scene.word,
-        worst_of(scene.certificate),
     )
     return [_picture(ground, pair) for pair in (scene.pairs if scene.n > 1 else [(0, 0)])]
 
@@ -118,13 +118,13 @@ def reach_ground(
     """The ranks around a region, as `reach_maps` draws them; `close` is where there are ranks or the region."""
     system = certificate.system
     ranked = Ranked(certificate.evidence.ranks, None, angles_in(system))
-    middle = np.zeros(system.n) if box is None else 0.5 * (box[0] + box[1])
+    domain = np.array([[float(end) for end in pair] for pair in system.domain]).T
+    at_rest = box is None and bool(np.all(domain[0] < 0) and np.all(domain[1] > 0))
+    middle = np.zeros(system.n) if at_rest else 0.5 * np.sum(domain if box is None else box, axis=0)
     beyond = function_of(system, certificate.claim.target, (), "numpy")
     path = (
         None if box is None else _runs(certificate, box, lambda x: beyond(x, np.zeros((*x.shape[:-1], system.m)), ()))
     )
-
-    domain = np.array([[float(end) for end in pair] for pair in system.domain]).T
     lo, hi = ends = np.minimum(ranked.tree.lo, domain[0]), np.maximum(ranked.tree.hi, domain[1])
     if box is not None and path is not None:
         lo, hi = _view(ranked.tree, np.concatenate([np.stack(box), path.reshape(-1, system.n)]), ends)
@@ -148,6 +148,7 @@ def reach_ground(
 
     shown = zip(system.states, system.exact_x_eq(), strict=True)
     return Ground(
+        certificate,
         ranked,
         float(certificate.claim.ranks.steps),
         [deviation(s.name, q, system.units.get(s.name, "")) for s, q in shown],
@@ -159,10 +160,8 @@ def reach_ground(
         outline,
         system.sample is not None,
         "proved" if accepted else "claimed",
-        worst_of(certificate),
-        ", all other states at 0"
-        if box is None
-        else ", all other states in the middle of the box that was asked about",
+        ", all other states "
+        + ("at 0" if at_rest else f"in the middle of the {'domain' if box is None else 'box that was asked about'}"),
     )
 
 
@@ -202,7 +201,7 @@ def draw_map(axes: Any, ground: Ground, pair: Pair) -> tuple[dict[str, Any], boo
         axes.set_ylabel(ground.labels[j])
     else:
         axes.set_yticks([])
-    broken = ground.worst is not None and draw_edges(axes, a, b, ground.worst(states), 1.5)
+    broken = draw_edges(axes, ground.certificate, a, b, states, 1.5)
     ground.outline(axes, pair)
     axes.set_xlim(*box[:2])
     axes.set_ylim(*box[2:])
