@@ -20,7 +20,7 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, evaluate
 from certify.loop.policies import bounded_by_form
 from certify.provers.bounds import Flow, Models, Taylor, loop_models, policy_enclosure, upper_bound
-from certify.provers.bounds.arrays import Array, Index, Mask, product
+from certify.provers.bounds.arrays import Array, Index, Mask, joined, pieces, product
 from certify.provers.bounds.taylor import EPS, TINY
 from certify.provers.boxes.rule import input_bounds_kept, operations_of_box
 from certify.provers.ranks.targets import Target
@@ -29,6 +29,7 @@ _WIDER = 1e-7  # share of a box's width, beyond all that two programs' rounding 
 _ENDS = 1e-9  # relative distance kept from ends of the domain
 _WIDEST = 0.15  # share of the root box beyond which an image is of no use
 _MORE_THAN_ROUNDING = 1e-13  # relative, of sums whose terms may cancel
+_NUMBERS = 2**16  # half a mebibyte of a model of second order at a time, of which a step of a loop has hundreds
 _MORE = 1.5  # operations of a step of a box, relative to those of a box's bound, whose symbols are fewer
 
 
@@ -110,6 +111,7 @@ class Course:
         self.doubt = 1e-12 + 16 * EPS * float(np.linalg.cond(self.into))  # relative, of errors: also of the inverse
         self.straight = [i for i in range(self.system.n) if i not in self.angles]
         self.memory, self.symbols = memory, self.system.n * (1 + memory)
+        self.most = min(self.piece, max(2, _NUMBERS // (self.symbols + self.system.m + 1) ** 2))
         self.policy = policy_enclosure(loop, self.symbols)
         self.dynamics = self.system.uncertain_dynamics()
         self.check_inputs = not bounded_by_form(loop.network, self.system.input_bounds)
@@ -121,6 +123,12 @@ class Course:
     @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
     def __call__(self, lo: Array, hi: Array, inner: float, outer: float) -> Images:
         """The images of boxes lo, hi (n, B); levels of V do not matter here."""
+        cut = pieces(lo.shape[1], self.most)
+        both = zip(np.array_split(lo, cut, 1), np.array_split(hi, cut, 1), strict=True)
+        return Images(*map(joined, zip(*(self._followed(*each) for each in both), strict=True)))
+
+    def _followed(self, lo: Array, hi: Array) -> Images:
+        """The same for as many boxes as memory is meant for."""
         n, batch, K = *lo.shape, len(self.counts)
         centre = 0.5 * lo + 0.5 * hi
         radius = np.maximum(hi - centre, centre - lo) * (1 + EPS)
