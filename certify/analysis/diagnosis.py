@@ -198,12 +198,9 @@ def _next(
     if result.stop.ran_out or result.stop is Stop.BOXES:
         step = _longer(result, options, proof, effort)
         return step if result.search is None else replace(step, options=(*step.options, ("--resume", "")))
-    if options.claim == "asymptotic" and options.only is not None and options.P is None and options.level is None:
+    if options.claim == "asymptotic" and options.only is not None and _is_free(options):
         return Step((("--candidate", "auto"),), f"only the candidate {options.only} was tried")
-    knows = not (
-        result.system.ranges or result.system.in_steps or result.constraints
-    )  # in steps there is no tube; with ranges or constraints none is looked for here
-    if result.stop is Stop.STALLED and knows and not options.enlarges and _has_tube(result, effort):
+    if result.stop is Stop.STALLED and _may_have_tube(result, options) and _has_tube(result, effort):
         return Step((("--enlarge", ""),), f"a tube leads into this set from one {_LONGER:g} times as long, at least")
     if result.stop is Stop.STALLED:
         worst = ", ".join(symbol(one) for one, _ in _hurting(result, proof)[:3])
@@ -229,6 +226,11 @@ def _flatter(result: RoaResult, options: RoaOptions, proof: Proof | None) -> Ste
         "than of the policy's linear part: a flatter policy that does the same may be proved on more"
     )
     return Step((), why, flattens=True)
+
+
+def _is_free(options: RoaOptions) -> bool:
+    """True if several candidates are tried once none is named: P, weights and a level say which one it is."""
+    return all(given is None for given in (options.P, options.Q, options.R, options.level))
 
 
 def _another_candidate(result: RoaResult, options: RoaOptions) -> Step:
@@ -266,9 +268,11 @@ def _around_a_constraint(result: RoaResult, options: RoaOptions) -> Step:
     shaped = any(one.candidate.startswith("optimised") for one in result.tried)
     if options.level is not None:
         return Step((), "leave --level out for the largest level that can be proved")
-    if not shaped and options.P is None:
+    several = options.claim == "asymptotic"  # one of them is shaped so
+    given = options.P is not None or options.resume
+    if not shaped and not given and (not several or (options.only is not None and _is_free(options))):
         why = "other candidates are shaped around the constraints, this one is not"
-        return Step((("--candidate", "auto" if options.claim == "asymptotic" else "optimised"),), why)
+        return Step((("--candidate", "auto" if several else "optimised"),), why)
     tried = max((t.volume for t in result.tried), default=0.0)
     if tried > _WORTH * (result.volume or 0.0) > 0:
         return Step((("--effort", _round(4 * options.effort)),), "another candidate reaches further")
@@ -318,6 +322,12 @@ def _bend(network: PolicyNetwork, half_widths: Array) -> float:
         total += float(np.sum(np.abs(gain) @ departure))
         gain = (gain * slope) @ W
     return total / linear if linear else 0.0
+
+
+def _may_have_tube(result: RoaResult, options: RoaOptions) -> bool:
+    """True if a tube may be asked for: in steps there is none; with ranges or constraints none is looked for here."""
+    odd = result.system.ranges or result.system.in_steps or result.constraints or result.claim != "asymptotic"
+    return not (odd or options.rate or options.enlarges or options.goes_beyond) and options.engine == "bounds"
 
 
 def _has_tube(result: RoaResult, effort: Effort) -> bool:
@@ -419,7 +429,7 @@ def _wider_domain(result: RoaResult, options: RoaOptions, effort: Effort) -> Ste
     system, problem, level = result.system, result.problem, result.levels.roa
     if problem is None or level is None:
         return Step((), result.reason)
-    free = options.P is None and options.engine != "dreal"
+    free = _is_free(options) and options.engine != "dreal"
     kinds = [(_WIDER, False)] + [(factor, True) for factor in (_WIDER, _SLIGHTLY_WIDER) if free]
     share, look = _shares(system, problem.V.P), effort.part(_LOOK, even_if_over=True)
     proved = volume(problem.V.P, level)

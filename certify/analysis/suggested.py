@@ -114,7 +114,8 @@ def beyond_the_ellipsoid(result: RoaResult, options: RoaOptions, effort: Effort)
     if result.outer is None and result.ranks is None:
         if result.stop in (Stop.BOXES, Stop.STALLED) or result.stop.ran_out:
             return None
-        other = "polynomial" if options.goes_on else "auto"  # auto has tried to learn a network
+        named = options.Q is not None or options.R is not None  # one candidate, with which auto does not go on
+        other = "polynomial" if options.goes_on else "neural" if named else "auto"  # auto has tried a network
         return by_learning(result, options, other) if simulated.share < MOST else None
     if options.lyapunov_level is not None:
         return None

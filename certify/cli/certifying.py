@@ -148,7 +148,7 @@ def _with_next_command(data: dict[str, Any], context: typer.Context, policy: Pat
     following = {} if data["diagnosis"] is None else data["diagnosis"]["next"]
     if following.get("flatten"):
         following["command"] = _flattened(context, policy)
-    elif following.get("options"):
+    elif following.get("options") and following["options"].keys() <= set(options_of(context.command).values()):
         following["command"] = _command(context, following["options"])
     return data
 

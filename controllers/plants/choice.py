@@ -24,9 +24,10 @@ def chosen_plant(name: str) -> tuple[System, Plant]:
 
     Raises
     ------
-    InputError : no such plant; its own file bears the name of one that ships; or its options cannot be used.
+    InputError : no such plant; its own file bears the name of one that ships; it has no operating
+        point inside its domain; or its options cannot be used.
     """
-    from certify.loop.plants import available_systems, chosen_system, get_system
+    from certify.loop.plants import available_systems, chosen_system, get_system, require_origin_inside
 
     if name in available_plants():
         return get_system(name), get_plant(name)
@@ -40,6 +41,7 @@ def chosen_plant(name: str) -> tuple[System, Plant]:
             f"the plant of {name} must not bear the name of one that ships, {system.name!r}: a policy is told by "
             "the name of its plant. Give it another `name`."
         )
+    require_origin_inside(system)
     plant = default_plant(system)
     if name.endswith(".toml"):
         from certify.loop.plants.source import read_plant_file

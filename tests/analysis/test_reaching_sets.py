@@ -16,6 +16,7 @@ from certify.analysis.reaching import ReachOptions, ReachResult, certify_reach, 
 from certify.certificates import Certificate, parse_certificate, run_checker
 from certify.certificates.located import Containment
 from certify.certificates.membership import proved_set
+from certify.effort import Effort
 from certify.errors import InputError, OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, sin, symbols
@@ -132,8 +133,10 @@ def test_ranks_beside_a_set_take_a_higher_order_if_the_ring_is_cheap(tmp_path: P
     closed = ClosedLoop(*loop)
     question = Question(closed, Region((loop[0].states[0],), loop[0].states), (), root_box(closed), 3)
     x = np.random.default_rng(0).uniform(*root_box(closed), (30, 2)).T
-    assert with_order(question, x, leaves=1000, most=1e3) == question
-    assert with_order(question, x, leaves=1000, most=1e9).order > 3
+    effort = Effort()
+    assert with_order(question, x, effort, leaves=1000, most=1e3) == question and not effort.spent
+    assert with_order(question, x, effort, leaves=1000, most=1e9).order > 3
+    assert effort.spent >= 30 * question.course((1,)).operations  # a step from each state
 
 
 def test_a_set_around_another_equilibrium(tmp_path: Path) -> None:

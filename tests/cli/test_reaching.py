@@ -116,6 +116,54 @@ def test_constraints_are_kept_until_then(asked: list[str], capsys: pytest.Captur
     assert "(kept along every trajectory from there until the region is reached: " in capsys.readouterr().out
 
 
+def test_pictures_show_where_a_constraint_is_violated(
+    asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Only where one is, in the part of the plane that is drawn; the figure for a paper says it in its legend."""
+    grey, page = "Grey: a constraint is violated there", tmp_path / "out" / "report.html"
+    for keep, shown in (("v >= -1.1", True), ("v >= -2.5", False), ("abs(F) <= 4.1", True)):
+        assert said(capsys, [*asked, "--keep", keep])[0] == 0
+        assert (grey in page.read_text()) is shown
+    figure = tmp_path / "set.svg"
+    assert _run(["plot", str(tmp_path / "out" / "certificate.json"), "--out", str(figure)], False) == 0
+    assert "where a constraint is violated, on a grid" in figure.read_text()
+
+
+TANK = """
+name = "tank"
+states = ["h", "c"]
+inputs = ["q"]
+[dynamics]
+h = "q - sqrt(h)"
+c = "(1 - c)/h"
+[domain]
+h = [0.2, 3]
+c = [0.1, 2]
+[u_eq]
+q = 0
+[input_bounds]
+q = [-10, 10]
+"""
+
+
+def test_nothing_need_rest_in_the_domain(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Equations without a value at 0, whose domain ends before: both checkers accept, and a claim with V is refused."""
+    weights, bias = (np.array([[-1.0, 0.0]]),), (np.array([2.0]),)
+    network = PolicyNetwork.of_layers(weights, bias, np.ones(1), np.zeros(1), "identity", "none")
+    save_policy(tmp_path / "tank.pt", Policy(network, "tank", {}))
+    (tmp_path / "tank.toml").write_text(TANK)
+    loop = ["--policy", str(tmp_path / "tank.pt"), "--system", str(tmp_path / "tank.toml"), "--quiet"]
+    folder = tmp_path / "out"
+    asked = ["reach", *loop, "--sample-time", "0.1", "--target", "h <= 2.1", "--out", str(folder)]
+    status, data = said(capsys, [*asked, "--from", "h=2.4..2.5,c=0.5..0.6", "--keep", "c <= 1.5"])
+    assert status == 0 and (data["checked"], data["reference"]) == ("ACCEPTED", "ACCEPTED")
+    certificate = str(folder / "certificate.json")
+    assert _run(["contains", certificate, "h=2.42", "c=0.55"], False) == 0
+    assert _run(["contains", certificate, "h=0", "c=0"], False) == 1
+    assert _run(["roa", *loop, "--out", str(tmp_path / "roa")], False) == 2
+    assert "the domain of h must contain 0 in its interior" in capsys.readouterr().err
+
+
 def test_a_share_is_rounded_down(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     """A share of 0.99996 is not 100 %, and is one of the box that was cut, which is smaller than the domain."""
     _, data = said(capsys, asked)

@@ -21,7 +21,15 @@ import torch
 
 from certify.errors import InputError
 from certify.loop.expressions import Number, Symbol, differentiate, evaluate_exactly, sqrt, symbols
-from certify.loop.plants import System, available_systems, exact, get_system, load_system
+from certify.loop.plants import (
+    System,
+    available_systems,
+    exact,
+    get_system,
+    load_system,
+    require_origin_inside,
+    with_origin,
+)
 from certify.loop.plants import shipped as plants
 from certify.loop.plants.ode import rk4_step
 from certify.loop.plants.toml import parse_expression
@@ -129,10 +137,17 @@ def test_a_domain_may_be_given_in_floats(pendulum: System) -> None:
     assert pendulum.with_domain({"theta": (-1.5, 0.1)}).domain[0] == (Fraction(-3, 2), Fraction(0.1))
 
 
-def test_domain_must_surround_the_origin(pendulum: System) -> None:
-    assert pendulum.with_domain({"theta": (Fraction(-1), Fraction(2))}).domain[0] == (-1, 2)
+def test_domain_must_surround_the_origin_where_v_is_0_there(pendulum: System) -> None:
+    inside = pendulum.with_domain({"theta": (Fraction(-1), Fraction(2))})
+    assert inside.domain[0] == (-1, 2)
+    require_origin_inside(inside)
+    at_its_end = pendulum.with_domain({"theta": (Fraction(0), Fraction(2))})
     with pytest.raises(InputError, match="interior"):
-        pendulum.with_domain({"theta": (Fraction(0), Fraction(2))})
+        require_origin_inside(at_its_end)
+    with pytest.raises(InputError, match="interior"):
+        with_origin(inside, (Fraction(2), Fraction(0)), (Fraction(0),))
+    with pytest.raises(InputError, match="lo < hi"):
+        pendulum.with_domain({"theta": (Fraction(1), Fraction(1))})
     with pytest.raises(InputError, match="no state 'phi'"):
         pendulum.with_domain({"phi": (Fraction(-1), Fraction(2))})
 
@@ -216,7 +231,7 @@ def test_a_plant_is_one_file(plant_file: Callable[[str, str], Path]) -> None:
         ("leak = 1", r"leak\.py must define a function `leak\(\)`"),
         ("def leak(): return 1", r"`leak\(\)` in .*leak\.py must return a System; it returns int"),
         (PLANT.format(function="leak", name="drip", lo=-1), "must have the name 'leak'; it is called 'drip'"),
-        (PLANT.format(function="leak", name="leak", lo=0), "the domain of x must contain 0"),
+        (PLANT.format(function="leak", name="leak", lo=1), "the domain of x must satisfy lo < hi"),
     ],
 )
 def test_a_file_that_holds_no_plant_is_refused_and_the_others_still_work(

@@ -17,7 +17,7 @@ from certify.certificates import RankTree, run_checker
 from certify.certificates.claims import UNPROVED
 from certify.certificates.ranked import Ranked, steps_from
 from certify.certificates.verdict import Verdict
-from certify.effort import UNIT, Effort
+from certify.effort import UNIT, UNLIMITED, Effort
 from certify.errors import OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, symbols
@@ -234,12 +234,14 @@ def steep(rate: int, period: Fraction) -> Question:
 def test_a_frame_is_taken_where_images_are_narrower_in_it() -> None:
     """A steep loop's errors grow in the states' own coordinates; a step whose map overflows has no other ones."""
     probes = np.random.default_rng(0).uniform(-1, 1, (2, 30))
-    found = with_frame(steep(0, Fraction(1, 40)), probes / 10)
+    effort = Effort()
+    found = with_frame(steep(0, Fraction(1, 40)), probes / 10, effort)
+    assert effort.spent >= 2 * 30 * found.course((1,)).operations  # a step from each state, in both frames
     assert found.frame is not None
     M = np.eye(2) + found.loop.step * found.loop.mean_rate()
     turned = found.frame @ M @ np.linalg.inv(found.frame)
     assert max(np.abs(np.linalg.eigvals(np.abs(M)))) > 0.99 > 0.6 > max(np.abs(np.linalg.eigvals(np.abs(turned))))
-    assert with_frame(steep(10**6, Fraction(5)), probes).frame is None
+    assert with_frame(steep(10**6, Fraction(5)), probes, UNLIMITED).frame is None
 
 
 def turning_slowly() -> Question:
@@ -264,8 +266,19 @@ def turning_slowly() -> Question:
 def test_memory_is_taken_where_it_is_worth_its_price() -> None:
     turning, straight = turning_slowly(), question(bistable(), 0.01)
     begin = np.array([[0.5], [0.2]])
-    assert with_memory(turning, begin - 0.05, begin + 0.05, 45).memory > 1
-    assert with_memory(straight, np.array([[0.1]]), np.array([[0.11]]), 10).memory == 1
+    box, effort = (begin - 0.05, begin + 0.05), Effort()
+    found = with_memory(turning, *box, 45, effort)
+    assert found.memory > 1
+    assert effort.spent >= 45 * found.course((1,)).operations
+    assert with_memory(straight, np.array([[0.1]]), np.array([[0.11]]), 10, UNLIMITED).memory == 1
+
+
+def test_memory_is_not_tried_when_the_effort_is_over() -> None:
+    """More memory takes more operations a step: one image is all that a run without effort is charged with."""
+    turning, begin = turning_slowly(), np.array([[0.5], [0.2]])
+    effort = Effort(1.0)
+    assert with_memory(turning, begin - 0.05, begin + 0.05, 45, effort).memory == 1
+    assert effort.spent <= 45 * turning.course((1,)).operations
 
 
 def test_a_box_whose_parts_lead_straight_there_has_a_tree_of_its_own() -> None:

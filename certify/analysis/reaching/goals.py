@@ -27,6 +27,7 @@ from certify.certificates import (
 from certify.certificates.claims import Ranks, Reaches
 from certify.certificates.ellipsoids import Ellipsoid, sublevel_set
 from certify.certificates.membership import accepted_bytes
+from certify.effort import Effort
 from certify.errors import OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.composition import composed
@@ -80,17 +81,17 @@ class Goal:
             return Region(self.expressions, self.loop.system.states)
         return Sublevel(self.given.V, self.given.roa)
 
-    def question(self, x: Array, tried: Callable[[Stated], Mapping[str, Any]]) -> Question:
+    def question(self, x: Array, effort: Effort, tried: Callable[[Stated], Mapping[str, Any]]) -> Question:
         """The question from where it is reached, for a search around states x (n, N); of a certificate the order of the
         series in time is raised if the checker still accepts it, `tried` so."""
         system, root = self.loop.system, root_box(self.loop)
-        asked = with_order(Question(self.loop, self.target, tuple(kept_constraints(system).values()), root), x)
+        asked = with_order(Question(self.loop, self.target, tuple(kept_constraints(system).values()), root), x, effort)
         if self.given is not None:
             known = _tree_of(self.given)
             higher = replace(self.given, system=system, evidence=replace(known, order=asked.order))
             if asked.order <= known.order or tried(higher)["result"] != "ACCEPTED":
                 asked = replace(asked, order=known.order)
-        return with_frame(asked, x)
+        return with_frame(asked, x, effort)
 
     def certificate(
         self, question: Question, evidence: RankTree, ranks: Ranks, provenance: Mapping[str, Any]

@@ -178,13 +178,15 @@ def _proved(
     whole = tuple(zip(*map(_exactly, root_box(goal.loop)), strict=True))
     longest = 0 if result.runs is None or result.runs.longest is None else result.runs.longest
     clerk = tools.clerk(path, options.jobs, True, options.cluster)
-    question = goal.question(begins(options.begin or whole)[:_PROBES].T, clerk.tried)
+    search = effort.share(_FOR_SEARCH)
+    question = goal.question(begins(options.begin or whole)[:_PROBES].T, search, clerk.tried)
     if options.begin is not None:
         with tools.timing("ranks"):
-            question = with_memory(question, *_parts(options.begin), min(longest or MOST_STEPS, MOST_STEPS))
+            most = min(longest or MOST_STEPS, MOST_STEPS)
+            question = with_memory(question, *_parts(options.begin), most, search)
     _require_periodic(goal, question, clerk)
     with tools.timing("ranks"), runner_at(options.cluster) as runner:
-        found = _searched(question, options, longest, effort.share(_FOR_SEARCH), runner, tools)
+        found = _searched(question, options, longest, search, runner, tools)
     evidence = None if found is None else _within(found.evidence, options.within)
     if found is None or evidence is None:
         return replace(result, reason="no box of the domain is proved to lead into the target")

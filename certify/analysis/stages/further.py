@@ -200,7 +200,7 @@ class ByRanks:
             probes = np.random.default_rng(0).uniform(lo, hi, (_PROBES, len(lo))).T
             question = Question(problem.loop, target, claim.keep, root, evidence.order)
             ring, most = evidence.tree.count(LEAF), _FOR_RING * tools.whole
-            question = with_frame(with_order(question, probes, _LITTLE, ring, most), probes)
+            question = with_frame(with_order(question, probes, share, _LITTLE, ring, most), probes, share)
             found = prove_ranks(question, share, tools.runner, told, enough=enough)
         if found is None:
             return state.noting("no box of the domain beyond the set is proved to lead into it")

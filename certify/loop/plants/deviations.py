@@ -8,6 +8,7 @@ from fractions import Fraction
 
 from certify.loop.expressions import Expression, Number, Operation, Symbol, as_expression, substitute
 from certify.loop.plants.system import Interval, System, Time
+from certify.loop.plants.validation import require_origin_inside
 
 
 def in_deviations(
@@ -44,7 +45,7 @@ def with_origin(system: System, origin: Sequence[Fraction], u: Sequence[Fraction
     by = map(Number, origin)
     x_eq = tuple(q if e == Number(0) else e + q if q.value else e for e, q in zip(system.x_eq, by, strict=True))
     held = tuple(constraints_of_values(system).values())
-    return replace(
+    moved = replace(
         system,
         dynamics=in_deviations(dynamics_of_values(system), system.states, x_eq, system.time),
         u_eq=tuple(map(Number, u)),
@@ -52,6 +53,8 @@ def with_origin(system: System, origin: Sequence[Fraction], u: Sequence[Fraction
         constraints=dict(zip(system.constraints, in_deviations(held, system.states, x_eq), strict=True)),
         domain=tuple((lo - q, hi - q) for (lo, hi), q in zip(system.domain, origin, strict=True)),
     )
+    require_origin_inside(moved)
+    return moved
 
 
 def dynamics_of_values(system: System) -> tuple[Expression, ...]:

@@ -98,8 +98,8 @@ class System:
 
     Raises
     ------
-    InputError : counts do not match, a domain does not contain 0 in its interior, a parameter that must be positive is
-        not, an expression is outside the grammar, x_eq is irrational, a range is of no name, or an angle is no state.
+    InputError : counts do not match, an interval is empty, a parameter that must be positive is not, an
+        expression is outside the grammar, x_eq is irrational, a range is of no name, or an angle is no state.
     """
 
     name: str

@@ -34,6 +34,21 @@ def validate(system: System) -> None:
     _check_sample(system)
 
 
+def require_origin_inside(system: System) -> None:
+    """Reject a plant whose operating point does not lie in the interior of its domain: no V is 0 there.
+
+    Raises
+    ------
+    InputError : it does not, in some state.
+    """
+    for symbol, (lo, hi) in zip(system.states, system.domain, strict=True):
+        if not lo < 0 < hi:
+            raise InputError(
+                f"the domain of {symbol} must contain 0 in its interior, as a deviation from x_eq; "
+                f"found [{float(lo)}, {float(hi)}]."
+            )
+
+
 def _check_counts(system: System) -> None:
     n, m = len(system.states), len(system.inputs)
     for label, found, wanted in (
@@ -70,13 +85,8 @@ def _check_names(system: System) -> None:
 
 def _check_intervals(system: System) -> None:
     for symbol, (lo, hi) in zip(system.states, system.domain, strict=True):
-        if lo > hi:
+        if not lo < hi:
             raise InputError(f"the domain of {symbol} must satisfy lo < hi; found [{float(lo):g}, {float(hi):g}].")
-        if not lo < 0 < hi:
-            raise InputError(
-                f"the domain of {symbol} must contain 0 in its interior, as a deviation from x_eq; "
-                f"found [{float(lo)}, {float(hi)}]."
-            )
     for symbol, (lo, hi) in zip(system.inputs, system.input_bounds, strict=True):
         if not lo < hi:
             raise InputError(f"the bounds of {symbol} must satisfy lo < hi; found [{float(lo)}, {float(hi)}].")

@@ -65,7 +65,7 @@ class Question:
 
 
 def with_order(
-    question: Question, x: Array, little: float = _LITTLE, leaves: int = 0, most: float = math.inf
+    question: Question, x: Array, effort: Effort, little: float = _LITTLE, leaves: int = 0, most: float = math.inf
 ) -> Question:
     """The question with the lowest order of the series in time, from its own on, that leaves an error of `little` of
     the root box at states x (n, N), or with the last one that still gained something; as it is where no input is
@@ -79,7 +79,7 @@ def with_order(
         course = asked.course((1,))
         if leaves * course.operations > most:
             break
-        found = course(x, x, 0.0, 0.0)
+        found = _images(course, x, x, effort)
         widths = ((found.hi - found.lo)[0] / (question.root[1] - question.root[0])[:, None]).max(0)
         width = float(np.nanmedian(widths)) if np.any(np.isfinite(widths)) else math.inf
         if width < _GAIN * least or least == math.inf:
@@ -89,7 +89,7 @@ def with_order(
     return best
 
 
-def with_frame(question: Question, x: Array) -> Question:
+def with_frame(question: Question, x: Array, effort: Effort) -> Question:
     """The question with the frame in which images of small boxes around states x (n, N) are the narrowest: that of the
     states, or the left eigenvectors of the step's linear map at the origin, if there is one."""
     frame = _eigenframe(question.loop)
@@ -98,7 +98,7 @@ def with_frame(question: Question, x: Array) -> Question:
     reach = _SMALL * (question.root[1] - question.root[0])[:, None]
 
     def widths(asked: Question) -> float:
-        found = asked.course(COUNTS)(x - reach, x + reach, 0.0, 0.0)
+        found = _images(asked.course(COUNTS), x - reach, x + reach, effort)
         relative = (found.hi - found.lo) / reach[None]
         return float(np.where(found.there, 0.0, np.log(np.nan_to_num(relative.max(1), nan=_LOST))).sum())
 
@@ -106,7 +106,7 @@ def with_frame(question: Question, x: Array) -> Question:
     return other if widths(other) < widths(question) else question
 
 
-def with_memory(question: Question, lo: Array, hi: Array, steps: int) -> Question:
+def with_memory(question: Question, lo: Array, hi: Array, steps: int, effort: Effort) -> Question:
     """The question with the memory of errors that is worth most for boxes (n, B) that are to be in the target after so
     many steps: the boxes that are needed grow with the root of an image's width in each state, and each has its
     operations."""
@@ -116,14 +116,21 @@ def with_memory(question: Question, lo: Array, hi: Array, steps: int) -> Questio
     for memory in _MEMORIES:
         asked = replace(question, memory=memory)
         course = asked.course((steps,))
-        found = course(lo, hi, 0.0, 0.0)
+        found = _images(course, lo, hi, effort)
         widths = np.nan_to_num(((found.hi - found.lo) / root).max(1), nan=1.0)
         boxes = np.log(np.where(found.there, _THERE, widths)).mean() * len(lo) / 2
         if boxes + math.log(course.operations) < least:
             best, least = asked, boxes + math.log(course.operations)
-        if np.all(found.there):  # more memory has more operations, and no fewer boxes
+        if np.all(found.there) or effort.over:  # more memory has more operations, and no fewer boxes
             break
     return best
+
+
+def _images(course: Course, lo: Array, hi: Array, effort: Effort) -> Images:
+    """Images of boxes (n, B), whose steps are charged."""
+    found = course(lo, hi, 0.0, 0.0)
+    effort.charge(float(found.taken.sum()) * course.operations)
+    return found
 
 
 def _eigenframe(loop: ClosedLoop) -> Array | None:

@@ -16,6 +16,7 @@ from certify.certificates import AnyCertificate, InvariantCertificate, ReachCert
 from certify.errors import InputError
 from certify.loop.plants import System
 from certify.report.figures import region_of, simulated_roa
+from certify.report.figures.edges import key_of_edges
 from certify.report.figures.line import draw_line
 from certify.report.figures.pairs import Pair, named_pairs
 from certify.report.figures.portrait import draw_plane, keys
@@ -137,16 +138,16 @@ def _reach_figure(certificate: ReachCertificate, accepted: bool, options: PaperO
 
     planes, ground = _planes(certificate.system, options), reach_ground(certificate, accepted, close=True)
     figure, panels, height = _panels(len(planes), options)
-    for axes, pair in zip(panels, planes, strict=True):
-        show = draw_map(axes, ground, pair)
+    drawn = [draw_map(axes, ground, pair) for axes, pair in zip(panels, planes, strict=True)]
     steps = "sampling instants" if ground.sampled else "steps"
-    scale = ScalarMappable(Normalize(0.0, ground.most), show["cmap"])
+    scale = ScalarMappable(Normalize(0.0, ground.most), drawn[0][0]["cmap"])
     bar = figure.colorbar(scale, ax=panels, label=f"{steps} to the region, at most", aspect=30)
     bar.locator = _whole()
     bar.update_ticks()
     legend = (
         Key("the region, on a grid", SET, 1.6),
         Key(f"nothing is {ground.word}", INK, 0.4, fill=PAPER),
+        *((key_of_edges(),) if any(broken for _, broken in drawn) else ()),
     )
     _put_legend(figure, legend, height, ground.beside.removeprefix(", ") if ground.n > 2 else "")
     return figure

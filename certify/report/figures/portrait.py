@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.report.figures.edges import draw_edges, keys_of_edges
+from certify.report.figures.edges import draw_edges, key_of_edges, worst_of
 from certify.report.figures.geometry import ellipse, shadow, shadows, thin
 from certify.report.figures.pairs import Pair
 from certify.report.figures.scene import Scene
@@ -173,7 +173,9 @@ def keys(scene: Scene, runs: Runs, region: Region | None, growing: bool) -> tupl
         found.append(Key(f"the second claim's set, V′ = {below(scene.taking_over[1])}{shown}", INNER, 1.4, "--"))
     if growing:
         found.append(Key(f"{scene.falling} ≥ 0 on a grid*", GROWTH, 1.0, fill=GROWTH_FILL))
-    found += keys_of_edges(scene)
+    worst = worst_of(scene.certificate)
+    if worst is not None and any(np.any(worst(scene.plane(pair)[2]) >= 0) for pair in scene.pairs):
+        found.append(key_of_edges("*"))
     found += [Key(text, colour, 1.4, style) for _, colour, style, text in _kinds(scene, runs)]
     if region is not None:
         found.append(Key("boundary of the simulated region*", REGION, 1.4, "--"))
@@ -210,7 +212,7 @@ def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region |
     section = ellipse(scene.P, pair, scene.outer)
     axes.fill(*section, color=SET_FILL, lw=0, zorder=1)
     _draw_outline(axes, scene, pair)
-    draw_edges(axes, scene, pair)
+    draw_edges(axes, scene.certificate, a, b, x, 0.7)
     growing = (change >= 0) & np.any(x != 0, axis=-1) & _shows_sign(scene)
     if np.any(growing):
         axes.contourf(a, b, change, levels=[0, np.inf], colors=[GROWTH_FILL], zorder=0)

@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates import RankTree, ReachCertificate, leaves_within
+from certify.certificates import AnyCertificate, RankTree, ReachCertificate, leaves_within
 from certify.certificates.membership import angles_in
 from certify.certificates.ranked import Ranked
 from certify.loop.plants.floating_point import function_of
+from certify.report.figures.edges import draw_edges
 from certify.report.figures.geometry import ellipse
 from certify.report.figures.pairs import MOST, Pair
 from certify.report.figures.scene import Scene
@@ -42,6 +43,7 @@ class Ground:
 
     Parameters
     ----------
+    certificate : of the claim.
     ranked, most : the leaves, and the most steps from one.
     labels, names : of the states.
     middle : the state (n,) through which planes go.
@@ -51,6 +53,7 @@ class Ground:
     word : "proved", or "claimed".
     """
 
+    certificate: AnyCertificate
     ranked: Ranked
     most: float
     labels: Sequence[str]
@@ -76,6 +79,7 @@ def rank_maps(scene: Scene) -> list[Picture]:
     if ranked is None or claim.ranks is None:
         return []
     ground = Ground(
+        scene.certificate,
         ranked,
         float(claim.ranks.steps),
         scene.labels,
@@ -114,13 +118,13 @@ def reach_ground(
     """The ranks around a region, as `reach_maps` draws them; `close` is where there are ranks or the region."""
     system = certificate.system
     ranked = Ranked(certificate.evidence.ranks, None, angles_in(system))
-    middle = np.zeros(system.n) if box is None else 0.5 * (box[0] + box[1])
+    domain = np.array([[float(end) for end in pair] for pair in system.domain]).T
+    at_rest = box is None and bool(np.all(domain[0] < 0) and np.all(domain[1] > 0))
+    middle = np.zeros(system.n) if at_rest else 0.5 * np.sum(domain if box is None else box, axis=0)
     beyond = function_of(system, certificate.claim.target, (), "numpy")
     path = (
         None if box is None else _runs(certificate, box, lambda x: beyond(x, np.zeros((*x.shape[:-1], system.m)), ()))
     )
-
-    domain = np.array([[float(end) for end in pair] for pair in system.domain]).T
     lo, hi = ends = np.minimum(ranked.tree.lo, domain[0]), np.maximum(ranked.tree.hi, domain[1])
     if box is not None and path is not None:
         lo, hi = _view(ranked.tree, np.concatenate([np.stack(box), path.reshape(-1, system.n)]), ends)
@@ -144,6 +148,7 @@ def reach_ground(
 
     shown = zip(system.states, system.exact_x_eq(), strict=True)
     return Ground(
+        certificate,
         ranked,
         float(certificate.claim.ranks.steps),
         [deviation(s.name, q, system.units.get(s.name, "")) for s, q in shown],
@@ -155,16 +160,17 @@ def reach_ground(
         outline,
         system.sample is not None,
         "proved" if accepted else "claimed",
-        ", all other states at 0"
-        if box is None
-        else ", all other states in the middle of the box that was asked about",
+        ", all other states "
+        + ("at 0" if at_rest else f"in the middle of the {'domain' if box is None else 'box that was asked about'}"),
     )
 
 
 def _picture(ground: Ground, pair: Pair, more: str = "") -> Picture:
     """The map of one plane, with the outline of the target on top."""
     figure, axes = figure_of(4.4, 3.6 if ground.n > 1 else 1.6, left=0.86, right=0.8)
-    _scale(figure, axes, ground.most, draw_map(axes, ground, pair))
+    show, broken = draw_map(axes, ground, pair)
+    _scale(figure, axes, ground.most, show)
+    grey = " Grey: a constraint is violated there, on a grid." if broken else ""
     steps = "sampling instants" if ground.sampled else "steps"
     other = ground.beside if ground.n > 2 else ""
     turned = [symbol(ground.names[k]) for k in ground.ranked.angles]
@@ -175,17 +181,18 @@ def _picture(ground: Ground, pair: Pair, more: str = "") -> Picture:
     return Picture(
         title if ground.n <= 2 else f"{title}: {ground.labels[i]}, {ground.labels[j]}",
         f"Colour: the number of {steps} after which every trajectory from there is in {ground.target}, the blue "
-        f"outline, at the latest{unless}{other}. White: nothing is {ground.word}.{place}{more}",
+        f"outline, at the latest{unless}{other}. White: nothing is {ground.word}.{grey}{place}{more}",
         to_svg(figure),
         simulated=bool(more),
     )
 
 
-def draw_map(axes: Any, ground: Ground, pair: Pair) -> dict[str, Any]:
-    """Draw the ranks and the target's outline in a plane; returns how numbers become colours."""
+def draw_map(axes: Any, ground: Ground, pair: Pair) -> tuple[dict[str, Any], bool]:
+    """Draw the ranks, violated constraints and the target's outline in a plane; returns how numbers become colours, and
+    whether a constraint is violated somewhere in the plane."""
     i, j = pair
     lo, hi = ground.lo, ground.hi
-    _, _, states = _plane(lo, hi, ground.middle, pair)
+    a, b, states = _plane(lo, hi, ground.middle, pair)
     values = ground.ranked.ranks_at(states.reshape(-1, ground.n)).reshape(states.shape[:-1])
     box = (lo[i], hi[i], lo[j], hi[j]) if ground.n > 1 else (lo[0], hi[0], 0.0, 1.0)
     show = {"cmap": _COLOURS, "vmin": 0.0, "vmax": ground.most, "origin": "lower", "interpolation": "nearest"}
@@ -194,11 +201,12 @@ def draw_map(axes: Any, ground: Ground, pair: Pair) -> dict[str, Any]:
         axes.set_ylabel(ground.labels[j])
     else:
         axes.set_yticks([])
+    broken = draw_edges(axes, ground.certificate, a, b, states, 1.5)
     ground.outline(axes, pair)
     axes.set_xlim(*box[:2])
     axes.set_ylim(*box[2:])
     axes.set_xlabel(ground.labels[i])
-    return show
+    return show, broken
 
 
 def _view(tree: RankTree, states: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:

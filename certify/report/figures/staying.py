@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates import InvariantCertificate
-from certify.loop.plants import corners
-from certify.loop.plants.floating_point import function_of
+from certify.report.figures.edges import worst_of
 from certify.report.figures.pairs import Pair
 from certify.report.figures.ranks import planes_of
 from certify.report.figures.style import INK, PAPER, SET, START, Picture, figure_of, to_svg
@@ -73,13 +72,14 @@ def draw_set(axes: Any, stage: Stage, pair: Pair) -> bool:
     a, b, states = _plane(lo, hi, pair)
     with np.errstate(all="ignore"):
         value = np.nan_to_num(outer.function(states), nan=np.inf).min(0)
-        kept = _worst(certificate, states).min(0)
+    worst = worst_of(certificate)
+    broken = None if worst is None else worst(states).min(0)
     if n > 1:
         finite = np.where(np.isfinite(value), value, outer.level + 1)
         axes.contourf(a, b, finite, levels=[-np.inf, outer.level], colors=[SET], alpha=0.25, zorder=1)
         axes.contour(a, b, finite, levels=[outer.level], colors=[SET], linewidths=[1.6], zorder=4)
-        if np.any(kept >= 0):
-            axes.contourf(a, b, kept, levels=[0.0, np.inf], colors=[START], alpha=0.35, zorder=2)
+        if broken is not None and np.any(broken >= 0):
+            axes.contourf(a, b, broken, levels=[0.0, np.inf], colors=[START], alpha=0.35, zorder=2)
         for run in range(runs.shape[1]):
             for colour, width in _RUNS:
                 axes.plot(runs[:, run, i], runs[:, run, j], color=colour, lw=width, zorder=3)
@@ -95,7 +95,7 @@ def draw_set(axes: Any, stage: Stage, pair: Pair) -> bool:
         axes.set_yticks([])
     axes.set_xlim(lo[i], hi[i])
     axes.set_xlabel(labels[i])
-    return bool(np.any(kept >= 0))
+    return broken is not None and bool(np.any(broken >= 0))
 
 
 def _plane(lo: Array, hi: Array, pair: Pair) -> tuple[Array, Array, Array]:
@@ -110,18 +110,6 @@ def _plane(lo: Array, hi: Array, pair: Pair) -> tuple[Array, Array, Array]:
     if n > 1:
         states[..., j] = b[:, None]
     return a, b, states
-
-
-def _worst(certificate: InvariantCertificate, states: Array) -> Array:
-    """The largest of all constraints' g at states (..., n), for the worst uncertain quantities; -inf without any."""
-    keep, system = tuple(certificate.constraints.values()), certificate.system
-    if not keep:
-        return np.full(states.shape[:-1], -np.inf)
-    g = function_of(system, keep, [s for s, _ in system.uncertain], "numpy")
-    flat = states.reshape(-1, system.n)
-    u = np.asarray(certificate.network.folded(system.exact_u_eq())(flat, system.exact_u_eq()))
-    found = [np.asarray(g(flat, u, [float(q) for q in values.values()])).max(-1) for values in corners(system)]
-    return np.asarray(np.max(found, axis=0)).reshape(states.shape[:-1])
 
 
 def _runs(certificate: InvariantCertificate, lo: Array, hi: Array) -> Array:
