@@ -143,7 +143,14 @@ def sums_along(data: Mapping[str, Any]) -> list[Along]:
         factors = {p: q / size for p, q in zip(priors, by, strict=True)}
         each = [sorted((q * a, q * b)) for q, (a, b) in zip(factors.values(), priors.values(), strict=True)]
         lo, hi = sorted(((-1 - at) / size, (1 - at) / size))
-        found.append(Along(name, factors, (sum(a for a, _ in each), sum(b for _, b in each)), (lo, hi)))
+        found.append(
+            Along(
+                name,
+                factors,
+                (sum((a for a, _ in each), Fraction(0)), sum((b for _, b in each), Fraction(0))),
+                (lo, hi),
+            )
+        )
     return found
 
 
