@@ -130,13 +130,13 @@ class Boxes(ABC):
 
         return evaluate(self.c.dynamics, constant, variables, lambda call, given: entries(call, given, self.calls))
 
-    def kept(self, states: list[Taylor], held: list[Taylor], gaps: Sequence[Callable[[Array], Taylor]]) -> Array:
-        """True for each constraint and box on which it is negative where no gap is, (K, B)."""
+    def kept(self, courses: list[list[Taylor]], held: list[Taylor], gaps: Sequence[Callable[[Array], Taylor]]) -> Array:
+        """True for each constraint and box on which it is negative at all of these states where no gap is, (K, B)."""
         if self.c.keep is None:
             return np.zeros((0, len(held[0].c)), dtype=bool)
         from .keep import on_boxes
 
-        return on_boxes(self, states, held, gaps)
+        return on_boxes(self, courses, held, gaps)
 
     def number(self, pair: tuple[Fraction, Fraction], symbol: int, batch: int) -> Taylor:
         """A number of a range, by its symbol, which may be one beyond all others."""

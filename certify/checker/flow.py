@@ -34,6 +34,7 @@ from .taylor import Taylor, affine, combination, constants, pairs, upper_bound
 Constant = Callable[[Fraction], Any]
 Way = tuple[Array, Array]  # the largest move of each state in a period: a number, and one times ||d||
 Enclosed = tuple[Way, list[Jet]]  # and f on the way
+_QUARTERS = 4  # of a period, for constraints
 _ATTEMPTS = 4  # at the a-priori enclosure
 
 
@@ -248,7 +249,8 @@ def longest(c: Certificate) -> float:
 def motion(
     boxes: Moving, period: tuple[Fraction, Fraction], states: list[Taylor], inputs: list[Taylor], ranges: list[Taylor]
 ) -> Motion:
-    """G over a period, and where the state may be until it is over: at x + s G, with s for h, for some s up to h."""
+    """G over a period, and where the state may be until it is over: at x + s G, with s for h, for some s up to h, which
+    is in one of its quarters."""
     c, most = boxes.c, longest(boxes.c)
     loose = [*inputs, *(affine(v.c, np.zeros_like(v.g), v.moved) for v in ranges)]  # by their ranges, without symbols
     during, F = enclosed(lambda x: boxes.f(x, loose), states, most)
@@ -260,11 +262,13 @@ def motion(
         rows = [[*row, *others] for row, others in zip(rows, more, strict=True)]
         way = way.least(highest(outwards(first), outwards(bent), most))
     G, ends = [risen(row, h) for row in rows], hull(states, way, boxes.widest)
-    if c.keep is not None:
-        s = boxes.number((Fraction(0), c.step), boxes.symbols, len(h.c))
-        states, loose, *rows = ([v.widened(boxes.symbols + 1) for v in some] for some in (states, loose, *rows))
-        states = [x + s * risen(row, s) for x, row in zip(states, rows, strict=True)]
-    return Motion(G, states, loose, ends)
+    if c.keep is None:
+        return Motion(G, [], loose, ends)
+    states, loose, *rows = ([v.widened(boxes.symbols + 1) for v in some] for some in (states, loose, *rows))
+    quarters = [(c.step * k / _QUARTERS, c.step * (k + 1) / _QUARTERS) for k in range(_QUARTERS)]
+    times = [boxes.number(quarter, boxes.symbols, len(h.c)) for quarter in quarters]
+    courses = [[x + s * risen(row, s) for x, row in zip(states, rows, strict=True)] for s in times]
+    return Motion(G, courses, loose, ends)
 
 
 def outwards(models: list[Taylor]) -> Array:

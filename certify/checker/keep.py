@@ -22,12 +22,12 @@ def constraints(boxes: Boxes, states: list[Taylor], held: list[Taylor]) -> list[
 
 
 def on_boxes(
-    boxes: Boxes, states: list[Taylor], held: list[Taylor], gaps: Sequence[Callable[[Array], Taylor]]
+    boxes: Boxes, courses: list[list[Taylor]], held: list[Taylor], gaps: Sequence[Callable[[Array], Taylor]]
 ) -> Array:
-    """True for each constraint and box on which it is negative where no gap is."""
-    found = constraints(boxes, states, held)
-    of_all = [lambda left, gap=gap: gap(left).widened(found[0].symbols) for gap in gaps]
-    return np.array([boxes.least_bound(g, of_all) < 0 for g in found])
+    """True for each constraint and box on which it is negative at all of these states where no gap is."""
+    of_all = [lambda left, gap=gap: gap(left).widened(held[0].symbols) for gap in gaps]
+    found = [constraints(boxes, states, held) for states in courses]
+    return np.all([[boxes.least_bound(g, of_all) < 0 for g in some] for some in found], axis=0)
 
 
 def on_leaves(leaves: Leaves) -> Failures:

@@ -250,7 +250,7 @@ class Beyond(Boxes):
         gaps = [course.below.at, lambda few: self.gap(centre[:, few], radius[:, few], self.c.c2, -1.0)]
         bound = self.least_bound(course.rise, gaps)
         hold = (bound < 0) & course.finite
-        kept = self.kept(course.states, course.held, gaps)
+        kept = self.kept([course.states], course.held, gaps)
         return Leaves(self, first + left, "outer leaf ", course.inputs.range, bound, hold, kept)
 
     def close(self, x: Form, free: Array) -> Array:

@@ -200,7 +200,7 @@ class Steps(Moving):
             hold = self.in_domain(*motion.ends)
             course.note("flow", hold, numbers, "the state may leave the domain during a period")
         if c.keep is not None:
-            hold = self.kept(motion.states, motion.held, ())
+            hold = self.kept(motion.courses, motion.held, ())
             course.note("keep", np.all(hold, axis=0), numbers, "a constraint may be violated")
         hold = self.in_domain(*x.range.ends)
         course.note("ranks", hold, numbers, "the state may leave the domain")

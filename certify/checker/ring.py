@@ -30,11 +30,11 @@ class RingLeaves(Leaves):
 @dataclass(frozen=True)
 class Motion:
     """On boxes G, which is F, or the increment in a step over its length; states and what else f reads, as constraints
-    take them, where inputs are held at any time of a period, which is a symbol more; and between what a state lies
-    during a period, (2, n, B)."""
+    take them, where inputs are held for each quarter of a period at any time of it, which is a symbol more; and between
+    what a state lies during a period, (2, n, B)."""
 
     G: list[Taylor]
-    states: list[Taylor]
+    courses: list[list[Taylor]]
     held: list[Taylor]
     ends: Array = None
 
@@ -59,7 +59,7 @@ class Moving(Boxes):
 
             return motion(self, states, inputs)
         held = [*inputs, *self.quantities(len(inputs[0].c))]
-        return Motion(self.f(states, held), states, held)
+        return Motion(self.f(states, held), [states], held)
 
 
 class Ring(Moving):
@@ -101,7 +101,7 @@ class Ring(Moving):
             rise = combination((1.0, rise), (2 * self.c.rate, self.gap(centre, radius, 0.0, -1.0)))
         bound = self.bound(rise, centre, radius, beyond)
         gaps = [lambda left: self.gap(centre[:, left], radius[:, left], self.c.c2, 1.0)]
-        kept = self.kept(motion.states, motion.held, gaps)
+        kept = self.kept(motion.courses, motion.held, gaps)
         hold = self.hold(bound, meet, motion.G)
         return RingLeaves(self, first + met, "leaf ", u.range, bound, hold, kept, meet, motion)
 

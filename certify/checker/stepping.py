@@ -135,4 +135,4 @@ def motion(boxes: Moving, states: list[Taylor], inputs: list[Taylor]) -> Motion:
 
         return motion(boxes, boxes.c.sample, states, inputs, boxes.quantities(len(inputs[0].c)))
     held = [*inputs, *boxes.quantities(len(inputs[0].c))]
-    return Motion([f + -x for f, x in zip(boxes.f(states, held), states, strict=True)], states, held)
+    return Motion([f + -x for f, x in zip(boxes.f(states, held), states, strict=True)], [states], held)

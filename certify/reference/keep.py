@@ -6,12 +6,12 @@ may be beyond {V <= c2}, and in a tube by the ball of each slab, for no ellipsoi
 With a sample they are so at all times of a period, in which the inputs are held, and what is uncertain may be any
 number of its range at each place. On a box the state after a time s is x + s G, G the mean of f until then. The
 coefficients of G up to the last are those at x, and the last is taken at all states of the longest period: so it holds
-for every s. A ball has all of those states at once.
+for every s. Each quarter of the longest period has a model of its own. A ball has all of those states at once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from .document import Interval
@@ -29,19 +29,27 @@ def kept(motion: Motion, at: Stage, within: Mapping[str, Taylor] | None, slacks:
 
     With a sample `within` are the states of the whole period.
     """
-    expressions, known = motion.c.keep, motion.numbers(at)
+    expressions = motion.c.keep
     if expressions is None:
         return
+    for names in moments(motion, at, within):
+        with under(RULE, at.place):
+            values: list[Taylor] = expressions.evaluate(names, constant)
+        for i, g in enumerate(values):
+            holds = g.is_finite() and is_negative(g, slacks)
+            require(holds, RULE, at.place, f"expression {i} is not certain to be negative")
+
+
+def moments(motion: Motion, at: Stage, within: Mapping[str, Taylor] | None) -> Iterator[Mapping[str, Taylor]]:
+    """All numbers by their names: those on the box, or with a sample those in each quarter of the period."""
+    known = motion.numbers(at)
     names = {**known.states, **known.inputs, **known.uncertain}
-    if within is not None:
-        s = motion.within_period()
+    if within is None:
+        yield names
+        return
+    for s in motion.quarters():
         moved = zip(known.states.items(), motion.mean(at, within, s), strict=True)
-        names |= {**known.anything, **{name: x + s * g for (name, x), g in moved}}
-    with under(RULE, at.place):
-        values: list[Taylor] = expressions.evaluate(names, constant)
-    for i, g in enumerate(values):
-        holds = g.is_finite() and is_negative(g, slacks)
-        require(holds, RULE, at.place, f"expression {i} is not certain to be negative")
+        yield {**names, **known.anything, **{name: x + s * g for (name, x), g in moved}}
 
 
 def kept_on_ball(steps: Steps, cells: Iterable[Sequence[Interval]], at: str) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 from flint import arb, arb_mat, fmpq
 
@@ -125,9 +126,10 @@ class Motion:
     def period(self) -> Taylor:
         return self.between(*(self.c.sample or (self.c.step, self.c.step)))
 
-    def within_period(self) -> Taylor:
-        """Any time from the start of a period to the end of the longest."""
-        return self.between(fmpq(0), self.c.step)
+    def quarters(self) -> list[Taylor]:
+        """Any time of each quarter of the longest period; each ends where the next starts, as rationals."""
+        ends = [self.c.step * fmpq(k, 4) for k in range(5)]
+        return [self.between(*pair) for pair in pairwise(ends)]
 
     def between(self, lo: fmpq, hi: fmpq) -> Taylor:
         """With the last symbol, where it may be one of many."""

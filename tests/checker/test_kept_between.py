@@ -103,21 +103,24 @@ VIOLATED = {
 
 
 def halved(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Motion, "within_period", lambda self: self.between(self.c.step * 0, self.c.step / 2))
+    monkeypatch.setattr(Motion, "quarters", lambda self: [self.between(self.c.step * 0, self.c.step / 2)])
     as_stated: Callable[..., Any] = Boxes.number
 
     def number(self: Any, pair: Any, symbol: int, batch: int) -> Any:
-        return as_stated(self, (pair[0], pair[1] / (2 if symbol == self.symbols else 1)), symbol, batch)
+        most = self.c.step / 2
+        return as_stated(
+            self, (min(pair[0], most), min(pair[1], most)) if symbol == self.symbols else pair, symbol, batch
+        )
 
     monkeypatch.setattr(Boxes, "number", number)
 
 
 def ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Motion, "within_period", lambda self: self.between(self.c.step, self.c.step))
+    monkeypatch.setattr(Motion, "quarters", lambda self: [self.between(self.c.step, self.c.step)])
     as_stated: Callable[..., Any] = Boxes.number
 
     def number(self: Any, pair: Any, symbol: int, batch: int) -> Any:
-        return as_stated(self, (pair[1], pair[1]) if symbol == self.symbols else pair, symbol, batch)
+        return as_stated(self, (self.c.step, self.c.step) if symbol == self.symbols else pair, symbol, batch)
 
     monkeypatch.setattr(Boxes, "number", number)
 
@@ -133,9 +136,9 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Motion, "numbers", numbers)
     kept: Callable[..., Any] = Boxes.kept
 
-    def with_symbols(self: Any, states: Any, held: Any, gaps: Any) -> Any:
-        own = [v.widened(states[0].symbols) for v in self.quantities(len(held[0].c))]
-        return kept(self, states, [*held[: self.m], *own], gaps)
+    def with_symbols(self: Any, courses: Any, held: Any, gaps: Any) -> Any:
+        own = [v.widened(held[0].symbols) for v in self.quantities(len(held[0].c))]
+        return kept(self, courses, [*held[: self.m], *own], gaps)
 
     monkeypatch.setattr(Boxes, "kept", with_symbols)
 
@@ -161,3 +164,22 @@ def test_each_part_of_the_rule_is_needed(name: str, monkeypatch: pytest.MonkeyPa
     assert verdicts(case.document(by)) == REFUSED
     MUTANTS[name](monkeypatch)
     assert verdicts(case.document(by)) == KEPT
+
+
+@pytest.mark.parametrize("k", range(4))
+def test_the_checker_asks_each_quarter(k: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """x is the time: within 1e-3 of the middle of one quarter alone g is not negative."""
+    bump = Case(["u"], (0.0,), ["-", ["**", ["-", "x", str(Fraction(2 * k + 1, 8))], 2]], Fraction(0))
+    violated = bump.document(-Fraction(1, 10**6))
+    assert verdicts(violated) == REFUSED
+    as_stated: Callable[..., Any] = Boxes.number
+    for left_out in range(4):
+
+        def number(self: Any, pair: Any, symbol: int, batch: int, left_out: int = left_out) -> Any:
+            other = Fraction((left_out + 2) % 4, 4)
+            missing = symbol == self.symbols and pair[0] == Fraction(left_out, 4)
+            return as_stated(self, (other, other) if missing else pair, symbol, batch)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(Boxes, "number", number)
+            assert verdicts(violated) == ((None if left_out == k else "keep"), "keep")

@@ -112,7 +112,11 @@ REFUSED = {
     "two policies": ({f"{p}.{k}": v for p in ("a", "b") for k, v in STATE.items()}, LAYERS, "--prefix"),
     "only a critic": ({f"critic.{k}": v for k, v in STATE.items()}, LAYERS, "holds 0"),
     "nothing": ({"x": torch.ones(2)}, LAYERS, "none .layers must be called"),
-    "a wrong prefix": (STATE, replace(LAYERS, prefix="actor"), "there must be layers actor.0.weight"),
+    "a wrong prefix": (
+        STATE,
+        replace(LAYERS, prefix="actor"),
+        "actor.0.weight and so on; found layers without",
+    ),
     "a state twice": (STATE, replace(LAYERS, states=("x0", "x0")), "--states must name each state once"),
     "no expression": (
         STATE,
@@ -134,10 +138,15 @@ def test_refused_state_dicts(name: str, tmp_path: Path) -> None:
         import_policy(saved(tmp_path, data), plant(), options)
 
 
-@pytest.mark.parametrize("name", ["prelu", "ELU", "sin"])
+@pytest.mark.parametrize("name", ["prelu", "ELUs", "sin"])
 def test_other_activations_are_refused_by_name(name: str) -> None:
     with pytest.raises(InputError, match=f"--activation must be one of tanh, relu, .*{name}"):
         ImportOptions(activation=name)
+
+
+@pytest.mark.parametrize("name", ["LeakyReLU", "leaky-relu", "leaky_relu", "LEAKYRELU"])
+def test_an_activation_may_be_written_as_torch_does(name: str) -> None:
+    assert ImportOptions(activation=name).activation == "leaky_relu"
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import math
+import weakref
 from fractions import Fraction
 
 import numpy as np
@@ -95,3 +97,26 @@ def test_the_series_of_a_solution_ends_at_the_solution() -> None:
 def test_a_solution_that_moves_at_a_constant_rate() -> None:
     rows = solution_series((Number(2), X), {X: 1.0, Y: 0.0}, {}, Numbers(), 4)
     assert rows == [[2, 0, 0, 0], [1, 1, 0, 0]]
+
+
+def test_what_a_series_is_made_of_goes_with_it() -> None:
+    """Models of a network's inputs have megabytes, and Python looks for circles by the number of objects."""
+
+    class Large(float):
+        pass
+
+    made: list[weakref.ref[Large]] = []
+
+    class Watched(Numbers):
+        def function(self, name: str, value: float) -> float:
+            found = Large(super().function(name, value))
+            made.append(weakref.ref(found))
+            return found
+
+    gc.disable()
+    try:
+        solution_series([parse_expression("sin(x)*tanh(x) + exp(x)", {"x": X})], {X: 0.5}, {}, Watched(), 4)
+        assert len(made) == 4  # sin and cos, tanh, exp
+        assert not [found for found in made if found() is not None]
+    finally:
+        gc.enable()

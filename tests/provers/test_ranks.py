@@ -179,6 +179,24 @@ def test_images_hold_trajectories(loop: tuple[System, PolicyNetwork], framed: bo
         assert np.all(np.abs(away) <= bounds + 1e-12)
 
 
+@pytest.mark.parametrize("loop", [bistable(), swinging()])
+def test_images_are_the_same_in_any_pieces(loop: tuple[System, PolicyNetwork]) -> None:
+    """Models among many symbols are large, and few boxes at a time have to be followed then."""
+    course, rng = followed(loop, None, 3), np.random.default_rng(0)
+    lo = rng.uniform(-0.4, 0.4, (loop[0].n, 37))
+    hi = lo + rng.uniform(1e-3, 1e-2, lo.shape)
+    assert course.most == 512
+    whole = course(lo, hi, 0.0, 0.0)
+    course.most = 4
+    for at_once, in_pieces in zip(whole, course(lo, hi, 0.0, 0.0), strict=True):
+        np.testing.assert_array_equal(at_once, in_pieces)
+
+
+def test_many_symbols_are_followed_for_few_boxes_at_a_time() -> None:
+    course = followed(swinging(), None, 60)
+    assert course.most * course.symbols**2 <= 2**16 and course.most >= 2
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_errors_in_a_frame_that_is_nearly_singular_are_not_less_than_they_are(seed: int) -> None:
     """The inverse in binary64 is wrong by the frame's condition."""

@@ -46,6 +46,11 @@ class PowerSeries(Algebra[Series[V]]):
             series.coefficients.append(rule(self._known))
         self._known += 1
 
+    def forget(self) -> None:
+        """Let go of all rules. They know this object and it knows them, a circle that would keep large values until
+        Python looks for circles."""
+        self._made.clear()
+
     def held(self, value: V) -> Series[V]:
         """A constant in time."""
         return self._follow(lambda k: None if k else value)
@@ -214,6 +219,7 @@ def solution_series(
             series.advance()
         for own, rate in zip(x.values(), f, strict=True):
             own.coefficients.append(_divided(rate.coefficients[k], k + 1, algebra))
+    series.forget()
     zero = algebra.constant(Fraction(0))
     return [[zero if v is None else v for v in own.coefficients[1:]] for own in x.values()]
 

@@ -37,6 +37,11 @@ def is_whole(index: Index, count: int) -> bool:
     return len(index) == count and (not count or bool(index[0] == 0 and index[-1] == count - 1))
 
 
+def pieces(count: int, most: int) -> int:
+    """Into how many pieces of at most so many boxes these are cut, at least one."""
+    return max(1, -(-count // most))
+
+
 def joined(parts: Any) -> Any:
     """Batches (..., B) one after the other, as one array."""
     return np.concatenate(parts, -1)

@@ -22,6 +22,7 @@ from certify.loop.plants.system import Interval
 from certify.provers.bounds.arrays import Array, Mask, chosen
 from certify.provers.bounds.taylor import EPS, TINY, Models, Taylor
 
+_QUARTERS = 4  # of a period, for constraints
 _ATTEMPTS, _WIDER = 4, 1.25  # at the enclosure of the solution
 Values = Mapping[Symbol, Taylor]
 
@@ -29,14 +30,14 @@ Values = Mapping[Symbol, Taylor]
 class Mean(NamedTuple):
     """`G`: models of the mean of f over the period, a component each; `down` and `up` (n, B): by how much the states
     fall and rise at most from its beginning to any time of the longest, at least 0; `exists` (B,): the solution does,
-    and these hold for it; `during`: all values at any time of the period, where it exists, with a symbol more for that
-    time, the last of all; none if nobody asks."""
+    and these hold for it; `during`: for each quarter of the period all values at any time of it, where it exists, with
+    a symbol more for that time, the last of all; none if nobody asks."""
 
     G: list[Taylor]
     down: Array
     up: Array
     exists: Mask
-    during: Values
+    during: Sequence[Values]
 
 
 class Flow:
@@ -74,19 +75,22 @@ class Flow:
             rows = [[model, *row[1:], last[-1]] for model, row, last in zip(now, inner, along, strict=True)]
         down, up = self._moved(now, along)
         rows = [[_mean(row[0], alike), *row[1:]] for row in rows]
-        during = self._during(states, held, rows) if self.throughout else {}
+        during = self._during(states, held, rows) if self.throughout else ()
         return Mean([_risen(row, self.times_period) for row in rows], down, up, exists, during)
 
-    def _during(self, states: Values, held: Values, rows: Sequence[Sequence[Taylor]]) -> Values:
-        """x + s G for any s up to the longest period, and what is held."""
+    def _during(self, states: Values, held: Values, rows: Sequence[Sequence[Taylor]]) -> list[Values]:
+        """x + s G for any s in each quarter of the longest period, and what is held."""
         wide = {symbol: _with_a_symbol(model) for symbol, model in {**states, **held}.items()}
+        wide_rows, found = [list(map(_with_a_symbol, row)) for row in rows], list[Values]()
         like = next(iter(wide.values()))
-        half = np.full_like(like.c, 0.5 * self.most)
-        g = np.zeros_like(like.g)
-        g[-1] = half
-        s = Taylor(half, g, np.zeros_like(like.Q), EPS * half)
-        moved = [s * _risen(list(map(_with_a_symbol, row)), s.__mul__) for row in rows]
-        return wide | {symbol: wide[symbol] + way for symbol, way in zip(states, moved, strict=True)}
+        half, none = np.full_like(like.c, 0.5 * self.most / _QUARTERS), np.zeros_like(like.Q)
+        for k in range(_QUARTERS):
+            g = np.zeros_like(like.g)
+            g[-1] = half
+            s = Taylor((2 * k + 1) * half, g, none, 2 * EPS * self.most + 0 * half)
+            moved = [s * _risen(row, s.__mul__) for row in wide_rows]
+            found.append(wide | {symbol: wide[symbol] + way for symbol, way in zip(states, moved, strict=True)})
+        return found
 
     def _moved(self, now: Sequence[Taylor], along: Sequence[Sequence[Taylor]]) -> tuple[Array, Array]:
         """By how much the states fall and rise at most: as fast as f along the solution or, where its order is at least

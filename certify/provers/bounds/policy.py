@@ -27,7 +27,7 @@ from certify.provers.bounds.steps import StepsOnBoxes, observed
 from certify.provers.bounds.taylor import EPS, TINY
 
 _ENTRY, _NEURON, _OBSERVATION = 0.05, 25.0, 4.0  # operations of an entry of a product, of a relaxation, a model
-_NUMBERS = 2**15  # units of a layer times boxes at a time, which stay in a core's cache
+_NUMBERS = 2**15  # units of a layer times boxes at a time, which stay in a core's cache, with a symbol for each axis
 _MOST = 512  # boxes at a time
 
 
@@ -40,13 +40,16 @@ class Enclosure(ABC):
     Parameters
     ----------
     centring : what is added to the last layer's value and to the output, each with its error, (m,) each.
+    symbols : of the forms that the states come as; by default the n box coordinates.
     """
 
-    def __init__(self, network: PolicyNetwork, centring: Sequence[Array]) -> None:
+    def __init__(self, network: PolicyNetwork, centring: Sequence[Array], symbols: int | None = None) -> None:
         self.squash, self.scale = network.squash == "tanh", network.scale
+        self.symbols = symbols or network.n
         self.shift, self.shift_error, self.offset, self.offset_error = centring
         self.clip = None if network.clip is None else tuple(end[:, None] for end in network.clip)
-        self.piece = min(_MOST, 2 ** ((_NUMBERS // max(network.network.sizes)) | 1).bit_length() // 2)
+        numbers = max(network.network.sizes) * max(1, self.symbols // network.n)
+        self.piece = min(_MOST, 2 ** ((_NUMBERS // numbers) | 1).bit_length() // 2)
 
     @np.errstate(all="ignore")
     def __call__(self, x: Array, x_error: Array) -> tuple[Array, Array, Array, Array]:
@@ -91,8 +94,8 @@ class LayersEnclosure(Enclosure):
 
     @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
     def __init__(self, network: PolicyNetwork, centring: Sequence[Array], symbols: int | None = None) -> None:
-        super().__init__(network, centring)
-        self.symbols, self.observation, self.origin = symbols or network.n, network.network.observation, None
+        super().__init__(network, centring, symbols)
+        self.observation, self.origin = network.network.observation, None
         layers = network.network.affine
         weights, biases = [step.weight.copy() for step in layers], [step.bias.copy() for step in layers]
         magnitudes, bias_errors = [np.abs(w) for w in weights], [np.zeros_like(b) for b in biases]
@@ -138,8 +141,8 @@ class LayersEnclosure(Enclosure):
 class StepsEnclosure(Enclosure):
     """A network of any steps."""
 
-    def __init__(self, network: PolicyNetwork, centring: Sequence[Array]) -> None:
-        super().__init__(network, centring)
+    def __init__(self, network: PolicyNetwork, centring: Sequence[Array], symbols: int | None = None) -> None:
+        super().__init__(network, centring, symbols)
         self.network, self.origin = network.network, network.origin if network.is_moved else None
         self.norms: dict[Step, float] = {step: norm_of(step.weight) for step in self.network.affine}
 
@@ -178,7 +181,7 @@ def policy_enclosure(loop: ClosedLoop, symbols: int | None = None) -> Enclosure:
     """Affine enclosures of pi in so many symbols, by default one for each state."""
     if loop.network.network.is_observed_chain:
         return LayersEnclosure(loop.network, centring_with_errors(loop), symbols)
-    return StepsEnclosure(loop.network, centring_with_errors(loop))
+    return StepsEnclosure(loop.network, centring_with_errors(loop), symbols)
 
 
 def clipped(mid: Array, slopes: Array, error: Array, least: Array, most: Array) -> tuple[Array, Array, Array]:

@@ -16,6 +16,7 @@ The centre of a box is therefore bounded alone: if it cannot be proved, no split
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -178,7 +179,7 @@ class VdotBound:
                 score = np.where(inside, score, np.abs(slopes[j]) + share * wide[j])
         if self.constraints is not None:
             asked = self.constraints
-            models = asked(x, error, mid, slopes, wide) if during is None else asked.during(during)
+            models = asked(x, error, mid, slopes, wide) if during is None else [*chain(*map(asked.during, during))]
             for held in held_back(models, known, self.V, centre, radius, outer):
                 proved, violated, smooth = proved & held.inside, violated | held.outside, smooth & held.inside
                 score = np.where(held.inside, score, held.score[:n] + share * held.score[n:].sum(0))
@@ -188,9 +189,9 @@ class VdotBound:
 
     def _decrease(
         self, x: Array, error: Array, mid: Array, slopes: Array, wide: Array, outer: float
-    ) -> tuple[Taylor, Array, Mask | None, Values | None]:
+    ) -> tuple[Taylor, Array, Mask | None, Sequence[Values] | None]:
         """D, what its third order adds (see `inner_product`), where (B,) the solution stays in the domain over a period
-        in which the input is held, if it is, and what all values are in the period.
+        in which the input is held, if it is, and what all values are in its quarters.
 
         Symbols: n box coordinates, m input errors, k uncertain quantities, and the period if that is in a range.
         """

@@ -33,7 +33,7 @@ from certify.provers.bounds import (
     policy_enclosure,
     upper_bound,
 )
-from certify.provers.bounds.arrays import Array, Index, Mask, chosen, is_whole, joined, product
+from certify.provers.bounds.arrays import Array, Index, Mask, chosen, is_whole, joined, pieces, product
 from certify.provers.bounds.taylor import EPS, TINY
 from certify.provers.boxes.form import FormBound
 from certify.provers.boxes.lessening import lessened
@@ -121,7 +121,7 @@ class LoopOnN(ABC):
             np.full_like(x[0, 0], np.inf),
         )
         opened = []
-        for part in np.array_split(index, _pieces(len(index), self.piece)):
+        for part in np.array_split(index, pieces(len(index), self.piece)):
             lowest, own, known = least_value(self.N, x.take(part, -1), error.take(part, -1), outer)
             proved = lowest > outer
             found.lowest[part], found.proved[part] = lowest, proved
@@ -287,7 +287,7 @@ class FaceBound:
     @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
     def __call__(self, lo: Array, hi: Array, inner: float, outer: float) -> OuterBounds:
         """Bounds for the level `outer` on boxes lo, hi (n, B), which have no extent along the face's own axis."""
-        cut = _pieces(lo.shape[1], self.piece)
+        cut = pieces(lo.shape[1], self.piece)
         both = zip(np.array_split(lo, cut, 1), np.array_split(hi, cut, 1), strict=True)
         parts = [self._judge(low, high, outer) for low, high in both]
         return OuterBounds(*map(joined, zip(*parts, strict=True)))
@@ -327,11 +327,6 @@ def least_value(
 def below(N: Taylor, level: float) -> Taylor:
     """n2 - N."""
     return Taylor(level - N.c, -N.g, -N.Q, N.r + EPS * (np.abs(N.c) + abs(level)))
-
-
-def _pieces(count: int, most: int) -> int:
-    """Into how many pieces of at most so many boxes these are cut, at least one."""
-    return max(1, -(-count // most))
 
 
 def _negative(model: Taylor) -> Taylor:

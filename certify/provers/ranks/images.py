@@ -10,17 +10,18 @@ FORMAT.md has the same in its chapter on ranks; boxes here are wider by more tha
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import Expression, evaluate
+from certify.loop.expressions import Expression, Symbol, evaluate
 from certify.loop.policies import bounded_by_form
 from certify.provers.bounds import Flow, Models, Taylor, loop_models, policy_enclosure, upper_bound
-from certify.provers.bounds.arrays import Array, Index, Mask, product
+from certify.provers.bounds.arrays import Array, Index, Mask, joined, pieces, product
 from certify.provers.bounds.taylor import EPS, TINY
 from certify.provers.boxes.rule import input_bounds_kept, operations_of_box
 from certify.provers.ranks.targets import Target
@@ -29,6 +30,7 @@ _WIDER = 1e-7  # share of a box's width, beyond all that two programs' rounding 
 _ENDS = 1e-9  # relative distance kept from ends of the domain
 _WIDEST = 0.15  # share of the root box beyond which an image is of no use
 _MORE_THAN_ROUNDING = 1e-13  # relative, of sums whose terms may cancel
+_NUMBERS = 2**16  # half a mebibyte of a model of second order at a time, of which a step of a loop has hundreds
 _MORE = 1.5  # operations of a step of a box, relative to those of a box's bound, whose symbols are fewer
 
 
@@ -110,6 +112,7 @@ class Course:
         self.doubt = 1e-12 + 16 * EPS * float(np.linalg.cond(self.into))  # relative, of errors: also of the inverse
         self.straight = [i for i in range(self.system.n) if i not in self.angles]
         self.memory, self.symbols = memory, self.system.n * (1 + memory)
+        self.most = min(self.piece, max(2, _NUMBERS // (self.symbols + self.system.m + 1) ** 2))
         self.policy = policy_enclosure(loop, self.symbols)
         self.dynamics = self.system.uncertain_dynamics()
         self.check_inputs = not bounded_by_form(loop.network, self.system.input_bounds)
@@ -121,6 +124,12 @@ class Course:
     @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
     def __call__(self, lo: Array, hi: Array, inner: float, outer: float) -> Images:
         """The images of boxes lo, hi (n, B); levels of V do not matter here."""
+        cut = pieces(lo.shape[1], self.most)
+        both = zip(np.array_split(lo, cut, 1), np.array_split(hi, cut, 1), strict=True)
+        return Images(*map(joined, zip(*(self._followed(*each) for each in both), strict=True)))
+
+    def _followed(self, lo: Array, hi: Array) -> Images:
+        """The same for as many boxes as memory is meant for."""
         n, batch, K = *lo.shape, len(self.counts)
         centre = 0.5 * lo + 0.5 * hi
         radius = np.maximum(hi - centre, centre - lo) * (1 + EPS)
@@ -177,18 +186,18 @@ class Course:
         )
         values = {**states, **inputs, **quantities}
         here = list(states.values())
-        models = Models(here[0])
+        during: Sequence[Mapping[Symbol, Taylor]] = [values]
         if self.flow is None:
             known: dict[Expression, Taylor] = {}
-            after = [evaluate(expression, values, models, known) for expression in self.dynamics]
+            after = [evaluate(expression, values, Models(here[0]), known) for expression in self.dynamics]
         else:
             mean = self.flow(states, inputs, quantities, self.symbols + system.m)
             after = [v + self.flow.times_period(rate) for v, rate in zip(here, mean.G, strict=True)]
             kept = kept & mean.exists & self.in_domain(below - mean.down, above + mean.up)
-            values = dict(mean.during)
+            during = mean.during
         lost = np.zeros_like(kept)
-        for expression in self.keep:
-            g = evaluate(expression, values, models, {})
+        for expression, then in itertools.product(self.keep, during):
+            g = evaluate(expression, then, Models(next(iter(then.values()))), {})
             kept, lost = kept & (upper_bound(g)[0] < 0), lost | (upper_bound(g.scaled(-1.0))[0] < 0)
         return self.form(after), kept & np.all([np.isfinite(v.c + v.radius()) for v in after], axis=0), lost
 

@@ -20,11 +20,12 @@ Norm = Literal["layer-before", "layer-after"]
 Observes = Literal["absolute", "deviation"]
 KNOWN_ACTIVATIONS = f"{', '.join(IMPORTED[:-1])} and {IMPORTED[-1]}"
 """The activations that are proved, in words."""
-WITH_TANH = (
-    f"The activations that are proved are {KNOWN_ACTIVATIONS}. Train the policy again with one of them between its "
-    "layers, such as tanh: policy_kwargs=dict(activation_fn=torch.nn.Tanh) for stable-baselines3, activation = 'tanh' "
-    "for rsl_rl, fcnet_activation = 'tanh' for RLlib."
+_WITH_ANOTHER = (
+    "Train the policy again with one of them between its layers, such as tanh: "
+    "policy_kwargs=dict(activation_fn=torch.nn.Tanh) for stable-baselines3, activation = 'tanh' for rsl_rl, "
+    "fcnet_activation = 'tanh' for RLlib."
 )
+WITH_TANH = f"The activations that are proved are {KNOWN_ACTIVATIONS}. {_WITH_ANOTHER}"
 """The next step where a policy has another activation."""
 WITHOUT_NORMALISATION = (
     "LayerNorm is read of a module, of TorchScript, of ONNX, and of a policy's state_dict with --norm layer-before or "
@@ -93,10 +94,13 @@ class ImportOptions:
         ):
             if value is not None and value not in known:
                 raise InputError(f"{option} must be one of {', '.join(known)}; found {value!r}.")
-        if self.activation is not None and self.activation not in IMPORTED:
-            raise InputError(
-                f"--activation must be one of {', '.join(IMPORTED)}; found {self.activation!r}. {WITH_TANH}"
-            )
+        if self.activation is not None:
+            named = {_plain(name): name for name in IMPORTED}
+            if _plain(self.activation) not in named:
+                raise InputError(
+                    f"--activation must be one of {', '.join(IMPORTED)}; found {self.activation!r}. {_WITH_ANOTHER}"
+                )
+            object.__setattr__(self, "activation", named[_plain(self.activation)])
         for name in ("action_scale", "action_offset"):
             if isinstance(value := getattr(self, name), int | float | Fraction):
                 object.__setattr__(self, name, (Fraction(value),))
@@ -124,6 +128,11 @@ _OPTIONS = {
     "action_offset": "--action-offset", "clip": "--clip", "centre": "--centre", "observes": "--observes",
     "ignore": "--ignore", "output": "--output", "norm": "--norm", "norm_epsilon": "--norm-epsilon",
 }  # fmt: skip
+
+
+def _plain(name: str) -> str:
+    """A name as `LeakyReLU`, `leaky_relu` and `leaky-relu` have it in common."""
+    return name.lower().replace("_", "").replace("-", "")
 
 
 def _text(value: Any) -> str:

@@ -365,7 +365,8 @@ def _numbers(tensors: Mapping[str, Numbers], prefix: str) -> list[int]:
             )
         numbers.add(int(match["number"]))
     if not numbers or any(f"{root}{k}.weight" not in tensors for k in numbers):
-        raise InputError(f"there must be layers {root}0.weight and so on; found {', '.join(list(tensors)[:12])}.")
+        found = ", ".join(f"--prefix {name}" if name else "layers without a prefix" for name in _groups(tensors))
+        raise InputError(f"there must be layers {root}0.weight and so on; found {found or ', '.join(tensors)}.")
     return sorted(numbers)
 
 

@@ -89,10 +89,11 @@ def unread(
         whole = "policy" if of_policy else "Lyapunov function"
         listed = ", ".join(f"{name} {tensors[name].shape}" for name in could[:8])
         more = f" and {len(could) - 8} more" if len(could) > 8 else ""
-        options = " ".join(f"--ignore {_quoted(name)}" for name in could[:3])
+        options = " ".join(f"--ignore {_quoted(name)}" for name in _patterns(could, set(tensors) - set(could)))
+        layers = prefix if " " in prefix else f"layers {_dot(prefix)}NUMBER"  # those listed have no common prefix
         raise InputError(
-            f"the layers {_dot(prefix)}NUMBER must be all of the {whole}, and the file holds what could belong to it: "
-            f"{listed}{more}. If the layers are all of it, say so: {options}{' ...' if len(could) > 3 else ''}. "
+            f"the {layers} must be all of the {whole}, and the file holds what could belong to it: "
+            f"{listed}{more}. If the layers are all of it, say so: {options}. "
             f"If they are not, export the {whole} as TorchScript or ONNX, which say what becomes of each number."
         )
     return found
@@ -128,7 +129,7 @@ def _names_another(part: str, words: set[str], leaf: str) -> bool:
     """True if a part of a name says that it is a critic, a value, a Lyapunov or a target network."""
     if words & _OTHER:
         return True
-    if "target" in words:  # which a state to be reached is called too
+    if words & {"target", "targ"}:  # which a state to be reached is called too
         return bool(words & _NETWORKS) or leaf in ("weight", "bias")
     return part not in ("q", "v") and bool(words & {"q", "v"}) and words <= _OF  # positions and velocities are q and v
 
@@ -136,6 +137,20 @@ def _names_another(part: str, words: set[str], leaf: str) -> bool:
 def _has_mean(tensors: Mapping[str, Numbers], parts: list[str]) -> bool:
     beside = ".".join([*parts, ""])
     return any(f"{beside}{mean}" in tensors for mean in ("mean", "running_mean", "mu", "loc"))
+
+
+def _patterns(names: Collection[str], others: Collection[str]) -> list[str]:
+    """Patterns of names, as few as parts of names give, that match all of these and none of the others.
+
+    >>> _patterns(["lo", "obs.0.bias", "obs.0.weight", "pi.K"], ["pi.0.weight"])
+    ['lo', 'obs.*', 'pi.K']
+    """
+    found = {}
+    for name in names:
+        starts = [name[: match.end()] for match in re.finditer(r"\.", name)]
+        own = next((start for start in starts if not any(other.startswith(start) for other in others)), name)
+        found[name if sum(other.startswith(own) for other in names) == 1 else f"{own}*"] = True
+    return list(found)
 
 
 def braced(names: Collection[str]) -> str:
