@@ -10,7 +10,7 @@ from . import words
 from .boxes import LEAF
 from .document import Certificate
 from .sections import MAX_RANK, Axis, Data, Outer, Ranks, Trusted
-from .words import expression, interval, number
+from .words import decimal, expression, interval, number
 
 if TYPE_CHECKING:
     from .rules import Tally
@@ -200,7 +200,8 @@ def consistent(c: Certificate, data: Data) -> str:
     noise = ", ".join(f"{name} within {number(w)}" for name, w in zip(c.states, data.noise, strict=True))
     moved = [f"{name} + {number(q)}" for name, q in zip(c.states, data.origin, strict=True) if q]
     of = f"; measured are {', '.join(moved)}" if moved else ""
-    such = "".join(f", {a.name} = {_sum(a, data.parameters)}" for a in data.axes)
+    axes = "".join(f", {a.name} = {_sum(a, data.parameters)}" for a in data.axes)
+    such = f"{axes} (about; the file has exact numbers)" if axes else ""
     lasting = "" if data.period is None else f" of {_lasting(data.period)} units of time, with the input held"
     return (
         f"and so for every plant with constant {priors}{such} that is consistent with {data.transitions} measured "
@@ -210,7 +211,7 @@ def consistent(c: Certificate, data: Data) -> str:
 
 
 def _sum(axis: Axis, parameters: tuple[str, ...]) -> str:
-    return " + ".join([number(axis.at), *(f"({number(q)}) {p}" for q, p in zip(axis.by, parameters, strict=True))])
+    return " + ".join([decimal(axis.at), *(f"({decimal(q)}) {p}" for q, p in zip(axis.by, parameters, strict=True))])
 
 
 def _lasting(period: tuple[Fraction, Fraction]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from decimal import Decimal
 from fractions import Fraction
 from typing import Any
 
@@ -143,6 +144,10 @@ def _clip(policy: Policy) -> str:
 
 def interval(pair: tuple[Fraction, Fraction]) -> str:
     return f"[{number(pair[0])}, {number(pair[1])}]"
+
+
+def decimal(q: Fraction) -> str:
+    return f"{Decimal(q.numerator) / Decimal(q.denominator):.6g}"
 
 
 def number(q: Fraction) -> str:

@@ -242,7 +242,7 @@ def _summary(result: IdentifyResult) -> RenderableType:
 
 def _rows(result: IdentifyResult) -> list[tuple[str, str]]:
     from certify.analysis.identifying.run import sizes_in_json
-    from certify.report.identified import direction_in_words, factors_in_words, noise_in_words
+    from certify.report.identified import direction_in_words, factors_in_words, noise_in_words, sums_along
 
     data, axis = result.measurements, result.least_determined
     each = ", ".join(f"{s} {float(w):g}" for s, w in zip(result.system.states, data.noise, strict=True))
@@ -257,6 +257,7 @@ def _rows(result: IdentifyResult) -> list[tuple[str, str]]:
         rows.append(
             ("axes", f"{len(data.axes)}, whose box is {result.smaller:.3g} times smaller than that of the ranges")
         )
+        rows += [(a.name, f"about {a.text}: {a.ends}, {a.shrink:.3g} x smaller") for a in sums_along(result.to_dict())]
     if axis is not None:
         rows.append(("least determined", direction_in_words(axis.entries, axis.share)))
         rows.append(("to narrow it", f"more like {result.readings.places[axis.telling]}: {result.at(axis.telling)}"))

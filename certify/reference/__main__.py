@@ -17,6 +17,8 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any
 
+from flint import arb, fmpq
+
 from .document import MAX_BYTES, Certificate, Data
 from .evidence import INVARIANT, WITHOUT_V, Tree
 from .limits import MAX_IN_PATIENCE
@@ -159,10 +161,16 @@ def measured(c: Certificate) -> str:
 def turned(data: Data) -> str:
     """The words for quantities that are sums of parameters."""
     each = [
-        f"{axis.name} = {axis.at}" + "".join(f" + ({by}) {p}" for by, p in zip(axis.by, data.parameters, strict=True))
+        f"{axis.name} = {short(axis.at)}"
+        + "".join(f" + ({short(by)}) {p}" for by, p in zip(axis.by, data.parameters, strict=True))
         for axis in data.axes
     ]
-    return f" with {', '.join(each)}" if each else ""
+    return f" with {', '.join(each)}, to six digits; the certificate states them exactly" if each else ""
+
+
+def short(q: fmpq) -> str:
+    """A number to six digits."""
+    return str(arb(q).str(6, radius=False))
 
 
 def sampled(c: Certificate) -> str:

@@ -29,6 +29,8 @@ TEMPLATE = "certify.report", "identified.html"
 Array = NDArray[np.float64]
 _MOST_DOTS = 4000  # of a figure
 _UPWARDS = 1.005  # by which three digits are no smaller
+_LEAST_FACTOR = Fraction(1, 10**4)  # that a sum shows
+Pair = tuple[Fraction, Fraction]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,18 +96,80 @@ def _sizes(each: Mapping[str, float], rounded: Callable[[float, int], str]) -> s
     return "at most " + ", ".join(f"{rounded(size, 3)} in {symbol(name)}′" for name, size in each.items())
 
 
+@dataclass(frozen=True, slots=True)
+class Along:
+    """A sum of parameters that an axis bounds, of which the largest factor is 1 in size.
+
+    Parameters
+    ----------
+    name : of the axis.
+    factors : by parameter.
+    prior, range : between what the sum lies for priors, and for what is left.
+    """
+
+    name: str
+    factors: Mapping[str, Fraction]
+    prior: Pair
+    range: Pair
+
+    @property
+    def shrink(self) -> float:
+        (a, b), (lo, hi) = self.prior, self.range
+        return float((b - a) / (hi - lo))
+
+    @property
+    def text(self) -> str:
+        """The sum, of factors with four digits."""
+        shown = ""
+        for name, q in self.factors.items():
+            if abs(q) >= _LEAST_FACTOR:
+                sign = ("−" if q < 0 else "") if not shown else " − " if q < 0 else " + "
+                shown += sign + ("" if abs(q) == 1 else f"{abs(float(q)):.4g} ") + symbol(name)
+        return shown
+
+    @property
+    def ends(self) -> str:
+        """The range, rounded outwards."""
+        lo, hi = self.range
+        return f"{below(lo)} to {above(hi)}"
+
+
+def sums_along(data: Mapping[str, Any]) -> list[Along]:
+    """The axes of an identified plant, from the object that `certify identify --json` prints."""
+    priors, found = {p["name"]: tuple(map(Fraction, p["prior"])) for p in data["parameters"]}, []
+    for name, sums in data["axes"]["sums"].items():
+        at, *by = map(Fraction, sums)
+        size = max(by, key=abs)
+        factors = {p: q / size for p, q in zip(priors, by, strict=True)}
+        each = [sorted((q * a, q * b)) for q, (a, b) in zip(factors.values(), priors.values(), strict=True)]
+        lo, hi = sorted(((-1 - at) / size, (1 - at) / size))
+        found.append(
+            Along(
+                name,
+                factors,
+                (sum((a for a, _ in each), Fraction(0)), sum((b for _, b in each), Fraction(0))),
+                (lo, hi),
+            )
+        )
+    return found
+
+
 def page(residuals: Residuals, data: Mapping[str, Any]) -> str:
     """The page as one HTML document, from the object that `certify identify --json` prints."""
     from matplotlib import rc_context
 
+    sums = sums_along(data)
+    bars = [_bar(p) for p in data["parameters"]] + [(symbol(a.name), a.prior, a.range) for a in sums]
     with rc_context(RC):
-        pictures = [_ranges(data["parameters"]), *_differences(residuals)]
+        pictures = [_ranges(bars), *_differences(residuals)]
     axis = data["least_determined"]
     return filled(
         *TEMPLATE,
         one_plane=True,
         data=data,
         parameters=[_row(p) for p in data["parameters"]],
+        sums=[_sum(a) for a in sums],
+        smaller=below(data["axes"]["smaller"], 3),
         noise=[_bound(name, w, residuals) for name, w in data["noise"].items()],
         period=" to ".join(dict.fromkeys(_short(h) for h in data["period"] or ())),
         pictures=pictures,
@@ -129,6 +193,17 @@ def _row(p: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
+def _bar(p: Mapping[str, Any]) -> tuple[str, Pair, Pair]:
+    (a, b), (lo, hi) = (map(Fraction, p[key]) for key in ("prior", "range"))
+    return label(p["name"], p["unit"]), (a, b), (lo, hi)
+
+
+def _sum(a: Along) -> dict[str, str]:
+    lo, hi = a.prior
+    prior = f"{below(lo)} to {above(hi)}"
+    return {"name": symbol(a.name), "sum": a.text, "prior": prior, "range": a.ends, "shrink": below(a.shrink, 3)}
+
+
 def _bound(name: str, bound: str, residuals: Residuals) -> str:
     unit = pretty_unit(residuals.units[residuals.names.index(name)])
     return f"{symbol(name)} {_short(bound)} {unit}".rstrip()
@@ -138,20 +213,19 @@ def _short(value: str) -> str:
     return f"{float(Fraction(value)):g}"
 
 
-def _ranges(parameters: Sequence[Mapping[str, Any]]) -> Picture:
-    """Each prior as a bar of one length, and in it the range."""
-    height = 0.75 + 0.42 * len(parameters)
+def _ranges(bars: Sequence[tuple[str, Pair, Pair]]) -> Picture:
+    """Each prior as a bar of one length, and in it the range; also of sums of parameters."""
+    height = 0.75 + 0.42 * len(bars)
     figure, axes = figure_of(8.6, height, left=1.1, right=0.2, bottom=0.5)
-    for k, p in enumerate(reversed(parameters)):
-        (a, b), (lo, hi) = ([float(Fraction(q)) for q in p[key]] for key in ("prior", "range"))
+    for k, (_, (a, b), (lo, hi)) in enumerate(reversed(bars)):
         axes.plot([0, 1], [k, k], color=LEAF_EDGE, lw=7, solid_capstyle="butt")
-        left, right = (lo - a) / (b - a), (hi - a) / (b - a)
+        left, right = (float((v - a) / (b - a)) for v in (lo, hi))
         axes.plot([left, right], [k, k], color=SET, lw=7, solid_capstyle="butt")
         axes.plot([(left + right) / 2], [k], color=SET, marker="|", ms=15, lw=0)
         axes.text(1.012, k, f"{above(100 * (right - left), 3)} %", va="center", fontsize=8.0)
-    axes.set_yticks(range(len(parameters)), [label(p["name"], p["unit"]) for p in reversed(parameters)])
+    axes.set_yticks(range(len(bars)), [name for name, _, _ in reversed(bars)])
     axes.set_xlim(-0.02, 1.08)
-    axes.set_ylim(-0.6, len(parameters) - 0.4)
+    axes.set_ylim(-0.6, len(bars) - 0.4)
     axes.set_xlabel("place in the prior, from its lower to its upper end")
     keys = (Key("prior", LEAF_EDGE, 5.0), Key("range that is left", SET, 5.0))
     caption = (

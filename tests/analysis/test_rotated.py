@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+import subprocess
+import sys
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -19,6 +22,7 @@ from certify.errors import InputError
 from certify.loop.plants import load_system
 from certify.loop.plants.axes import axes_of, sums_of
 from certify.loop.policies import load_policy
+from certify.report.identified import page, sums_along
 from tests.analysis.test_identify import POLICY, STRUCTURE, TRUE, Array, command, holds, identified, simulated, write
 
 WIDE = STRUCTURE.replace("[10, 30]", "[2, 100]").replace("[1, 4]", "[0.1, 20]").replace("[10, 50]", "[5, 200]")
@@ -129,7 +133,8 @@ def test_ranges_of_axes_that_are_too_narrow_are_refused(known: Path, tmp_path: P
     text = (known / "known.toml").read_text()
     table = text.index("[data.axes]")
     lines = text[table:].splitlines()
-    narrow = [line.replace(line.split(", ")[1], str(float(line.split(", ")[1]) / 2)) for line in lines[1:]]
+    parts = [line.split(", ") for line in lines[1:]]
+    narrow = [", ".join([first, str(float(slope) / 2), *others]) for first, slope, *others in parts]
     (tmp_path / "known.toml").write_text("\n".join([text[:table], lines[0], *narrow]))
     with pytest.raises(InputError, match="the range of axis_1 must hold all that the data leave"):
         certify.certify_roa(tmp_path / "known.toml", POLICY, data=known / "data.csv", candidate="lyapunov")
@@ -171,3 +176,25 @@ def test_the_command_turns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     known = load_system(tmp_path / "known.toml")
     assert replace(known, measurements=None).ranges == dict.fromkeys(["axis_1", "axis_2", "axis_3"], (-1, 1))
     assert _run(["plant", str(tmp_path / "known.toml")], False) == 0
+
+
+def test_pages_and_words_name_the_sums_that_axes_bound(known: Path) -> None:
+    found = certify.identify(
+        known / "data.csv", known / "structure.toml", noise="1e-3", sample_time="0.02", rotate=True
+    )
+    said, sums, data = found.to_dict(), sums_along(found.to_dict()), found.measurements
+    assert len(sums) == 3 and max(a.shrink for a in sums) > 30
+    for along, axis in zip(sums, data.axes, strict=True):
+        size = max(axis.by, key=abs)
+        ends = [sum(q * v for q, v in zip(axis.by, TRUE.values(), strict=True)) / size]
+        assert along.range[0] <= ends[0] <= along.range[1] and along.prior[0] < along.range[0] + 1
+        assert {axis.at + size * v for v in along.range} == {-1, 1}
+        assert max(map(abs, along.factors.values())) == 1
+    text = page(found.residuals(), said)
+    assert all(a.text in text and a.ends in text for a in sums) and "axis₁" in text
+    proved(known, "known")
+    certificate = known / "known" / "certificate.json"
+    for program in ("certify.checker", "certify.reference"):
+        command = [sys.executable, "-m", program, str(certificate)]
+        words = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        assert "axis_1 = " in words and not re.search(r"axis_\d = [^,]*\d{12}", words)

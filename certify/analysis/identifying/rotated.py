@@ -6,6 +6,7 @@ axes are, what is claimed of them is shown by multipliers.
 
 from __future__ import annotations
 
+import math
 from fractions import Fraction
 
 import numpy as np
@@ -42,8 +43,13 @@ def axes_for(found: Identified) -> tuple[tuple[Axis, ...], float]:
     middle = np.array([float(a + b) / 2 for a, b in found.ranges.values()])
     reach = np.array([float(b - a) / 2 for a, b in found.ranges.values()])
     centre, T = middle + reach * (inverse @ (lo + hi)) / 2, reach[:, None] * inverse * half
-    rows = np.column_stack([centre, T]).tolist()
-    return axes_of([tuple(Fraction(f"{v:.12g}") for v in row) for row in rows]), smaller
+    return axes_of([_short(row) for row in np.column_stack([centre, T])]), smaller
+
+
+def _short(row: Array) -> tuple[Fraction, ...]:
+    """The value in the middle and the slopes of a parameter, to twelve digits of its largest slope."""
+    unit = Fraction(10) ** (math.floor(math.log10(np.abs(row[1:]).max())) - 11)
+    return tuple(round(Fraction(v) / unit) * unit for v in row.tolist())
 
 
 def _normals(points: Array) -> Array:
