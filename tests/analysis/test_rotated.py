@@ -19,9 +19,10 @@ from certify.certificates.checking import ask
 from certify.certificates.reading import read_certificate
 from certify.cli.main import _run
 from certify.errors import InputError
-from certify.loop.plants import load_system
+from certify.loop.plants import Axis, Measurements, System, load_system
 from certify.loop.plants.axes import axes_of, sums_of
 from certify.loop.policies import load_policy
+from certify.provers import data as provers_data
 from certify.report.identified import page, sums_along
 from tests.analysis.test_identify import POLICY, STRUCTURE, TRUE, Array, command, holds, identified, simulated, write
 
@@ -99,6 +100,23 @@ def test_axes_are_much_closer_than_ranges(tmp_path: Path) -> None:
     plain = identified(tmp_path, under_the_policy(), WIDE)
     assert plain.smaller == 1 and plain.to_dict()["axes"]["sums"] == {} and plain.system.ranges == plain.known.ranges
     assert plain.ranges == found.ranges
+
+
+def test_axes_that_do_not_hold_all_that_is_left_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of what the data leave, as where ranges are 1e8 times narrower than their priors, and the axes' ends round inside."""
+    plain = identified(tmp_path, under_the_policy(), WIDE)
+    identify, asked = provers_data.identify, list[tuple[Axis, ...]]()
+
+    def wider(system: System, measurements: Measurements, **how: Any) -> Any:
+        found = identify(system, measurements, **how)
+        asked.append(measurements.axes)
+        return replace(found, turned={name: (lo, 1 + hi) for name, (lo, hi) in found.turned.items()})
+
+    monkeypatch.setattr(provers_data, "identify", wider)
+    found = identified(tmp_path, under_the_policy(), WIDE, rotate=True)
+    assert [bool(axes) for axes in asked] == [False, True]
+    assert found.smaller == 1 and found.system.measurements is not None and found.system.measurements.axes == ()
+    assert found.system.ranges == plain.system.ranges
 
 
 def test_one_parameter_has_no_other_axis(tmp_path: Path) -> None:

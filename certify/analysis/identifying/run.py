@@ -261,8 +261,8 @@ def identify_plant(
         plant = replace(plant, ranges={name: plant.ranges[name] for name in measured.ranges})
     left, (axes, smaller) = polytope_of(found), axes_for(found) if rotate else ((), 1.0)
     known, plant = plant, along_axes(replace(plant, measurements=replace(data, axes=axes)))
-    if axes:
-        _require_inside(plant)
+    if axes and not _holds(plant):
+        smaller, plant = 1.0, along_axes(replace(known, measurements=replace(data, axes=())))
     if out is not None and structure is not None:
         write_known(out, structure, replace(known, measurements=plant.measurements), source)
     return IdentifyResult(
@@ -282,15 +282,13 @@ def identify_plant(
     )
 
 
-def _require_inside(plant: System) -> None:
-    """Reject a plant of which the measurements, in another run, leave more than the axes' ranges."""
+def _holds(plant: System) -> bool:
+    """True unless the measurements, in another run, leave more of a plant than the ranges along its axes."""
     from certify.provers.data import identify
 
     data = plant.measurements
     found = {} if data is None else identify(plant, data).turned
-    odd = [name for name, (lo, hi) in found.items() if not -1 <= lo <= hi <= 1]
-    if odd:
-        raise InputError(f"no axes hold what the data leave of {odd[0]}; leave out `rotate`.")
+    return all(-1 <= lo <= hi <= 1 for lo, hi in found.values())
 
 
 def with_data(system: System, path: Path, tell: Tell = lambda _: None) -> System:
