@@ -103,7 +103,7 @@ def test_axes_are_much_closer_than_ranges(tmp_path: Path) -> None:
 
 
 def test_axes_that_do_not_hold_all_that_is_left_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of what the data leave, as where ranges are 1e8 times narrower than their priors, and the axes' ends round inside."""
+    """As where ranges are 1e8 times narrower than their priors, and the axes' ends round inside."""
     plain = identified(tmp_path, under_the_policy(), WIDE)
     identify, asked = provers_data.identify, list[tuple[Axis, ...]]()
 
