@@ -239,6 +239,7 @@ def test_a_check_that_needs_patience_is_said(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(roa, "run_checker", slow)
     result = certify_roa(*scalar_tanh(), tmp_path)
     assert result.verdict is Verdict.PROVED and "certify check --patient" in str(result.notice)
+    assert result.checker is not None and result.checker["patient"] is True
 
 
 def test_the_limits_are_the_checker_s() -> None:

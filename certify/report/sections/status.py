@@ -22,11 +22,13 @@ class Status:
     """A certificate's status: kind is ACCEPTED, TRUSTED, REJECTED or NOT CHECKED; note says why.
 
     `modules` are those of the checker's files that were used, if it accepted or trusted; empty if its answer has none.
+    `patient` is True if it had to be asked with --patient.
     """
 
     kind: str
     note: str
     modules: tuple[str, ...] = ()
+    patient: bool = False
 
     @property
     def accepted(self) -> bool:
@@ -86,7 +88,12 @@ def status_of(certificate: AnyCertificate, sha256: str, answer: Mapping[str, Any
     second = answer.get("reference") or {}
     both = (second.get("result"), second.get("certificate_sha256")) == ("ACCEPTED", sha256)
     also = " So did the reference, a second checker that shares no code with it." if both else ""
-    return Status("ACCEPTED", f"The independent checker accepted the certificate.{also}", _modules(answer))
+    return Status(
+        "ACCEPTED",
+        f"The independent checker accepted the certificate.{also}",
+        _modules(answer),
+        bool(answer.get("patient")),
+    )
 
 
 def _steps(said: Any) -> Any:
