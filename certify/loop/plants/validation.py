@@ -87,7 +87,8 @@ def _check_intervals(system: System) -> None:
     for symbol, (lo, hi) in zip(system.states, system.domain, strict=True):
         if not lo < hi:
             raise InputError(
-                f"the domain of {symbol} must satisfy lo < hi and so have an interior; found [{float(lo):g}, {float(hi):g}]."
+                f"the domain of {symbol} must satisfy lo < hi and so have an interior; "
+                f"found [{float(lo):g}, {float(hi):g}]."
             )
     for symbol, (lo, hi) in zip(system.inputs, system.input_bounds, strict=True):
         if not lo < hi:
