@@ -32,8 +32,8 @@ from certify.loop.policies.importers.steps import Clip
 
 SAMPLES = 20  # powers of 2
 PENDULUM = {"m": "0.15", "l": "0.5", "b": "0.1", "g": "9.81"}
-SPEED_UP = "g/l*sin({0}) - b/(m*l**2)*{1} + u/(m*l**2)"
-ERROR = "g/l*(sin(theta) - sin(theta - e)) - b/(m*l**2)*e_dot"
+SPEEDING = "g/l*sin(theta) - b/(m*l**2)*theta_dot + u/(m*l**2)"
+PARTING = "g/l*(sin(theta) - sin(theta - e)) - b/(m*l**2)*e_dot"
 TRAINING = ("lower_limit", "upper_limit", "kappa", "rho", "x_boundary")
 
 
@@ -44,9 +44,11 @@ class Loop:
     Parameters
     ----------
     file : name of the file without its ending.
-    plant : parameters, definitions, next states, and what the policy reads.
+    parameters, where, dynamics : of the plant's file, the dynamics being the next states.
+    reads : the expressions that the policy reads.
     box : half-widths of the domain, by the states.
-    u_eq, limits : the input at rest, and the ends of its range.
+    limits : the ends of each input's range.
+    inputs, u_eq : their names, and what each is at rest.
     """
 
     file: str
@@ -101,7 +103,7 @@ def _ignored(loop: Loop, folder: Path, of: str = "observer") -> list[str]:
 
 def _pendulum(file: str, torque: str) -> Loop:
     dynamics = {"theta": "theta + dt*theta_dot", "theta_dot": "theta_dot + dt*speeding"}
-    where = {"speeding": SPEED_UP.format("theta", "theta_dot")}
+    where = {"speeding": SPEEDING}
     box = dict.fromkeys(dynamics, "12")
     return Loop(file, PENDULUM | {"dt": "0.05"}, where, dynamics, tuple(dynamics), box, (f"-{torque}", torque))
 
@@ -123,7 +125,7 @@ def _measured(file: str, torque: str, angle: str, error: str) -> Loop:
         "e": f"e + dt*e_dot + dt**2/2*parting - {corrected[0]}",
         "e_dot": f"e_dot + dt*parting - {corrected[1]}",
     }
-    where = {"speeding": SPEED_UP.format("theta", "theta_dot"), "parting": ERROR}
+    where = {"speeding": SPEEDING, "parting": PARTING}
     box = {"theta": angle, "theta_dot": angle, "e": error, "e_dot": error}
     reads = (*z.split(", "), "e")
     return Loop(file, PENDULUM | {"dt": "0.01"}, where, dynamics, reads, box, (f"-{torque}", torque))
@@ -210,17 +212,14 @@ def run(loop: Loop, folder: Path, out: Path, effort: float) -> RoaResult:
     start = time.perf_counter()
     result = certify_roa(system, policy, out / loop.file, effort=effort)
     seconds = time.perf_counter() - start
-    first = "nothing" if result.checker is None else result.checker["result"]
-    second = (
-        "nothing"
-        if result.checker is None
-        else run_checker(out / loop.file / "certificate.json", "reference")["result"]
-    )
+    said = ["nothing"]
+    if result.certificate is not None:
+        said = [run_checker(result.certificate, program)["result"] for program in ("checker", "reference")]
     theirs = most_of(path, np.array([float(half) for half in loop.box.values()]))
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
     print(f"\n{loop.file} ({digest}...)")
     print(f"  their V    at most {theirs:.4g} in the box")
-    print(f"  here       {result.verdict.value}, {seconds:.1f} s in all; the checker {first}, the reference {second}")
+    print(f"  here       {result.verdict.value}, {seconds:.1f} s in all; checkers: {' and '.join(said)}")
     print(f"  ellipsoid  {result.volume or 0:.4g}")
     if result.ranks is not None:
         print(f"  boxes      {result.ranks.volume:.4g}, {result.ranks.covered:.2%} of the box")

@@ -73,7 +73,7 @@ class Desk:
         """
         answer = self._answered(path, patient=False)
         if (answer.get("rule"), answer.get("at")) == ("limits", "operations"):
-            answer = {**self._answered(path, patient=True), "patient": True}
+            answer = self._answered(path, patient=True)
             if answer["result"] != "REJECTED":
                 self.remarks.append("its check takes more than ten minutes: type `certify check --patient` for another")
         elif answer["result"] == "ACCEPTED":

@@ -79,7 +79,8 @@ def run_checker(
     operations: int | None = None,
     every: bool = False,
 ) -> dict[str, Any]:
-    """The JSON answer of a checker that reached a verdict; the parameters are those of `ask`.
+    """The JSON answer of a checker that reached a verdict, with `patient` if it was asked so; the parameters are those
+    of `ask`.
 
     Raises
     ------
@@ -88,4 +89,4 @@ def run_checker(
     status, answer = ask(path, program, jobs, patient, operations, every)
     if "error" in answer:
         raise BackendError(f"the {program} ended with status {status} and no verdict: {answer['error']}")
-    return answer
+    return answer | ({"patient": True} if patient else {})

@@ -26,8 +26,8 @@ def on_boxes(
 ) -> Array:
     """True for each constraint and box on which it is negative at all of these states where no gap is."""
     of_all = [lambda left, gap=gap: gap(left).widened(held[0].symbols) for gap in gaps]
-    found = [constraints(boxes, states, held) for states in courses]
-    return np.all([[boxes.least_bound(g, of_all) < 0 for g in some] for some in found], axis=0)
+    models = (constraints(boxes, states, held) for states in courses)
+    return np.all([[boxes.least_bound(g, of_all) < 0 for g in some] for some in models], axis=0)
 
 
 def on_leaves(leaves: Leaves) -> Failures:

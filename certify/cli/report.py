@@ -28,7 +28,7 @@ def report(
     with tempfile.TemporaryDirectory() as folder:  # the bytes drawn are the bytes checked, whatever happens to the path
         private = Path(folder) / "certificate.json"
         private.write_bytes(raw)
-        answer = run_checker(private, patient=patient) | ({"patient": True} if patient else {})
+        answer = run_checker(private, patient=patient)
     write(target, page_of(raw, certificate, answer, None))
     stated = {"report": str(target), "result": answer["result"]}
     say(json.dumps(stated) if as_json else f"{answer['result']}  {target}")

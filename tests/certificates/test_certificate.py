@@ -233,7 +233,7 @@ def test_what_no_checker_takes_ends_in_words(at: str, tmp_path: Path, monkeypatc
 def test_a_check_that_needs_patience_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def slow(path: Path, jobs: int = 1, patient: bool = False, every: bool = False) -> dict[str, Any]:
         if patient:
-            return run_checker(path)
+            return run_checker(path, patient=patient)
         return {"result": "REJECTED", "rule": "limits", "at": "operations", "detail": "the file asks for 1e20"}
 
     monkeypatch.setattr(roa, "run_checker", slow)

@@ -6,7 +6,7 @@ quantities anywhere in their ranges (FORMAT.md, keep).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -44,10 +44,13 @@ class ConstraintModels:
             self.tapes = [self._recorded(g) for g in self.expressions]
         return [played(loops(0), tape, self.system, x, error, mid, slopes, wide)[0] for tape in self.tapes]
 
-    def during(self, values: Mapping[Symbol, Taylor]) -> list[Taylor]:
-        """The models at these states, inputs and quantities."""
-        models, known = Models(next(iter(values.values()))), dict[Expression, Taylor]()
-        return [evaluate(g, values, models, known) for g in self.expressions]
+    def during(self, courses: Iterable[Mapping[Symbol, Taylor]]) -> list[Taylor]:
+        """The models at each of these states, with their inputs and quantities."""
+        found = []
+        for values in courses:
+            models, known = Models(next(iter(values.values()))), dict[Expression, Taylor]()
+            found += [evaluate(g, values, models, known) for g in self.expressions]
+        return found
 
     def _recorded(self, g: Expression) -> Tape:
         system = self.system

@@ -16,7 +16,6 @@ The centre of a box is therefore bounded alone: if it cannot be proved, no split
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -179,7 +178,7 @@ class VdotBound:
                 score = np.where(inside, score, np.abs(slopes[j]) + share * wide[j])
         if self.constraints is not None:
             asked = self.constraints
-            models = asked(x, error, mid, slopes, wide) if during is None else [*chain(*map(asked.during, during))]
+            models = asked(x, error, mid, slopes, wide) if during is None else asked.during(during)
             for held in held_back(models, known, self.V, centre, radius, outer):
                 proved, violated, smooth = proved & held.inside, violated | held.outside, smooth & held.inside
                 score = np.where(held.inside, score, held.score[:n] + share * held.score[n:].sum(0))

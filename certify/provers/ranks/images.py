@@ -10,7 +10,6 @@ FORMAT.md has the same in its chapter on ranks; boxes here are wider by more tha
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -23,6 +22,7 @@ from certify.loop.policies import bounded_by_form
 from certify.provers.bounds import Flow, Models, Taylor, loop_models, policy_enclosure, upper_bound
 from certify.provers.bounds.arrays import Array, Index, Mask, joined, pieces, product
 from certify.provers.bounds.taylor import EPS, TINY
+from certify.provers.boxes.kept import ConstraintModels
 from certify.provers.boxes.rule import input_bounds_kept, operations_of_box
 from certify.provers.ranks.targets import Target
 
@@ -105,7 +105,7 @@ class Course:
         frame: Array | None = None,
         memory: int = 1,
     ) -> None:
-        self.system, self.target, self.keep = loop.system, target, tuple(keep)
+        self.system, self.target, self.constraints = loop.system, target, ConstraintModels(loop.system, keep)
         self.angles, self.root, self.counts, self.frame = tuple(angles), root, tuple(counts), frame
         self.into = np.eye(self.system.n) if frame is None else frame
         self.back = np.linalg.inv(self.into)
@@ -117,7 +117,7 @@ class Course:
         self.dynamics = self.system.uncertain_dynamics()
         self.check_inputs = not bounded_by_form(loop.network, self.system.input_bounds)
         sample = self.system.sample
-        self.flow = None if sample is None else Flow(self.dynamics, sample, order, bool(self.keep))
+        self.flow = None if sample is None else Flow(self.dynamics, sample, order, bool(keep))
         self.ends = np.array([[float(end) for end in pair] for pair in self.system.domain]).T[:, :, None]
         self.operations = _MORE * operations_of_box(loop, order, (memory - 1) * self.system.n)  # of a step
 
@@ -196,8 +196,7 @@ class Course:
             kept = kept & mean.exists & self.in_domain(below - mean.down, above + mean.up)
             during = mean.during
         lost = np.zeros_like(kept)
-        for expression, then in itertools.product(self.keep, during):
-            g = evaluate(expression, then, Models(next(iter(then.values()))), {})
+        for g in self.constraints.during(during):
             kept, lost = kept & (upper_bound(g)[0] < 0), lost | (upper_bound(g.scaled(-1.0))[0] < 0)
         return self.form(after), kept & np.all([np.isfinite(v.c + v.radius()) for v in after], axis=0), lost
 
