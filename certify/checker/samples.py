@@ -1,7 +1,8 @@
-"""Chapter samples: functions of which only samples on a grid and bounds of second derivatives are known.
+"""Chapter samples: functions of which only samples and bounds of second derivatives are known.
 
-An equation P + r E stands for all of them. Between the points of the grid a function is near its interpolant, and at
-the origin near its linear part; how near follows from second derivatives, in rationals.
+An equation P + r E stands for all of them. Weighted samples bound a function at the points of a grid, between which it
+is near its interpolant, or its slopes at the origin, where it is near its linear part; how near follows from second
+derivatives, in rationals.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from .words import interval, number
 if TYPE_CHECKING:
     from .rules import Tally
 
-MAX_SAMPLES, MAX_VARIABLES, MAX_WEIGHTS, MAX_SHORT = 2**18, 8, 64, 2**7  # bits of a number
+MAX_VARIABLES, MAX_WEIGHTS, MAX_SHORT = 8, 64, 2**7  # bits of a number
 MAX_TERMS, MAX_PAIRS, MAX_DEGREE, MAX_BITS, MAX_PARTS = 2**7, 2**10, 20, 2**9, 2**9  # of polynomials
 CLAIMS = ("asymptotic", "practical")
 ZERO = fmpq(0)
@@ -42,32 +43,23 @@ Terms = Mapping[tuple[int, ...], fmpq]  # the coefficients of a polynomial by th
 class Function:
     """A function of d variables and what stands for it: of names, numbers of the plant's states, inputs, uncertain.
 
-    `values` are within `noise` of the function at the points of the grid that `axes` span, the last axis fastest;
-    `curvature` (d, d) bounds second derivatives. `weights` are those of the lower and the upper end of each slope.
+    `values` are within `noise` of the function at `points` of the `box`, where `curvature` (d, d) bounds second
+    derivatives. `weights` are those of the lower and the upper end of each slope, or without slopes of the function at
+    each point of the grid that `axes` span, the last axis fastest.
     """
 
     state: int
     variables: tuple[int, ...]
+    box: tuple[Pair, ...]
     curvature: tuple[Point, ...]
     noise: fmpq
     vanishes: bool
-    axes: tuple[Point, ...]
+    points: tuple[Point, ...]
     values: Point
     error: int | None = None
     slopes: tuple[int, ...] = ()
+    axes: tuple[Point, ...] = ()
     weights: tuple[tuple[Weights, Weights], ...] = ()
-
-    @property
-    def box(self) -> tuple[Pair, ...]:
-        return tuple((axis[0], axis[-1]) for axis in self.axes)
-
-    def point(self, k: int) -> Point:
-        """The point of value k."""
-        found = []
-        for axis in reversed(self.axes):
-            k, i = divmod(k, len(axis))
-            found.append(axis[i])
-        return tuple(reversed(found))
 
     def beyond(self, z: Point) -> fmpq:
         """rho(z)."""
@@ -110,8 +102,8 @@ def _short(value: Value) -> fmpq:
 
 
 def _function(value: Value, c: Certificate) -> Function:
-    state, variables, curvature, noise, vanishes, axes, values = value.keys(
-        "state variables curvature noise vanishes axes values"
+    state, variables, box, curvature, noise, vanishes, points, values = value.keys(
+        "state variables box curvature noise vanishes points values"
     )
     names = (*c.states, *c.inputs)
     read = variables.listed(lambda name: names.index(name.choice(*names)), 1, MAX_VARIABLES)
@@ -122,16 +114,22 @@ def _function(value: Value, c: Certificate) -> Function:
     curvature.must(symmetric, "symmetric, of numbers that are at least 0")
     noise.must(bound >= 0, "at least 0")
     vanishes.must(isinstance(vanishes.raw, bool), "true or false")
-    grid = axes.listed(lambda axis: axis.listed(_short, 2, MAX_SAMPLES), d)
-    axes.must(all(a < b for axis in grid for a, b in pairwise(axis)), "ascending")
-    count = prod(map(len, grid))
-    axes.must(count <= MAX_SAMPLES, f"of {MAX_SAMPLES} points at most")
-    of = c.states.index(state.choice(*c.states))
-    return Function(of, read, M, bound, vanishes.raw, grid, values.listed(_short, count))
+    ends = box.listed(lambda pair: _axis(pair, 2), d)
+    sampled = points.listed(lambda z: z.listed(_short, d))
+    within = all(lo <= v <= hi for z in sampled for v, (lo, hi) in zip(z, ends, strict=True))
+    points.must(within, "in the box")
+    of, sides = c.states.index(state.choice(*c.states)), tuple((lo, hi) for lo, hi in ends)
+    return Function(of, read, sides, M, bound, vanishes.raw, sampled, values.listed(_short, len(sampled)))
+
+
+def _axis(value: Value, *count: int) -> Point:
+    axis = value.listed(_short, *count)
+    value.must(all(a < b for a, b in pairwise(axis)), "ascending")
+    return axis
 
 
 def _shown(value: Value, f: Function, c: Certificate) -> Function:
-    error, slopes, weights = value.keys("error slopes weights")
+    error, slopes, axes, weights = value.keys("error slopes axes weights")
     d, first = len(f.variables), len(c.states) + len(c.inputs)
 
     def quantity(name: Value) -> int:
@@ -140,9 +138,12 @@ def _shown(value: Value, f: Function, c: Certificate) -> Function:
 
     named = slopes.listed(quantity, d if slopes.raw else 0)
     slopes.must(f.vanishes or not named, "empty where the function need not vanish")
-    ends = weights.listed(lambda pair: pair.listed(lambda each: _weights(each, len(f.values)), 2), d if named else 0)
+    grid = axes.listed(lambda axis: _axis(axis, 2, None), 0 if named else d)
+    axes.must(all((axis[0], axis[-1]) == ends for axis, ends in zip(grid, f.box)), "from end to end of the box")
+    count = d if named else prod(map(len, grid))
+    ends = weights.listed(lambda pair: pair.listed(lambda each: _weights(each, len(f.values)), 2), count)
     pairs = tuple((lower, upper) for lower, upper in ends)
-    return replace(f, error=None if error.raw is None else quantity(error), slopes=named, weights=pairs)
+    return replace(f, error=None if error.raw is None else quantity(error), slopes=named, axes=grid, weights=pairs)
 
 
 def _weights(value: Value, count: int) -> Weights:
