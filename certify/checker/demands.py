@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from math import prod
 
 from .case import AT_CORNERS
@@ -75,17 +76,18 @@ def of_data(sizes: Sizes) -> int:
 
 
 def of_samples(sizes: Sizes) -> int:
-    """Equations as polynomials, and what these may be off by on cells or at weighted points."""
+    """Equations as polynomials, weighted samples, and what polynomials may be off by on cells."""
     samples, found = sizes.c.samples, 0
     if samples is None:
         return 0
     for f in samples.functions:
-        d, cells = len(f.variables), prod(len(axis) - 1 for axis in f.axes)
-        bits = max(q.height_bits() for axis in f.axes for q in axis)
-        if f.slopes:
-            found += 2**17 * d**2 * sum(len(weights) for pair in f.weights for weights in pair)
-        else:
-            found += 2**12 * bits * d * len(f.values) + cells * (2**18 * bits * d + 2 ** (d + 10))
+        d = len(f.variables)
+        for weights in chain(*f.weights):
+            count, bits = len(weights), max(v.height_bits() for _, v in weights)
+            found += 2**3 * d * count * (2**11 * d + count * bits)
+        if not f.slopes:
+            bits, cells = max(q.height_bits() for axis in f.axes for q in axis), prod(len(axis) - 1 for axis in f.axes)
+            found += 2**12 * bits * d * len(f.weights) + cells * (2**18 * bits * d + 2 ** (d + 10))
     return found + 2**24 * len(sizes.c.dynamics.operations)
 
 

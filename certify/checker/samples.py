@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import pairwise, product
 from math import comb, prod
+from operator import sub
 from typing import TYPE_CHECKING
 
 from flint import fmpq
@@ -26,7 +27,7 @@ from .words import interval, number
 if TYPE_CHECKING:
     from .rules import Tally
 
-MAX_VARIABLES, MAX_WEIGHTS, MAX_SHORT = 8, 64, 2**7  # bits of a number
+MAX_SAMPLES, MAX_VARIABLES, MAX_WEIGHTS, MAX_SHORT = 2**18, 8, 64, 2**7  # bits of a number
 MAX_TERMS, MAX_PAIRS, MAX_DEGREE, MAX_BITS, MAX_PARTS = 2**7, 2**10, 20, 2**9, 2**9  # of polynomials
 CLAIMS = ("asymptotic", "practical")
 ZERO = fmpq(0)
@@ -50,7 +51,7 @@ class Function:
 
     state: int
     variables: tuple[int, ...]
-    box: tuple[Pair, ...]
+    box: tuple[Point, ...]
     curvature: tuple[Point, ...]
     noise: fmpq
     vanishes: bool
@@ -65,6 +66,16 @@ class Function:
         """rho(z)."""
         pairs = product(range(len(z)), repeat=2)
         return sum((self.curvature[i][j] * abs(z[i] * z[j]) for i, j in pairs), ZERO) / 2
+
+    def ends(self, p: Point, both: tuple[Weights, Weights]) -> Iterator[tuple[Point, fmpq]]:
+        """The sums of v and of v z over each list of weights, and the end of the interval at p."""
+        for sign, weights in zip((-1, 1), both, strict=True):
+            whole, end = (ZERO,) * (len(p) + 1), ZERO
+            for k, v in weights:
+                z = self.points[k]
+                whole = tuple(s + v * q for s, q in zip(whole, (1, *z), strict=True))
+                end += v * self.values[k] + sign * abs(v) * (self.noise + self.beyond(tuple(map(sub, z, p))))
+            yield whole, end
 
 
 @dataclass(frozen=True)
@@ -115,15 +126,14 @@ def _function(value: Value, c: Certificate) -> Function:
     noise.must(bound >= 0, "at least 0")
     vanishes.must(isinstance(vanishes.raw, bool), "true or false")
     ends = box.listed(lambda pair: _axis(pair, 2), d)
-    sampled = points.listed(lambda z: z.listed(_short, d))
-    within = all(lo <= v <= hi for z in sampled for v, (lo, hi) in zip(z, ends, strict=True))
-    points.must(within, "in the box")
-    of, sides = c.states.index(state.choice(*c.states)), tuple((lo, hi) for lo, hi in ends)
-    return Function(of, read, sides, M, bound, vanishes.raw, sampled, values.listed(_short, len(sampled)))
+    sampled = points.listed(lambda z: z.listed(_short, d), 1, MAX_SAMPLES)
+    points.must(all(lo <= v <= hi for z in sampled for v, (lo, hi) in zip(z, ends, strict=True)), "in the box")
+    of = c.states.index(state.choice(*c.states))
+    return Function(of, read, ends, M, bound, vanishes.raw, sampled, values.listed(_short, len(sampled)))
 
 
-def _axis(value: Value, *count: int) -> Point:
-    axis = value.listed(_short, *count)
+def _axis(value: Value, most: int) -> Point:
+    axis = value.listed(_short, 2, most)
     value.must(all(a < b for a, b in pairwise(axis)), "ascending")
     return axis
 
@@ -138,8 +148,9 @@ def _shown(value: Value, f: Function, c: Certificate) -> Function:
 
     named = slopes.listed(quantity, d if slopes.raw else 0)
     slopes.must(f.vanishes or not named, "empty where the function need not vanish")
-    grid = axes.listed(lambda axis: _axis(axis, 2, None), 0 if named else d)
-    axes.must(all((axis[0], axis[-1]) == ends for axis, ends in zip(grid, f.box)), "from end to end of the box")
+    grid = axes.listed(lambda axis: _axis(axis, MAX_SAMPLES), 0 if named else d)
+    reach = tuple((axis[0], axis[-1]) for axis in grid)
+    axes.must(not grid or reach == f.box, "from end to end of the box")
     count = d if named else prod(map(len, grid))
     ends = weights.listed(lambda pair: pair.listed(lambda each: _weights(each, len(f.values)), 2), count)
     pairs = tuple((lower, upper) for lower, upper in ends)
@@ -270,7 +281,7 @@ def is_enclosed(case: Case) -> Failures:
         bounds = [_exactly((*c.domain, *c.input_bounds)[k]) for k in f.variables]
         for k, (first, last), (lo, hi) in zip(f.variables, f.box, bounds, strict=True):
             if not (first <= lo and hi <= last and (first <= 0 <= last or not f.vanishes)):
-                yield (*c.states, *c.inputs)[k], "samples must reach over all of the domain and the input bounds"
+                yield (*c.states, *c.inputs)[k], "the box must hold all of the domain and the input bounds"
         terms = right[f.state].terms
         parts = None if terms is None else parted(f, terms)
         if parts is None:
@@ -294,13 +305,19 @@ def on_cells(f: Function, P: Terms, E: Terms, name: str) -> Iterator[tuple[str, 
     if sum(prod(k + 1 for k in powers) for powers in P) > MAX_PARTS:
         yield name, f"the sum of prod (k + 1) must be at most {MAX_PARTS}"
         return
-    points = product(*f.axes)
-    off = {z: abs(y - at(P, z)) for z, y in zip(points, f.values, strict=True)}
+    off = dict[Point, fmpq]()
+    for p, both in zip(product(*f.axes), f.weights, strict=True):
+        (low, lo), (high, hi) = f.ends(p, both)
+        if not low == high == (1, *p):
+            yield name, f"weights must have the sum 1 and give their point, {_shown_point(p)}"
+        if not lo <= hi:
+            yield name, f"the samples contradict the declared bounds, at {_shown_point(p)}"
+        off[p] = max(hi - at(P, p), at(P, p) - lo)
     for cell in product(*(tuple(pairwise(axis)) for axis in f.axes)):
         bend = sum((M[j] * ((hi - lo) / 2) ** 2 for j, (M, (lo, hi)) in enumerate(zip(f.curvature, cell, strict=True))),
                    ZERO)  # fmt: skip
         bend += sum((abs(c) * sum(k * (k - 1) for k in powers) for powers, c in moved(P, cell).items()), ZERO)
-        if not least(E, cell) >= max(off[z] for z in product(*cell)) + f.noise + bend / 2:
+        if not least(E, cell) >= max(off[p] for p in product(*cell)) + bend / 2:
             where = ", ".join(map(_shown_pair, cell))
             yield name, f"the equation may be farther from a function of these samples than it says, on {where}"
 
@@ -322,13 +339,13 @@ def near_the_origin(
         if not E.get(square, ZERO) * size >= bend:
             yield name, "E must be at least what second derivatives allow beyond the linear part"
     for one, k, both in zip(alone, f.slopes, f.weights, strict=True):
-        for end, sign, weights in zip(ranges[k], (-1, 1), both, strict=True):
-            found = [(v, f.point(i), f.values[i]) for i, v in weights]
-            whole = [sum((v * z[j] for v, z, _ in found), ZERO) for j in range(d)]
-            middle = sum((v * y for v, _, y in found), ZERO)
-            doubt = sum((abs(v) * (f.noise + f.beyond(z)) for v, z, _ in found), ZERO)
-            if whole != [*one] or not sign * (end - middle) >= doubt:
-                yield name, "a slope may be outside its range, by these weights"
+        (low, lo), (high, hi) = f.ends((ZERO,) * d, both)
+        if not low[1:] == high[1:] == one:
+            yield name, "weights must give the direction of their variable"
+        if not lo <= hi:
+            yield name, "the samples contradict the declared bounds, at the origin"
+        if not ranges[k][0] <= lo <= hi <= ranges[k][1]:
+            yield name, "a slope may be outside its range, by these weights"
 
 
 def examine(tally: Tally, case: Case) -> None:
@@ -346,6 +363,10 @@ def _shown_pair(pair: Pair) -> str:
     return interval((lo, hi))
 
 
+def _shown_point(p: Point) -> str:
+    return ", ".join(number(fraction(v)) for v in p)
+
+
 def sampled(c: Certificate, samples: Samples) -> list[str]:
     """The statement of chapter samples, line by line."""
     names, lines = (*c.states, *c.inputs), list[str]()
@@ -359,7 +380,7 @@ def sampled(c: Certificate, samples: Samples) -> list[str]:
             f"  and so for every plant in which {c.states[f.state]}{'+' if c.discrete else chr(39)} is instead a "
             f"function of {', '.join(z)} with continuous second derivatives, of size at most {bends} where {box}, that "
             f"is within {number(fraction(f.noise))} of the {len(f.values)} samples that the certificate states "
-            f"at the points of a grid there{rest}"
+            f"at points there{rest}"
         )
     end = f"  of other functions nothing is claimed; the samples are said to be of a file with sha256 {samples.sha256}"
     return [*lines, end]
