@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import product
 from typing import Any
 
 from certify.errors import InputError
-from certify.loop.plants import Grid, Samples, Unknown
+from certify.loop.plants import Sampled, Samples, Unknown
 
 Weights = tuple[tuple[int, Fraction], ...]
-"""Numbers of samples in the grid's order, the last axis fastest, and the weight of each."""
+"""Numbers of samples, and the weight of each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,11 +22,13 @@ class Standing:
     ----------
     error : the name of r; None where E is 0.
     slopes : names of the slopes at the origin of which P is made, one for each variable; none where P is of variables.
-    weights : of samples that bound each slope, from below and from above.
+    axes : of a grid over the box, without slopes.
+    weights : of samples that bound each slope, or g at each point of the grid, from below and from above.
     """
 
     error: str | None
     slopes: tuple[str, ...] = ()
+    axes: tuple[tuple[Fraction, ...], ...] = ()
     weights: tuple[tuple[Weights, Weights], ...] = ()
 
 
@@ -42,15 +43,16 @@ def samples_claim(samples: Samples, bounds: SampleBounds) -> dict[str, Any]:
 
 
 def _function(one: Unknown, samples: Samples, vanishes: bool) -> dict[str, Any]:
-    grid = samples.grids[one.state]
+    taken = samples.taken[one.state]
     return {
         "state": one.state,
         "variables": list(one.variables),
+        "box": list(map(_texts, one.box)),
         "curvature": list(map(_texts, one.curvature)),
         "noise": str(samples.noise[one.state]),
         "vanishes": vanishes,
-        "axes": list(map(_texts, grid.axes)),
-        "values": _texts([grid.values[z] for z in product(*grid.axes)]),
+        "points": list(map(_texts, taken.points)),
+        "values": _texts(taken.values),
     }
 
 
@@ -64,6 +66,7 @@ def samples_evidence(bounds: SampleBounds) -> list[dict[str, Any]]:
         {
             "error": by.error,
             "slopes": list(by.slopes),
+            "axes": list(map(_texts, by.axes)),
             "weights": [[[[k, str(v)] for k, v in weights] for weights in ends] for ends in by.weights],
         }
         for by in bounds
@@ -72,16 +75,19 @@ def samples_evidence(bounds: SampleBounds) -> list[dict[str, Any]]:
 
 def read_samples(claim: Mapping[str, Any], evidence: Sequence[Mapping[str, Any]]) -> tuple[Samples, SampleBounds]:
     """The samples of both entries, and what stands for the functions."""
-    unknowns, grids = list[Unknown](), dict[str, Grid]()
+    unknowns, taken = list[Unknown](), dict[str, Sampled]()
     for f in claim["functions"]:
-        axes, values = tuple(map(_numbers, f["axes"])), _numbers(f["values"])
-        grids[f["state"]] = Grid(axes, dict(zip(product(*axes), values, strict=True)))
-        unknowns.append(Unknown(f["state"], tuple(f["variables"]), tuple(map(_numbers, f["curvature"]))))
+        taken[f["state"]] = Sampled(tuple(map(_numbers, f["points"])), _numbers(f["values"]))
+        box = tuple((Fraction(lo), Fraction(hi)) for lo, hi in f["box"])
+        unknowns.append(Unknown(f["state"], tuple(f["variables"]), tuple(map(_numbers, f["curvature"])), box))
     noise = {f["state"]: Fraction(f["noise"]) for f in claim["functions"]}
-    bounds = tuple(Standing(e["error"], tuple(e["slopes"]), tuple(map(_ends, e["weights"]))) for e in evidence)
-    if len(bounds) != len(unknowns) or len(grids) != len(unknowns):
+    bounds = tuple(
+        Standing(e["error"], tuple(e["slopes"]), tuple(map(_numbers, e["axes"])), tuple(map(_ends, e["weights"])))
+        for e in evidence
+    )
+    if len(bounds) != len(unknowns) or len(taken) != len(unknowns):
         raise InputError("samples must have an entry of the evidence for each function, of different states.")
-    return Samples(str(claim["sha256"]), tuple(unknowns), noise, grids), bounds
+    return Samples(str(claim["sha256"]), tuple(unknowns), noise, taken), bounds
 
 
 def _numbers(texts: Sequence[str]) -> tuple[Fraction, ...]:

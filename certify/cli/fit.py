@@ -65,7 +65,7 @@ def _lines(result: FitResult) -> list[str]:
     lines = []
     for one in result.found:
         state = one.unknown.state
-        lines.append(f"FITTED  {state}: {one.samples:,} samples, {len(one.polynomial.powers)} terms")
+        lines.append(f"FITTED  {state}: {len(one.taken.values):,} samples, {len(one.polynomial.powers)} terms")
         bound, rise = one.error, zip(one.unknown.variables, one.error.rise, strict=True)
         more = "".join(f" + {above(k)} {v}^2" for v, k in rise if k)
         lines.append(f"error        at most {above(bound.constant)}{more}, on every cell at most {above(one.largest)}")

@@ -17,7 +17,7 @@ from certify.report.words import Varying, below, listed, symbol
 def described(system: System) -> dict[str, Any] | None:
     """The samples of a claim's plant as JSON has them; None where there are none, or only their file is known."""
     samples = system.samples
-    if samples is None or not samples.grids:
+    if samples is None or not samples.taken:
         return None
     functions = []
     for one in samples.unknowns:
@@ -30,7 +30,7 @@ def described(system: System) -> dict[str, Any] | None:
                 "variables": list(one.variables),
                 "curvature": [[str(q) for q in row] for row in one.curvature],
                 "noise": str(samples.noise[one.state]),
-                "samples": len(samples.grids[one.state].values),
+                "samples": len(samples.taken[one.state].values),
                 "vanishes": vanishes,
                 "quantities": [name for name in own if name in system.ranges],
             }

@@ -1,6 +1,7 @@
-"""Samples of a plant that ships on a grid, in place of an experiment: states, an input, and the rate of a state.
+"""Samples of a plant that ships, in place of an experiment: states, an input, and the rate of a state.
 
-`python examples/unknown/sample.py pendulum samples.csv`. Each rate is off by at most the noise; `certify fit` is told
+`python examples/unknown/sample.py pendulum samples.csv` takes them on a grid, `--scattered 525` at random points, half
+of them close to the origin by a random factor. Each rate is off by at most the noise; `certify fit` is told
 the noise and bounds of second derivatives, and nothing of the plant's equations.
 """
 
@@ -41,14 +42,20 @@ def main() -> None:
     parser.add_argument("plant", choices=sorted(GRIDS))
     parser.add_argument("out")
     parser.add_argument("--noise", type=float, default=1e-2)
+    parser.add_argument("--scattered", type=int, metavar="N", help="N random points instead of a grid")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     name, state, axes = GRIDS[given.plant]
     plant = load_system(HERE / name) if name.endswith(".toml") else get_system(name)
-    z, n = np.array(list(product(*axes)), dtype=float), plant.n
+    draw, n = np.random.default_rng(given.seed), plant.n
+    z = np.array(list(product(*axes)), dtype=float)
+    if given.scattered:
+        z = draw.uniform(-1, 1, (given.scattered, len(axes))) * z.max(axis=0)
+        z[::2, :n] *= 10 ** draw.uniform(-2.5, 0, (len(z[::2]), 1))
+        z = z.round(6)
     row = [s.name for s in plant.states].index(state)
     rates = plant.function()(z[:, :n], z[:, n:])[:, row]
-    rates += np.random.default_rng(given.seed).uniform(-given.noise, given.noise, len(z))
+    rates += draw.uniform(-given.noise, given.noise, len(z))
     with open(given.out, "w", newline="") as file:
         table = csv.writer(file)
         table.writerow([*(s.name for s in plant.states), *(u.name for u in plant.inputs), f"{state}_rate"])

@@ -1,17 +1,18 @@
-"""The linear part of an unknown function at the origin, and a bound of all beyond it, from samples near by.
+"""Bounds of an unknown function at a point, or of its slopes at the origin, from samples around it.
 
-With g(0) = 0 and |g_ab| <= M_ab on a convex set around the origin, g(z) = a.z + r(z), |r(z)| <= 1/2 sum M_ab |z_a z_b|.
-For samples z_k that span the space and weights w with sum_k w_k z_k = e_j, the unit vector,
+With |g_ab| <= M_ab on a convex box that holds p and the samples z_k, g(z_k) = g(p) + grad g(p).(z_k - p) + r_k with
+|r_k| <= 1/2 sum M_ab |z_k - p|_a |z_k - p|_b. For samples and weights v with sum_k v_k = 1, sum_k v_k z_k = p
 
-    a_j = sum_k w_k a.z_k,  which lies within sum_k |w_k| (noise + |r|(z_k)) of sum_k w_k y_k.
+    g(p) lies within sum_k |v_k| (noise + |r_k|) of sum_k v_k y_k,
 
-The samples are the active ones of a linear program, whose optimum is the least bound; the weights are solved for in
-rationals, so that nothing rests on its solver.
+and at the origin, where g is 0, its slope a_j does if sum_k v_k z_k = e_j, the unit vector. The samples are the active
+ones of a linear program, whose optimum is the least bound; the weights are solved for in rationals, so that nothing
+rests on its solver.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -19,8 +20,9 @@ import numpy as np
 from flint import fmpq, fmpq_mat
 from scipy.optimize import linprog
 
+from certify.certificates.samples import Weights
 from certify.errors import CertifyError, InputError
-from certify.loop.plants.samples import Grid, Point, Unknown
+from certify.loop.plants.samples import Point, Sampled, Unknown
 
 
 class Contradicted(CertifyError):
@@ -31,108 +33,154 @@ _MOST = 400  # samples, those of the least bounds, that the programs see
 
 
 def beyond(one: Unknown, z: Point) -> Fraction:
-    """The bound of |r| at a point."""
+    """The bound of |r| at a distance z."""
     pairs = ((row, v) for row, v in zip(one.curvature, z, strict=True))
     return sum((m * abs(v * w) for row, v in pairs for m, w in zip(row, z, strict=True)), Fraction(0)) / 2
 
 
-class Slope(NamedTuple):
-    """An interval that holds a first derivative of g at the origin, and the weights of samples that show each end."""
+class Bounds(NamedTuple):
+    """An interval that holds a value of g, or a slope at the origin, and the weights of samples that show each end."""
 
     lo: Fraction
     hi: Fraction
-    lower: Mapping[Point, Fraction]
-    upper: Mapping[Point, Fraction]
+    lower: Weights
+    upper: Weights
 
 
-def slopes(one: Unknown, grid: Grid, noise: Fraction) -> tuple[Slope, ...]:
-    """Intervals that hold the first derivatives of g at the origin.
+class Row(NamedTuple):
+    """What a sample says of q, the value and the slopes of g at a point, or the slopes alone: |a.q - y| <= e."""
 
-    Raises
-    ------
-    InputError : the samples do not span the variables.
-    Contradicted : no function with these bounds has such samples.
+    a: Point
+    y: Fraction
+    e: Fraction
+
+
+class Sampling:
+    """Samples of a function, of which linear programs ask."""
+
+    def __init__(self, one: Unknown, taken: Sampled, noise: Fraction) -> None:
+        self.one, self.taken, self.noise = one, taken, noise
+        self.points = np.array([[float(v) for v in z] for z in taken.points])
+        self.values, self.M = np.array([float(y) for y in taken.values]), np.array(one.curvature, dtype=float)
+        self.size = np.array([float(hi - lo) for lo, hi in one.box])
+
+    def at(self, p: Point) -> Bounds:
+        """An interval that holds g(p).
+
+        Raises
+        ------
+        InputError : the samples do not span the variables.
+        Contradicted : no function with these bounds has such samples.
+        """
+        return _Around(self, p, True).bounds(0)
+
+    def slopes(self) -> tuple[Bounds, ...]:
+        """Intervals that hold the first derivatives of g at the origin, where it is 0; raises like `at`."""
+        around = _Around(self, (Fraction(0),) * len(self.size), False)
+        return tuple(around.bounds(j) for j in range(len(self.size)))
+
+
+class _Around:
+    """Samples around a point p, those of the least errors, and their linear programs; `valued` where g(p) is unknown.
+
+    The programs see floats, in which each variable is scaled by its box.
     """
-    near = sorted(((noise + beyond(one, z), z, y) for z, y in grid.values.items() if any(z)), key=lambda row: row[0])
-    near = _widest(near)
-    size = [max(abs(axis[0]), abs(axis[-1])) for axis in grid.axes]
-    Z = np.array([[float(v / s) for v, s in zip(z, size, strict=True)] for _, z, _ in near])
-    y, e = np.array([float(row[2]) for row in near]), np.array([float(row[0]) for row in near])
-    found = []
-    for j in range(len(size)):
-        unit = [Fraction(int(i == j)) for i in range(len(size))]
-        (lo, lower), (hi, upper) = (_end(Z, y, e, near, j, sign, unit) for sign in (1, -1))
-        if not lo <= hi:
-            raise Contradicted(
-                f"{one.state} would have a slope along {one.variables[j]} from {float(lo):.6g} to {float(hi):.6g}"
-            )
-        found.append(Slope(lo, hi, lower, upper))
-    return tuple(found)
 
+    def __init__(self, sampling: Sampling, p: Point, valued: bool) -> None:
+        self.sampling, self.p, self.valued = sampling, p, valued
+        away = sampling.points - np.array([float(v) for v in p])
+        e = float(sampling.noise) + 0.5 * np.einsum("ki,ij,kj->k", np.abs(away), sampling.M, np.abs(away))
+        telling = np.flatnonzero(away.any(axis=1) | valued)
+        order = telling[np.argsort(e[telling], kind="stable")]
+        alone = order[_MOST:][np.count_nonzero(away[order[_MOST:]], axis=1) == 1]
+        self.numbers = np.concatenate([order[:_MOST], alone[:_MOST]])
+        Z = away[self.numbers] / sampling.size
+        self.A = np.column_stack([np.ones(len(Z)), Z]) if valued else Z
+        self.y, self.e = sampling.values[self.numbers], e[self.numbers]
 
-Row = tuple[Fraction, Point, Fraction]  # the bound of a sample's distance from the linear part, the point, the value
+    def row(self, k: int) -> Row:
+        """What sample k says, exactly."""
+        s = self.sampling
+        away = tuple(v - w for v, w in zip(s.taken.points[k], self.p, strict=True))
+        a = (Fraction(1), *away) if self.valued else away
+        return Row(a, s.taken.values[k], s.noise + beyond(s.one, away))
 
+    def bounds(self, j: int) -> Bounds:
+        """An interval of the j-th entry of q."""
+        (lo, lower), (hi, upper) = (self._end(j, sign) for sign in (1, -1))
+        if lo > hi:
+            raise self._contradicted([k for k, _ in (*lower, *upper)])
+        return Bounds(lo, hi, lower, upper)
 
-def _widest(near: Sequence[Row]) -> list[Row]:
-    """Rows that tell of slopes: the least error by the length of z, and those of the axes."""
-    alone = [row for row in near if sum(map(bool, row[1])) == 1]
-    return (list(near[:_MOST]) + [row for row in alone if row not in near[:_MOST]])[: 2 * _MOST]
+    def _end(self, j: int, sign: int) -> tuple[Fraction, Weights]:
+        """The lower (sign 1) or upper end, from samples that a linear program chooses, and their weights."""
+        cost = np.zeros(self.A.shape[1])
+        cost[j] = sign
+        left, right = np.vstack([self.A, -self.A]), np.concatenate([self.y + self.e, self.e - self.y])
+        solved = linprog(cost, A_ub=left, b_ub=right, bounds=(None, None))
+        if solved.status == 2:
+            raise self._contradiction()
+        if solved.status != 0:
+            what = f"do not bound {self.sampling.one.state} or its slopes at {self._where()}"
+            raise InputError(f"the samples {what}: take some near it along each variable.")
+        order = np.argsort(-np.abs(solved.ineqlin.marginals), kind="stable") % len(self.A)
+        unit = [Fraction(int(i == j)) for i in range(len(cost))]
+        weights = self._weights(list(dict.fromkeys(self.numbers[order].tolist())), unit)
+        rows = [(v, self.row(k)) for k, v in weights]
+        middle = sum((v * row.y for v, row in rows), Fraction(0))
+        return middle - sign * sum((abs(v) * row.e for v, row in rows), Fraction(0)), weights
 
+    def _weights(self, order: Sequence[int], unit: Sequence[Fraction]) -> Weights:
+        """v with sum_k v_k a_k = unit, for the first samples in an order that span the space."""
+        basis: list[int] = []
+        columns: list[list[fmpq]] = []
+        for k in order:
+            more = [*columns, list(map(_exact, self.row(k).a))]
+            if fmpq_mat(more).rank() == len(more):
+                basis, columns = [*basis, k], more
+            if len(basis) == len(unit):
+                break
+        else:
+            raise InputError(f"the samples of {self.sampling.one.state} must differ in each variable.")
+        solved = fmpq_mat(columns).transpose().solve(fmpq_mat([[_exact(v)] for v in unit])).entries()
+        return tuple((k, Fraction(int(v.p), int(v.q))) for k, v in zip(basis, solved, strict=True) if v)
 
-def _end(
-    Z: np.ndarray, y: np.ndarray, e: np.ndarray, rows: Sequence[Row], j: int, sign: int, unit: Sequence[Fraction]
-) -> tuple[Fraction, Mapping[Point, Fraction]]:
-    """The lower (sign 1) or upper end of a_j, from samples that a linear program chooses, and their weights."""
-    cost = np.zeros(Z.shape[1])
-    cost[j] = sign
-    solved = linprog(cost, A_ub=np.vstack([Z, -Z]), b_ub=np.concatenate([y + e, e - y]), bounds=(None, None))
-    if solved.status == 2:
-        raise _contradiction(Z, y, e, rows)
-    if solved.status != 0:
-        raise InputError("the samples do not bound the slopes at the origin: take some near it along each variable.")
-    active = np.argsort(-np.abs(solved.ineqlin.marginals), kind="stable") % len(rows)
-    chosen = list(dict.fromkeys(active.tolist()))
-    weights = _weights(rows, chosen, unit)
-    middle = sum((w * rows[k][2] for k, w in weights.items()), Fraction(0))
-    doubt = sum((abs(w) * rows[k][0] for k, w in weights.items()), Fraction(0))
-    return middle - sign * doubt, {rows[k][1]: w for k, w in weights.items()}
-
-
-def _contradiction(Z: np.ndarray, y: np.ndarray, e: np.ndarray, rows: Sequence[Row]) -> CertifyError:
-    """The finding that samples contradict one another, if rationals show it: w with sum_k w_k z_k = 0 for which
-    |sum_k w_k y_k| is larger than the errors allow."""
-    ones = np.ones((len(Z), 1))
-    cost = np.append(np.zeros(Z.shape[1]), 1.0)
-    left = np.vstack([np.hstack([Z, -ones]), np.hstack([-Z, -ones])])
-    solved = linprog(cost, A_ub=left, b_ub=np.concatenate([y + e, e - y]), bounds=(None, None))
-    if solved.status == 0:
-        active = np.argsort(-np.abs(solved.ineqlin.marginals), kind="stable") % len(rows)
-        chosen = list(dict.fromkeys(active.tolist()))[: Z.shape[1] + 1]
-        null, rank = (
-            fmpq_mat([[_exact(rows[k][1][i]) for k in chosen] for i in range(Z.shape[1])]).numer_denom()[0].nullspace()
+    def _contradiction(self) -> CertifyError:
+        """The finding that samples contradict one another, if rationals show it: v with sum_k v_k a_k = 0 for which
+        |sum_k v_k y_k| is larger than the errors allow."""
+        ones = np.ones((len(self.A), 1))
+        cost = np.append(np.zeros(self.A.shape[1]), 1.0)
+        left = np.vstack([np.hstack([self.A, -ones]), np.hstack([-self.A, -ones])])
+        right = np.concatenate([self.y + self.e, self.e - self.y])
+        solved = linprog(cost, A_ub=left, b_ub=right, bounds=(None, None))
+        if solved.status == 0:
+            order = np.argsort(-np.abs(solved.ineqlin.marginals), kind="stable") % len(self.A)
+            chosen = list(dict.fromkeys(self.numbers[order].tolist()))[: self.A.shape[1] + 1]
+            rows = [self.row(k) for k in chosen]
+            null, rank = fmpq_mat([list(map(_exact, row.a)) for row in rows]).transpose().numer_denom()[0].nullspace()
+            for column in range(rank):
+                v = [Fraction(int(null[i, column])) for i in range(len(rows))]
+                off = abs(sum((w * row.y for w, row in zip(v, rows, strict=True)), Fraction(0)))
+                if off > sum((abs(w) * row.e for w, row in zip(v, rows, strict=True)), Fraction(0)):
+                    return self._contradicted([k for k, w in zip(chosen, v, strict=True) if w])
+        return InputError(
+            f"{self.sampling.one.state} cannot be bounded at {self._where()}: the samples are nearly a contradiction."
         )
-        for column in range(rank):
-            w = [Fraction(int(null[i, column])) for i in range(len(chosen))]
-            off = abs(sum((v * rows[k][2] for v, k in zip(w, chosen, strict=True)), Fraction(0)))
-            if off > sum((abs(v) * rows[k][0] for v, k in zip(w, chosen, strict=True)), Fraction(0)):
-                return Contradicted(f"no slopes at the origin are consistent with {len(chosen)} of the samples")
-    return InputError("the slopes at the origin cannot be bounded: the samples are nearly a contradiction.")
+
+    def _contradicted(self, numbers: Sequence[int]) -> Contradicted:
+        taken = self.sampling.taken
+        each = [f"{float(taken.values[k]):.6g} at {_words(taken.points[k])}" for k in sorted({*numbers})]
+        what = "no value and slopes" if self.valued else "no slopes"
+        return Contradicted(
+            f"{what} of {self.sampling.one.state} at {self._where()} are consistent with the samples {'; '.join(each)}"
+        )
+
+    def _where(self) -> str:
+        return f"({_words(self.p)})" if any(self.p) else "the origin"
 
 
-def _weights(rows: Sequence[Row], order: Sequence[int], unit: Sequence[Fraction]) -> dict[int, Fraction]:
-    """w with sum_k w_k z_k = unit, for the first samples in an order that span the space."""
-    basis: list[int] = []
-    for k in order:
-        columns = [rows[i][1] for i in (*basis, k)]
-        if fmpq_mat([[_exact(v) for v in z] for z in columns]).rank() == len(columns):
-            basis.append(k)
-        if len(basis) == len(unit):
-            break
-    else:
-        raise InputError("the samples near the origin must differ in each variable.")
-    matrix = fmpq_mat([[_exact(rows[k][1][i]) for k in basis] for i in range(len(unit))])
-    solved = matrix.solve(fmpq_mat([[_exact(v)] for v in unit]))
-    return {k: Fraction(int(w.p), int(w.q)) for k, w in zip(basis, solved.entries(), strict=True)}
+def _words(z: Point) -> str:
+    return ", ".join(f"{float(v):g}" for v in z)
 
 
 def _exact(q: Fraction) -> fmpq:

@@ -1,13 +1,13 @@
-"""A polynomial through samples on a grid, and a bound of how far the sampled function may be from it.
+"""A polynomial near an unknown function, and a bound of how far the function may be from it.
 
-Let g be sampled within `noise` at the points of a grid, |g_jj| <= H_j, p a polynomial and r = g - p. On a cell of the
+Let an interval hold g at each point of a grid, |g_jj| <= H_j, p a polynomial and r = g - p. On a cell of the
 grid with the widths s the multilinear interpolation I r of r at the cell's corners has
 
     |r - I r| <= sum_j s_j^2/8 sup|r_jj| <= sum_j s_j^2/8 (H_j + sup|p_jj|),
 
 for interpolation along one axis errs by at most s^2/8 sup|r_jj| (Davis, *Interpolation and Approximation*, theorem
-3.1.1), and interpolation along the others takes means. |I r| is at most the largest |r| at the corners, which is known
-within the noise. p is any polynomial: how it is found decides how small the bound is, not whether it is true.
+3.1.1), and interpolation along the others takes means. |I r| is at most the largest |r| at the corners, which
+the intervals bound. p is any polynomial: how it is found decides how small the bound is, not whether it is true.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from math import comb, frexp, prod
 import numpy as np
 from scipy.optimize import linprog
 
+from certify.analysis.fitting.grid import Grid
 from certify.errors import InputError
-from certify.loop.plants.samples import Grid, Point, Unknown
+from certify.loop.plants.samples import Point, Unknown
 
 _DIGITS = 12  # of a coefficient after the point, as a share of the largest sampled value
 _HELD = 10**12  # denominators of bounds that stand in files
@@ -96,8 +97,8 @@ def _shown(q: Fraction) -> str:
 
 
 def fitted(one: Unknown, grid: Grid, degree: int) -> Polynomial:
-    """The polynomial without a constant term, of least squares at the samples; its degree in a variable of bounded
-    second derivative 0 is 1, and terms of several variables are of degree 3 at most."""
+    """The polynomial without a constant term, of least squares at the intervals' middles; its degree in a variable of
+    bounded second derivative 0 is 1, and terms of several variables are of degree 3 at most."""
     curved = [max(row) > 0 for row in one.curvature]
     most = [min(degree if bent else 1, len(axis) - 1) for bent, axis in zip(curved, grid.axes, strict=True)]
     powers = [
@@ -107,8 +108,8 @@ def fitted(one: Unknown, grid: Grid, degree: int) -> Polynomial:
         raise InputError(f"`degree` {degree} makes a larger polynomial than the checkers expand: try a lower one.")
     # powers of 2, whose own powers are short numbers
     scale = tuple(Fraction(2) ** frexp(max(abs(axis[0]), abs(axis[-1])))[1] for axis in grid.axes)
-    points = np.array([[float(v / s) for v, s in zip(z, scale, strict=True)] for z in grid.values])
-    values = np.array([float(y) for y in grid.values.values()])
+    points = np.array([[float(v / s) for v, s in zip(z, scale, strict=True)] for z in grid.middles])
+    values = np.array([float(y) for y in grid.middles.values()])
     columns = np.stack([np.prod(points ** np.array(p), axis=1) for p in powers], axis=1)
     found = np.linalg.lstsq(columns, values, rcond=None)[0]
     unit = Fraction(10) ** (len(str(int(max(1.0, float(np.abs(values).max()))))) - _DIGITS)
@@ -122,12 +123,15 @@ def cells(grid: Grid) -> Iterator[Cell]:
     return product(*(tuple(pairwise(axis)) for axis in grid.axes))
 
 
-def errors(p: Polynomial, one: Unknown, grid: Grid, noise: Fraction) -> dict[Cell, Fraction]:
+def errors(p: Polynomial, one: Unknown, grid: Grid) -> dict[Cell, Fraction]:
     """A bound of |g - p| on each cell of the grid."""
-    off = {z: abs(y - p.at(z)) for z, y in grid.values.items()}
+    off = {}
+    for z, (lo, hi, *_) in grid.bounds.items():
+        y = p.at(z)
+        off[z] = max(hi - y, y - lo)
     found = {}
     for cell in cells(grid):
-        each = max(off[corner] for corner in product(*cell)) + noise
+        each = max(off[corner] for corner in product(*cell))
         for j, (lo, hi) in enumerate(cell):
             each += (hi - lo) ** 2 / 8 * (one.curvature[j][j] + p.bent(j, cell))
         found[cell] = each

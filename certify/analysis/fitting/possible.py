@@ -8,8 +8,9 @@ from itertools import combinations, product
 
 import numpy as np
 
+from certify.analysis.fitting.grid import Grid
 from certify.analysis.fitting.linear import Contradicted
-from certify.loop.plants.samples import Grid, Point, Unknown
+from certify.loop.plants.samples import Point, Unknown
 
 
 def require_possible(one: Unknown, grid: Grid, noise: Fraction) -> None:
@@ -23,7 +24,7 @@ def require_possible(one: Unknown, grid: Grid, noise: Fraction) -> None:
     ------
     Contradicted : no function with these bounds has such samples.
     """
-    at_0 = abs(grid.values.get((Fraction(0),) * len(grid.axes), Fraction(0)))
+    at_0 = abs(grid.middles.get((Fraction(0),) * len(grid.axes), Fraction(0)))
     if at_0 > noise:
         raise Contradicted(f"{one.state} is {float(at_0):.6g} away from 0 at the origin")
     for j, axis in enumerate(grid.axes):
@@ -31,15 +32,15 @@ def require_possible(one: Unknown, grid: Grid, noise: Fraction) -> None:
             left, right = b - a, c - b
             most = one.curvature[j][j] * (c - a) / 2 + 2 * noise * (1 / left + 1 / right)
             for z in product(*grid.axes[:j], (b,), *grid.axes[j + 1 :]):
-                p, q, r = (grid.values[*z[:j], v, *z[j + 1 :]] for v in (a, b, c))
+                p, q, r = (grid.middles[*z[:j], v, *z[j + 1 :]] for v in (a, b, c))
                 if abs((r - q) / right - (q - p) / left) > most:
                     raise Contradicted(f"{one.state} bends more along {one.variables[j]} around {_words(one, z)}")
-    values = np.array([float(grid.values[z]) for z in product(*grid.axes)]).reshape([len(axis) for axis in grid.axes])
+    values = np.array([float(grid.middles[z]) for z in product(*grid.axes)]).reshape([len(axis) for axis in grid.axes])
     for i, j in combinations(range(len(grid.axes)), 2):
         for steps in product(_steps(grid.axes[i]), _steps(grid.axes[j])):
             low, high = _twisted_most(one, grid, values, dict(zip((i, j), steps, strict=True)))
             corners = low, high, _with(low, i, high[i]), _with(high, i, low[i])
-            p, q, r, s = (grid.values[z] for z in corners)
+            p, q, r, s = (grid.middles[z] for z in corners)
             if abs(p + q - r - s) > one.curvature[i][j] * (high[i] - low[i]) * (high[j] - low[j]) + 4 * noise:
                 both, where = f"{one.variables[i]} and {one.variables[j]}", f"{_words(one, low)} to {_words(one, high)}"
                 raise Contradicted(f"{one.state} bends more along {both} from {where}")

@@ -17,13 +17,14 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from certify.analysis.fitting.linear import residual_text, slopes
+from certify.analysis.fitting.grid import Grid, axes_of, enclosed
+from certify.analysis.fitting.linear import Sampling, residual_text
 from certify.analysis.fitting.polynomial import Bound, Polynomial, bounded, errors, fitted
 from certify.analysis.fitting.possible import require_possible
-from certify.analysis.fitting.samples import bounds_of, read_samples, require_covered, suffix_of
+from certify.analysis.fitting.samples import bounds_of, boxed, read_samples, require_within, suffix_of
 from certify.certificates import write_atomically
 from certify.errors import InputError
-from certify.loop.plants import Grid, System, Unknown, load_system
+from certify.loop.plants import Sampled, System, Unknown, load_system
 from certify.loop.plants.samples import slope_name
 from certify.loop.plants.source import PlantFile, read_plant_file
 from certify.loop.plants.toml import build_system
@@ -34,11 +35,13 @@ Interval = tuple[Fraction, Fraction]
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """One unknown: the polynomial, a bound of its error and the largest one on a cell, slopes at the origin, and the
-    bound of what lies beyond them."""
+    """One unknown: its samples in the box and the number of all, the grid, the polynomial, a bound of its error and the
+    largest one on a cell, slopes at the origin, and the bound of what lies beyond them."""
 
     unknown: Unknown
-    samples: int
+    taken: Sampled
+    found: int
+    grid: Grid
     polynomial: Polynomial
     error: Bound
     largest: Fraction
@@ -67,7 +70,7 @@ class FitResult:
             "data": {"sha256": self.sha256},
             "unknown": {
                 one.unknown.state: {
-                    "samples": one.samples,
+                    "samples": len(one.taken.values),
                     "terms": len(one.polynomial.powers),
                     "error": one.error.text(),
                     "largest_error": str(one.largest),
@@ -93,7 +96,7 @@ def fit_plant(
 
     Raises
     ------
-    InputError : a file cannot be read, or samples are no grid over domain and input bounds.
+    InputError : a file cannot be read, or the samples do not bound a function on the domain and the input bounds.
     Contradicted : no function with the bounds has these samples.
     """
     file = read_plant_file(structure)
@@ -107,11 +110,12 @@ def fit_plant(
     zeros = {**known, "dynamics": {**table, **{one.state: "0" for one in unknowns}}}
     system = build_system(replace(file, data=zeros))
     _require_at_rest(system, file)
-    grids, sha256 = read_samples(samples, unknowns, suffix_of(system))
-    found = tuple(_fitted(one, grids[one.state], noise(one.state), system, degree, samples) for one in unknowns)
+    taken, sha256 = read_samples(samples, unknowns, suffix_of(system))
+    found = tuple(_fitted(one, taken[one.state], noise(one.state), system, degree) for one in unknowns)
     said = [f'file = "{samples.name}"', f'sha256 = "{sha256}"']
     bounds = ", ".join(f'{one.state} = "{noise(one.state)}"' for one in unknowns)
-    said.append(f"noise = {{ {bounds} }}")
+    boxes = ", ".join(f"{one.unknown.state} = {{ {_sides(one.unknown)} }}" for one in found)
+    said += [f"noise = {{ {bounds} }}", f"box = {{ {boxes} }}"]
     text = "\n".join(_into(structure.read_text(encoding="utf-8").splitlines(), "samples", said))
     out.mkdir(parents=True, exist_ok=True)
     far = {one.unknown.state: (one.polynomial.text(), one.error.text()) for one in found}
@@ -128,18 +132,27 @@ def _require_at_rest(system: System, file: PlantFile) -> None:
         raise file.refuse("a structure with unknown functions must have x_eq and u_eq 0; found another.", "x_eq")
 
 
-def _fitted(one: Unknown, grid: Grid, noise: Fraction, system: System, degree: int, samples: Path) -> Fitted:
-    require_covered(system, one, grid, noise, str(samples))
+def _fitted(one: Unknown, taken: Sampled, noise: Fraction, system: System, degree: int) -> Fitted:
     if noise < 0:
         raise InputError(f"the bound of the noise must be at least 0; found {float(noise):g} for {one.state}.")
-    require_possible(one, grid, noise)
+    axes = axes_of(taken)
+    one = boxed(system, one, axes)
+    require_within(system, one, noise)
+    left = taken.within(one.box)
+    grid = enclosed(one, left, noise)
+    if grid.axes == axes:
+        require_possible(one, grid, noise)
     p = fitted(one, grid, degree)
     sizes = [max(abs(lo), abs(hi)) for lo, hi in (bounds_of(system)[name] for name in one.variables)]
-    each = errors(p, one, grid, noise)
-    error = bounded(one.variables, each)
-    a = tuple((slope.lo, slope.hi) for slope in slopes(one, grid, noise))
-    beyond = residual_text(one, sizes)
-    return Fitted(one, len(grid.values), p, error, max(each.values()), a, beyond)
+    each = errors(p, one, grid)
+    a = tuple((slope.lo, slope.hi) for slope in Sampling(one, left, noise).slopes())
+    return Fitted(one, left, len(taken.points), grid, p, bounded(one.variables, each), max(each.values()), a,
+                  residual_text(one, sizes))  # fmt: skip
+
+
+def _sides(one: Unknown) -> str:
+    """The box as a table of TOML."""
+    return ", ".join(f'{v} = ["{lo}", "{hi}"]' for v, (lo, hi) in zip(one.variables, one.box, strict=True))
 
 
 def _sum(one: Fitted) -> str:

@@ -1,4 +1,4 @@
-"""Samples of an unknown right-hand side on a grid, from a file.
+"""Samples of an unknown right-hand side, from a file.
 
 Numbers are the decimals of the file, as exact fractions: nothing here is rounded.
 """
@@ -8,30 +8,29 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
-from itertools import chain, product
-from math import prod
+from itertools import chain
 from pathlib import Path
 
 from certify.errors import InputError
 from certify.loop.plants.equations import decimal
-from certify.loop.plants.samples import Grid, Samples, Unknown
+from certify.loop.plants.samples import Point, Sampled, Samples, Unknown
 from certify.loop.plants.system import Interval, System
 
 _MOST_SAMPLES, _MOST_BITS = 200_000, 2**7  # bits of a number, as the checkers read them
 _LENGTH = "some 35 digits at most"
 
 
-def read_samples(path: Path, unknowns: Sequence[Unknown], suffix: str) -> tuple[dict[str, Grid], str]:
-    """The grid of each unknown, by its state, from a CSV file; and the sha256 of the file.
+def read_samples(path: Path, unknowns: Sequence[Unknown], suffix: str) -> tuple[dict[str, Sampled], str]:
+    """The samples of each unknown, by its state, from a CSV file; and the sha256 of the file.
 
     A column `NAME_rate` (`suffix`; in discrete time `NAME_next`) has the values of each unknown.
 
     Raises
     ------
-    InputError : the file cannot be read, a column or a number is missing, or the points are no grid.
+    InputError : the file cannot be read, or a column or a number is missing.
     """
     try:
         raw = path.read_bytes()
@@ -50,21 +49,37 @@ def read_samples(path: Path, unknowns: Sequence[Unknown], suffix: str) -> tuple[
     columns = {
         name: [_number(row, header.index(name), path, k) for k, row in enumerate(rows[1:], 2)] for name in wanted
     }
-    grids = {one.state: _grid(one, columns, f"{one.state}{suffix}", path) for one in unknowns}
-    return grids, hashlib.sha256(raw).hexdigest()
+    taken = {
+        one.state: Sampled(
+            tuple(zip(*(columns[v] for v in one.variables), strict=True)), tuple(columns[f"{one.state}{suffix}"])
+        )
+        for one in unknowns
+    }
+    return taken, hashlib.sha256(raw).hexdigest()
 
 
-def require_covered(system: System, one: Unknown, grid: Grid, noise: Fraction, which: str) -> None:
-    """Reject samples that do not reach over the domain, the input bounds and 0, or bounds of too long numbers."""
+def boxed(system: System, one: Unknown, axes: tuple[Point, ...] | None) -> Unknown:
+    """The unknown with its box: that of samples that are a grid over the domain, the input bounds and 0, else the box
+    of these."""
+    bounds = bounds_of(system)
+    box = tuple((min(lo, Fraction(0)), max(hi, Fraction(0))) for lo, hi in (bounds[name] for name in one.variables))
+    reach = tuple((axis[0], axis[-1]) for axis in axes or ())
+    if reach and all(a <= lo and hi <= b for (a, b), (lo, hi) in zip(reach, box, strict=True)):
+        box = reach
+    return replace(one, box=box)
+
+
+def require_within(system: System, one: Unknown, noise: Fraction) -> None:
+    """Reject a domain or input bounds beyond the box, and bounds of too long numbers."""
     bounds = bounds_of(system)
     if any(map(_is_long, (noise, *chain(*one.curvature)))):
         raise InputError(f"bounds of the noise and of second derivatives of {one.state} must have {_LENGTH}.")
-    for name, axis in zip(one.variables, grid.axes, strict=True):
+    for name, (first, last) in zip(one.variables, one.box, strict=True):
         lo, hi = bounds[name]
-        if not (axis[0] <= min(lo, Fraction(0)) and max(hi, Fraction(0)) <= axis[-1]):
+        if not (first <= lo and hi <= last):
             raise InputError(
-                f"samples {which} must reach over all of {name} in [{float(lo):g}, {float(hi):g}]; they reach over "
-                f"[{float(axis[0]):g}, {float(axis[-1]):g}]. Take more, or make the domain smaller."
+                f"{name} must lie in [{float(first):g}, {float(last):g}], where the bounds of second derivatives of "
+                f"{one.state} are assumed; found [{float(lo):g}, {float(hi):g}]. Fit again with that domain."
             )
 
 
@@ -81,13 +96,14 @@ def with_samples(system: System, samples: Samples, path: Path) -> System:
     ------
     InputError : the file is another one or cannot be read.
     """
-    grids, sha256 = read_samples(path, samples.unknowns, suffix_of(system))
+    taken, sha256 = read_samples(path, samples.unknowns, suffix_of(system))
     if sha256 != samples.sha256:
         raise InputError(
             f"data file {path} must be the one to which the plant was fitted, of sha256 {samples.sha256}; found "
             f"{sha256}. For other samples run certify fit again."
         )
-    return replace(system, samples=replace(samples, grids=grids))
+    taken = {one.state: taken[one.state].within(one.box) for one in samples.unknowns}
+    return replace(system, samples=replace(samples, taken=taken))
 
 
 def suffix_of(system: System) -> str:
@@ -107,19 +123,3 @@ def _number(row: Sequence[str], at: int, path: Path, line: int) -> Fraction:
 
 def _is_long(q: Fraction) -> bool:
     return max(q.numerator.bit_length(), q.denominator.bit_length()) > _MOST_BITS
-
-
-def _grid(one: Unknown, columns: Mapping[str, Sequence[Fraction]], name: str, path: Path) -> Grid:
-    points = list(zip(*(columns[v] for v in one.variables), strict=True))
-    axes = tuple(tuple(sorted(set(columns[v]))) for v in one.variables)
-    if len(points) != prod(map(len, axes)) or len(set(points)) != len(points):
-        shape = " x ".join(str(len(axis)) for axis in axes)
-        raise InputError(
-            f"samples {path} must be a grid in {', '.join(one.variables)}: each combination of their values in one "
-            f"row; {shape} values need {prod(map(len, axes)):,} rows, found {len(points):,}."
-        )
-    values = dict(zip(points, columns[name], strict=True))
-    thin = next((v for v, axis in zip(one.variables, axes, strict=True) if len(axis) < 2), None)
-    if thin is not None or set(product(*axes)) != set(values):
-        raise InputError(f"samples {path} must have two values or more of each of {', '.join(one.variables)}.")
-    return Grid(axes, values)

@@ -9,17 +9,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import product
 from math import prod
 from typing import Any
 
-from certify.analysis.fitting.linear import least_square, slopes
+from certify.analysis.fitting.grid import enclosed
+from certify.analysis.fitting.linear import Sampling, least_square
 from certify.analysis.fitting.polynomial import Bound, Polynomial, errors
-from certify.analysis.fitting.samples import bounds_of, require_covered
+from certify.analysis.fitting.samples import bounds_of, require_within
 from certify.certificates.samples import SampleBounds, Standing, Weights
 from certify.errors import InputError
 from certify.loop.expressions import to_tree
-from certify.loop.plants import Grid, Samples, System, Unknown
+from certify.loop.plants import Sampled, Samples, System, Unknown
 from certify.loop.plants.samples import slope_name
 from certify.loop.plants.unknown import residual_name
 
@@ -54,25 +54,26 @@ def standing_for(system: System, samples: Samples) -> SampleBounds:
     Raises
     ------
     InputError : an equation is not as `certify fit` writes it, a range or a bound does not hold all that the samples
-        leave, or the samples do not reach over the domain and the input bounds.
+        leave, or the domain or the input bounds reach beyond the box.
     """
-    return tuple(_standing(system, one, samples.grids[one.state], samples.noise[one.state]) for one in samples.unknowns)
+    return tuple(_standing(system, one, samples.taken[one.state], samples.noise[one.state]) for one in samples.unknowns)
 
 
-def _standing(system: System, one: Unknown, grid: Grid, noise: Fraction) -> Standing:
-    require_covered(system, one, grid, noise, f"of {one.state}")
+def _standing(system: System, one: Unknown, taken: Sampled, noise: Fraction) -> Standing:
+    require_within(system, one, noise)
     found = _equation(system, one)
     if found.error is not None and not (system.ranges[found.error][0] <= -1 and system.ranges[found.error][1] >= 1):
         raise InputError(f"the range of {found.error} must hold [-1, 1], as certify fit writes it.")
     if found.slopes:
-        return Standing(found.error, found.slopes, _of_slopes(system, found, grid, noise))
+        return Standing(found.error, found.slopes, (), _of_slopes(system, found, Sampling(one, taken, noise)))
     p = Polynomial(one.variables, (Fraction(1),) * len(one.variables), tuple(found.P), tuple(found.P.values()))
-    if any(e > found.E.least(cell) for cell, e in errors(p, one, grid, noise).items()):
+    grid = enclosed(one, taken, noise)
+    if any(e > found.E.least(cell) for cell, e in errors(p, one, grid).items()):
         raise found.refused("a bound [residual] that holds all that the samples allow")
-    return Standing(found.error)
+    return Standing(found.error, (), grid.axes, tuple((each.lower, each.upper) for each in grid.bounds.values()))
 
 
-def _of_slopes(system: System, found: Equation, grid: Grid, noise: Fraction) -> tuple[tuple[Weights, Weights], ...]:
+def _of_slopes(system: System, found: Equation, sampling: Sampling) -> tuple[tuple[Weights, Weights], ...]:
     """The weights of samples that show the ranges of the slopes at the origin."""
     one, d = found.unknown, len(found.slopes)
     if {tuple(int(i % d == j) for i in range(2 * d)): Fraction(1) for j in range(d)} != found.P:
@@ -80,16 +81,15 @@ def _of_slopes(system: System, found: Equation, grid: Grid, noise: Fraction) -> 
     sizes = [max(abs(lo), abs(hi)) for lo, hi in (bounds_of(system)[name] for name in one.variables)]
     if found.E.constant or any(k < q for k, q in zip(found.E.rise, least_square(one, sizes), strict=True)):
         raise found.refused("a bound [residual] that holds what second derivatives allow beyond the linear part")
-    number, weights = {z: k for k, z in enumerate(product(*grid.axes))}, list[tuple[Weights, Weights]]()
-    for name, slope in zip(found.slopes, slopes(one, grid, noise), strict=True):
+    weights = list[tuple[Weights, Weights]]()
+    for name, slope in zip(found.slopes, sampling.slopes(), strict=True):
         lo, hi = system.ranges[name]
         if not lo <= slope.lo <= slope.hi <= hi:
             raise InputError(
                 f"the range of {name} must hold all that the samples leave, [{float(slope.lo):.9g}, "
                 f"{float(slope.hi):.9g}]; found [{float(lo):.9g}, {float(hi):.9g}]. certify fit writes such ranges."
             )
-        lower, upper = (tuple((number[z], v) for z, v in by.items() if v) for by in (slope.lower, slope.upper))
-        weights.append((lower, upper))
+        weights.append((slope.lower, slope.upper))
     return tuple(weights)
 
 

@@ -56,7 +56,7 @@ class Setting:
         elif system.measurements is not None:
             with self.tools.timing("data"):
                 state = _identified(state, system.measurements)
-        if system.samples is not None and not system.samples.grids:
+        if system.samples is not None and not system.samples.taken:
             state = _without_samples(state)
         elif system.samples is not None:
             with self.tools.timing("data"):

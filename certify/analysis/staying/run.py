@@ -81,7 +81,7 @@ def certify_invariant(
             "`claim` invariant must be about a plant in continuous time whose input follows the state at once; the "
             f"time of {system.name} goes in steps."
         )
-    if (system.measurements and system.measurements.runs) or (system.samples and system.samples.grids):
+    if (system.measurements and system.measurements.runs) or (system.samples and system.samples.taken):
         raise OptionError(
             "`claim` invariant must be for ranges as they stand: no such claim has measurements yet; leave out `data`."
         )

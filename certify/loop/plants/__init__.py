@@ -15,7 +15,7 @@ from certify.loop.plants.linear import Controllability, Matrix, controllability,
 from certify.loop.plants.measurements import Axis, Measurements, Run
 from certify.loop.plants.operating_point import require_equilibrium, residuals, rests_where
 from certify.loop.plants.registry import available_systems, chosen_system, get_system, shipped_system
-from certify.loop.plants.samples import Grid, Samples, Unknown
+from certify.loop.plants.samples import Sampled, Samples, Unknown
 from certify.loop.plants.system import System, exact
 from certify.loop.plants.toml import load_system
 from certify.loop.plants.uncertainty import at_values, corners, input_errors, kind_of, with_input_errors
@@ -24,10 +24,10 @@ from certify.loop.plants.validation import require_origin_inside
 __all__ = [
     "Axis",
     "Controllability",
-    "Grid",
     "Matrix",
     "Measurements",
     "Run",
+    "Sampled",
     "Samples",
     "System",
     "Unknown",

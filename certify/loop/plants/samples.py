@@ -1,4 +1,4 @@
-"""Functions of which nobody wrote down the equations: bounds of their second derivatives, and samples on a grid."""
+"""Functions of which nobody wrote down the equations: bounds of their second derivatives, and samples."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 Point = tuple[Fraction, ...]
+Box = tuple[tuple[Fraction, Fraction], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,26 +18,33 @@ class Unknown:
     ----------
     state : its name.
     variables : names of the states and inputs that g depends on, and of no others.
-    curvature : bounds of the absolute second derivatives of g wherever the grid of samples reaches, (d, d), symmetric.
+    curvature : bounds of the absolute second derivatives of g on the box, (d, d), symmetric.
+    box : the interval of each variable on which they hold; () before there are samples.
     """
 
     state: str
     variables: tuple[str, ...]
     curvature: tuple[Point, ...]
+    box: Box = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
-    """Samples of g at all points of a grid.
+class Sampled:
+    """Samples of g.
 
     Parameters
     ----------
-    axes : the values of each variable, ascending.
-    values : g at each point, by the point; each is off by at most the noise.
+    points : where they were taken, anywhere and in any order.
+    values : of g there, each off by at most the noise.
     """
 
-    axes: tuple[Point, ...]
-    values: Mapping[Point, Fraction]
+    points: tuple[Point, ...]
+    values: Point
+
+    def within(self, box: Box) -> Sampled:
+        """The samples in a box."""
+        kept = [k for k, z in enumerate(self.points) if all(lo <= v <= hi for v, (lo, hi) in zip(z, box, strict=True))]
+        return Sampled(tuple(self.points[k] for k in kept), tuple(self.values[k] for k in kept))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,13 +56,13 @@ class Samples:
     sha256 : of the file of samples, 64 hexadecimal digits.
     unknowns : the functions.
     noise : the bound of a sample's error, by the state's name.
-    grids : the samples, by the state's name; empty where only the file is known.
+    taken : the samples, by the state's name; empty where only the file is known.
     """
 
     sha256: str
     unknowns: tuple[Unknown, ...]
     noise: Mapping[str, Fraction]
-    grids: Mapping[str, Grid]
+    taken: Mapping[str, Sampled]
 
 
 def slope_name(state: str, variable: str) -> str:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
 from certify.loop.expressions import Expression, Operation, Symbol
 from certify.loop.plants.axes import axes_of
 from certify.loop.plants.measurements import Axis, Measurements
-from certify.loop.plants.samples import Samples, Unknown
+from certify.loop.plants.samples import Box, Samples, Unknown
 from certify.loop.plants.source import PlantFile, interval_at, interval_in, number_at
 from certify.loop.plants.system import Interval
 
 _DATA = ("file", "sha256", "period", "noise", "priors", "axes")
-_SAMPLES = ("file", "sha256", "noise")
+_SAMPLES = ("file", "sha256", "noise", "box")
 _DIGITS = frozenset("0123456789abcdef")
 
 
@@ -203,7 +204,18 @@ def samples_in(file: PlantFile, states: Sequence[str], inputs: Sequence[str]) ->
     bounds = {state: number_at(file, noise[state], "samples", "noise", state) for state in named}
     if min(bounds.values()) < 0:
         raise file.refuse("must be at least 0.", "samples", "noise")
-    return Samples(_file_of(file, "samples"), unknowns, bounds, {})
+    _inner(file, "samples", "box", named, "unknown function")
+    boxed = tuple(replace(one, box=_box(file, one)) for one in unknowns)
+    return Samples(_file_of(file, "samples"), boxed, bounds, {})
+
+
+def _box(file: PlantFile, one: Unknown) -> Box:
+    """The box on which the bounds of second derivatives hold."""
+    found = file.table("samples")["box"].get(one.state)
+    if not isinstance(found, dict) or {*found} != {*one.variables}:
+        what = f"must be a table of intervals of {', '.join(one.variables)}; found {found!r:.80}."
+        raise file.refuse(what, "samples", "box", one.state)
+    return tuple(interval_in(file, found[name], "samples", "box", one.state, name) for name in one.variables)
 
 
 def _file_of(file: PlantFile, table: str) -> str:

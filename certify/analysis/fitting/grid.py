@@ -1,0 +1,105 @@
+"""A grid over the box of an unknown function, with an interval at each point that holds the function there.
+
+Samples on a grid are such a grid themselves. Among scattered ones it is chosen: an axis is halved where second
+derivatives add more between two of its values than samples leave open at them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+from itertools import pairwise, product
+from math import floor, log10, prod
+
+import numpy as np
+
+from certify.analysis.fitting.linear import Bounds, Sampling
+from certify.loop.plants.samples import Box, Point, Sampled, Unknown
+
+_MOST = 1500  # points of a grid that is chosen
+_SHARE = 0.25  # of an interval's half width that second derivatives may add along an axis
+Interval = tuple[Fraction, Fraction]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Intervals of g at the points of a grid.
+
+    Parameters
+    ----------
+    axes : the values of each variable, ascending, from end to end of the box.
+    bounds : an interval of g at each point, the last axis fastest, with the weights that show it.
+    """
+
+    axes: tuple[Point, ...]
+    bounds: Mapping[Point, Bounds]
+
+    @cached_property
+    def middles(self) -> dict[Point, Fraction]:
+        """The middle of each interval."""
+        return {p: (each.lo + each.hi) / 2 for p, each in self.bounds.items()}
+
+
+def axes_of(taken: Sampled) -> tuple[Point, ...] | None:
+    """The axes of samples that are a grid, one at each of its points; None of others."""
+    axes = tuple(tuple(sorted(set(column))) for column in zip(*taken.points, strict=True))
+    whole = prod(map(len, axes)) == len(taken.points) == len(set(taken.points)) and min(map(len, axes)) > 1
+    return axes if whole else None
+
+
+def enclosed(one: Unknown, taken: Sampled, noise: Fraction) -> Grid:
+    """A grid over the box: that of the samples, or one that is chosen.
+
+    Raises
+    ------
+    InputError : the samples do not span the variables.
+    Contradicted : no function with the bounds has these samples.
+    """
+    axes = axes_of(taken)
+    if axes is not None and _reach(axes) == one.box:
+        one_of = {z: ((k, Fraction(1)),) for k, z in enumerate(taken.points)}
+        value = dict(zip(taken.points, taken.values, strict=True))
+        return Grid(axes, {z: Bounds(value[z] - noise, value[z] + noise, one_of[z], one_of[z]) for z in product(*axes)})
+    sampling, found = Sampling(one, taken, noise), dict[Point, Bounds]()
+    finer: tuple[Point, ...] | None = one.box
+    while finer is not None:
+        axes = finer
+        for p in product(*axes):
+            if p not in found:
+                found[p] = _outwards(sampling.at(p))
+        finer = _finer(one, axes, found)
+    return Grid(axes or (), {p: found[p] for p in product(*(axes or ()))})
+
+
+def _reach(axes: tuple[Point, ...]) -> Box:
+    return tuple((axis[0], axis[-1]) for axis in axes)
+
+
+def _outwards(found: Bounds) -> Bounds:
+    """The interval with shorter ends, wider by a millionth at most."""
+    width = found.hi - found.lo
+    if not width:
+        return found
+    unit = Fraction(10) ** (floor(log10(width)) - 6)
+    return found._replace(lo=found.lo // unit * unit, hi=-(-found.hi // unit) * unit)
+
+
+def _finer(one: Unknown, axes: tuple[Point, ...], found: Mapping[Point, Bounds]) -> tuple[Point, ...] | None:
+    """The axes with the middles of all pairs of values between which g may bend too much, those first that do most, as
+    long as the grid is small; None if nothing changes."""
+    half = np.array([float(found[p].hi - found[p].lo) / 2 for p in product(*axes)]).reshape([len(a) for a in axes])
+    bent = list[tuple[float, int, Fraction]]()
+    for j, axis in enumerate(axes):
+        for i, (lo, hi) in enumerate(pairwise(axis)):
+            most = _SHARE * float(np.median(half.take((i, i + 1), axis=j)))
+            bend = float(one.curvature[j][j] * (hi - lo) ** 2) / 8
+            if bend > most:
+                bent.append((bend / most if most else np.inf, j, (lo + hi) / 2))
+    more = [list(axis) for axis in axes]
+    for _, j, middle in sorted(bent, key=lambda each: each[0], reverse=True):
+        if prod(len(axis) + (k == j) for k, axis in enumerate(more)) <= _MOST:
+            more[j].append(middle)
+    finer = tuple(tuple(sorted(axis)) for axis in more)
+    return None if finer == axes else finer
