@@ -312,7 +312,8 @@ def on_cells(f: Function, P: Terms, E: Terms, name: str) -> Iterator[tuple[str, 
             yield name, f"weights must have the sum 1 and give their point, {_shown_point(p)}"
         if not lo <= hi:
             yield name, f"the samples contradict the declared bounds, at {_shown_point(p)}"
-        off[p] = max(hi - at(P, p), at(P, p) - lo)
+        middle = at(P, p)
+        off[p] = max(hi - middle, middle - lo)
     for cell in product(*(tuple(pairwise(axis)) for axis in f.axes)):
         bend = sum((M[j] * ((hi - lo) / 2) ** 2 for j, (M, (lo, hi)) in enumerate(zip(f.curvature, cell, strict=True))),
                    ZERO)  # fmt: skip

@@ -15,11 +15,11 @@ from certify.cli.terminal import say
 from certify.errors import InputError
 
 if TYPE_CHECKING:
-    from certify.analysis.fitting.run import FitResult
+    from certify.analysis.fitting.run import FitResult, Fitted
 
 
 def fit(
-    samples: Annotated[Path, typer.Argument(help="Samples on a grid: .csv.")],
+    samples: Annotated[Path, typer.Argument(help="Samples, on a grid or scattered: .csv.")],
     structure: Annotated[
         Path, typer.Option(metavar="PLANT.toml", help="The plant, with a table [unknown.STATE] for each unknown.")
     ],
@@ -32,8 +32,8 @@ def fit(
 ) -> None:
     """Fit functions that nobody wrote down, with bounds of what they may be off by.
 
-    The bounds of second derivatives in the structure are what is assumed, wherever the grid of samples reaches. The
-    exit status is 1 if the samples refute them.
+    The bounds of second derivatives in the structure are what is assumed, on the domain and the input bounds, and as far
+    as a grid of samples reaches. The exit status is 1 if the samples refute them.
     """
     from certify.analysis.fitting.linear import Contradicted
     from certify.analysis.fitting.run import fit_plant
@@ -49,14 +49,28 @@ def fit(
     try:
         result = fit_plant(samples, structure, of, out, degree)
     except Contradicted as error:
-        what = (
-            "these samples refute the bounds of second derivatives and of the noise, as far as the grid reaches, or "
-            "that 0 is an equilibrium"
-        )
+        what = "these samples refute the bounds of second derivatives and of the noise, or that 0 is an equilibrium"
         found = {"verdict": "REFUTED", "reason": f"{what}: {error}"}
         say(json.dumps(found) if as_json else f"REFUTED  {found['reason']}")
         raise typer.Exit(1) from None
     say(json.dumps(result.to_dict()) if as_json else "\n".join(_lines(result)))
+
+
+def _scattered(one: Fitted) -> list[str]:
+    """Lines about samples that are no grid over the domain."""
+    if not one.missing.points:
+        return []
+    p, left = one.missing.points[0], one.found - len(one.sampling.values)
+    half = (one.grid.bounds[p].hi - one.grid.bounds[p].lo) / 2
+    where = ", ".join(f"{v} = {float(q):.4g}" for v, q in zip(one.unknown.variables, p, strict=True))
+    lines = [f"scattered    {one.unknown.state} is bounded at {len(one.grid.bounds):,} points of a grid"]
+    if left:
+        lines.append(f"left out     {left:,} samples beyond the domain or the input bounds")
+    lines.append(f"missing      samples near {where}, where it is known within {float(half):.3g}")
+    if one.missing.largest is not None:
+        more = f"{len(one.missing.points):,} more, at points that --json names"
+        lines.append(f"try next     {more}: they would bring the largest error to about {one.missing.largest:.3g}")
+    return lines
 
 
 def _lines(result: FitResult) -> list[str]:
@@ -65,14 +79,15 @@ def _lines(result: FitResult) -> list[str]:
     lines = []
     for one in result.found:
         state = one.unknown.state
-        lines.append(f"FITTED  {state}: {len(one.taken.values):,} samples, {len(one.polynomial.powers)} terms")
+        lines.append(f"FITTED  {state}: {len(one.sampling.values):,} samples, {len(one.polynomial.powers)} terms")
         bound, rise = one.error, zip(one.unknown.variables, one.error.rise, strict=True)
         more = "".join(f" + {above(k)} {v}^2" for v, k in rise if k)
         lines.append(f"error        at most {above(bound.constant)}{more}, on every cell at most {above(one.largest)}")
         for v, (lo, hi) in zip(one.unknown.variables, one.slopes, strict=True):
             lines.append(f"slope        {v}: {below(lo)} to {above(hi)}")
         lines.append(f"beyond       at most {one.beyond}")
-    assumed = "the bounds of second derivatives and of the noise, as far as the grid reaches"
+        lines += _scattered(one)
+    assumed = "the bounds of second derivatives and of the noise, as far as a grid of samples or the domain reaches"
     lines.append(f"assumed      {assumed}, and that 0 is an equilibrium")
     lines.append("in a claim   with certify roa --data, for which both checkers derive error and slopes again")
     return [*lines, f"far          {result.far}", f"near         {result.near}"]

@@ -18,8 +18,8 @@ import numpy as np
 from certify.analysis.fitting.linear import Bounds, Sampling
 from certify.loop.plants.samples import Box, Point, Sampled, Unknown
 
-_MOST = 1500  # points of a grid that is chosen
-_SHARE = 0.25  # of an interval's half width that second derivatives may add along an axis
+_MOST = 1000  # points of a grid that is chosen
+_SHARE = 0.1  # of an interval's half width that second derivatives may add along an axis
 Interval = tuple[Fraction, Fraction]
 
 
@@ -49,7 +49,7 @@ def axes_of(taken: Sampled) -> tuple[Point, ...] | None:
     return axes if whole else None
 
 
-def enclosed(one: Unknown, taken: Sampled, noise: Fraction) -> Grid:
+def enclosed(sampling: Sampling) -> Grid:
     """A grid over the box: that of the samples, or one that is chosen.
 
     Raises
@@ -57,12 +57,13 @@ def enclosed(one: Unknown, taken: Sampled, noise: Fraction) -> Grid:
     InputError : the samples do not span the variables.
     Contradicted : no function with the bounds has these samples.
     """
+    one, taken, noise = sampling.one, sampling.taken, sampling.noise
     axes = axes_of(taken)
     if axes is not None and _reach(axes) == one.box:
         one_of = {z: ((k, Fraction(1)),) for k, z in enumerate(taken.points)}
         value = dict(zip(taken.points, taken.values, strict=True))
         return Grid(axes, {z: Bounds(value[z] - noise, value[z] + noise, one_of[z], one_of[z]) for z in product(*axes)})
-    sampling, found = Sampling(one, taken, noise), dict[Point, Bounds]()
+    found = dict[Point, Bounds]()
     finer: tuple[Point, ...] | None = one.box
     while finer is not None:
         axes = finer

@@ -29,7 +29,7 @@ class Contradicted(CertifyError):
     """The samples are of no function with these bounds of second derivatives, this noise and the value 0 at 0."""
 
 
-_MOST = 400  # samples, those of the least bounds, that the programs see
+_MOST = 200  # samples, those of the least bounds, that the programs see
 
 
 def beyond(one: Unknown, z: Point) -> Fraction:
@@ -56,9 +56,16 @@ class Row(NamedTuple):
 
 
 class Sampling:
-    """Samples of a function, of which linear programs ask."""
+    """Samples of a function in its box, of which linear programs ask.
+
+    Raises
+    ------
+    InputError : there are none.
+    """
 
     def __init__(self, one: Unknown, taken: Sampled, noise: Fraction) -> None:
+        if not taken.points:
+            raise InputError(f"no sample of {one.state} lies in the domain and the input bounds: take some there.")
         self.one, self.taken, self.noise = one, taken, noise
         self.points = np.array([[float(v) for v in z] for z in taken.points])
         self.values, self.M = np.array([float(y) for y in taken.values]), np.array(one.curvature, dtype=float)

@@ -12,6 +12,7 @@ the intervals bound. p is any polynomial: how it is found decides how small the 
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -174,3 +175,29 @@ def bounded(variables: tuple[str, ...], each: Mapping[Cell, Fraction], flat: boo
         e - sum((k * q for k, q in zip(rise, least[cell], strict=True)), Fraction(0)) for cell, e in each.items()
     )
     return Bound(variables, Fraction(-(-max(missed, Fraction(0)) * _HELD // 1), _HELD), tuple(rise))
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """Points of a grid at which samples are missing, those first where the interval is widest; with samples there the
+    largest error on a cell would be at most `largest`, half of what it is, if their values are the intervals' middles.
+    Where no number of points does that, the first alone and no bound."""
+
+    points: tuple[Point, ...] = ()
+    largest: float | None = None
+
+
+def missing(p: Polynomial, grid: Grid, each: Mapping[Cell, Fraction], noise: Fraction) -> Missing:
+    """The fewest of the widest points of a chosen grid that halve the largest error, in floats."""
+    points = sorted(grid.bounds, key=lambda z: grid.bounds[z].hi - grid.bounds[z].lo, reverse=True)
+    away = {z: float(abs(grid.middles[z] - p.at(z))) for z in points}
+    half = {z: float(grid.bounds[z].hi - grid.bounds[z].lo) / 2 for z in points}
+    bend = {cell: float(e) - max(away[z] + half[z] for z in product(*cell)) for cell, e in each.items()}
+
+    def largest(count: int) -> float:
+        off = {z: away[z] + (float(noise) if k < count else half[z]) for k, z in enumerate(points)}
+        return max(b + max(off[z] for z in product(*cell)) for cell, b in bend.items())
+
+    goal = float(max(each.values())) / 2
+    count = bisect_left(range(len(points) + 1), -goal, key=lambda k: -largest(k))
+    return Missing(tuple(points[:count]), largest(count)) if count <= len(points) else Missing(tuple(points[:1]))

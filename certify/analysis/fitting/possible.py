@@ -1,4 +1,5 @@
-"""Samples of which no function with the declared bounds can be found: differences of samples show it, in rationals."""
+"""Samples of which no function with the declared bounds can be found: differences of samples on a grid show it, in
+rationals, or weights of scattered ones."""
 
 from __future__ import annotations
 
@@ -9,8 +10,11 @@ from itertools import combinations, product
 import numpy as np
 
 from certify.analysis.fitting.grid import Grid
-from certify.analysis.fitting.linear import Contradicted
+from certify.analysis.fitting.linear import Contradicted, Sampling
+from certify.analysis.fitting.polynomial import Polynomial
 from certify.loop.plants.samples import Point, Unknown
+
+_ASKED = 200  # scattered samples
 
 
 def require_possible(one: Unknown, grid: Grid, noise: Fraction) -> None:
@@ -44,6 +48,19 @@ def require_possible(one: Unknown, grid: Grid, noise: Fraction) -> None:
             if abs(p + q - r - s) > one.curvature[i][j] * (high[i] - low[i]) * (high[j] - low[j]) + 4 * noise:
                 both, where = f"{one.variables[i]} and {one.variables[j]}", f"{_words(one, low)} to {_words(one, high)}"
                 raise Contradicted(f"{one.state} bends more along {both} from {where}")
+
+
+def require_consistent(sampling: Sampling, p: Polynomial) -> None:
+    """Reject scattered samples of which one contradicts those around it; those farthest from the polynomial are asked.
+
+    Raises
+    ------
+    Contradicted : no function with these bounds has such samples.
+    """
+    taken = sampling.taken
+    off = [abs(y - p.at(z)) for z, y in zip(taken.points, taken.values, strict=True)]
+    for k in sorted(range(len(off)), key=lambda k: off[k], reverse=True)[:_ASKED]:
+        sampling.at(taken.points[k])
 
 
 def _twisted_most(one: Unknown, grid: Grid, values: np.ndarray, steps: Mapping[int, int]) -> tuple[Point, Point]:

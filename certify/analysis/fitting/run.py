@@ -19,8 +19,8 @@ from typing import Any
 
 from certify.analysis.fitting.grid import Grid, axes_of, enclosed
 from certify.analysis.fitting.linear import Sampling, residual_text
-from certify.analysis.fitting.polynomial import Bound, Polynomial, bounded, errors, fitted
-from certify.analysis.fitting.possible import require_possible
+from certify.analysis.fitting.polynomial import Bound, Missing, Polynomial, bounded, errors, fitted, missing
+from certify.analysis.fitting.possible import require_consistent, require_possible
 from certify.analysis.fitting.samples import bounds_of, boxed, read_samples, require_within, suffix_of
 from certify.certificates import write_atomically
 from certify.errors import InputError
@@ -35,11 +35,17 @@ Interval = tuple[Fraction, Fraction]
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """One unknown: its samples in the box and the number of all, the grid, the polynomial, a bound of its error and the
-    largest one on a cell, slopes at the origin, and the bound of what lies beyond them."""
+    """One unknown.
 
-    unknown: Unknown
-    taken: Sampled
+    Parameters
+    ----------
+    sampling : its samples in the box, of which there are `found` in the file.
+    grid, polynomial, error, largest : the polynomial, and a bound of its error, whose largest value is on some cell.
+    slopes, beyond : intervals of the slopes at the origin, and the bound of what lies beyond them.
+    missing : what more samples would help.
+    """
+
+    sampling: Sampling
     found: int
     grid: Grid
     polynomial: Polynomial
@@ -47,6 +53,11 @@ class Fitted:
     largest: Fraction
     slopes: tuple[Interval, ...]
     beyond: str
+    missing: Missing
+
+    @property
+    def unknown(self) -> Unknown:
+        return self.sampling.one
 
     def of_variables(self) -> Iterator[tuple[str, Interval]]:
         """The variables with the ranges of their slopes."""
@@ -70,12 +81,15 @@ class FitResult:
             "data": {"sha256": self.sha256},
             "unknown": {
                 one.unknown.state: {
-                    "samples": len(one.taken.values),
+                    "samples": len(one.sampling.values),
+                    "left_out": one.found - len(one.sampling.values),
+                    "grid": len(one.grid.bounds),
                     "terms": len(one.polynomial.powers),
                     "error": one.error.text(),
                     "largest_error": str(one.largest),
                     "slopes": {v: [str(lo), str(hi)] for v, (lo, hi) in one.of_variables()},
                     "beyond": one.beyond,
+                    "missing": [list(map(str, point)) for point in one.missing.points],
                 }
                 for one in self.found
             },
@@ -138,16 +152,19 @@ def _fitted(one: Unknown, taken: Sampled, noise: Fraction, system: System, degre
     axes = axes_of(taken)
     one = boxed(system, one, axes)
     require_within(system, one, noise)
-    left = taken.within(one.box)
-    grid = enclosed(one, left, noise)
+    sampling = Sampling(one, taken.within(one.box), noise)
+    grid = enclosed(sampling)
     if grid.axes == axes:
         require_possible(one, grid, noise)
     p = fitted(one, grid, degree)
+    if grid.axes != axes:
+        require_consistent(sampling, p)
     sizes = [max(abs(lo), abs(hi)) for lo, hi in (bounds_of(system)[name] for name in one.variables)]
     each = errors(p, one, grid)
-    a = tuple((slope.lo, slope.hi) for slope in Sampling(one, left, noise).slopes())
-    return Fitted(one, left, len(taken.points), grid, p, bounded(one.variables, each), max(each.values()), a,
-                  residual_text(one, sizes))  # fmt: skip
+    a = tuple((slope.lo, slope.hi) for slope in sampling.slopes())
+    more = Missing() if grid.axes == axes else missing(p, grid, each, noise)
+    bound, beyond = bounded(one.variables, each), residual_text(one, sizes)
+    return Fitted(sampling, len(taken.points), grid, p, bound, max(each.values()), a, beyond, more)
 
 
 def _sides(one: Unknown) -> str:

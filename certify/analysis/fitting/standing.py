@@ -61,13 +61,14 @@ def standing_for(system: System, samples: Samples) -> SampleBounds:
 
 def _standing(system: System, one: Unknown, taken: Sampled, noise: Fraction) -> Standing:
     require_within(system, one, noise)
+    sampling = Sampling(one, taken, noise)
     found = _equation(system, one)
     if found.error is not None and not (system.ranges[found.error][0] <= -1 and system.ranges[found.error][1] >= 1):
         raise InputError(f"the range of {found.error} must hold [-1, 1], as certify fit writes it.")
     if found.slopes:
-        return Standing(found.error, found.slopes, (), _of_slopes(system, found, Sampling(one, taken, noise)))
+        return Standing(found.error, found.slopes, (), _of_slopes(system, found, sampling))
     p = Polynomial(one.variables, (Fraction(1),) * len(one.variables), tuple(found.P), tuple(found.P.values()))
-    grid = enclosed(one, taken, noise)
+    grid = enclosed(sampling)
     if any(e > found.E.least(cell) for cell, e in errors(p, one, grid).items()):
         raise found.refused("a bound [residual] that holds all that the samples allow")
     return Standing(found.error, (), grid.axes, tuple((each.lower, each.upper) for each in grid.bounds.values()))
