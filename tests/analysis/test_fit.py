@@ -251,7 +251,9 @@ def test_samples_that_refute_the_bounds(
         rows = [row.rsplit(",", 1) for row in samples.read_text().splitlines()[1:]]
         samples.write_text("x,v,u,v_rate\n" + "\n".join(f"{z},{float(y) + 3!r}" for z, y in rows))
     assert _run(asked, False) == 1
-    said = "REFUTED  these samples refute the bounds of second derivatives and of the noise, or that 0 is an equilibrium"
+    said = (
+        "REFUTED  these samples refute the bounds of second derivatives and of the noise, or that 0 is an equilibrium"
+    )
     assert capsys.readouterr().out.startswith(said)
     assert not (tmp_path / "out").exists()
 
