@@ -20,7 +20,7 @@ from certify.analysis.fitting.grid import Grid, enclosed
 from certify.analysis.fitting.linear import Bounds, Contradicted, Sampling, beyond
 from certify.analysis.fitting.polynomial import bounded, errors, fitted
 from certify.analysis.fitting.possible import require_possible
-from certify.analysis.fitting.run import fit_plant
+from certify.analysis.fitting.run import Fitted, fit_plant
 from certify.analysis.stated import stated
 from certify.certificates import Certificate, parse_certificate
 from certify.cli.main import _run
@@ -124,6 +124,51 @@ def within(truth: Truth, share: float = 1.0, scattered: bool = False) -> tuple[b
 @pytest.mark.parametrize("seed", slow_after(8, range(60)))
 def test_the_truth_is_within_what_is_found(seed: int, scattered: bool) -> None:
     assert within(Truth(seed), scattered=scattered) == (True, True)
+
+
+@pytest.mark.parametrize("seed", slow_after(10, range(100)))
+def test_an_interval_holds_the_truth(seed: int) -> None:
+    """At random points of the box, among scattered samples and far from all of them."""
+    truth = Truth(seed)
+    sampling = Sampling(truth.unknown(), truth.samples(True), Fraction(truth.noise) + Fraction(1, 10**12))
+    for z in truth.draw.uniform(-2, 2, (20, truth.d)).round(4):
+        lo, hi, *both = sampling.at(tuple(map(decimal, z.tolist())))
+        assert float(lo) - 1e-9 <= float(truth(z[None])[0]) <= float(hi) + 1e-9
+        assert all(sum(v for _, v in weights) == 1 for weights in both)
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("noise", [Fraction(0), Fraction(1, 100)])
+def test_an_interval_is_sharp(seed: int, noise: Fraction) -> None:
+    """A quadratic function that bends as much as is declared, and whose samples are off by all the noise, is at the end
+    of its interval in the middle of d + 1 samples around it; with less of either it is outside."""
+    draw = np.random.default_rng(seed)
+    d = int(draw.integers(1, 4))
+    M = [Fraction(int(v), 10) for v in draw.integers(1, 50, d)]
+    p, a, sign = (
+        tuple(Fraction(int(v), 10) for v in draw.integers(-5, 6, d)),
+        draw.integers(-5, 6, d).tolist(),
+        seed % 2 * 2 - 1,
+    )
+    steps = [tuple(Fraction(int(v), 10) for v in row) for row in draw.integers(1, 9, (d, d)) * np.eye(d, dtype=int)]
+    steps.append(tuple(Fraction(-int(v), 10) for v in draw.integers(1, 9, d)))  # with the others around 0
+    points = tuple(tuple(map(sum, zip(p, s, strict=True))) for s in steps)
+    bend = [sum((m * v * v for m, v in zip(M, s, strict=True)), Fraction(0)) / 2 for s in steps]
+    values = tuple(sum((k * v for k, v in zip(a, z, strict=True)), Fraction(0)) + sign * (b + noise)
+                   for z, b in zip(points, bend, strict=True))  # fmt: skip
+    true = sum((k * v for k, v in zip(a, p, strict=True)), Fraction(0))
+
+    def interval(share: Fraction, off: Fraction) -> Bounds:
+        rows = tuple(tuple(share * m * (i == j) for j in range(d)) for i, m in enumerate(M))
+        one = Unknown("y", tuple(f"z{j}" for j in range(d)), rows, ((Fraction(-2), Fraction(2)),) * d)
+        return Sampling(one, Sampled(points, values), off).at(p)
+
+    found = interval(Fraction(1), noise)
+    assert (found.lo if sign > 0 else found.hi) == true
+    less = Fraction(1) - Fraction(1, 10**9)
+    for share, off in ((less, noise), (Fraction(1), less * noise)):
+        lo, hi, *_ = interval(share, off)
+        assert (share, off) == (1, noise) or not lo <= true <= hi
 
 
 def test_understated_bounds_lose_the_truth_or_are_refuted() -> None:
@@ -274,6 +319,72 @@ def test_one_sample_that_refutes_the_bounds(
     assert said in capsys.readouterr().out
 
 
+def scattered_rows(count: int, off: float = 0.0) -> str:
+    """Samples of the same function at random points, the first of which is off by so much."""
+    z = np.random.default_rng(0).uniform(-1, 1, (count, 3)).round(4)
+    z[::2] = (z[::2] / 10).round(4)
+    y = -2 * np.sin(z[:, 0]) - z[:, 1] + z[:, 2]
+    y[0] += off
+    return "\n".join(["x,v,u,v_rate", *(",".join(map(repr, row)) for row in np.column_stack([z, y]).tolist())])
+
+
+def test_scattered_samples(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """What is missing is said in both forms; of samples beyond the domain nothing is assumed, and they are left out."""
+    Path(asked[1]).write_text(scattered_rows(60) + "\n7,0,0,123\n0,0,-1.001,5\n")
+    assert _run([*asked, "--json"], True) == 0
+    data = json.loads(capsys.readouterr().out)["unknown"]["v"]
+    assert (data["samples"], data["left_out"]) == (60, 2) and data["grid"] > 8 and data["missing"]
+    lo, hi = map(Fraction, data["slopes"]["x"])
+    assert lo <= -2 <= hi and hi - lo < 0.6
+    assert _run(asked, False) == 0
+    said = capsys.readouterr().out
+    assert "left out     2 samples beyond the domain or the input bounds" in said
+    assert "missing      samples near x = " in said
+    assert f"try next     {len(data['missing'])} more, at points that --json names" in said
+
+
+def test_more_samples_where_they_are_missing_help_as_much_as_is_said(asked: list[str], tmp_path: Path) -> None:
+    def found() -> Fitted:
+        return fit_plant(Path(asked[1]), Path(asked[3]), lambda _: Fraction(1, 10**9), tmp_path / "out").found[0]
+
+    Path(asked[1]).write_text(scattered_rows(40))
+    before = found()
+    assert before.missing.largest is not None and before.missing.largest <= float(before.largest) / 2
+    z = np.array([[float(v) for v in p] for p in before.missing.points])
+    y = -2 * np.sin(z[:, 0]) - z[:, 1] + z[:, 2]
+    more = [",".join(map(repr, row)) for row in np.column_stack([z, y]).tolist()]
+    Path(asked[1]).write_text("\n".join([scattered_rows(40), *more]))
+    assert float(found().largest) < 1.1 * before.missing.largest
+
+
+@pytest.mark.parametrize("off", [0.5, -3.0])
+def test_a_scattered_sample_that_refutes_the_bounds(
+    asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], off: float
+) -> None:
+    Path(asked[1]).write_text(scattered_rows(80, off))
+    assert _run(asked, False) == 1
+    said = capsys.readouterr().out
+    first = scattered_rows(1).splitlines()[1].split(",")
+    assert "are consistent with the samples" in said and ", ".join(first[:3]) in said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        (["7,0,0,1", "8,0,0,1"], "no sample of v lies in the domain and the input bounds"),
+        (["0.5,0,0,1", "0.25,0.5,0,1"], "take some near it along each variable"),
+        ([f"{x},{2 * x},0,{x}" for x in (-0.5, 0.25, 0.125, 0.5)], "take some near it along each variable"),
+    ],
+)
+def test_scattered_samples_that_bound_nothing(
+    asked: list[str], capsys: pytest.CaptureFixture[str], rows: list[str], said: str
+) -> None:
+    Path(asked[1]).write_text("\n".join(["x,v,u,v_rate", *rows]))
+    assert _run(asked, False) == 2
+    assert said in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("noise", ["1e400", "1e-40", "-1", "v=1,v=2", "x=1"])
 def test_bounds_of_the_noise_that_are_none(asked: list[str], capsys: pytest.CaptureFixture[str], noise: str) -> None:
     asked[asked.index("--noise") + 1] = noise
@@ -422,6 +533,26 @@ def test_samples_are_a_part_of_the_claim(fitted_box: Path, capsys: pytest.Captur
     said = capsys.readouterr().out
     assert "for every function v′ = g(x, v, u) with which 54 samples are consistent, every trajectory" in said
     assert "checker      ACCEPTED, reference ACCEPTED" in said
+
+
+def test_scattered_samples_are_a_part_of_the_claim(
+    asked: list[str], fitted_box: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two at the same point, and two that are left out, among them."""
+    Path(asked[1]).write_text(scattered_rows(120) + "\n0,0,0,1e-10\n0,0,0,0\n7,0,0,123\n0,0,-1.001,5\n")
+    assert _run(asked, False) == 0
+    for name, claim in (("far", "practical"), ("near", "asymptotic")):
+        result = proved(fitted_box, name, claim=claim)
+        assert result.verdict == "PROVED", result.reason
+        assert (result.checker or {})["reference"]["result"] == "ACCEPTED"
+        assert dict(stated(result))["for every"] == "function v′ = g(x, v, u) with which 122 samples are consistent"
+        raw = (fitted_box / name / "certificate.json").read_bytes()
+        c = parse_certificate(raw, name)
+        again = Certificate(c.system, c.network, c.V, c.claim, c.evidence, c.provenance, c.data).document()
+        assert {**again, "provenance": {}} == {**json.loads(raw), "provenance": {}}
+    paths = [str(fitted_box / name / "certificate.json") for name in ("far", "near")]
+    assert _run(["compose", *paths, "--out", str(fitted_box / "both")], False) == 0
+    assert "for every function v′ = g(x, v, u) with which 122 samples are consistent" in capsys.readouterr().out
 
 
 def test_two_that_are_of_other_plants_are_not_joined_in_words(

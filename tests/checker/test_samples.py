@@ -641,25 +641,30 @@ class Random:
                 M[i, j] += factor * np.prod([v**e for v, e in zip(reach, left, strict=True)])
         return [[Fraction(int(max(M[i, j], M[j, i]) * 1e6) + 1, 10**6) for j in range(self.d)] for i in range(self.d)]
 
-    def document(self, E: Fraction) -> Document:
+    def document(self, E: Fraction, scattered: bool) -> Document:
         terms = [["*", str(q), *(["**", z, e] for z, e in zip(self.names, k, strict=True) if e)]
                  for q, k in zip(self.P, self.powers, strict=True)]  # fmt: skip
         data = edited(two(), "plant.dynamics.0", ["+", *terms, ["*", "r", str(E)]])
         points = np.array([[float(v) for v in z] for z in product(*self.axes)])
+        if scattered:
+            points = self.draw.uniform(points.min(axis=0), points.max(axis=0), (15 * self.d, self.d)).round(2)
         wrong = self.draw.choice([-0.0099, 0.0099], len(points))
         values = [Fraction(f"{y:.12f}") for y in self.value(points) + wrong]
         f = {
             **function("x", self.names, self.curvature, "1/100", False, self.axes, lambda *_: 0),
+            "points": [texts([Fraction(str(v)) for v in z]) for z in points.tolist()],
             "values": texts(values),
         }
-        return edited(edited(data, F, f), BY, on_grid(self.axes))
+        by = bounded_by_programs(f, self.axes) if scattered else on_grid(self.axes)
+        return edited(edited(data, F, f), BY, by)
 
 
+@pytest.mark.parametrize("scattered", [False, True])
 @pytest.mark.parametrize("seed", slow_after(12, range(200)))
-def test_true_functions_are_within_the_least_bound(seed: int) -> None:
+def test_true_functions_are_within_the_least_bound(seed: int, scattered: bool) -> None:
     """The least E that both programs accept holds g - P at drawn points and in cells' middles; the two agree on it."""
     g, lo, hi = Random(seed), Fraction(0), Fraction(10**8)
-    data = g.document(hi)
+    data = g.document(hi, scattered)
 
     def shown(E: Fraction) -> bool:
         return is_shown(edited(data, "plant.dynamics.0", lambda tree: [*tree[:-1], ["*", "r", str(E)]]))
