@@ -32,8 +32,8 @@ def fit(
 ) -> None:
     """Fit functions that nobody wrote down, with bounds of what they may be off by.
 
-    The bounds of second derivatives in the structure are what is assumed, on the domain and the input bounds, and as far
-    as a grid of samples reaches. The exit status is 1 if the samples refute them.
+    The bounds of second derivatives in the structure are what is assumed, on the domain and the input bounds, and
+    beyond as far as a grid of samples reaches. The exit status is 1 if the samples refute them.
     """
     from certify.analysis.fitting.linear import Contradicted
     from certify.analysis.fitting.run import fit_plant

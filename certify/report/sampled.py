@@ -11,7 +11,7 @@ from typing import Any, Self
 from certify.loop.plants import System
 from certify.loop.plants.samples import slope_name
 from certify.loop.plants.unknown import residual_name
-from certify.report.words import Varying, below, listed, symbol
+from certify.report.words import Varying, above, below, listed, symbol
 
 
 def described(system: System) -> dict[str, Any] | None:
@@ -28,6 +28,7 @@ def described(system: System) -> dict[str, Any] | None:
             {
                 "state": one.state,
                 "variables": list(one.variables),
+                "box": [[str(lo), str(hi)] for lo, hi in one.box],
                 "curvature": [[str(q) for q in row] for row in one.curvature],
                 "noise": str(samples.noise[one.state]),
                 "samples": len(samples.taken[one.state].values),
@@ -99,9 +100,13 @@ class Sampled:
             ]  # fmt: skip
             zero = "; and 0 at the origin" if f["vanishes"] else ""
             of = f"{symbol(f['state'])}: " if len(self.functions) > 1 else ""
+            box = [
+                f"{symbol(v)} in [{below(Fraction(lo))}, {above(Fraction(hi))}]"
+                for v, (lo, hi) in zip(f["variables"], f["box"], strict=True)
+            ]
             each.append(
-                f"{of}its second derivatives are continuous and at most {listed(bends)} in size wherever the grid of "
-                f"samples reaches; at the grid's points it is within {below(Fraction(f['noise']))} of the samples{zero}"
+                f"{of}its second derivatives are continuous and at most {listed(bends)} in size where {listed(box)}; "
+                f"at the sampled points it is within {below(Fraction(f['noise']))} of the samples{zero}"
             )
         return "; ".join(each)
 

@@ -145,11 +145,8 @@ def test_an_interval_is_sharp(seed: int, noise: Fraction) -> None:
     draw = np.random.default_rng(seed)
     d = int(draw.integers(1, 4))
     M = [Fraction(int(v), 10) for v in draw.integers(1, 50, d)]
-    p, a, sign = (
-        tuple(Fraction(int(v), 10) for v in draw.integers(-5, 6, d)),
-        draw.integers(-5, 6, d).tolist(),
-        seed % 2 * 2 - 1,
-    )
+    p, sign = tuple(Fraction(int(v), 10) for v in draw.integers(-5, 6, d)), seed % 2 * 2 - 1
+    a = draw.integers(-5, 6, d).tolist()
     steps = [tuple(Fraction(int(v), 10) for v in row) for row in draw.integers(1, 9, (d, d)) * np.eye(d, dtype=int)]
     steps.append(tuple(Fraction(-int(v), 10) for v in draw.integers(1, 9, d)))  # with the others around 0
     points = tuple(tuple(map(sum, zip(p, s, strict=True))) for s in steps)
@@ -527,7 +524,7 @@ def test_samples_are_a_part_of_the_claim(fitted_box: Path, capsys: pytest.Captur
         page = page_of(raw, fitted_box / name / "certificate.json", dict(result.checker or {}), None)
         assert "For every function v′ = g(x, v, u) with which 54 samples are consistent" in page
         assert "The equation stands for v′ = g(x, v, u): whatever the function is" in page
-        assert ("and 0 at the origin" in page) is zero and "a corner between two points of the grid" in page
+        assert ("and 0 at the origin" in page) is zero and "a corner between two samples" in page
     paths = [str(fitted_box / name / "certificate.json") for name in ("far", "near")]
     assert _run(["compose", *paths, "--out", str(fitted_box / "both")], False) == 0
     said = capsys.readouterr().out

@@ -127,8 +127,8 @@ def _parts(certificate: Certificate, notes: Mapping[str, str]) -> list[tuple[str
             (
                 "Samples",
                 "Wherever states are in the domain and inputs in their bounds, the equations have the values of every "
-                "consistent function: between the grid's points by how far interpolation may be off, at the origin by "
-                "slopes that sums of samples bound; in rationals.",
+                "consistent function: between the points of a grid by how far interpolation may be off, at the origin "
+                "by slopes; sums of samples bound values and slopes, in rationals.",
                 f"From {sampled.count:,} samples of a file with the sha256 {sampled.sha256}.",
             )
         )

@@ -176,7 +176,7 @@ def _not_of_the_sampled(system: System, sampled: Sampled) -> list[tuple[str, str
             "That the plant is one of these.",
             "That the functions depend on these variables alone, the bounds of their second derivatives, the bound of "
             f"the samples' errors{zero} are assumed: samples can contradict them and never show them. A single error "
-            "that is larger, or a corner between two points of the grid, makes the plant another one, and so does "
+            "that is larger, or a corner between two samples, makes the plant another one, and so does "
             "anything else in the other equations.",
         ),
         (
