@@ -179,8 +179,7 @@ def sampled(c: Certificate) -> str:
         return ""
     each = []
     for f in c.samples.functions:
-        box = zip(f.variables, f.axes, strict=True)
-        where = ", ".join(f"{name} in [{axis[0]}, {axis[-1]}]" for name, axis in box)
+        where = ", ".join(f"{name} in [{lo}, {hi}]" for name, (lo, hi) in zip(f.variables, f.box, strict=True))
         d = range(len(f.variables))
         bends = ", ".join(
             f"{f.curvature[i][j]} by {f.variables[i]} and {f.variables[j]}" for i in d for j in d if i <= j
@@ -188,7 +187,8 @@ def sampled(c: Certificate) -> str:
         zero = ", is 0 at 0" if f.vanishes else ""
         each.append(
             f"{c.plant.states[f.state]}, of {', '.join(f.variables)} in {where}: continuous second derivatives of at "
-            f"most {bends}, values within {f.noise} of the {len(f.values)} that the certificate states{zero}"
+            f"most {bends}, at points there values within {f.noise} of the {len(f.values)} that the certificate "
+            f"states{zero}"
         )
     return (
         f"; and this holds, instead of for the equations alone, for all functions of these (samples said to be of a "

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 from .document import Certificate
 from .evidence import Covering, Ranked, Tree, Trusted
@@ -273,16 +274,17 @@ def of_data(c: Certificate, z: Sizes, evidence: Tree) -> int:
 
 
 def of_samples(c: Certificate) -> int:
-    """Operations to expand the equations, and for each function on its grid."""
+    """Operations to expand the equations, and of each function for its weights and on its grid."""
     if c.samples is None:
         return 0
     work = 2**24 * len(c.plant.dynamics.steps)
     for f in c.samples.functions:
-        d, b = len(f.variables), max(q.height_bits() for axis in f.axes for q in axis)
-        if f.slopes:
-            work += 2**17 * d**2 * sum(len(lower) + len(upper) for lower, upper in f.weights)
-        else:
-            work += 2**12 * b * d * len(f.values) + f.cells * (2**18 * b * d + 2 ** (d + 10))
+        d = len(f.variables)
+        for weights in chain.from_iterable(f.weights):
+            work += 2**3 * d * len(weights) * (2**11 * d + len(weights) * max(q.height_bits() for _, q in weights))
+        if not f.slopes:
+            b = max(q.height_bits() for axis in f.axes for q in axis)
+            work += 2**12 * b * d * len(f.weights) + f.cells * (2**18 * b * d + 2 ** (d + 10))
     return work
 
 

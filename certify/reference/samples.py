@@ -1,8 +1,9 @@
 """Sampled functions: rule `format` for what is stated of them, and rule `samples`.
 
-Nobody has written these functions down. What is known of each is its values, nearly, at the points of a grid, and how
-much it bends at most. From this an equation P + r E has to have all values that such a function may have: on each cell
-of the grid, or around the origin. Everything here is rational.
+Nobody has written these functions down. What is known of each is its values, nearly, at some points of a box, and how
+much it bends at most. Weighted sums of the values bound it at each point of a grid, or its slopes at the origin. From
+this an equation P + r E has to have all values that such a function may have: on each cell of the grid, or around the
+origin. Everything here is rational.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from itertools import pairwise, product
 from math import prod
 from typing import TYPE_CHECKING, Any
 
-from flint import fmpq
+from flint import fmpq, fmpq_mat
 
 from .expressions import operands_of, rational
 from .fields import entries, keys
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from .document import Certificate, Interval, Plant
 
 RULE = "samples"
-MAX_VALUES, MAX_VARIABLES, MAX_WEIGHTS, SHORT = 2**18, 8, 64, 2**7  # SHORT in bits
+MAX_POINTS, MAX_VARIABLES, MAX_WEIGHTS, SHORT = 2**18, 8, 64, 2**7  # SHORT in bits
 MAX_TERMS, MAX_PAIRS, MAX_DEGREE, LONG, MAX_MOVED = 2**7, 2**10, 20, 2**9, 2**9  # of polynomials; LONG in bits
 ZERO, ONE, HALF = fmpq(0), fmpq(1), fmpq(1, 2)
 Weighted = tuple[tuple[int, fmpq], ...]
@@ -34,19 +35,22 @@ Coefficients = Mapping[tuple[int, ...], fmpq]  # by the powers of variables
 class Sampled:
     """The function whose values the derivative of `state`, or its next value, has.
 
-    Its second derivatives are at most `curvature`, its values at the points of the grid of `axes` within `noise` of
-    `values`. The equation's `error` is r, its `slopes` are the a_j, each with weights for its lower and upper end.
+    On `box` its second derivatives are at most `curvature`, its values at `points` within `noise` of `values`. The
+    equation's `error` is r, its `slopes` are the a_j. Two lists of `weights` are for the lower and the upper end of
+    each slope, or of the function at each point of the grid of `axes`.
     """
 
     state: int
     variables: tuple[str, ...]
+    box: tuple[Interval, ...]
     curvature: tuple[tuple[fmpq, ...], ...]
     noise: fmpq
     vanishes: bool
-    axes: tuple[tuple[fmpq, ...], ...]
+    points: tuple[tuple[fmpq, ...], ...]
     values: tuple[fmpq, ...]
     error: str | None
     slopes: tuple[str, ...]
+    axes: tuple[tuple[fmpq, ...], ...]
     weights: tuple[tuple[Weighted, Weighted], ...]
 
     @property
@@ -89,8 +93,8 @@ def read_samples(value: Any, shown: Any, sha256_is: Any, plant: Plant, angles: S
 
 def read_function(value: Any, shown: Any, number: int, plant: Plant) -> Sampled:
     at, by = f"claim.samples.functions.{number}", f"evidence.samples.{number}"
-    f = keys(value, at, "state", "variables", "curvature", "noise", "vanishes", "axes", "values")
-    e = keys(shown, by, "error", "slopes", "weights")
+    f = keys(value, at, "state", "variables", "box", "curvature", "noise", "vanishes", "points", "values")
+    e = keys(shown, by, "error", "slopes", "axes", "weights")
     state, variables = f["state"], entries(f["variables"], f"{at}.variables")
     known = isinstance(state, str) and state in plant.states
     require(known, "format", f"{at}.state", "the name of a state was expected")
@@ -104,26 +108,33 @@ def read_function(value: Any, shown: Any, number: int, plant: Plant) -> Sampled:
     (noise,) = short([f["noise"]], f"{at}.noise", 1)
     require(bool(noise >= 0), "format", f"{at}.noise", "must not be negative")
     require(type(f["vanishes"]) is bool, "format", f"{at}.vanishes", "true or false was expected")
-    axes = tuple(short(axis, f"{at}.axes.{j}") for j, axis in enumerate(entries(f["axes"], f"{at}.axes", d)))
-    rising = all(len(axis) >= 2 and all(bool(p < q) for p, q in pairwise(axis)) for axis in axes)
-    require(rising, "format", f"{at}.axes", "two numbers or more were expected on each axis, one above the other")
-    points = prod(map(len, axes))
-    require(points <= MAX_VALUES, "format", f"{at}.axes", f"more than {MAX_VALUES} points")
-    values = short(f["values"], f"{at}.values", points)
+    box = tuple((lo, hi) for lo, hi in (short(pair, f"{at}.box", 2) for pair in entries(f["box"], f"{at}.box", d)))
+    require(all(bool(lo < hi) for lo, hi in box), "format", f"{at}.box", "lo < hi must hold")
+    points = tuple(short(z, f"{at}.points.{k}", d) for k, z in enumerate(entries(f["points"], f"{at}.points")))
+    require(1 <= len(points) <= MAX_POINTS, "format", f"{at}.points", f"1 to {MAX_POINTS} points were expected")
+    inside = all(bool(lo <= v <= hi) for z in points for v, (lo, hi) in zip(z, box, strict=True))
+    require(inside, "format", f"{at}.points", "a point is outside of the box")
+    values = short(f["values"], f"{at}.values", len(points))
     error, slopes, weights = e["error"], entries(e["slopes"], f"{by}.slopes"), entries(e["weights"], f"{by}.weights")
     uncertain = all(isinstance(name, str) and name in plant.uncertain for name in slopes)
     uncertain = uncertain and (error is None or (isinstance(error, str) and error in plant.uncertain))
     require(uncertain, "format", by, "names of uncertain quantities were expected")
     fitting = not slopes or (f["vanishes"] and len(slopes) == d)
     require(fitting, "format", f"{by}.slopes", "none were expected, or one for each variable of what vanishes at 0")
-    require(len(weights) == len(slopes), "format", f"{by}.weights", "an entry for each slope was expected")
-    ends = [
-        tuple(weighted(w, f"{by}.weights.{j}", points) for w in entries(both, f"{by}.weights.{j}", 2))
-        for j, both in enumerate(weights)
-    ]
-    pairs = tuple((lower, upper) for lower, upper in ends)
-    more = noise, f["vanishes"], axes, values, error, tuple(slopes), pairs
-    return Sampled(plant.states.index(state), tuple(variables), curvature, *more)
+    spanned = entries(e["axes"], f"{by}.axes", 0 if slopes else d)
+    axes = tuple(short(axis, f"{by}.axes.{j}") for j, axis in enumerate(spanned))
+    for axis, ends in zip(axes, box, strict=not slopes):
+        rising = (*axis[:1], *axis[-1:]) == ends and all(bool(p < q) for p, q in pairwise(axis))
+        require(rising, "format", f"{by}.axes", "rising numbers were expected, from one end of the box to the other")
+    count = len(weights) == (len(slopes) or prod(map(len, axes)))
+    require(count, "format", f"{by}.weights", "an entry was expected for each slope, or each point of the grid")
+    pairs = []
+    for j, both in enumerate(weights):
+        lower, upper = entries(both, f"{by}.weights.{j}", 2)
+        place = f"{by}.weights.{j}", len(points)
+        pairs.append((weighted(lower, *place), weighted(upper, *place)))
+    stated = box, curvature, noise, f["vanishes"], points, values
+    return Sampled(plant.states.index(state), tuple(variables), *stated, error, tuple(slopes), axes, tuple(pairs))
 
 
 def short(value: Any, at: str, count: int | None = None) -> tuple[fmpq, ...]:
@@ -231,11 +242,11 @@ def samples(c: Certificate) -> None:
             alone = i == f.state or not mentioned(c, i) & set(f.own)
             require(alone, RULE, f"dynamics.{i}", f"it has quantities of the function of {plant.states[f.state]}")
         bounds = dict(zip((*plant.states, *plant.inputs), (*plant.domain, *plant.input_bounds), strict=True))
-        for name, axis in zip(f.variables, f.axes, strict=True):
+        for name, (least, most) in zip(f.variables, f.box, strict=True):
             lo, hi = bounds[name]
-            covered = bool(axis[0] <= lo) and bool(hi <= axis[-1])
-            covered = covered and (not f.vanishes or (bool(axis[0] <= 0) and bool(axis[-1] >= 0)))
-            require(covered, RULE, name, "samples do not reach as far as states and inputs may")
+            covered = bool(least <= lo) and bool(hi <= most)
+            covered = covered and (not f.vanishes or (bool(least <= 0) and bool(most >= 0)))
+            require(covered, RULE, name, "the box does not reach as far as states and inputs may")
         ranges = dict(zip(plant.uncertain, plant.ranges, strict=True))
         P, E = parts(f, right[f.state])
         if f.error is not None:
@@ -262,7 +273,10 @@ def between(f: Sampled, P: Coefficients, E: Coefficients) -> None:
     """On each cell E is at least the distance of the function from P that samples and second derivatives allow."""
     size = sum(prod(k + 1 for k in powers) for powers in P)
     require(size <= MAX_MOVED, RULE, f"dynamics.{f.state}", f"{size} coefficients on a cell, {MAX_MOVED} are allowed")
-    off = [abs(y - p) for y, p in zip(f.values, on_grid(P, f.axes), strict=True)]
+    off = []
+    for p, q, pair in zip(product(*f.axes), on_grid(P, f.axes), f.weights, strict=True):
+        lo, hi = interval(f, pair, p, [ONE, *p], ", ".join(map(str, p)))
+        off.append(max(hi - q, q - lo))
     steps = [prod(map(len, f.axes[j + 1 :])) for j in range(len(f.axes))]  # from a value to the next along an axis
     for place in product(*(range(len(axis) - 1) for axis in f.axes)):
         cell = [(axis[i], axis[i + 1]) for axis, i in zip(f.axes, place, strict=True)]
@@ -272,7 +286,7 @@ def between(f: Sampled, P: Coefficients, E: Coefficients) -> None:
         bent = sum((((hi - lo) / 2) ** 2 * f.curvature[j][j] for j, (lo, hi) in enumerate(cell)), ZERO)
         for powers, q in around(P, cell).items():
             bent += abs(q) * sum(k * (k - 1) for k in powers)
-        wanted = max(off[k] for k in corners) + f.noise + HALF * bent
+        wanted = max(off[k] for k in corners) + HALF * bent
         smallest = sum((least(q, powers, cell) for powers, q in E.items()), ZERO)
         at = ", ".join(f"{name} in [{lo}, {hi}]" for name, (lo, hi) in zip(f.variables, cell, strict=True))
         require(bool(smallest >= wanted), RULE, f"dynamics.{f.state}", f"E is too small where {at}")
@@ -338,25 +352,27 @@ def linear(
     for j in range(d):
         bent = HALF * sum((f.curvature[j][i] * sizes[i] for i in range(d)), ZERO)
         require(bool(k.get(j, ZERO) * sizes[j] >= bent), RULE, at, f"E is too small along {f.variables[j]}")
-    for j, (slope, (lower, upper)) in enumerate(zip(f.slopes, f.weights, strict=True)):
-        lo, hi = ranges[slope]
-        for weights, sign in ((lower, -1), (upper, 1)):
-            direction, end = [ZERO] * d, ZERO
-            for number, v in weights:
-                z = point(f, number)
-                direction = [p + v * q for p, q in zip(direction, z, strict=True)]
-                end += v * f.values[number] + sign * abs(v) * (f.noise + rho(f, z))
-            right = direction == [fmpq(int(i == j)) for i in range(d)]
-            require(right, RULE, slope, "the weighted points do not give the direction of its variable")
-            require(bool(lo <= end) if sign < 0 else bool(end <= hi), RULE, slope, "its range lacks what samples allow")
+    for j, (slope, pair) in enumerate(zip(f.slopes, f.weights, strict=True)):
+        least, most = ranges[slope]
+        lo, hi = interval(f, pair, [ZERO] * d, [fmpq(int(i == j)) for i in range(d)], slope)
+        require(bool(least <= lo) and bool(hi <= most), RULE, slope, "its range lacks what samples allow")
 
 
-def point(f: Sampled, number: int) -> list[fmpq]:
-    """The point of a value, by its number."""
-    found: list[fmpq] = []
-    for j, axis in enumerate(f.axes):
-        found.append(axis[number // prod(map(len, f.axes[j + 1 :])) % len(axis)])
-    return found
+def interval(f: Sampled, pair: Sequence[Weighted], p: Sequence[fmpq], sums: Sequence[fmpq], at: str) -> Interval:
+    """The ends, by two lists of weights, of the function at p or of a slope.
+
+    Over each list the sums of the weighted points, or of the weights and these, must be `sums`.
+    """
+    ends = []
+    for weights, sign in zip(pair, (-1, 1), strict=True):
+        v, size = fmpq_mat([[q for _, q in weights]]), fmpq_mat([[abs(q) for _, q in weights]])
+        *found, end = (v * fmpq_mat([[ONE, *f.points[k], f.values[k]] for k, _ in weights])).entries()
+        require(found[-len(sums) :] == sums, RULE, at, "its weighted samples have other sums")
+        away = ([a - b for a, b in zip(f.points[k], p, strict=True)] for k, _ in weights)
+        ends.append(end + sign * (size * fmpq_mat([[f.noise + rho(f, z)] for z in away]))[0, 0])
+    lo, hi = ends
+    require(bool(lo <= hi), RULE, at, "no function has such samples")
+    return lo, hi
 
 
 def rho(f: Sampled, z: Sequence[fmpq]) -> fmpq:
