@@ -129,6 +129,12 @@ def two() -> Document:
 
 
 @cache
+def unbent() -> Document:
+    """The same, of x' = g(x) without noise or curvature, of which any weights give exact values."""
+    return edited(edited(two(), F, function("x", ("x",), [[0]], 0, False, [X], lambda v: -v)), BY, on_grid([X]))
+
+
+@cache
 def scattered() -> Document:
     """x' = g(x, u) as in `far`, of which 80 samples are taken anywhere, each off by 1/2000 in turn."""
     draw = np.random.default_rng(3)
@@ -188,6 +194,7 @@ TRUE = {
     "near": near,
     "aslant": aslant,
     "two": two,
+    "unbent": unbent,
     "composed": lambda: joined(far(), near()),
     "composed of scattered samples": lambda: joined(scattered(), near()),
 }
@@ -452,6 +459,11 @@ def of_two() -> dict[str, list[Document]]:
         ],
         "functions in another order": e("claim.samples.functions", lambda f: f[::-1]) + e(
             "evidence.samples", lambda s: s[::-1]),
+        "weights that give the point and another sum": [
+            edited(unbent(), f"{BY}.weights.{k}.{side}", v)
+            for k, v in ((0, [[6, "-1"]]), (0, [[1, "3/2"]]), (3, [[3, "2"]]), (2, [[2, "1"], [3, "1"]]))
+            for side in (0, 1)
+        ],
         "another variable": e("claim.samples.functions.0.variables", ["y"], ["u"]),
         "a sampled state in another equation": e("plant.dynamics.1", ["+", ["-", "y"], ["*", "q", "1/10"], "x"]),
     }  # fmt: skip
