@@ -132,19 +132,19 @@ class Simulation:
         return tuple(min(max(Fraction(v), lo), hi) for v, (lo, hi) in each)
 
 
-def stays(loop: ClosedLoop, x: Array, steps: int, effort: Effort) -> NDArray[np.bool_] | None:
-    """True for states (N, n) from which a run of so many steps stays in the domain and keeps constraints; None if the
-    effort ends first."""
-    simulation, count = Simulation(loop, (), ()), len(x)
-    alive = np.arange(count)
-    for k in range(steps + 1):
-        going = ~np.isin(np.arange(len(x)), list(simulation.ended(x, k)))
-        x, alive = x[going], alive[going]
-        effort.charge(simulation.operations(len(x)))
+def later(loop: ClosedLoop, x: Array, steps: int, effort: Effort) -> Array | None:
+    """The states (N, n) after so many steps of runs from states x, (N, n), NaN of those that leave the domain or
+    violate a constraint; None if the effort ends first."""
+    simulation, end = Simulation(loop, (), ()), x.copy()
+    for k in range(steps):
+        alive = np.flatnonzero(np.isfinite(end).all(-1))
+        end[alive[list(simulation.ended(end[alive], k))]] = np.nan
+        alive = np.flatnonzero(np.isfinite(end).all(-1))
+        effort.charge(simulation.operations(len(alive)))
         if effort.over:
             return None
-        x = simulation.later(x)
-    return np.isin(np.arange(count), alive)
+        end[alive] = simulation.later(end[alive])
+    return end
 
 
 def begins(box: Box) -> Array:

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from certify.analysis.beyond import constraints_in_words, rank_facts
 from certify.analysis.facts import StayingFacts
 from certify.analysis.options import RoaOptions
-from certify.analysis.reaching.runs import stays
+from certify.analysis.reaching.runs import later
 from certify.analysis.staying.results import InvariantResult
 from certify.analysis.without_v import Tools, accepted, require_periodic
 from certify.certificates import RanksAlone, RankTree, RemainCertificate, leaves_within
@@ -29,6 +30,7 @@ from certify.provers.base import Progress
 from certify.provers.execution import ThreadRunner
 from certify.provers.ranks import Nothing, Question, prove_remaining, root_box, turning, with_frame, with_order
 
+Array = NDArray[np.float64]
 _FOR_SEARCH, _FOR_RUNS = 0.7, 0.05  # shares of the effort, the rest being for the check
 _PROBES, _RUNS, _STEPS = 30, 1000, 1000  # states at which the series is chosen; simulated states, and their steps
 _MENDED = 20  # leaves that the checker may refuse
@@ -50,13 +52,18 @@ def proved_in_steps(
     """
     options, system = result.options, loop.system
     _require_no_function(options)
-    root, search = root_box(loop), effort.share(_FOR_SEARCH)
+    root = root_box(loop)
+    with tools.timing("simulate"):
+        begins = np.random.default_rng(0).uniform(*root, (_RUNS, system.n))
+        ends = later(loop, begins, _STEPS, effort.share(_FOR_RUNS))
+    search = effort.share(_FOR_SEARCH)
 
     def report(share: float, boxes: int, waiting: int) -> None:
         tools.tell("set", Progress(0.0, 0.0, boxes, waiting, share, search.left))
 
     with tools.timing("search"):
-        x = np.random.default_rng(0).uniform(*root, (_PROBES, system.n)).T
+        seeds = np.zeros((system.n, 0)) if ends is None else ends[np.isfinite(ends).all(-1)].T
+        x = (seeds if seeds.size else begins.T)[:, :_PROBES]
         question = Question(loop, Nothing(), tuple(kept_constraints(system).values()), root)
         question = with_frame(with_order(question, x, search), x, search)
 
@@ -67,7 +74,7 @@ def proved_in_steps(
     clerk = tools.clerk(path, options.jobs, True)
     require_periodic(system, tuple(system.states[i].name for i in turning(loop)), root, certificate_of, clerk)
     with tools.timing("search"):
-        found = prove_remaining(question, search, ThreadRunner(), report)
+        found = prove_remaining(question, seeds, search, ThreadRunner(), report)
     if found is None:
         return replace(result, reason=_nothing(search.over), following=_following(options, search.over))
     proof, without = found
@@ -84,7 +91,7 @@ def proved_in_steps(
         verdict=Verdict.PROVED,
         reason="done" if proof.done else "effort",
         ranks=rank_facts(certificate, proof),
-        simulated=_simulated(loop, certificate, effort.share(_FOR_RUNS)),
+        simulated=None if ends is None else _simulated(certificate, begins, ends),
         state=_state_in(certificate),
         boxes=proof.boxes,
         constraints=constraints_in_words(certificate),
@@ -118,15 +125,11 @@ def _nothing(over: bool) -> str:
     return f"no box of the domain is proved to be never left: {left}"
 
 
-def _simulated(loop: ClosedLoop, certificate: RemainCertificate, effort: Effort) -> StayingFacts | None:
-    """The share of the simulated runs that stay, of states drawn from the domain, which start in the boxes."""
-    lo, hi = root_box(loop)
-    x = np.random.default_rng(0).uniform(lo, hi, (_RUNS, loop.system.n))
-    staying = stays(loop, x, _STEPS, effort)
-    if staying is None:
-        return None
-    held = region_of(certificate).holds_in_floats(x)
-    return StayingFacts(_RUNS, _STEPS, int(staying.sum()), int((staying & held).sum()))
+def _simulated(certificate: RemainCertificate, begins: Array, ends: Array) -> StayingFacts:
+    """The counts of simulated runs, of those that stay, and of these that start in the boxes."""
+    staying = np.isfinite(ends).all(-1)
+    held = region_of(certificate).holds_in_floats(begins)
+    return StayingFacts(len(begins), _STEPS, int(staying.sum()), int((staying & held).sum()))
 
 
 def _state_in(certificate: RemainCertificate) -> dict[str, float]:

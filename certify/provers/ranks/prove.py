@@ -233,6 +233,7 @@ def prove_ranks(
 
 def prove_remaining(
     question: Question,
+    seeds: Array,
     effort: Effort,
     runner: Runner,
     report: Callable[[float, int, int], None] | None = None,
@@ -241,6 +242,7 @@ def prove_remaining(
 
     Parameters
     ----------
+    seeds : states (n, N) that runs come to.
     report : as that of `prove_ranks`.
 
     Returns
@@ -249,7 +251,7 @@ def prove_remaining(
         there are no such leaves.
     """
     course = question.course(COUNTS)
-    search = Remaining(course, *question.root)
+    search = Remaining(course, *question.root, seeds)
     with shared(runner, course) as bound:
         rounds, done = _grow(search, bound, effort, report, 1.0)
     search.tighten()

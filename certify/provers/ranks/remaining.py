@@ -1,12 +1,13 @@
 """The search for boxes that are never left: the largest set of leaves from each of which an image lies in the set.
 
 All leaves whose images are in the root box are in it at first; those of which no image lies in the set are taken out,
-until none is left to take out (the greatest fixed point; Dellnitz and Hohmann 1997, Bertsekas 1972 for sets of states).
-The rest is halved, but for *lost* leaves, which no trajectory stays in the root box from, and taken in again, so that
-the set only grows.
+until none is left to take out (the greatest fixed point; Bertsekas 1972 for sets of states, Dellnitz and Hohmann 1997
+for boxes). The rest is halved and taken in again, so that the set only grows.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -14,17 +15,26 @@ from certify.certificates.claims import UNPROVED
 from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.ranks.images import Course, Images
 from certify.provers.ranks.search import Search
+from certify.provers.ranks.wanted import SearchFrom, Wanted
+
+_FOR_CORE = 5.0  # leaves looked at for the seeds alone, relative to those of the first tree
 
 
-class Remaining(Search):
+class Remaining(SearchFrom):
     """The leaves that are never left; the rank of each is the number of steps after which it is in one of them again.
 
-    `lost` are leaves, by their numbers, that no trajectory starts from which remains.
+    First the leaves are looked for that hold `seeds` (n, N), states that runs come to, and all that these need; then
+    the leaves whose images meet one of these. `lost` are leaves, by their numbers, from which no trajectory remains.
     """
 
-    def __init__(self, course: Course, lo: Array, hi: Array) -> None:
-        super().__init__(course, lo, hi)
-        self.lost = np.zeros(1, dtype=bool)
+    def __init__(self, course: Course, lo: Array, hi: Array, seeds: Array) -> None:
+        super().__init__(course, lo, hi, Wanted(lo, hi))
+        self.seeds, self.lost, self.most, self.core = seeds, np.zeros(1, dtype=bool), math.inf, True
+
+    def begin(self, most: float) -> Index:
+        """The leaves of a first tree, all of one size, that hold seeds; all if there are none."""
+        self.most = _FOR_CORE * most
+        return super().begin(most)
 
     def halve(self, nodes: Index, axes: Index) -> Index:
         """Halve leaves; nothing is lost of their halves yet."""
@@ -37,12 +47,44 @@ class Remaining(Search):
         super().take(nodes, found)
         self.lost[nodes] = found.fails
 
+    def is_done(self, near: Index) -> bool:
+        """True if no leaf is left whose halves could gain anything, or the last rounds have gained next to nothing."""
+        return not self.core and Search.is_done(self, near)
+
     def spread(self) -> Index:
         """Find all leaves that remain by now; those that may do so once they are halved."""
+        self._settle(self._live)
+        return self._live
+
+    def further(self, near: Index) -> Index:
+        """The leaves to look at next."""
+        if self.core:
+            needed = self._needed()
+            new, waiting = self._unseen(needed), np.intersect1d(needed, near)
+            self.core = self.boxes < self.most and len(new) + len(waiting) > 0
+            if self.core:
+                return new if len(new) else self.halve(*self.next(waiting))
+        new = self._unseen(self.cover.leaves)
+        return new if len(new) else self.halve(*self.next(self._beside(near)))
+
+    @property
+    def _live(self) -> Index:
         unknown = self.unknown
-        self._settle(unknown[~self.lost[unknown]])
-        waiting: Index = unknown[~self.lost[unknown] & (self.rank[unknown] == UNPROVED)]
-        return waiting
+        live: Index = unknown[self.seen[unknown] & ~self.lost[unknown]]
+        return live
+
+    @property
+    def _own(self) -> Index:
+        """The leaves that hold seeds."""
+        return self._met(self.seeds, self.seeds)
+
+    def _beside(self, near: Index) -> Index:
+        """Those of some leaves whose images meet one that remains; all if there are none."""
+        k, at = np.nonzero(np.isfinite(self.lo[:, 0, near]))
+        node = near[at]
+        _, image, leaf = self.cover.met_by(self.lo[k, :, node].T, self.hi[k, :, node].T)
+        beside: Index = np.unique(node[image[self.rank[leaf] < UNPROVED]])
+        return beside if len(beside) else near
 
     def tighten(self) -> None:
         """Give all leaves the fewest steps that their images show."""
