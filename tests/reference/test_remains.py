@@ -26,6 +26,10 @@ NO, PLANE = UNRANKED, ("x", "y")
 Ends = Sequence[float]
 
 
+def made(more: Document, **known: Any) -> Loop:
+    return Loop(**{"target": None} | known | more)
+
+
 def remaining(loop: Loop, lo: Ends, hi: Ends, depth: int, ranks: Sequence[int], steps: Sequence[int]) -> Document:
     tree, _ = uniform(lo, hi, depth)
     data = loop.document(lo, hi, tree, two_bytes(ranks), bytes(steps))
@@ -43,7 +47,7 @@ def rejected(data: Document) -> tuple[str | None, str | None]:
 def contracting(kept: float = 1.0, **more: Any) -> Document:
     """x+ = x/2 + y/4, y+ = u = y/2 - x/4 on [-2, 2]^2, 64 leaves, of which those in [-kept, kept]^2 have ranks."""
     dynamics: list[Any] = [["+", ["/", "x", "2"], ["/", "y", "4"]], "u"]
-    loop = Loop(**{"dynamics": dynamics, "network": [affine([[-0.25, 0.5]])], "target": None, "states": PLANE} | more)
+    loop = made(more, dynamics=dynamics, network=[affine([[-0.25, 0.5]])], states=PLANE)
     _, leaves = uniform([-2.0, -2.0], [2.0, 2.0], 6)
     inside = [all(-kept <= a and b <= kept for a, b in leaf) for leaf in leaves]
     return remaining(loop, [-2.0] * 2, [2.0] * 2, 6, [1 if here else NO for here in inside], list(map(int, inside)))
@@ -52,14 +56,15 @@ def contracting(kept: float = 1.0, **more: Any) -> Document:
 def winding(count: int, lo: Ends = (-1.0, -1.0), **more: Any) -> Document:
     """x+ = -y, y+ = u = x - y, a third of a turn: on the one leaf [-1, 1]^2 |y| is at most 2 after one step, |x| is
     after two, and after three steps each state is where it was."""
-    loop = Loop(**{"dynamics": [["-", "y"], "u"], "network": [affine([[1.0, -1.0]])], "target": None, "states": PLANE} | more)  # fmt: skip  # noqa: E501
+    loop = made(more, dynamics=[["-", "y"], "u"], network=[affine([[1.0, -1.0]])], states=PLANE)
     return remaining(loop, lo, [1.0, 1.0], 0, [count], [count])
 
 
 def turning(hole: int | None = None, **more: Any) -> Document:
     """An angle x+ = x + 1/2 and y+ = u = y/2 + sin(x)/4 on [-3.25, 3.25] x [-1, 1], without the leaf `hole` of 8."""
     dynamics: list[Any] = [["+", "x", "1/2"], ["+", "u", ["/", ["sin", "x"], "4"]]]
-    loop = Loop(**{"dynamics": dynamics, "network": [affine([[0.0, 0.5]])], "target": None, "states": PLANE, "angles": ("x",), "domain": ("-2", "2")} | more)  # fmt: skip  # noqa: E501
+    known = {"states": PLANE, "angles": ("x",), "domain": ("-2", "2")} | more
+    loop = made(known, dynamics=dynamics, network=[affine([[0.0, 0.5]])])
     ranks = [NO if i == hole else 1 for i in range(8)]
     return remaining(loop, [-3.25, -1.0], [3.25, 1.0], 3, ranks, [int(r == 1) for r in ranks])
 
@@ -67,13 +72,14 @@ def turning(hole: int | None = None, **more: Any) -> Document:
 def braking(wall: str = "17/10", **more: Any) -> Document:
     """x' = v, v' = u = -x - 3/2 v, held for 1: all is 0 after two periods. From x = 1, v = 2 the state x is at most 1
     at sampling instants, and 3/2 between the first two."""
-    loop = Loop(**{"dynamics": ["v", "u"], "network": [affine([[-1.0, -1.5]])], "target": None, "states": ("x", "v"), "sample": ("1", "1"), "order": 2, "keep": [["-", "x", wall]]} | more)  # fmt: skip  # noqa: E501
+    known = {"sample": ("1", "1"), "order": 2, "keep": [["-", "x", wall]]} | more
+    loop = made(known, dynamics=["v", "u"], network=[affine([[-1.0, -1.5]])], states=("x", "v"))
     return remaining(loop, [-1.0, -2.0], [1.0, 2.0], 0, [2], [2])
 
 
 def line(gain: float, shift: float, ranks: Sequence[int], steps: Sequence[int] | None = None, **more: Any) -> Document:
     """x+ = u = gain x + shift on the leaves [0, 1], [1, 2], [2, 3], [3, 4]."""
-    loop = Loop(**{"dynamics": ["u"], "network": [affine([[gain]], [shift])], "target": None} | more)
+    loop = made(more, dynamics=["u"], network=[affine([[gain]], [shift])])
     return remaining(loop, [0.0], [4.0], 2, ranks, [int(r < NO) for r in ranks] if steps is None else steps)
 
 
@@ -156,7 +162,8 @@ def test_one_leaf_of_many_leads_out() -> None:
 def test_no_leaf_has_rank_0() -> None:
     """Nothing lies in the target, and all leaves that this one meets have ranks."""
     for i in range(4):
-        assert rejected(line(0.5, 1.0, [int(i != j) for j in range(4)], [int(i != j) for j in range(4)])) == ("ranks", f"ranks leaf {i}")  # fmt: skip  # noqa: E501
+        ranks = [int(i != j) for j in range(4)]
+        assert rejected(line(0.5, 1.0, ranks, ranks)) == ("ranks", f"ranks leaf {i}")
     assert rejected(winding(0)) == ("ranks", "ranks leaf 0")
 
 
