@@ -62,6 +62,8 @@ def _claim(certificate: InvariantCertificate) -> dict[str, Any]:
     short = not isinstance(N, Neural) and len(str(N.expression)) <= _LONGEST
     return {
         "own": "N",
+        "steps": "",
+        "turned": "",
         "level": repr(outer.level),
         "function": typeset(identifier("N"), N.expression) if short and not isinstance(N, Neural) else None,
         "words": f"{words} the certificate states.",
@@ -91,6 +93,8 @@ def _of_boxes(certificate: RemainCertificate) -> dict[str, Any]:
         parts.append(("Constraints", f"Each of them holds before each of these {steps}{meanwhile}."))
     return {
         "own": "boxes",
+        "function": None,
+        "words": "",
         "steps": f"{claim.ranks.steps:,} {steps if claim.ranks.steps > 1 else steps[:-1]}",
         "inside": inside,
         "turned": angles,

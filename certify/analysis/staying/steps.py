@@ -32,7 +32,9 @@ from certify.provers.ranks import Nothing, Question, prove_remaining, root_box, 
 
 Array = NDArray[np.float64]
 _FOR_SEARCH, _FOR_RUNS = 0.7, 0.05  # shares of the effort, the rest being for the check
-_PROBES, _RUNS, _STEPS = 30, 1000, 1000  # states at which the series is chosen; simulated states, and their steps
+_QUICK = 10.0  # multiplications of many runs at once that are worth an operation
+_LITTLE = 1e-4  # error of a step that does no harm, as a share of the root box
+_PROBES, _RUNS, _STEPS = 30, 500, 500  # states at which the series is chosen; simulated states, and their steps
 _MENDED = 20  # leaves that the checker may refuse
 
 
@@ -55,7 +57,9 @@ def proved_in_steps(
     root = root_box(loop)
     with tools.timing("simulate"):
         begins = np.random.default_rng(0).uniform(*root, (_RUNS, system.n))
-        ends = later(loop, begins, _STEPS, effort.share(_FOR_RUNS))
+        runs = Effort(_QUICK * _FOR_RUNS * effort.left)
+        ends = later(loop, begins, _STEPS, runs)
+        effort.charge(runs.spent / _QUICK)
     search = effort.share(_FOR_SEARCH)
 
     def report(share: float, boxes: int, waiting: int) -> None:
@@ -65,7 +69,7 @@ def proved_in_steps(
         seeds = np.zeros((system.n, 0)) if ends is None else ends[np.isfinite(ends).all(-1)].T
         x = (seeds if seeds.size else begins.T)[:, :_PROBES]
         question = Question(loop, Nothing(), tuple(kept_constraints(system).values()), root)
-        question = with_frame(with_order(question, x, search), x, search)
+        question = with_frame(with_order(question, x, search, _LITTLE), x, search)
 
     def certificate_of(leaves: RankTree, ranks: Ranks) -> RemainCertificate:
         claim = Remains(ranks, question.keep)

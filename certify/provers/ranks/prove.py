@@ -33,6 +33,7 @@ _SMALL, _LOST = 0.002, 1e3  # half-width of a box, as a share of the root box's 
 _DEPENDENT = 1e8  # condition of a frame that is of no use
 _MEMORIES = (1, 2, 4, 8)
 _THERE = 1e-6  # width of an image in the target, as a share of the root box's
+_COUNTS_BACK = COUNTS[:7]  # the leaf itself or its neighbours are not far away
 _AT_FIRST = 0.1  # share of the effort for the first tree
 
 
@@ -250,7 +251,7 @@ def prove_remaining(
     tuple[RankProof, Callable] | None : the leaves, and what is left of them without the one of this number; None if
         there are no such leaves.
     """
-    course = question.course(COUNTS)
+    course = question.course(_COUNTS_BACK)
     search = Remaining(course, *question.root, seeds)
     with shared(runner, course) as bound:
         rounds, done = _grow(search, bound, effort, report, 1.0)

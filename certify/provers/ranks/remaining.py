@@ -79,11 +79,11 @@ class Remaining(SearchFrom):
         return self._met(self.seeds, self.seeds)
 
     def _beside(self, near: Index) -> Index:
-        """Those of some leaves whose images meet one that remains; all if there are none."""
-        k, at = np.nonzero(np.isfinite(self.lo[:, 0, near]))
-        node = near[at]
-        _, image, leaf = self.cover.met_by(self.lo[k, :, node].T, self.hi[k, :, node].T)
-        beside: Index = np.unique(node[image[self.rank[leaf] < UNPROVED]])
+        """Those of some leaves that have no image, or one that meets a leaf that remains; all if there are none."""
+        imaged = np.isfinite(self.lo[:, 0, near])
+        k, at = np.nonzero(imaged)
+        _, image, leaf = self.cover.met_by(self.lo[k, :, near[at]].T, self.hi[k, :, near[at]].T)
+        beside: Index = np.union1d(near[~imaged.any(0)], near[at[image[self.rank[leaf] < UNPROVED]]])
         return beside if len(beside) else near
 
     def tighten(self) -> None:
