@@ -1,4 +1,4 @@
-"""Claim `remains` in the reference: boxes with ranks that are never left, and what just leaves them.
+"""Claim `remains`: boxes with ranks that are never left, and what just leaves them, in both programs.
 
 Every certificate is JSON by hand: small trees whose images are known.
 """
@@ -19,7 +19,7 @@ from certify.reference import rules
 from certify.reference.__main__ import in_words
 from certify.reference.document import read
 from tests.support.certificates import edited
-from tests.support.rank_forgeries import by_reference as verdict
+from tests.support.rank_forgeries import by_checker, by_reference
 from tests.support.ranked import UNRANKED, Document, Loop, affine, dumped, encode, raw, two_bytes, uniform
 
 NO, PLANE = UNRANKED, ("x", "y")
@@ -35,6 +35,13 @@ def remaining(loop: Loop, lo: Ends, hi: Ends, depth: int, ranks: Sequence[int], 
     data = loop.document(lo, hi, tree, two_bytes(ranks), bytes(steps))
     claim = {key: value for key, value in data["claim"].items() if key != "target"}
     return edited(data, "claim", claim | {"kind": "remains"})
+
+
+def verdict(data: Document) -> str | None:
+    """The rule that both refuse it by, if any."""
+    by = by_reference(data)
+    assert by_checker(data) == by
+    return by
 
 
 def rejected(data: Document) -> tuple[str | None, str | None]:
@@ -96,9 +103,25 @@ def test_boxes_of_a_contraction_are_never_left() -> None:
 
 
 def test_a_third_of_a_turn_returns_after_three_steps() -> None:
-    assert verdict(winding(3)) is None and verdict(winding(6)) is None
+    assert by_reference(winding(3)) is None and by_reference(winding(6)) is None
     for count in (1, 2, 4):
         assert rejected(winding(count)) == ("ranks", "ranks leaf 0")
+
+
+def test_a_little_less_than_a_third_of_a_turn() -> None:
+    """Edges that coincide exactly are for rationals; three steps shrink this by 3e-8."""
+    less = [affine([[1 - 1e-4, 1e-4 - 1]])]
+    assert verdict(winding(3, network=less)) is None and verdict(winding(6, network=less)) is None
+    for count in (1, 2, 4):
+        assert verdict(winding(count, network=less)) == "ranks"
+    assert verdict(winding(3, network=less, domain=("-2", "2"))) is None
+    assert verdict(winding(3, network=less, domain=("-19/10", "19/10"))) == "ranks"
+    assert verdict(winding(3, network=less, keep=[["-", "x", "199/100"]])) == "keep"
+    assert verdict(winding(3, network=less, bound="199/100")) == "inputs"
+    mirrored = [
+        line(-1 + 1e-9, 4 - 1e-9, ranks, most=65_534) for ranks in ([1] * 4, [1, 2, 2, 65_534], [65_534, 9, 9, 3])
+    ]
+    assert [verdict(one) for one in mirrored] == [None] * 3
 
 
 def test_an_angle_goes_round_for_ever() -> None:
@@ -120,10 +143,10 @@ def test_held_inputs_keep_constraints_between_sampling_instants() -> None:
 def test_ranks_need_not_fall() -> None:
     """x+ = 4 - x exchanges [0, 1] with [3, 4]: whatever ranks they have, the other's may be higher."""
     for ranks in ([1, 1, 1, 1], [1, 2, 2, 65_534], [65_534, 9, 9, 3]):
-        assert verdict(line(-1.0, 4.0, ranks, most=65_534)) is None
-    assert verdict(line(-1.0, 4.0, [5] * 4, [5, 3, 3, 5])) is None
+        assert by_reference(line(-1.0, 4.0, ranks, most=65_534)) is None
+    assert by_reference(line(-1.0, 4.0, [5] * 4, [5, 3, 3, 5])) is None
     reaches = edited(line(-1.0, 4.0, [5] * 4), "claim", lambda claim: claim | {"kind": "reaches", "target": ["1"]})
-    assert verdict(reaches) == "ranks"
+    assert by_reference(reaches) == "ranks"
 
 
 def test_what_is_uncertain() -> None:
@@ -145,9 +168,9 @@ def test_an_image_that_meets_a_leaf_without_a_rank_by_little(end: float, good: b
 @pytest.mark.parametrize(("by", "good"), [(0.0, True), (1e-12, False)])
 def test_an_image_that_leaves_the_root_box_by_little(by: float, good: bool) -> None:
     for shift in (2 + by, -by):
-        assert (verdict(line(0.5, shift, [1] * 4)) is None) == good
+        assert (by_reference(line(0.5, shift, [1] * 4)) is None) == good
     quarter = [affine([[1.0, 0.0]])]  # of a turn, on a box that is `by` less high than wide
-    assert (verdict(winding(1, lo=(-1.0, by - 1.0), network=quarter)) is None) == good
+    assert (by_reference(winding(1, lo=(-1.0, by - 1.0), network=quarter)) is None) == good
 
 
 def test_one_leaf_of_many_leads_out() -> None:
@@ -174,15 +197,15 @@ def test_ranks_and_steps_that_do_not_fit() -> None:
 
 
 def test_the_domain_on_the_way() -> None:
-    assert verdict(winding(3, domain=("-2001/1000", "2001/1000"))) is None
+    assert by_reference(winding(3, domain=("-2001/1000", "2001/1000"))) is None
     assert rejected(winding(3, domain=("-2", "2"))) == ("ranks", "ranks leaf 0")
     for axis in (0, 1):  # x touches its end after two of three steps, y after one
         for end in (["-9", "2"], ["-2", "9"]):
-            assert verdict(edited(winding(3), f"plant.domain.{axis}", end)) == "ranks"
+            assert by_reference(edited(winding(3), f"plant.domain.{axis}", end)) == "ranks"
             wider = ["-9", "2001/1000"] if end[1] == "2" else ["-2001/1000", "9"]
-            assert verdict(edited(winding(3), f"plant.domain.{axis}", wider)) is None
-    assert verdict(line(0.5, 1.0, [1] * 4, domain=("0", "9"))) == "ranks"  # a leaf's end is the domain's
-    assert verdict(line(0.5, 1.0, [NO, 1, 1, 1], domain=("0", "9"))) is None
+            assert by_reference(edited(winding(3), f"plant.domain.{axis}", wider)) is None
+    assert by_reference(line(0.5, 1.0, [1] * 4, domain=("0", "9"))) == "ranks"  # a leaf's end is the domain's
+    assert by_reference(line(0.5, 1.0, [NO, 1, 1, 1], domain=("0", "9"))) is None
 
 
 def test_constraints_and_inputs_on_the_way() -> None:
@@ -190,11 +213,11 @@ def test_constraints_and_inputs_on_the_way() -> None:
     for axis in PLANE:
         for sign in ("1", "-1"):
             g = ["*", sign, axis]
-            assert verdict(winding(3, keep=["-1", ["-", g, "2001/1000"]])) is None
+            assert by_reference(winding(3, keep=["-1", ["-", g, "2001/1000"]])) is None
             assert rejected(winding(3, keep=["-1", ["-", g, "1999/1000"]])) == ("keep", "ranks leaf 0")
-    assert verdict(winding(3, bound="2")) is None and verdict(winding(3, bound="1999/1000")) == "inputs"
-    assert verdict(line(0.5, 1.0, [1] * 4, keep=[["-", "x", "4"]])) == "keep"  # also where it starts
-    assert verdict(line(0.5, 1.0, [1, 1, 1, NO], keep=[["-", "x", "4"]])) is None
+    assert by_reference(winding(3, bound="2")) is None and by_reference(winding(3, bound="1999/1000")) == "inputs"
+    assert by_reference(line(0.5, 1.0, [1] * 4, keep=[["-", "x", "4"]])) == "keep"  # also where it starts
+    assert by_reference(line(0.5, 1.0, [1, 1, 1, NO], keep=[["-", "x", "4"]])) is None
 
 
 def test_a_next_state_that_may_not_exist() -> None:

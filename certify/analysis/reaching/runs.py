@@ -132,9 +132,9 @@ class Simulation:
         return tuple(min(max(Fraction(v), lo), hi) for v, (lo, hi) in each)
 
 
-def later(loop: ClosedLoop, x: Array, steps: int, effort: Effort) -> Array | None:
+def later(loop: ClosedLoop, x: Array, steps: int, effort: Effort) -> tuple[Array, int]:
     """The states (N, n) after so many steps of runs from states x, (N, n), NaN of those that leave the domain or
-    violate a constraint; None if the effort ends first."""
+    violate a constraint; and the number of steps, which the effort may cut."""
     simulation, end = Simulation(loop, (), ()), x.copy()
     for k in range(steps):
         alive = np.flatnonzero(np.isfinite(end).all(-1))
@@ -142,9 +142,9 @@ def later(loop: ClosedLoop, x: Array, steps: int, effort: Effort) -> Array | Non
         alive = np.flatnonzero(np.isfinite(end).all(-1))
         effort.charge(simulation.operations(len(alive)))
         if effort.over:
-            return None
+            return end, k
         end[alive] = simulation.later(end[alive])
-    return end
+    return end, steps
 
 
 def begins(box: Box) -> Array:

@@ -31,8 +31,8 @@ from certify.provers.execution import ThreadRunner
 from certify.provers.ranks import Nothing, Question, prove_remaining, root_box, turning, with_frame, with_order
 
 Array = NDArray[np.float64]
-_FOR_SEARCH, _FOR_RUNS = 0.7, 0.05  # shares of the effort, the rest being for the check
-_QUICK = 10.0  # multiplications of many runs at once that are worth an operation
+_FOR_SEARCH = 0.7  # share of the effort, the rest being for the check
+_OF_RUNS = 1e10  # operations for simulated runs, a few seconds, which no effort is charged with
 _LITTLE = 1e-4  # error of a step that does no harm, as a share of the root box
 _PROBES, _RUNS, _STEPS = 30, 500, 500  # states at which the series is chosen; simulated states, and their steps
 _MENDED = 20  # leaves that the checker may refuse
@@ -57,16 +57,14 @@ def proved_in_steps(
     root = root_box(loop)
     with tools.timing("simulate"):
         begins = np.random.default_rng(0).uniform(*root, (_RUNS, system.n))
-        runs = Effort(_QUICK * _FOR_RUNS * effort.left)
-        ends = later(loop, begins, _STEPS, runs)
-        effort.charge(runs.spent / _QUICK)
+        ends, count = later(loop, begins, _STEPS, Effort(_OF_RUNS))
     search = effort.share(_FOR_SEARCH)
 
     def report(share: float, boxes: int, waiting: int) -> None:
         tools.tell("set", Progress(0.0, 0.0, boxes, waiting, share, search.left))
 
     with tools.timing("search"):
-        seeds = np.zeros((system.n, 0)) if ends is None else ends[np.isfinite(ends).all(-1)].T
+        seeds = ends[np.isfinite(ends).all(-1)].T
         x = (seeds if seeds.size else begins.T)[:, :_PROBES]
         question = Question(loop, Nothing(), tuple(kept_constraints(system).values()), root)
         question = with_frame(with_order(question, x, search, _LITTLE), x, search)
@@ -95,7 +93,7 @@ def proved_in_steps(
         verdict=Verdict.PROVED,
         reason="done" if proof.done else "effort",
         ranks=rank_facts(certificate, proof),
-        simulated=None if ends is None else _simulated(certificate, begins, ends),
+        simulated=_simulated(certificate, begins, ends, count),
         state=_state_in(certificate),
         boxes=proof.boxes,
         constraints=constraints_in_words(certificate),
@@ -129,11 +127,11 @@ def _nothing(over: bool) -> str:
     return f"no box of the domain is proved to be never left: {left}"
 
 
-def _simulated(certificate: RemainCertificate, begins: Array, ends: Array) -> StayingFacts:
+def _simulated(certificate: RemainCertificate, begins: Array, ends: Array, steps: int) -> StayingFacts:
     """The counts of simulated runs, of those that stay, and of these that start in the boxes."""
     staying = np.isfinite(ends).all(-1)
     held = region_of(certificate).holds_in_floats(begins)
-    return StayingFacts(len(begins), _STEPS, int(staying.sum()), int((staying & held).sum()))
+    return StayingFacts(len(begins), steps, int(staying.sum()), int((staying & held).sum()))
 
 
 def _state_in(certificate: RemainCertificate) -> dict[str, float]:
