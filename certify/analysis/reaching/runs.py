@@ -116,7 +116,7 @@ class Simulation:
         return 1 if self.flow.discrete else self.flow.steps_between(self.step)
 
     def operations(self, runs: int) -> float:
-        """Those of a step of the loop of so many runs."""
+        """The operations of a step of the loop of so many runs."""
         return self._each * self.flow.operations(runs)
 
     def later(self, x: Array) -> Array:

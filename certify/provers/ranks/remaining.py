@@ -79,7 +79,7 @@ class Remaining(SearchFrom):
         return self._met(self.seeds, self.seeds)
 
     def _beside(self, near: Index) -> Index:
-        """Those of some leaves that have no image, or one that meets a leaf that remains; all if there are none."""
+        """The leaves among some that have no image, or one that meets a leaf that remains; all if there are none."""
         imaged = np.isfinite(self.lo[:, 0, near])
         k, at = np.nonzero(imaged)
         _, image, leaf = self.cover.met_by(self.lo[k, :, near[at]].T, self.hi[k, :, near[at]].T)
