@@ -32,7 +32,7 @@ class Remaining(SearchFrom):
         self.seeds, self.lost, self.most, self.core = seeds, np.zeros(1, dtype=bool), math.inf, True
 
     def begin(self, most: float) -> Index:
-        """The leaves of a first tree, all of one size, that hold seeds; all if there are none."""
+        """The leaves of a first tree, all of one size, that hold seeds."""
         self.most = _FOR_CORE * most
         return super().begin(most)
 
