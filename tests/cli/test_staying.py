@@ -79,7 +79,9 @@ def test_boxes_are_proved_with_a_held_input(
     assert data["simulated"]["share"] > 0.5 and data["ranks"]["covered"] > 0.4
     certificate = str(tmp_path / "out" / "certificate.json")
     capsys.readouterr()
-    assert _run(["check", certificate], False) == 0 and "in such a leaf again after" in capsys.readouterr().out
+    assert _run(["check", certificate], False) == 0
+    told = capsys.readouterr().out
+    assert "in such a leaf again after" in told and "of these, at all times: " in told
     assert _run(["contains", certificate, "x=1", "y=0"], False) == 0
     assert "(kept along every trajectory from there: " in capsys.readouterr().out
     assert _run(["contains", certificate, "x=0", "y=0"], False) == 1
