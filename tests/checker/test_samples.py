@@ -487,7 +487,11 @@ def odd() -> dict[str, Document]:
         edited(edited(two(), "plant.uncertain", []), "evidence.cells", []), "plant.dynamics", [["-", "x"], "0"]
     )
     exact = edited(exact, "evidence.samples", [on_grid([X], None)] * 2)
+    beyond = edited(
+        edited(far(), f"{F}.points", lambda v: [*v, ["3000001/1000000", "0"]]), f"{F}.values", lambda v: [*v, "0"]
+    )
     return {
+        "a point outside of the box": beyond,
         "no name, of no quantities": edited(exact, "evidence.samples.0.error", ""),
         "no name": edited(two(), "evidence.samples.0.error", ""),
         "a state twice": edited(same, "evidence.samples.1", on_grid([X], "q")),
