@@ -347,6 +347,14 @@ def of_far() -> dict[str, list[Document]]:
     }  # fmt: skip
 
 
+def shorter(k: int, side: int, share: Fraction) -> Document:
+    """`near` with one list of weights times a factor, and the end of the slope's range that follows from it."""
+    data = edited(near(), f"{BY}.weights.{k}.{side}", lambda w: [[i, str(share * Fraction(v))] for i, v in w])
+    both = data["evidence"]["samples"][0]["weights"][k]
+    end = ends_at(data["claim"]["samples"]["functions"][0], (0, 0), both)[side]
+    return edited(data, f"plant.uncertain.{k}.range.{side}", str(end))
+
+
 def of_near() -> dict[str, list[Document]]:
     data = near()
     e = lambda path, *values: [edited(data, path, v) for v in values]  # noqa: E731
@@ -372,6 +380,9 @@ def of_near() -> dict[str, list[Document]]:
         ],
         "samples that are none": [
             edited(data, f"{BY}.weights.{k}.{side}.0.0", v) for k, side in ends for v in (25, -1, True, "7", None, 7.0)
+        ],
+        "weights that give less than the direction, and a range by them": [
+            shorter(k, side, share) for k, side in ends for share in (Fraction(999, 1000), Fraction(1001, 1000))
         ],
         "weights of the other slope": e(f"{BY}.weights", lambda w: w[::-1]),
         "lists of weights": e(f"{BY}.weights.0", [], [[[7, "-5"], [17, "5"]]], None)
@@ -544,6 +555,19 @@ def test_samples_that_contradict_each_other_about_a_slope(off: Fraction) -> None
     assert ends_at(data["claim"]["samples"]["functions"][0], (0, 0), data["evidence"]["samples"][0]["weights"][0]) == [
         -1 + 10 * off - e, -1 + e]  # fmt: skip
     assert verdicts(data) == (ACCEPTED if 10 * off <= 2 * e else ("samples", "samples"))
+
+
+@pytest.mark.parametrize(("low", "rule"), [("-1", "local"), ("1/100", "samples")])
+def test_the_box_of_what_vanishes_has_the_origin(low: str, rule: str) -> None:
+    """Slopes from samples with u > 0; with the first box, in which 0 is, a later rule is the first to fail."""
+    f = function("x", ("x", "u"), [["1/5", "1/50"], ["1/50", "1/10"]], "1/1000", True, [NEAR_X, [Fraction(1, 10), 1]],
+                 lambda x, u: -x + u / 2)  # fmt: skip
+    data = edited(edited(near(), F, f), f"{F}.box.1", [low, "1"])
+    both = [[[2, "-5"], [6, "5"]]] * 2, [[[4, "10"]]] * 2
+    data = edited(edited(data, f"{BY}.weights", list(both)), "plant.input_bounds.0", [low, "1"])
+    for k, ends in enumerate((["-2", "0"], ["0", "1"])):
+        data = edited(data, f"plant.uncertain.{k}.range", ends)
+    assert verdicts(data) == (rule, rule)
 
 
 def test_a_sample_may_have_several_weights_in_a_list() -> None:
