@@ -105,7 +105,7 @@ class Sampled:
                 for v, (lo, hi) in zip(f["variables"], f["box"], strict=True)
             ]
             each.append(
-                f"{of}its second derivatives are continuous and at most {listed(bends)} in size where {listed(box)}; "
+                f"{of}its second derivatives are continuous and at most {listed(bends)} in size for {listed(box)}; "
                 f"at the sampled points it is within {below(Fraction(f['noise']))} of the samples{zero}"
             )
         return "; ".join(each)
