@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from itertools import pairwise
 from typing import Any
 
 import mpmath
@@ -206,6 +207,63 @@ def test_the_checker_asks_each_quarter(k: int, monkeypatch: pytest.MonkeyPatch) 
             assert verdicts(violated) == ((None if left_out == k else "keep"), "keep")
 
 
+LONGEST = ["1", "1/3", "1/10", "7/10", "1/1000"]
+
+
+@pytest.mark.parametrize("jitter", [False, True])
+@pytest.mark.parametrize("hi", LONGEST)
+def test_quarters_are_those_of_the_longest_period_in_rationals(
+    hi: str, jitter: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between two of them no number is missing, not even one beside an end that binary64 does not have."""
+    lo, asked = str(Fraction(hi) / 2) if jitter else hi, dict[str, list[tuple[Fraction, ...]]]()
+    number: Callable[..., Any] = Boxes.number
+    between: Callable[..., Any] = Motion.between
+
+    def numbers(self: Any, pair: Any, symbol: int, batch: int) -> Any:
+        if symbol == self.symbols:
+            asked.setdefault("checker", []).append(tuple(map(Fraction, pair)))
+        return number(self, pair, symbol, batch)
+
+    def times(self: Any, *pair: Any) -> Any:
+        asked.setdefault("reference", []).append(tuple(Fraction(str(end)) for end in pair))
+        return between(self, *pair)
+
+    monkeypatch.setattr(Boxes, "number", numbers)
+    monkeypatch.setattr(Motion, "between", times)
+    assert verdicts(replace(CASES["held"], hi=hi).document(Fraction(1), lo)) == KEPT
+    ends = [Fraction(hi) * k / 4 for k in range(5)]
+    assert asked["checker"] == list(pairwise(ends))
+    assert [pair for pair in asked["reference"] if pair != (Fraction(lo), Fraction(hi))] == list(pairwise(ends))
+
+
+@pytest.mark.parametrize("hi", LONGEST)
+@pytest.mark.parametrize("k", range(5))
+def test_no_instant_beside_an_end_is_missing(k: int, hi: str) -> None:
+    """v is the share of the period that is over, and g is violated within 2^-36 of an end of a quarter, or of a time
+    2^-34 before or after it."""
+    over = ["*", str(1 / Fraction(hi)), "u"]
+    for beside in (Fraction(-1, 2**34), Fraction(0), Fraction(1, 2**34)):
+        at = Fraction(k, 4) + beside
+        if not 0 <= at <= 1:
+            continue
+        near = Case(["u", over], (0.0, 0.0), ["-", ["abs", ["-", "v", str(at)]]], Fraction(0), hi=hi)
+        for jitter in (None, "0"):
+            assert verdicts(near.document(Fraction(-1, 2**36), jitter)) == REFUSED
+            assert verdicts(near.document(Fraction(1, 4), jitter)) == KEPT
+
+
+@pytest.mark.parametrize("k", range(4))
+def test_what_has_no_value_within_one_quarter_is_refused(k: int) -> None:
+    """x is the time. No product with 0 hides a pole, nor a root of what is negative at an end; beyond them all is well.
+    A constraint that is 0 is not negative either."""
+    pole = ["/", "1", ["-", "x", str(Fraction(2 * k + 1, 8))]]
+    for nothing in (pole, ["sqrt", ["-", "x", "1/8"]], ["sqrt", ["-", "7/8", "x"]], "1"):
+        assert verdicts(Case(["u"], (0.0,), ["*", "0", nothing], Fraction(0)).document(Fraction(0))) == REFUSED
+    for value in (["/", "1", ["+", "x", "1/8"]], ["sqrt", ["+", "x", "1/8"]], "1"):
+        assert verdicts(Case(["u"], (0.0,), ["*", "0", value], Fraction(0)).document(Fraction(1, 8))) == KEPT
+
+
 # --------------------------------------------------------------------------------------------------- states in between
 
 
@@ -377,7 +435,11 @@ def test_a_loop_overshoots_its_level_within_a_period() -> None:
     for bound in (most(0.0) + 1e-6, TOP - 1e-6):
         for depth in (6, 12):
             assert both(overshooting(bound, depth)) == ("keep", "keep")
-    assert both(overshooting(1.1 * TOP)) == ("ACCEPTED", None)
+    kept, violated = overshooting(1.1 * TOP), overshooting(TOP - 1e-6, 6)
+    assert both(kept) == ("ACCEPTED", None)
+    (g,), (h,) = (data["claim"]["keep"] for data in (kept, violated))
+    for some in ([h, g, g], [g, h, g], [g, g, h]):
+        assert both(edited(kept, "claim.keep", some)) == ("keep", "keep")
 
 
 def test_v_in_a_gap_is_that_of_the_sampling_instant(monkeypatch: pytest.MonkeyPatch) -> None:
