@@ -264,6 +264,13 @@ def test_what_has_no_value_within_one_quarter_is_refused(k: int) -> None:
         assert verdicts(Case(["u"], (0.0,), ["*", "0", value], Fraction(0)).document(Fraction(1, 8))) == KEPT
 
 
+def test_each_of_several_constraints_is_asked_before_a_step() -> None:
+    data = CASES["until the end"].document(-Fraction(1, 10**6))
+    _, g = data["claim"]["keep"]
+    for some in ([g], [g, "-1"], ["-1", g, "-1"], ["-1", "-1", g]):
+        assert verdicts(edited(data, "claim.keep", some)) == REFUSED
+
+
 # --------------------------------------------------------------------------------------------------- states in between
 
 
