@@ -255,13 +255,12 @@ def test_no_instant_beside_an_end_is_missing(k: int, hi: str) -> None:
 
 @pytest.mark.parametrize("k", range(4))
 def test_what_has_no_value_within_one_quarter_is_refused(k: int) -> None:
-    """x is the time. No product with 0 hides a pole, nor a root of what is negative at an end; beyond them all is well.
-    A constraint that is 0 is not negative either."""
-    pole = ["/", "1", ["-", "x", str(Fraction(2 * k + 1, 8))]]
-    for nothing in (pole, ["sqrt", ["-", "x", "1/8"]], ["sqrt", ["-", "7/8", "x"]], "1"):
-        assert verdicts(Case(["u"], (0.0,), ["*", "0", nothing], Fraction(0)).document(Fraction(0))) == REFUSED
-    for value in (["/", "1", ["+", "x", "1/8"]], ["sqrt", ["+", "x", "1/8"]], "1"):
-        assert verdicts(Case(["u"], (0.0,), ["*", "0", value], Fraction(0)).document(Fraction(1, 8))) == KEPT
+    """x is the time. g is -1/8, but for a pole or a root of what is negative at an end, times 0."""
+    pole, right = ["/", "1", ["-", "x", str(Fraction(2 * k + 1, 8))]], ["/", "1", ["+", "x", "1/8"]]
+    for wrong in (pole, ["sqrt", ["-", "x", "1/8"]], ["sqrt", ["-", "7/8", "x"]]):
+        assert verdicts(Case(["u"], (0.0,), ["*", "0", wrong], Fraction(0)).document(Fraction(1, 8))) == REFUSED
+    for good in (right, ["sqrt", ["+", "x", "1/8"]], ["sqrt", ["-", "9/8", "x"]]):
+        assert verdicts(Case(["u"], (0.0,), ["*", "0", good], Fraction(0)).document(Fraction(1, 8))) == KEPT
 
 
 def test_each_of_several_constraints_is_asked_before_a_step() -> None:
