@@ -215,15 +215,18 @@ LONGEST = ["1", "1/3", "1/10", "7/10", "1/1000"]
 def test_quarters_are_those_of_the_longest_period_in_rationals(
     hi: str, jitter: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Between two of them no number is missing, not even one beside an end that binary64 does not have."""
+    """Of two that meet no time is missing, not even beside an end that binary64 does not have; models have these ends."""
     lo, asked = str(Fraction(hi) / 2) if jitter else hi, dict[str, list[tuple[Fraction, ...]]]()
     number: Callable[..., Any] = Boxes.number
     between: Callable[..., Any] = Motion.between
 
     def numbers(self: Any, pair: Any, symbol: int, batch: int) -> Any:
+        found = number(self, pair, symbol, batch)
         if symbol == self.symbols:
             asked.setdefault("checker", []).append(tuple(map(Fraction, pair)))
-        return number(self, pair, symbol, batch)
+            middle, reach, wrong = (Fraction(float(v)) for v in (found.c[0], found.g[symbol, 0], found.r.top))
+            assert middle - reach - wrong <= pair[0] and pair[1] <= middle + reach + wrong
+        return found
 
     def times(self: Any, *pair: Any) -> Any:
         asked.setdefault("reference", []).append(tuple(Fraction(str(end)) for end in pair))
