@@ -20,8 +20,10 @@ from certify.checker import flow as checker_flow
 from certify.checker import keep as checker_keep
 from certify.checker.boxes import Boxes
 from certify.checker.case import Case as Of
+from certify.checker.near import Above
 from certify.checker.network import enclose_on_boxes
 from certify.checker.ranks import Steps
+from certify.checker.taylor import Taylor as Model
 from certify.checker.taylor import combination, constants
 from certify.reference import leaves as reference_leaves
 from certify.reference import motion as reference_motion
@@ -39,6 +41,7 @@ from tests.support.rank_truth import Truth
 from tests.support.ranked import Document, Loop, affine, dumped, encode, two_bytes
 from tests.support.reference import judge
 from tests.support.stepped_loops import WIDE as FAR
+from tests.support.stepped_loops import fitted, linear
 
 KEPT, REFUSED = (None, None), ("keep", "keep")
 WIDE = 2.0**-40  # half of the leaf's width
@@ -215,7 +218,7 @@ LONGEST = ["1", "1/3", "1/10", "7/10", "1/1000"]
 def test_quarters_are_those_of_the_longest_period_in_rationals(
     hi: str, jitter: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of two that meet no time is missing, not even beside an end that binary64 does not have; models have these ends."""
+    """Of two that meet no time is missing, not even beside an end that binary64 does not have. Models hold the ends."""
     lo, asked = str(Fraction(hi) / 2) if jitter else hi, dict[str, list[tuple[Fraction, ...]]]()
     number: Callable[..., Any] = Boxes.number
     between: Callable[..., Any] = Motion.between
@@ -388,6 +391,37 @@ def test_a_time_within_a_period_has_a_symbol_that_nothing_else_has(doubt: str, s
         named = {"name": "cut", "reads": 1, "steps": [affine([[2.0**20]]), corner]}
         data["networks"] += [named] * (doubt == "a call")
         assert verdicts(data) == said
+
+
+@pytest.mark.parametrize("more", [0, 1, 3])
+def test_a_model_among_more_symbols_does_not_depend_on_these(more: int) -> None:
+    chance, N = np.random.default_rng(more), 3
+    model = Model(np.ones(1), chance.standard_normal((N + N * (N + 1) // 2, 1)), Above(np.full(1, 0.5)))
+    wide = model.widened(N + more)
+
+    def at(v: Model, d: Any) -> float:
+        i, j = np.triu_indices(len(d))
+        return float(v.c[0] + v.g[:, 0] @ d + v.q[:, 0] @ (d[i] * d[j]))
+
+    assert wide.symbols == N + more and wide.r.top == model.r.top
+    for _ in range(9):
+        d = chance.uniform(-1, 1, N + more)
+        assert at(wide, d) == pytest.approx(at(model, d[:N]), abs=1e-12)
+
+
+@pytest.mark.parametrize("claim", ["asymptotic", "practical"])
+def test_what_has_no_value_on_a_ball_is_refused(claim: str) -> None:
+    """Within a period x comes to 5/4 of its size at the start or more, by the a-priori bound: further than the ball."""
+    data = linear(["u"], [[0.5]], 1.0, sample=("1/4", "1/2"), claim=claim)
+    data = fitted(
+        edited(data, "levels.floor", (0.5).hex()) if claim == "practical" else data, edge=0.25 * (claim == "practical")
+    )
+    assert both(data) == ("ACCEPTED", None)
+    for wrong in (["/", "1", ["-", "x", "9/8"]], ["sqrt", ["-", "x", "-9/8"]], ["sqrt", "x"]):
+        kept = edited(data, "claim", lambda old, wrong=wrong: old | {"keep": ["-1", ["-", ["*", "0", wrong], "1"]]})
+        assert both(kept) == ("keep", "keep")
+    far = edited(data, "claim", lambda old: old | {"keep": ["-1", ["-", ["*", "0", ["sqrt", ["+", "x", "2"]]], "1"]]})
+    assert both(far) == ("ACCEPTED", None)
 
 
 # ------------------------------------------------------------------------------------------------- beyond the level set
