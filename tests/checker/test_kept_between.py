@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 from flint import arb, ctx
 
-from certify.checker import document
+from certify.checker import document, rules
 from certify.checker import flow as checker_flow
 from certify.checker import keep as checker_keep
 from certify.checker.boxes import Boxes
 from certify.checker.case import Case as Of
+from certify.checker.errors import Rejected
 from certify.checker.near import Above
 from certify.checker.network import enclose_on_boxes
 from certify.checker.ranks import Steps
@@ -27,13 +28,14 @@ from certify.checker.taylor import Taylor as Model
 from certify.checker.taylor import combination, constants
 from certify.reference import leaves as reference_leaves
 from certify.reference import motion as reference_motion
+from certify.reference import rules as reference_rules
 from certify.reference.document import read
 from certify.reference.evidence import Ranked
 from certify.reference.leaves import Box
 from certify.reference.motion import Motion, Stage
 from certify.reference.ranks import Walk
 from certify.reference.taylor import Taylor
-from tests.support.certificates import decode, edited, make, verdict, with_tree
+from tests.support.certificates import decode, dump, edited, make, parse, verdict, with_tree
 from tests.support.certificates import halved as cut
 from tests.support.marks import slow_after
 from tests.support.rank_forgeries import Draw, verdicts
@@ -518,7 +520,7 @@ def test_v_in_a_gap_is_that_of_the_sampling_instant(monkeypatch: pytest.MonkeyPa
 
 def test_a_gap_counts_with_one_sign_and_leaves_inside_are_asked() -> None:
     """1/2 - V is positive near the origin, and with -1 times the gap 1 - V more it would be -1/2; 1/64 - V is so where
-    V is below c0 alone."""
+    V is below c0 alone. What fails is said of its leaf."""
     data = make(
         ["u"], [([[-1.0]], [0.0])], [[1.0]], (0.25, 1.0), domain=FAR, input_bounds=[("-99", "99")],
         squash="identity", centre="none", scale=(1.0,), claim="practical",
@@ -531,3 +533,9 @@ def test_a_gap_counts_with_one_sign_and_leaves_inside_are_asked() -> None:
         (["-", "1/64", ["*", "x", "x"]], ("keep", "keep")),
     ):
         assert both(edited(data, "claim", lambda claim, g=g: claim | {"keep": [g]})) == said
+    for leaf in range(8):
+        near = ["-", "1/1000", ["**", ["-", "x", str(Fraction(2 * leaf - 7, 8))], 2]]
+        hole = edited(data, "claim", lambda claim, near=near: claim | {"keep": ["-1", near]})
+        with pytest.raises(Rejected) as refused:
+            rules.check(parse(hole))
+        assert refused.value.at == str(reference_rules.judge(dump(hole)).at) == f"leaf {leaf}"
