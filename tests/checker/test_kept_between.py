@@ -263,10 +263,14 @@ def test_no_instant_beside_an_end_is_missing(k: int, hi: str) -> None:
 
 @pytest.mark.parametrize("k", range(4))
 def test_what_has_no_value_within_one_quarter_is_refused(k: int) -> None:
-    """x is the time. g is -1/8, but for a pole or a root of what is negative at an end, times 0."""
+    """x is the time. g is -1/8, but for a pole or a root of what is negative at an end, times 0, or what overflows."""
     pole, right = ["/", "1", ["-", "x", str(Fraction(2 * k + 1, 8))]], ["/", "1", ["+", "x", "1/8"]]
     for wrong in (pole, ["sqrt", ["-", "x", "1/8"]], ["sqrt", ["-", "7/8", "x"]]):
         assert verdicts(Case(["u"], (0.0,), ["*", "0", wrong], Fraction(0)).document(Fraction(1, 8))) == REFUSED
+    rising: Any = ["*", "9", ["-", "x", str(Fraction(k - 1, 4))]]
+    for _ in range(4):
+        rising = ["exp", rising]
+        assert verdicts(Case(["u"], (0.0,), rising, Fraction(0)).document(Fraction(1))) == REFUSED
     for good in (right, ["sqrt", ["+", "x", "1/8"]], ["sqrt", ["-", "9/8", "x"]]):
         assert verdicts(Case(["u"], (0.0,), ["*", "0", good], Fraction(0)).document(Fraction(1, 8))) == KEPT
 
