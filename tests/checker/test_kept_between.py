@@ -275,6 +275,15 @@ def test_what_has_no_value_within_one_quarter_is_refused(k: int) -> None:
         assert verdicts(Case(["u"], (0.0,), ["*", "0", good], Fraction(0)).document(Fraction(1, 8))) == KEPT
 
 
+@pytest.mark.parametrize("function", ["sin", "tanh", "atan", "abs"])
+def test_a_function_of_what_is_infinite_is_refused(function: str) -> None:
+    """Of exp(exp(exp(80 x))) balls have neither a middle nor a radius that is finite."""
+    rising: Any = ["*", "80", "x"]
+    for name in ("exp", "exp", "exp", function):
+        rising = [name, rising]
+    assert verdicts(Case(["u"], (0.0,), ["*", "0", rising], Fraction(0)).document(Fraction(1))) == REFUSED
+
+
 def test_each_of_several_constraints_is_asked_before_a_step() -> None:
     data = CASES["until the end"].document(-Fraction(1, 10**6))
     _, g = data["claim"]["keep"]
