@@ -424,6 +424,16 @@ def test_a_model_among_more_symbols_does_not_depend_on_these(more: int) -> None:
         assert at(wide, d) == pytest.approx(at(model, d[:N]), abs=1e-12)
 
 
+def test_on_a_ball_quantities_are_any_numbers_of_their_ranges() -> None:
+    """Within a period they may leave their cell, of which there are two."""
+    more: dict[str, Any] = {"sample": ("1/4", "1/4"), "uncertain": [("q", "-1/10", "1/10")], "cells": [2]}
+    data = fitted(linear([["+", "u", ["*", "q", "x"]]], [[0.5]], 1.0, **more))
+    for sign in ("1", "-1"):
+        for bound, said in (("1/20", ("keep", "keep")), ("1/9", ("ACCEPTED", None))):
+            g = ["-", ["*", sign, "q"], bound]
+            assert both(edited(data, "claim", lambda old, g=g: old | {"keep": ["-1", g]})) == said
+
+
 @pytest.mark.parametrize("claim", ["asymptotic", "practical"])
 def test_what_has_no_value_on_a_ball_is_refused(claim: str) -> None:
     """Within a period x comes to 5/4 of its size at the start or more, by the a-priori bound: further than the ball."""
