@@ -143,6 +143,20 @@ def test_an_interval_holds_the_truth(seed: int) -> None:
         assert all(sum(v for _, v in weights) == 1 for weights in both)
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("share", [Fraction(1, 10**9), Fraction(10**9)])
+def test_an_interval_is_as_sharp_of_small_and_large_values(seed: int, share: Fraction) -> None:
+    truth = Truth(seed)
+    one, taken, noise = truth.unknown(), truth.samples(True), Fraction(truth.noise)
+    rows = tuple(tuple(share * m for m in row) for row in one.curvature)
+    scaled = Sampled(taken.points, tuple(share * y for y in taken.values))
+    for z in truth.draw.uniform(-2, 2, (5, truth.d)).round(2):
+        p = tuple(map(decimal, z.tolist()))
+        lo, hi, *_ = Sampling(one, taken, noise).at(p)
+        low, high, *_ = Sampling(replace(one, curvature=rows), scaled, share * noise).at(p)
+        assert abs((high - low) / share / (hi - lo) - 1) < Fraction(1, 10**6)
+
+
 @pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize("noise", [Fraction(0), Fraction(1, 100)])
 def test_an_interval_is_sharp(seed: int, noise: Fraction) -> None:

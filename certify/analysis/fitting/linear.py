@@ -90,7 +90,7 @@ class Sampling:
 class _Around:
     """Samples around a point p, those of the least errors, and their linear programs; `valued` where g(p) is unknown.
 
-    The programs see floats, in which each variable is scaled by its box.
+    The programs see floats, in which each variable is scaled by its box, and values by the largest error.
     """
 
     def __init__(self, sampling: Sampling, p: Point, valued: bool) -> None:
@@ -103,7 +103,8 @@ class _Around:
         self.numbers = np.concatenate([order[:_MOST], alone[:_MOST]])
         Z = away[self.numbers] / sampling.size
         self.A = np.column_stack([np.ones(len(Z)), Z]) if valued else Z
-        self.y, self.e = sampling.values[self.numbers], e[self.numbers]
+        unit = float(e[self.numbers].max()) or 1.0  # of values, for the programs' tolerances are absolute
+        self.y, self.e = sampling.values[self.numbers] / unit, e[self.numbers] / unit
 
     def row(self, k: int) -> Row:
         """The inequality of sample k, exactly."""
