@@ -36,7 +36,7 @@ _MOST_LEAVES = 1000  # that are split again
 _LONG = 1_000_000  # bytes of a certificate, from which on several processes check it
 _MOST_JOBS = 64
 _QUICK = 2**27  # operations of the reference, as docs/mathematics/limits.md counts: at most some five seconds
-_NEWEST = {b'"directions"': 2**31, b'"samples"': 2**33}  # the same of the newest rules: about a minute at most
+_NEWEST = {b'"directions"': 2**31, b'"samples"': 2**34}  # the same of the newest rules: about a minute at most
 _HIGHER = 1.5  # the next floor, after one that is refused
 
 

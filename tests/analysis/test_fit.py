@@ -54,6 +54,12 @@ u = [-1, 1]
 """
 
 
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Grids among scattered samples of fewer points, that a test may end soon."""
+    monkeypatch.setattr("certify.analysis.fitting.grid._MOST", 300)
+
+
 def grid_of(values: Mapping[Point, Fraction], noise: Fraction = Fraction(0)) -> Grid:
     """The grid of samples."""
     axes = tuple(tuple(sorted(set(axis))) for axis in zip(*values, strict=True))

@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from flint import fmpq
 
 from certify.analysis.fitting.linear import Sampling
 from certify.checker import document, rules
 from certify.checker.errors import Rejected
+from certify.checker.samples import Function
 from certify.checker.words import report
 from certify.loop.plants import Sampled, Unknown
 from certify.reference.__main__ import in_words
@@ -602,6 +604,40 @@ def test_a_bump_between_two_samples_is_what_is_allowed(M: Fraction, step: Fracti
         assert less == 0 or not is_shown(one(M, step, noise, top - less))
     assert not is_shown(one(M + TINY, step, noise, top)) and not is_shown(one(M, step, noise + TINY, top))
     assert not is_shown(one(M, step, noise, top, off=TINY)) and not is_shown(one(M, step, noise, top, off=-TINY))
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_any_weights_bound_a_consistent_function(seed: int) -> None:
+    """At the point that they give, exactly: of a quadratic function whose second derivatives are M or -M, sampled with
+    all of the noise, which is the function at an end where weights are positive and it bends most along each axis."""
+    draw, extreme, sign = np.random.default_rng(seed), seed % 3 == 0, -1 if seed % 2 else 1
+    d, count = int(draw.integers(1, 5)), int(draw.integers(1, 9))
+
+    def numbers(least: int, *shape: int) -> list[Any]:
+        return [Fraction(v, 10) for v in draw.integers(least, 9, shape).ravel().tolist()]
+
+    z = [tuple(numbers(-9, d)) for _ in range(count)]
+    v = numbers(1 if extreme else -5, count)
+    v = [w / sum(v) for w in v] if sum(v) else [Fraction(1), *[Fraction(0)] * (count - 1)]
+    p = tuple(sum((w * q[j] for w, q in zip(v, z, strict=True)), Fraction(0)) for j in range(d))
+    upper, signs = np.triu(draw.integers(0, 30, (d, d))), np.triu(draw.choice([-1, 1], (d, d)))
+    bends = np.diag(np.diag(upper)) if extreme else upper + np.triu(upper, 1).T
+    turned = sign * bends if extreme else bends * (signs + np.triu(signs, 1).T)
+    M, H = ([[Fraction(m, 10) for m in row] for row in each.tolist()] for each in (bends, turned))
+    a, w = numbers(-9, d), Fraction(1, 7)
+
+    def g(q: Sequence[Fraction]) -> Fraction:
+        bent = sum((H[i][j] * q[i] * q[j] for i in range(d) for j in range(d)), Fraction(0)) / 2
+        return bent + sum((s * c for s, c in zip(a, q, strict=True)), Fraction(0))
+
+    values = [g(q) + sign * w * (1 if u >= 0 else -1) for q, u in zip(z, v, strict=True)]
+    exact = lambda q: fmpq(q.numerator, q.denominator)  # noqa: E731
+    vector = lambda q: tuple(map(exact, q))  # noqa: E731
+    f = Function(0, tuple(range(d)), (), tuple(map(vector, M)), exact(w), False, tuple(map(vector, z)), vector(values))
+    each = tuple((k, exact(u)) for k, u in enumerate(v))
+    (low_sums, lo), (high_sums, hi) = f.ends(vector(p), (each, each))
+    assert low_sums == high_sums == (1, *vector(p)) and lo <= exact(g(p)) <= hi
+    assert not extreme or (lo if sign > 0 else hi) == exact(g(p))
 
 
 class Random:

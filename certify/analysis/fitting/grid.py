@@ -1,7 +1,8 @@
 """A grid over the box of an unknown function, with an interval at each point that holds the function there.
 
-Samples on a grid are such a grid themselves. Among scattered ones it is chosen: an axis is halved where second
-derivatives add more between two of its values than samples leave open at them.
+Samples on a grid are such a grid themselves. Among scattered ones it is chosen: an axis is halved between two values
+where second derivatives add much, or where the intervals at one are much wider than at the other, for the error on a
+cell is that of its worst corner.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from certify.analysis.fitting.linear import Bounds, Sampling
 from certify.loop.plants.samples import Box, Point, Sampled, Unknown
 
 _MOST = 1000  # points of a grid that is chosen
-_SHARE = 0.1  # of an interval's half width that second derivatives may add along an axis
+_SHARE = 0.5  # of the error between two values that second derivatives and differences of half widths may make
 Interval = tuple[Fraction, Fraction]
 
 
@@ -88,16 +89,17 @@ def _outwards(found: Bounds) -> Bounds:
 
 
 def _finer(one: Unknown, axes: tuple[Point, ...], found: Mapping[Point, Bounds]) -> tuple[Point, ...] | None:
-    """The axes with the middles of all pairs of values between which g may bend too much, those first that do most, as
-    long as the grid is small; None if nothing changes."""
+    """The axes with the middles of all pairs of values between which the error changes too much, those first that do
+    most, as long as the grid is small; None if nothing changes."""
     half = np.array([float(found[p].hi - found[p].lo) / 2 for p in product(*axes)]).reshape([len(a) for a in axes])
     bent = list[tuple[float, int, Fraction]]()
     for j, axis in enumerate(axes):
         for i, (lo, hi) in enumerate(pairwise(axis)):
-            most = _SHARE * float(np.median(half.take((i, i + 1), axis=j)))
-            bend = float(one.curvature[j][j] * (hi - lo) ** 2) / 8
-            if bend > most:
-                bent.append((bend / most if most else np.inf, j, (lo + hi) / 2))
+            a, b, bend = half.take(i, axis=j), half.take(i + 1, axis=j), float(one.curvature[j][j] * (hi - lo) ** 2) / 8
+            most = np.maximum(a, b) + bend
+            share = float(np.mean(np.divide(np.abs(a - b) + bend, most, out=np.zeros_like(most), where=most > 0)))
+            if share > _SHARE:
+                bent.append((share, j, (lo + hi) / 2))
     more = [list(axis) for axis in axes]
     for _, j, middle in sorted(bent, key=lambda each: each[0], reverse=True):
         if prod(len(axis) + (k == j) for k, axis in enumerate(more)) <= _MOST:
