@@ -421,6 +421,14 @@ def test_a_box_may_be_larger_than_the_domain() -> None:
     assert verdicts(edited(wider, "plant.dynamics.0", far_equation(E * (1 - CLOSE)))) == REFUSED
 
 
+def test_a_box_has_a_width() -> None:
+    """All samples and the grid may have the same input, but then the box's ends are not a pair."""
+    data = edited(edited(far(), f"{F}.box.1", ["0", "0"]), f"{BY}.axes.1", ["0"])
+    data = edited(data, f"{F}.points", lambda z: [[x, "0"] for x, _ in z])
+    weights = [[[[k, "1"]]] * 2 for k in range(len(AXES[0]))]
+    assert verdicts(edited(data, f"{BY}.weights", weights)) == MALFORMED
+
+
 @pytest.mark.parametrize("name", ["far", "near"])
 def test_the_box_reaches_over_domain_and_input_bounds(name: str) -> None:
     data = far() if name == "far" else near()
