@@ -454,6 +454,19 @@ def test_a_function_that_vanishes_does_so_in_its_box() -> None:
     assert verdicts(edited(data, f"{F}.vanishes", True)) == REFUSED
 
 
+def test_there_are_as_many_samples_as_may_be() -> None:
+    c, shown = document.read(dumped(far())), far()["evidence"]["samples"]
+
+    def read(count: int) -> int:
+        stated = edited(far()["claim"]["samples"], "functions.0.points", lambda z: z + [["0", "0"]] * (count - len(z)))
+        stated["functions"][0]["values"] += ["0"] * (count - len(stated["functions"][0]["values"]))
+        return len(read_samples(stated, shown, document.SHA256, c.plant, ()).functions[0].values)
+
+    assert read(2**18) == 2**18
+    with pytest.raises(Refused, match="1 to 262144 points"):
+        read(2**18 + 1)
+
+
 def test_no_variable_is_an_angle() -> None:
     c = document.read(dumped(far()))
     stated, shown = far()["claim"]["samples"], far()["evidence"]["samples"]
