@@ -345,7 +345,7 @@ def near_the_origin(
             yield name, "weights must give the direction of their variable"
         if not lo <= hi:
             yield name, "the samples contradict the declared bounds, at the origin"
-        if not ranges[k][0] <= lo <= hi <= ranges[k][1]:
+        if not (ranges[k][0] <= lo and hi <= ranges[k][1]):
             yield name, "a slope may be outside its range, by these weights"
 
 

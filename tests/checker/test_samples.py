@@ -129,6 +129,12 @@ def two() -> Document:
 
 
 @cache
+def unbent() -> Document:
+    """The same, of x' = g(x) without noise or curvature, of which any weights give exact values."""
+    return edited(edited(two(), F, function("x", ("x",), [[0]], 0, False, [X], lambda v: -v)), BY, on_grid([X]))
+
+
+@cache
 def scattered() -> Document:
     """x' = g(x, u) as in `far`, of which 80 samples are taken anywhere, each off by 1/2000 in turn."""
     draw = np.random.default_rng(3)
@@ -188,6 +194,7 @@ TRUE = {
     "near": near,
     "aslant": aslant,
     "two": two,
+    "unbent": unbent,
     "composed": lambda: joined(far(), near()),
     "composed of scattered samples": lambda: joined(scattered(), near()),
 }
@@ -340,6 +347,14 @@ def of_far() -> dict[str, list[Document]]:
     }  # fmt: skip
 
 
+def shorter(k: int, side: int, share: Fraction) -> Document:
+    """`near` with one list of weights times a factor, and the end of the slope's range that follows from it."""
+    data = edited(near(), f"{BY}.weights.{k}.{side}", lambda w: [[i, str(share * Fraction(v))] for i, v in w])
+    both = data["evidence"]["samples"][0]["weights"][k]
+    end = ends_at(data["claim"]["samples"]["functions"][0], (0, 0), both)[side]
+    return edited(data, f"plant.uncertain.{k}.range.{side}", str(end))
+
+
 def of_near() -> dict[str, list[Document]]:
     data = near()
     e = lambda path, *values: [edited(data, path, v) for v in values]  # noqa: E731
@@ -365,6 +380,9 @@ def of_near() -> dict[str, list[Document]]:
         ],
         "samples that are none": [
             edited(data, f"{BY}.weights.{k}.{side}.0.0", v) for k, side in ends for v in (25, -1, True, "7", None, 7.0)
+        ],
+        "weights that give less than the direction, and a range by them": [
+            shorter(k, side, share) for k, side in ends for share in (Fraction(999, 1000), Fraction(1001, 1000))
         ],
         "weights of the other slope": e(f"{BY}.weights", lambda w: w[::-1]),
         "lists of weights": e(f"{BY}.weights.0", [], [[[7, "-5"], [17, "5"]]], None)
@@ -452,6 +470,11 @@ def of_two() -> dict[str, list[Document]]:
         ],
         "functions in another order": e("claim.samples.functions", lambda f: f[::-1]) + e(
             "evidence.samples", lambda s: s[::-1]),
+        "weights that give the point and another sum": [
+            edited(unbent(), f"{BY}.weights.{k}.{side}", v)
+            for k, v in ((0, [[6, "-1"]]), (0, [[1, "3/2"]]), (3, [[3, "2"]]), (2, [[2, "1"], [3, "1"]]))
+            for side in (0, 1)
+        ],
         "another variable": e("claim.samples.functions.0.variables", ["y"], ["u"]),
         "a sampled state in another equation": e("plant.dynamics.1", ["+", ["-", "y"], ["*", "q", "1/10"], "x"]),
     }  # fmt: skip
@@ -475,7 +498,11 @@ def odd() -> dict[str, Document]:
         edited(edited(two(), "plant.uncertain", []), "evidence.cells", []), "plant.dynamics", [["-", "x"], "0"]
     )
     exact = edited(exact, "evidence.samples", [on_grid([X], None)] * 2)
+    beyond = edited(
+        edited(far(), f"{F}.points", lambda v: [*v, ["3000001/1000000", "0"]]), f"{F}.values", lambda v: [*v, "0"]
+    )
     return {
+        "a point outside of the box": beyond,
         "no name, of no quantities": edited(exact, "evidence.samples.0.error", ""),
         "no name": edited(two(), "evidence.samples.0.error", ""),
         "a state twice": edited(same, "evidence.samples.1", on_grid([X], "q")),
@@ -528,6 +555,19 @@ def test_samples_that_contradict_each_other_about_a_slope(off: Fraction) -> None
     assert ends_at(data["claim"]["samples"]["functions"][0], (0, 0), data["evidence"]["samples"][0]["weights"][0]) == [
         -1 + 10 * off - e, -1 + e]  # fmt: skip
     assert verdicts(data) == (ACCEPTED if 10 * off <= 2 * e else ("samples", "samples"))
+
+
+@pytest.mark.parametrize(("low", "rule"), [("-1", "local"), ("1/100", "samples")])
+def test_the_box_of_what_vanishes_has_the_origin(low: str, rule: str) -> None:
+    """Slopes from samples with u > 0; with the first box, in which 0 is, a later rule is the first to fail."""
+    f = function("x", ("x", "u"), [["1/5", "1/50"], ["1/50", "1/10"]], "1/1000", True, [NEAR_X, [Fraction(1, 10), 1]],
+                 lambda x, u: -x + u / 2)  # fmt: skip
+    data = edited(edited(near(), F, f), f"{F}.box.1", [low, "1"])
+    both = [[[2, "-5"], [6, "5"]]] * 2, [[[4, "10"]]] * 2
+    data = edited(edited(data, f"{BY}.weights", list(both)), "plant.input_bounds.0", [low, "1"])
+    for k, ends in enumerate((["-2", "0"], ["0", "1"])):
+        data = edited(data, f"plant.uncertain.{k}.range", ends)
+    assert verdicts(data) == (rule, rule)
 
 
 def test_a_sample_may_have_several_weights_in_a_list() -> None:

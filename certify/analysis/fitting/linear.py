@@ -48,7 +48,7 @@ class Bounds(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What a sample says of q, the value and the slopes of g at a point, or the slopes alone: |a.q - y| <= e."""
+    """A sample's inequality |a.q - y| <= e for q, the value and the slopes of g at a point, or the slopes alone."""
 
     a: Point
     y: Fraction
@@ -106,7 +106,7 @@ class _Around:
         self.y, self.e = sampling.values[self.numbers], e[self.numbers]
 
     def row(self, k: int) -> Row:
-        """What sample k says, exactly."""
+        """The inequality of sample k, exactly."""
         s = self.sampling
         away = tuple(v - w for v, w in zip(s.taken.points[k], self.p, strict=True))
         a = (Fraction(1), *away) if self.valued else away
