@@ -168,6 +168,11 @@ class Certificate:
         return self.claim in WITHOUT_V
 
     @property
+    def stated(self) -> int:
+        """The number of operations of constraints and of the target."""
+        return sum(tape.size for tape in (self.keep, self.target) if tape is not None)
+
+    @property
     def c0(self) -> float:
         """The level that a practical claim ends at; 0 of other claims."""
         return self.levels.get("floor", 0.0)
