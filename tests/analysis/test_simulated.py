@@ -19,7 +19,7 @@ from certify.analysis.acceptance import Clerk
 from certify.analysis.facts import SimulatedFacts, Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
-from certify.analysis.simulated import simulated_region
+from certify.analysis.simulated import Simulator, simulated_region
 from certify.analysis.stages import simulation
 from certify.analysis.suggested import beyond_the_ellipsoid
 from certify.certificates import Certificate
@@ -71,7 +71,7 @@ def by_default(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
 
 
 def test_states_that_converge_are_those_of_the_region(tmp_path: Path) -> None:
-    found = simulated_region(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 0.5, Effort(10 * UNIT))
+    found = simulated_region(Simulator(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 0.5), Effort(10 * UNIT))
     assert found is not None and found.runs >= 1000
     assert np.all((found.converging > -3.001) & (found.converging < 1.001))
     share = len(found.converging) / found.runs
@@ -79,7 +79,7 @@ def test_states_that_converge_are_those_of_the_region(tmp_path: Path) -> None:
 
 
 def test_runs_that_cannot_be_decided_tell_nothing() -> None:
-    assert simulated_region(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 0.5, Effort(1.0)) is None
+    assert simulated_region(Simulator(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 0.5), Effort(1.0)) is None
 
 
 def test_the_default_goes_beyond_the_ellipsoid(by_default: RoaResult) -> None:
