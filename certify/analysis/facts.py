@@ -180,6 +180,22 @@ class SimulatedFacts:
 
 
 @dataclass(frozen=True, slots=True)
+class StayingFacts:
+    """Counts of simulated runs of so many `steps` from states drawn from the domain, which are no part of a proof: of
+    all `runs`, of those that are `staying` in the domain and keep constraints, and of these that start in the `proved`
+    set."""
+
+    runs: int
+    steps: int
+    staying: int
+    proved: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, with the share of those that stay."""
+        return {**asdict(self), "share": self.proved / self.staying if self.staying else None}
+
+
+@dataclass(frozen=True, slots=True)
 class Share:
     """The set's reach along a state, and that as a share of the nearer side of its domain."""
 

@@ -40,8 +40,9 @@ class RoaOptions:
     claim: Asked = option("auto", "claim", "word", first=True, help=(
         "asymptotic: trajectories converge to the origin. practical: they enter a small set and stay there. nearby: "
         "they also converge to one equilibrium in it, if that can be shown. auto: asymptotic if the origin is "
-        "exactly an equilibrium of the loop, else nearby. invariant: no trajectory leaves {N <= n2}, and no "
-        "equilibrium is needed; N is given, or learned: a network, or a polynomial if that is the candidate."))
+        "exactly an equilibrium of the loop, else nearby. invariant: no trajectory leaves a set, and no "
+        "equilibrium is needed. The set is {N <= n2}; N is given, or learned: a network, or a polynomial if that is "
+        "the candidate. In steps it is one of boxes."))
     around: Around = option("auto", "claim", "word", metavar="POINT", help=(
         "The centre of V if the origin is no equilibrium: the origin, or rest, the loop's equilibrium, which then is "
         "the operating point. auto: rest if that is a stable point and nothing is given around the origin."))

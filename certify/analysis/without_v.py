@@ -9,10 +9,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from certify.analysis.acceptance import Clerk, Desk
 from certify.analysis.stages.state import Report, StageName, timed
-from certify.certificates import AnyCertificate, parse_any
+from certify.certificates import AnyCertificate, RankTree, parse_any
+from certify.certificates.claims import UNPROVED, Ranks
 from certify.certificates.drawn import nonlinearity_of
+from certify.certificates.tree import LEAF
 from certify.certificates.verdict import Verdict
 from certify.errors import BackendError, InputError, SoundnessError
 from certify.loop.plants import System
@@ -23,6 +28,7 @@ AS_THEY_STAND = (
     "the plant's ranges are taken as they stand: no claim of this kind has the measurements or samples on which they "
     "rest yet"
 )
+Array = NDArray[np.float64]
 C = TypeVar("C", bound=AnyCertificate)
 
 
@@ -139,3 +145,33 @@ def accepted(
             "Run without the cluster."
         )
     raise SoundnessError(f"the checker rejects what the engine proved: {answer}.")
+
+
+def require_periodic(
+    system: System,
+    angles: tuple[str, ...],
+    root: tuple[Array, Array],
+    certificate: Callable[[RankTree, Ranks], AnyCertificate],
+    clerk: Clerk,
+) -> None:
+    """Refuse a loop or a region that is not the same after a full turn of an angle, as the checker sees it.
+
+    Parameters
+    ----------
+    root : corners (n,) of the box of boxes with ranks.
+    certificate : makes a certificate with these.
+
+    Raises
+    ------
+    InputError : it is not.
+    """
+    if not angles:
+        return
+    nothing = RankTree(*root, bytes([LEAF]), np.array([UNPROVED], np.uint16), np.zeros(1, np.uint8))
+    answer = clerk.tried(certificate(nothing, Ranks(angles, 1)))
+    if answer.get("rule") == "angles":
+        raise InputError(
+            f"the loop, the region and the constraints must be the same after a full turn of {', '.join(angles)}"
+            f", an angle of {system.name}: {answer['at']}, {answer['detail']}. Write them with sin and cos of it, or "
+            "take the angle out of the plant's `angles`."
+        )

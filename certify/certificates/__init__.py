@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         Certificate,
         InvariantCertificate,
         ReachCertificate,
+        RemainCertificate,
         loop_sections,
     )
     from certify.certificates.reading import parse_any, parse_certificate, read_certificate, read_raw
@@ -57,7 +58,14 @@ _NAMES = {
         "Waypoint",
     ),
     "limits": ("require_short", "require_within_limits"),
-    "model": ("AnyCertificate", "Certificate", "InvariantCertificate", "ReachCertificate", "loop_sections"),
+    "model": (
+        "AnyCertificate",
+        "Certificate",
+        "InvariantCertificate",
+        "ReachCertificate",
+        "RemainCertificate",
+        "loop_sections",
+    ),
     "reading": ("parse_any", "parse_certificate", "read_certificate", "read_raw"),
     "tree": ("leaves", "leaves_within"),
     "writing": ("SEARCH", "earlier_aside", "remove", "set_aside", "sole_writer", "write_atomically", "write_beside"),
@@ -76,6 +84,7 @@ __all__ = [
     "RankTree",
     "RanksAlone",
     "ReachCertificate",
+    "RemainCertificate",
     "Slab",
     "TrustedSolver",
     "Waypoint",

@@ -27,6 +27,7 @@ from certify.certificates import (
     InvariantCertificate,
     PartitionTree,
     ReachCertificate,
+    RemainCertificate,
     parse_any,
     read_raw,
     run_checker,
@@ -253,7 +254,7 @@ def set_of(raw: bytes, name: str) -> ProvedSet:
 
 def region_of(read: AnyCertificate) -> Region:
     """The region that a certificate is about; whether it is proved is for the checker to say."""
-    if isinstance(read, ReachCertificate):
+    if isinstance(read, ReachCertificate | RemainCertificate):
         return Region((), ranked=Ranked(read.evidence.ranks, None, angles_in(read.system)))
     if isinstance(read, InvariantCertificate):
         return Region((), Sublevel(read.claim.outer.function, read.claim.outer.level, tuple(read.system.domain)))

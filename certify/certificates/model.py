@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates.claims import Claim, Invariant, Outer, Ranks, Reaches
+from certify.certificates.claims import Claim, Invariant, Outer, Ranks, Reaches, Remains
 from certify.certificates.data import DataBounds, data_claim, data_evidence
 from certify.certificates.encoding import encode, network_section
 from certify.certificates.evidence import OuterTree, PartitionTree, RanksAlone, TrustedSolver, evidence_section
@@ -38,12 +38,18 @@ class _Stated(ABC):
     __slots__ = ()
     system: System
     network: PolicyNetwork
+    claim: Claim | Reaches | Remains | Invariant
     provenance: Mapping[str, Any]
 
     @property
-    @abstractmethod
     def kept(self) -> tuple[Expression, ...]:
         """The claim's constraints."""
+        return self.claim.keep
+
+    @property
+    def kind(self) -> str:
+        """The claim's kind."""
+        return self.claim.kind
 
     @abstractmethod
     def sections(self) -> dict[str, Any]:
@@ -122,16 +128,6 @@ class Certificate(_Stated):
         return self.V.P
 
     @property
-    def kept(self) -> tuple[Expression, ...]:
-        """The claim's constraints."""
-        return self.claim.keep
-
-    @property
-    def kind(self) -> str:
-        """The claim's kind."""
-        return self.claim.kind
-
-    @property
     def inner(self) -> float:
         """The level from which the ring reaches outwards."""
         return self.claim.inner
@@ -190,30 +186,31 @@ class ReachCertificate(_Stated):
     evidence: RanksAlone
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
-    @property
-    def kept(self) -> tuple[Expression, ...]:
-        """The claim's constraints."""
-        return self.claim.keep
+    def sections(self) -> dict[str, Any]:
+        """The sections of the claim, V, its levels and the evidence, and of networks beside the policy's."""
+        return _of_ranks(self, {"target": [to_tree(t) for t in self.claim.target]})
 
-    @property
-    def kind(self) -> str:
-        """The claim's kind."""
-        return self.claim.kind
+
+@dataclass(frozen=True, slots=True)
+class RemainCertificate(_Stated):
+    """A claim that boxes are never left, with its evidence.
+
+    Parameters
+    ----------
+    system, network : the closed loop; parameters are already put into the equations.
+    claim, evidence : what is kept, and the boxes.
+    provenance : anything that helps people; the checker ignores it.
+    """
+
+    system: System
+    network: PolicyNetwork
+    claim: Remains
+    evidence: RanksAlone
+    provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def sections(self) -> dict[str, Any]:
         """The sections of the claim, V, its levels and the evidence, and of networks beside the policy's."""
-        claim = self.claim
-        target = {"target": [to_tree(t) for t in claim.target]}
-        return {
-            "claim": {"kind": claim.kind, "sample": _sample(self.system)}
-            | target
-            | _ranks(claim.ranks)
-            | _keep(claim.keep),
-            "networks": [],
-            "lyapunov": None,
-            "levels": {},
-            "evidence": evidence_section(self.evidence),
-        }
+        return _of_ranks(self, {})
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,16 +238,6 @@ class InvariantCertificate(_Stated):
         if self.system.in_steps:
             raise InputError("a claim that a set is never left must be about a loop whose time does not go in steps.")
 
-    @property
-    def kept(self) -> tuple[Expression, ...]:
-        """The claim's constraints."""
-        return self.claim.keep
-
-    @property
-    def kind(self) -> str:
-        """The claim's kind."""
-        return self.claim.kind
-
     def sections(self) -> dict[str, Any]:
         """The sections of the claim, V, its levels and the evidence, and of networks beside the policy's."""
         claim = self.claim
@@ -263,7 +250,21 @@ class InvariantCertificate(_Stated):
         }
 
 
-AnyCertificate = Certificate | ReachCertificate | InvariantCertificate
+AnyCertificate = Certificate | ReachCertificate | RemainCertificate | InvariantCertificate
+
+
+def _of_ranks(certificate: ReachCertificate | RemainCertificate, target: dict[str, Any]) -> dict[str, Any]:
+    """The sections of a certificate whose claim is about ranks alone, with a target or none."""
+    claim = certificate.claim
+    return {
+        "claim": {"kind": claim.kind, "sample": _sample(certificate.system), **target}
+        | _ranks(claim.ranks)
+        | _keep(claim.keep),
+        "networks": [],
+        "lyapunov": None,
+        "levels": {},
+        "evidence": evidence_section(certificate.evidence),
+    }
 
 
 def loop_sections(system: System, network: PolicyNetwork) -> dict[str, Any]:

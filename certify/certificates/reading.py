@@ -20,12 +20,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificates.claims import CLAIMS, Claim, Invariant, Outer, Ranks, Reaches
+from certify.certificates.claims import CLAIMS, Claim, Invariant, Outer, Ranks, Reaches, Remains
 from certify.certificates.data import DataBounds, read_data_bounds, read_measurements
 from certify.certificates.encoding import decode, network_named, read_network
 from certify.certificates.evidence import read_evidence, read_outer_alone, read_ranks_alone
 from certify.certificates.formats import SCHEMA, other_version
-from certify.certificates.model import AnyCertificate, Certificate, InvariantCertificate, ReachCertificate
+from certify.certificates.model import (
+    AnyCertificate,
+    Certificate,
+    InvariantCertificate,
+    ReachCertificate,
+    RemainCertificate,
+)
 from certify.certificates.samples import SampleBounds, read_samples
 from certify.errors import CertificateFormatError
 from certify.loop.expressions import Expression, Number, Symbol, from_tree
@@ -114,7 +120,7 @@ def parse_any(raw: bytes, name: str) -> AnyCertificate:
             raise CertificateFormatError(
                 f"{name}: `schema` must be {SCHEMA!r}; found {data['schema']!r:.60}.{f' {known}' if known else ''}"
             )
-        kind, kinds = data["claim"]["kind"], (*CLAIMS, Reaches.kind, Invariant.kind)
+        kind, kinds = data["claim"]["kind"], (*CLAIMS, Reaches.kind, Remains.kind, Invariant.kind)
         if kind not in kinds:
             raise CertificateFormatError(f"{name}: `claim.kind` must be one of {', '.join(kinds)}; found {kind!r}.")
         n = len(data["plant"]["states"])
@@ -126,6 +132,10 @@ def parse_any(raw: bytes, name: str) -> AnyCertificate:
             reaches = _read_reaches(data["claim"], system)
             evidence = read_ranks_alone(data["evidence"], n)
             return ReachCertificate(_with_constraints(system, reaches, names), network, reaches, evidence, provenance)
+        if kind == Remains.kind:
+            remains = Remains(_read_ranks(data["claim"]["ranks"]), _read_keep(data["claim"], system))
+            evidence = read_ranks_alone(data["evidence"], n)
+            return RemainCertificate(_with_constraints(system, remains, names), network, remains, evidence, provenance)
         if kind == Invariant.kind:
             stays = Invariant(
                 _read_outer(data["claim"]["outer"], data["networks"], system.states), _read_keep(data["claim"], system)
@@ -198,7 +208,7 @@ def _read_provenance(data: Any, plant: Mapping[str, Any]) -> tuple[dict[str, str
     return {k: str(v) for k, v in found.items() if not read.get(k)}, read
 
 
-def _with_constraints(system: System, claim: Claim | Reaches | Invariant, names: str) -> System:
+def _with_constraints(system: System, claim: Claim | Reaches | Remains | Invariant, names: str) -> System:
     """The plant with the claim's angles, and its constraints by the names that the file has for people, if it has a
     usable one for each."""
     found = re.findall(r"'([A-Za-z_][A-Za-z0-9_]{0,63})'", names)

@@ -105,7 +105,7 @@ def answers(c: Certificate, tally: Tally) -> dict[str, Any]:
 def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
     """The whole answer, line by line, with the statements of a certificate that takes over."""
     result, then, counted = answer["result"], list[str](), list[str]()
-    if c.claim == "reaches":
+    if c.claim in ("reaches", "remains"):
         rest = f"leaves {answer['ranks']['leaves']}"
     elif c.claim == "invariant":
         margin = answer["margins"]["outer"]
@@ -166,7 +166,8 @@ def without_V(c: Certificate, start: str) -> str:
     if c.ranks is None:
         raise TypeError("a claim without V is about a set of N or about ranks")
     said = by_ranks(c, c.ranks, start, "")
-    return f"every trajectory of the closed loop that {said}; nothing is claimed of later"
+    ending = "of later" if c.claim == "reaches" else "of where it goes"
+    return f"every trajectory of the closed loop that {said}; nothing is claimed {ending}"
 
 
 def beyond(c: Certificate, outer: Outer) -> str:
@@ -180,17 +181,23 @@ def beyond(c: Certificate, outer: Outer) -> str:
 
 def by_ranks(c: Certificate, ranks: Ranks, start: str, rest: str) -> str:
     """The statement of chapter ranks, with what comes after the target."""
-    target = f"V <= {c.c2!r}" if c.target is None else "the target"
     angles = ", ".join(c.states[i] for i in ranks.angles)
     places = f" up to multiples of 2 pi in {angles}" if angles else ""
     others = f"each state but {angles}" if angles else "the state"
     inside = f"{others} is in the interior of the domain and " if len(ranks.angles) < len(c.states) else ""
     each = memoryview(ranks.ranks).cast("H")  # of two bytes, whose order does not matter to what is asked
     count = sum(rank != MAX_RANK for rank in each)
+    begins = f"starts in a leaf of finite rank ({count} of {len(each)} leaves){start}"
+    steps = "steps" if c.discrete else "periods"
+    if c.claim == "remains":
+        return (
+            f"{begins} exists at all times and is in such a leaf again{places} after {ranks.most} {steps} at most, and "
+            f"so on for ever; at all times {inside}u stays in its bounds"
+        )
+    target = f"V <= {c.c2!r}" if c.target is None else "the target"
     return (
-        f"starts in a leaf of finite rank ({count} of {len(each)} leaves){start} is in {target}{places} after as many "
-        f"{'steps' if c.discrete else 'periods'} as the rank is, at the latest, {ranks.most} at most{rest}; until then "
-        f"{inside}u stays in its bounds"
+        f"{begins} is in {target}{places} after as many {steps} as the rank is, at the latest, {ranks.most} at most"
+        f"{rest}; until then {inside}u stays in its bounds"
     )
 
 

@@ -25,13 +25,14 @@ if TYPE_CHECKING:
 MAX_STATES = 64
 MAX_ORDER = 8  # of a series in time
 MAX_CELLS, MAX_CUTS = 4096, 64  # of the box of uncertain quantities in all, and of one range
-PLAIN, WITH_TUBE, WITHOUT_V = ("asymptotic", "practical"), ("enlarged", "reached"), ("reaches", "invariant")
-PRACTICAL = ("practical", "nearby")
+PLAIN, WITH_TUBE = ("asymptotic", "practical"), ("enlarged", "reached")
+PRACTICAL, WITHOUT_V = ("practical", "nearby"), ("reaches", "remains", "invariant")
 CLAIMS = {  # the keys of each claim, and those that may be missing
     **dict.fromkeys((*PLAIN, "nearby"), ("rate sample outer", "ranks keep data samples")),
     "enlarged": ("rate sample outer start", "keep data"),
     "reached": ("rate sample outer start centre", "keep"),
     "reaches": ("sample target ranks", "keep"),
+    "remains": ("sample ranks", "keep"),
     "invariant": ("outer", "keep"),
 }
 EVIDENCE = {  # the keys of each kind of evidence
@@ -152,7 +153,7 @@ class Certificate:
     contraction: Contraction | None = None  # a ball on which they come closer
     outer: Outer | None = None  # whose set trajectories leave into {V <= c2} only; never, if there is no V
     ranks: Ranks | None = None  # of the leaves from which trajectories reach the target
-    target: Tape | None = None  # whose outputs are at most 0 there; None if the target is {V <= c2}
+    target: Tape | None = None  # whose outputs are at most 0 there; None if the target is {V <= c2}, or nothing
     keep: Tape | None = None  # whose outputs stay negative
     data: Data | None = None  # with which the uncertain parameters are consistent
     samples: Samples | None = None  # of functions that equations stand for
@@ -165,6 +166,11 @@ class Certificate:
     @property
     def without_V(self) -> bool:
         return self.claim in WITHOUT_V
+
+    @property
+    def stated(self) -> int:
+        """The number of operations of constraints and of the target."""
+        return sum(tape.size for tape in (self.keep, self.target) if tape is not None)
 
     @property
     def c0(self) -> float:
@@ -210,7 +216,7 @@ def certificate(data: Any, sha256: str, at: str = "", kinds: Sequence[str] = tup
         c = replace(c, **_of_V(whole["lyapunov"], whole["levels"], said["rate"], c))
     beyond = {*said} - {"kind", "rate"}
     beyond -= {key for key in beyond if said[key].raw is None and key not in may_be}
-    by = {"reaches": "ranks", "invariant": "outer"}.get(kind, "partition-tree")
+    by = {"reaches": "ranks", "remains": "ranks", "invariant": "outer"}.get(kind, "partition-tree")
     solved = kind in PLAIN and not (beyond or c.rate or c.discrete or c.uncertain)
     by = whole["evidence"].kind((by, "trusted-solver") if solved else (by,))
     both = ("ranks", "data", "samples") if by == "partition-tree" else ()

@@ -97,8 +97,7 @@ class Sizes:
         self.s = self.n + self.m + self.y + self.z
         self.d = self.n + (c.claim == "reached")
         self.t = 2 * self.d**2 + self.d * (self.d + 1) * (self.d + 2) // 6
-        self.a = c.dynamics.size + c.policy.network.operations
-        self.a += sum(tape.size for tape in (c.keep, c.target) if tape is not None)
+        self.a = c.dynamics.size + c.policy.network.operations + c.stated
         self.net = Net(c.dynamics.called, [c.policy.network])
 
     # ------------------------------------------------------------------------------------------------------ numbers

@@ -1,4 +1,5 @@
-"""The rules for ranks: from each leaf of a finite rank a few steps lead to the target, or to leaves of lower ranks.
+"""The rules for ranks: from each leaf of a finite rank a few steps lead to the target, or to leaves of lower ranks;
+where there is no target, to leaves of any finite rank.
 
 A leaf is followed step by step: its image is affine in the symbols of the leaf and of the errors of the last steps, n
 of each. New errors are bounded in coordinates N x, and so are the oldest ones, which have no symbols any more. `Cover`
@@ -173,9 +174,10 @@ class Steps(Moving):
             left = np.flatnonzero(count[moving] >= k)
             moving, x = moving[left], self.step(x[:, left], numbers[moving[left]], course)
             done = np.flatnonzero(count[moving] == k)
-            arrived, bound = moving[done], rank[moving[done]] - k
+            arrived = moving[done]
+            bound = np.full(len(arrived), MAX_RANK - 1) if self.c.claim == "remains" else rank[arrived] - k
             hold = self.arrives(x[:, done], bound)
-            course.note("ranks", hold, numbers[arrived], "the steps may not lead to the target or to lower ranks")
+            course.note("ranks", hold, numbers[arrived], "the steps may lead neither to the target nor to such ranks")
         return course
 
     def start(self, lo: Array, hi: Array) -> Form:
@@ -243,6 +245,8 @@ class Steps(Moving):
 
     def is_in_target(self, x: Form) -> Array:
         """True where forms certainly lie in the target, as places."""
+        if self.c.claim == "remains":
+            return np.zeros(x.value.shape[2], dtype=bool)
         value, error = x.value.copy(), x.error
         if self.c.target is None:
             for i in self.ranks.angles:

@@ -51,8 +51,12 @@ def reach(
         ),
     ] = None,
     within: Annotated[
-        int | None,
-        typer.Option(metavar="STEPS", help="With --target: the most steps that it may take.", rich_help_panel=_CLAIM),
+        str | None,
+        typer.Option(
+            metavar="STEPS|TIMEs",
+            help="With --target: the most steps that it may take, or with a held input a time, as in 2.5s.",
+            rich_help_panel=_CLAIM,
+        ),
     ] = None,
     out: Results = None,
     as_json: Json = False,
@@ -63,7 +67,7 @@ def reach(
     set of a certificate."""
     start, note, path = time.perf_counter(), noting(quiet), the_policy(context, file, policy)
     from certify.analysis.reaching import ReachOptions, certify_reach, into_set_of
-    from certify.analysis.reaching.options import is_file
+    from certify.analysis.reaching.options import is_file, steps_within
     from certify.report.reached import summary
 
     with kind_called(_KIND):
@@ -80,13 +84,13 @@ def reach(
     towards = ReachOptions(
         target=tuple(target),
         begin=None if asked is None else region(asked, plant, "--from"),
-        within=within,
+        within=None if within is None else steps_within(within, plant),
         **{name: read_option(name, text) for name, text in typed.items()},
     )
     concluded(certify_reach, summary, path, stored, plant, towards, out, start, quiet, as_json)
 
 
-def _require_one(target: list[str] | None, within: int | None, typed: dict[str, Any], by_tube: bool) -> None:
+def _require_one(target: list[str] | None, within: str | None, typed: dict[str, Any], by_tube: bool) -> None:
     """Refuse options that do not go together; `by_tube` says that a tube is looked for.
 
     Raises

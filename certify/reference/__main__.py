@@ -20,7 +20,7 @@ from typing import Any
 from flint import arb, fmpq
 
 from .document import MAX_BYTES, Certificate, Data
-from .evidence import INVARIANT, WITHOUT_V, Tree
+from .evidence import INVARIANT, REMAINS, WITHOUT_V, Tree
 from .limits import MAX_IN_PATIENCE
 from .rules import Verdict, judge
 
@@ -40,7 +40,7 @@ def read_once(path: str) -> bytes:
 def in_words(c: Certificate) -> str:
     if c.claim == INVARIANT:
         return of_staying(c) + kept(c)
-    said = of_ranks(c) if c.target is not None else of_trajectories(c) + further(c) + in_ranks(c)
+    said = of_ranks(c) if c.claim in WITHOUT_V else of_trajectories(c) + further(c) + in_ranks(c)
     return said + kept(c) + measured(c) + sampled(c) + handed_over(c)
 
 
@@ -86,10 +86,12 @@ def further(c: Certificate) -> str:
 
 def of_ranks(c: Certificate) -> str:
     """The statement of a claim without V."""
-    reached = f"each of the {len(c.target.results)} expressions" if c.target is not None else ""
+    head = f"{c.plant.name}, policy {c.policy.sha256}{stepping(c)}: {from_leaves(c)}"
+    if c.target is None:
+        return f"{head}{on_the_way(c)}; nothing is said of where it goes among these boxes"
     return (
-        f"{c.plant.name}, policy {c.policy.sha256}{stepping(c)}: {from_leaves(c)} where {reached} that the certificate "
-        f"states as its target is at most 0{on_the_way(c)}; nothing is said of what happens there"
+        f"{head} where each of the {len(c.target.results)} expressions that the certificate states as its target is at "
+        f"most 0{on_the_way(c)}; nothing is said of what happens there"
     )
 
 
@@ -113,22 +115,23 @@ def in_ranks(c: Certificate) -> str:
 
 
 def from_leaves(c: Certificate) -> str:
-    """The words for the starts and the time; a state follows where the trajectory is then."""
+    """The words for the starts and the time; where the trajectory is then follows, unless it is in boxes again."""
     most = 0 if c.ranks is None else c.ranks.steps
     after, when = ("steps", "") if c.plant.discrete else ("periods", " at a sampling instant")
-    return (
-        f"every trajectory that starts{when} in a box of the certificate's tree of ranks whose rank is r < 65535 is, "
-        f"after r {after} at the latest ({most} at most),"
-    )
+    start = f"every trajectory that starts{when} in a box of the certificate's tree of ranks whose rank is r < 65535"
+    if c.claim == REMAINS:
+        return f"{start} exists at all times, is in such a box again after at most {most} {after}, and so on for ever"
+    return f"{start} is, after r {after} at the latest ({most} at most),"
 
 
 def on_the_way(c: Certificate) -> str:
-    """The words for what holds until then, and for places."""
+    """The words for what holds until then, or always, and for places."""
     angles = () if c.ranks is None else c.ranks.angles
     others = [name for name in c.plant.states if name not in angles]
     places = f" (states that differ by multiples of 2 pi in {', '.join(angles)} being the same)" if angles else ""
     inside = f", and {', '.join(others)} inside the domain" if others else ""
-    return f"{places}, until then with {', '.join(c.plant.inputs)} within the input bounds{inside}{whatever(c)}"
+    when = "at all times" if c.claim == REMAINS else "until then"
+    return f"{places}, {when} with {', '.join(c.plant.inputs)} within the input bounds{inside}{whatever(c)}"
 
 
 def kept(c: Certificate) -> str:

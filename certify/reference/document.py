@@ -16,6 +16,7 @@ from flint import fmpq, fmpq_mat
 from .evidence import (
     INVARIANT,
     REACHES,
+    REMAINS,
     WITH_FLOOR,
     WITH_TUBE,
     WITHOUT_V,
@@ -291,16 +292,17 @@ def with_samples(c: Certificate, value: Any, shown: Any) -> Certificate:
 
 
 def read_claim(value: Any) -> dict[str, Any]:
-    """Its keys by its kind. Claims without V have no rate, as if it were 0, and one of them no outer set, the other no
-    sample, as if these were null."""
+    """Its keys by its kind. Claims without V have no rate, as if it were 0, and `invariant` no sample, the others no
+    outer set, as if these were null."""
     named = isinstance(value, dict) and value.get("kind") in CLAIMS
     require(named, "format", "claim.kind", f"one of {', '.join(CLAIMS)} was expected")
     if value["kind"] == INVARIANT:
         said = keys(value, "claim", "kind", "outer", maybe=("keep",))
         require(said["outer"] is not None, "format", "claim.outer", "an object was expected")
         return {**said, "rate": (0.0).hex(), "sample": None}
-    if value["kind"] == REACHES:
-        said = keys(value, "claim", "kind", "sample", "target", "ranks", maybe=("keep",))
+    if value["kind"] in (REACHES, REMAINS):
+        target = ("target",) if value["kind"] == REACHES else ()
+        said = keys(value, "claim", "kind", "sample", *target, "ranks", maybe=("keep",))
         return {**said, "rate": (0.0).hex(), "outer": None}
     more = {"enlarged": ("start",), "reached": ("start", "centre")}.get(value["kind"], ())
     maybe = {"enlarged": ("keep", "data"), "reached": ("keep",)}.get(

@@ -23,8 +23,8 @@ MAX_ORDER = 8  # of a series in time
 MAX_MEMORY = 16  # steps after which errors of images have no symbols any more
 MAX_PIECES, MAX_ROUNDS, MAX_LEAVES = 64, 64, 4096  # of a measured transition; of bounds from all of them; of priors
 WITH_TUBE = ("enlarged", "reached")  # claims about a set of starts that is no level set of V
-REACHES, INVARIANT = "reaches", "invariant"
-WITHOUT_V = (REACHES, INVARIANT)
+REACHES, REMAINS, INVARIANT = "reaches", "remains", "invariant"
+WITHOUT_V = (REACHES, REMAINS, INVARIANT)
 WITH_FLOOR = ("practical", "nearby")  # claims about a set in which everything ends, {V <= c0}, and not the origin
 WORD = re.compile(r"[A-Za-z0-9_.+-]{1,80}")
 
@@ -162,7 +162,7 @@ class Tree:
 
 @dataclass(frozen=True)
 class Ranked:
-    """Evidence for a claim that a region is reached, that can be replayed as well."""
+    """Evidence for a claim that a region is reached or boxes are never left, that can be replayed as well."""
 
     order: int
     ranking: Ranking
@@ -200,8 +200,8 @@ def read_evidence(
     """`sampled` says whether a series in time may have an order above 1, `further` whether the claim has an `outer`,
     `ranked` whether it has `ranks`, `held` whether inputs are, `functions` whether some are sampled; `fitted` is there
     with `data`."""
-    if claim == REACHES:
-        return read_ranked(value, n, sampled)
+    if claim in (REACHES, REMAINS):
+        return read_ranked(value, n, claim, sampled)
     if claim == INVARIANT:
         alone = keys(value, "evidence", "kind", "outer")
         require(alone["kind"] == "outer", "format", "evidence.kind", f"'outer' was expected with claim '{claim}'")
@@ -241,9 +241,9 @@ def read_evidence(
     return Tree(T, root, tree, order, cells, ball, contraction, slabs, covering, ranking, fit)
 
 
-def read_ranked(value: Any, n: int, sampled: bool) -> Ranked:
+def read_ranked(value: Any, n: int, claim: str, sampled: bool) -> Ranked:
     evidence = keys(value, "evidence", "kind", "order", "ranks")
-    require(evidence["kind"] == "ranks", "format", "evidence.kind", f"'ranks' was expected with claim '{REACHES}'")
+    require(evidence["kind"] == "ranks", "format", "evidence.kind", f"'ranks' was expected with claim '{claim}'")
     return Ranked(read_order(evidence["order"], "evidence.order", sampled), read_ranking(evidence["ranks"], n))
 
 

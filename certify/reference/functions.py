@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from flint import arb, arb_mat
 
-from .balls import SPREAD, ZERO, identity, total
+from .balls import SPREAD, ZERO, cube, identity, total
 from .lipschitz import beyond_linear, beyond_square
 from .refusal import Refused
 from .rows import Four
@@ -172,4 +172,4 @@ def steepness(v: Model, phi: Expansion) -> arb | None:
     third = 3 * phi.twisted * (y * y * (steep + 2 * z) + y * z * (2 * steep + z) + z * z * steep)
     of_H, of_C, _ = mistaken(v, phi)
     wrong = phi.moved[1] * steep + 2 * of_H + 3 * of_C
-    return second + third + phi.last * v.radius**3 * (y + steep) + wrong
+    return second + third + phi.last * cube(v.radius) * (y + steep) + wrong

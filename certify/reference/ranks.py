@@ -1,4 +1,5 @@
-"""Rules `ranks`, `inputs`, `flow` and `keep` on boxes with ranks: each leads to lower ones, and so to the target.
+"""Rules `ranks`, `inputs`, `flow` and `keep` on boxes with ranks: each leads to lower ones, and so to the target, or
+without a target to any that have a rank.
 
 A leaf of rank r with k steps is followed for these steps as a box that is affine in the leaf's symbols and in those of
 the errors of its last steps. Where it ends all of it is in the target, or every leaf that it meets has a rank of at
@@ -17,7 +18,7 @@ from .affine import Form
 from .balls import ZERO, total
 from .batches import in_batches
 from .document import Certificate, Ranks
-from .evidence import Ranked, Ranking, Tree
+from .evidence import REMAINS, Ranked, Ranking, Tree
 from .keep import kept
 from .leaves import LEAF, Box, cut, structure
 from .motion import Motion, Stage
@@ -37,7 +38,7 @@ def ranks(c: Certificate, evidence: Tree | Ranked, jobs: int) -> int:
         raise Refused("format", "evidence.ranks", "the claim needs boxes with ranks")
     cover = Cover(c, c.ranks, ranking)
     walk = Walk(c, evidence.order, ranking)
-    target = Target(c, c.ranks)
+    target = None if c.claim == REMAINS else Target(c, c.ranks)
     asked = (box for box in cut(cover.lo, cover.hi, ranking.tree) if cover.ranks[box.number] != UNRANKED)
 
     def check(some: list[Box]) -> None:
@@ -51,7 +52,7 @@ def ranks(c: Certificate, evidence: Tree | Ranked, jobs: int) -> int:
     return len(cover.ranks)
 
 
-def follow(some: Sequence[Box], cover: Cover, walk: Walk, target: Target) -> None:
+def follow(some: Sequence[Box], cover: Cover, walk: Walk, target: Target | None) -> None:
     """The rules for some leaves, whose policies are enclosed together, or a refusal."""
     places = [f"ranks leaf {box.number}" for box in some]
     steps = [cover.steps[box.number] for box in some]
@@ -62,9 +63,9 @@ def follow(some: Sequence[Box], cover: Cover, walk: Walk, target: Target) -> Non
             each[b] = walk.step(each[b], places[b], u)
     for box, rows, count, at in zip(some, each, steps, places, strict=True):
         rank = cover.ranks[box.number]
-        if not target.holds(rows, at):
-            require(rank > 0, RULE, at, "its rank is 0, and it is not certain to lie in the target")
-            cover.leads_to(rows, rank - count, at)
+        if target is None or not target.holds(rows, at):
+            require(rank > 0, RULE, at, "its rank is 0, and it is not certain to lie in a target")
+            cover.leads_to(rows, UNRANKED - 1 if target is None else rank - count, at)
 
 
 class Cover:

@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 
 from flint import arb, fmpq
 
-from .balls import ONE
+from .balls import ONE, cube
 from .lines import Line, tanh_between
 from .refusal import require
 
@@ -70,7 +70,7 @@ class Function(ABC):
         if most is None:
             return None
         value, slope, second, _ = at
-        return slope, value - slope * middle, abs(second) / 2 * reach * reach + most / 6 * reach**3
+        return slope, value - slope * middle, abs(second) / 2 * reach * reach + most / 6 * cube(reach)
 
 
 class Tanh(Function):

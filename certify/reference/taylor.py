@@ -11,7 +11,7 @@ from functools import cache
 
 from flint import arb, arb_mat, fmpq
 
-from .balls import ONE, SPREAD, ZERO, total
+from .balls import ONE, SPREAD, ZERO, cube, total
 from .refusal import Refused
 from .rows import Function
 from .table import FUNCTIONS
@@ -183,7 +183,7 @@ class Taylor:
         if most is None:
             raise Refused("ring", "leaf", row.undefined)
         half = at[2] / 2
-        r = abs(at[1]) * self.r + abs(half) * (2 * first * rest + rest * rest) + most * reach**3 / 6
+        r = abs(at[1]) * self.r + abs(half) * (2 * first * rest + rest * rest) + most * cube(reach) / 6
         Q = mix(at[1], self.Q, ZERO, None)
         if self.g is not None and not half.is_zero():
             Q = plus(Q, self.g.transpose() * (self.g * half))

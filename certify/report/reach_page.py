@@ -33,7 +33,7 @@ def reached_parts(certificate: ReachCertificate, status: Status, result: Mapping
         "asked": _asked(result) if status.accepted else {},
         "pictures": pictures,
         "trouble": trouble,
-        "ranked": ranked_rows(certificate, "the region"),
+        "ranked": ranked_rows(certificate, "to the region"),
         "measure": volume_name(certificate.system.n),
         "not_proved": not_reached_of(certificate),
     }

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from certify.certificates import InvariantCertificate, ReachCertificate
+from certify.certificates import InvariantCertificate, ReachCertificate, RemainCertificate
 from certify.errors import InputError
 from certify.report.reach_page import reached_parts
 from certify.report.sections.numbers import file_rows, run_rows
@@ -18,7 +18,7 @@ from certify.report.stay_page import stayed_parts
 
 
 def render_short(
-    certificate: ReachCertificate | InvariantCertificate,
+    certificate: ReachCertificate | RemainCertificate | InvariantCertificate,
     answer: Mapping[str, Any] | None,
     result: Mapping[str, Any] | None,
     path: Path,

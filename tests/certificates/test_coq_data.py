@@ -250,6 +250,7 @@ def test_what_coqs_statement_cannot_say_is_refused(found: str) -> None:
     ("kind", "entries"),
     [
         ("reaches", ("kind", "sample", "target", "ranks")),
+        ("remains", ("kind", "sample", "ranks")),
         ("invariant", ("kind", "outer")),
         ("practical", ("kind", "rate", "sample", "outer")),
     ],

@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from itertools import pairwise
 from typing import Any
 
 import mpmath
@@ -14,23 +15,27 @@ import numpy as np
 import pytest
 from flint import arb, ctx
 
-from certify.checker import document
+from certify.checker import document, rules
 from certify.checker import flow as checker_flow
 from certify.checker import keep as checker_keep
 from certify.checker.boxes import Boxes
 from certify.checker.case import Case as Of
+from certify.checker.errors import Rejected
+from certify.checker.near import Above
 from certify.checker.network import enclose_on_boxes
 from certify.checker.ranks import Steps
+from certify.checker.taylor import Taylor as Model
 from certify.checker.taylor import combination, constants
 from certify.reference import leaves as reference_leaves
 from certify.reference import motion as reference_motion
+from certify.reference import rules as reference_rules
 from certify.reference.document import read
 from certify.reference.evidence import Ranked
 from certify.reference.leaves import Box
 from certify.reference.motion import Motion, Stage
 from certify.reference.ranks import Walk
 from certify.reference.taylor import Taylor
-from tests.support.certificates import decode, edited, make, verdict, with_tree
+from tests.support.certificates import decode, dump, edited, make, parse, verdict, with_tree
 from tests.support.certificates import halved as cut
 from tests.support.marks import slow_after
 from tests.support.rank_forgeries import Draw, verdicts
@@ -38,6 +43,7 @@ from tests.support.rank_truth import Truth
 from tests.support.ranked import Document, Loop, affine, dumped, encode, two_bytes
 from tests.support.reference import judge
 from tests.support.stepped_loops import WIDE as FAR
+from tests.support.stepped_loops import fitted, linear
 
 KEPT, REFUSED = (None, None), ("keep", "keep")
 WIDE = 2.0**-40  # half of the leaf's width
@@ -206,6 +212,85 @@ def test_the_checker_asks_each_quarter(k: int, monkeypatch: pytest.MonkeyPatch) 
             assert verdicts(violated) == ((None if left_out == k else "keep"), "keep")
 
 
+LONGEST = ["1", "1/3", "1/10", "7/10", "1/1000"]
+
+
+@pytest.mark.parametrize("jitter", [False, True])
+@pytest.mark.parametrize("hi", LONGEST)
+def test_quarters_are_those_of_the_longest_period_in_rationals(
+    hi: str, jitter: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two that meet no time is missing, not even beside an end that binary64 does not have. Models hold the ends."""
+    lo, asked = str(Fraction(hi) / 2) if jitter else hi, dict[str, list[tuple[Fraction, ...]]]()
+    number: Callable[..., Any] = Boxes.number
+    between: Callable[..., Any] = Motion.between
+
+    def numbers(self: Any, pair: Any, symbol: int, batch: int) -> Any:
+        found = number(self, pair, symbol, batch)
+        if symbol == self.symbols:
+            asked.setdefault("checker", []).append(tuple(map(Fraction, pair)))
+            middle, reach, wrong = (Fraction(float(v)) for v in (found.c[0], found.g[symbol, 0], found.r.top))
+            assert middle - reach - wrong <= pair[0] and pair[1] <= middle + reach + wrong
+        return found
+
+    def times(self: Any, *pair: Any) -> Any:
+        asked.setdefault("reference", []).append(tuple(Fraction(str(end)) for end in pair))
+        return between(self, *pair)
+
+    monkeypatch.setattr(Boxes, "number", numbers)
+    monkeypatch.setattr(Motion, "between", times)
+    assert verdicts(replace(CASES["held"], hi=hi).document(Fraction(1), lo)) == KEPT
+    ends = [Fraction(hi) * k / 4 for k in range(5)]
+    assert asked["checker"] == list(pairwise(ends))
+    assert [pair for pair in asked["reference"] if pair != (Fraction(lo), Fraction(hi))] == list(pairwise(ends))
+
+
+@pytest.mark.parametrize("hi", LONGEST)
+@pytest.mark.parametrize("k", range(5))
+def test_no_instant_beside_an_end_is_missing(k: int, hi: str) -> None:
+    """v is the share of the period that is over, and g is violated within 2^-36 of an end of a quarter, or of a time
+    2^-34 before or after it."""
+    over = ["*", str(1 / Fraction(hi)), "u"]
+    for beside in (Fraction(-1, 2**34), Fraction(0), Fraction(1, 2**34)):
+        at = Fraction(k, 4) + beside
+        if not 0 <= at <= 1:
+            continue
+        near = Case(["u", over], (0.0, 0.0), ["-", ["abs", ["-", "v", str(at)]]], Fraction(0), hi=hi)
+        for jitter in (None, "0"):
+            assert verdicts(near.document(Fraction(-1, 2**36), jitter)) == REFUSED
+            assert verdicts(near.document(Fraction(1, 4), jitter)) == KEPT
+
+
+@pytest.mark.parametrize("k", range(4))
+def test_what_has_no_value_within_one_quarter_is_refused(k: int) -> None:
+    """x is the time. g is -1/8, but for a pole or a root of what is negative at an end, times 0, or what overflows."""
+    pole, right = ["/", "1", ["-", "x", str(Fraction(2 * k + 1, 8))]], ["/", "1", ["+", "x", "1/8"]]
+    for wrong in (pole, ["sqrt", ["-", "x", "1/8"]], ["sqrt", ["-", "7/8", "x"]]):
+        assert verdicts(Case(["u"], (0.0,), ["*", "0", wrong], Fraction(0)).document(Fraction(1, 8))) == REFUSED
+    rising: Any = ["*", "9", ["-", "x", str(Fraction(k - 1, 4))]]
+    for _ in range(4):
+        rising = ["exp", rising]
+        assert verdicts(Case(["u"], (0.0,), rising, Fraction(0)).document(Fraction(1))) == REFUSED
+    for good in (right, ["sqrt", ["+", "x", "1/8"]], ["sqrt", ["-", "9/8", "x"]]):
+        assert verdicts(Case(["u"], (0.0,), ["*", "0", good], Fraction(0)).document(Fraction(1, 8))) == KEPT
+
+
+@pytest.mark.parametrize("function", ["sin", "tanh", "atan", "abs"])
+def test_a_function_of_what_is_infinite_is_refused(function: str) -> None:
+    """Of exp(exp(exp(80 x))) balls have neither a middle nor a radius that is finite."""
+    rising: Any = ["*", "80", "x"]
+    for name in ("exp", "exp", "exp", function):
+        rising = [name, rising]
+    assert verdicts(Case(["u"], (0.0,), ["*", "0", rising], Fraction(0)).document(Fraction(1))) == REFUSED
+
+
+def test_each_of_several_constraints_is_asked_before_a_step() -> None:
+    data = CASES["until the end"].document(-Fraction(1, 10**6))
+    _, g = data["claim"]["keep"]
+    for some in ([g], [g, "-1"], ["-1", g, "-1"], ["-1", "-1", g]):
+        assert verdicts(edited(data, "claim.keep", some)) == REFUSED
+
+
 # --------------------------------------------------------------------------------------------------- states in between
 
 
@@ -323,6 +408,47 @@ def test_a_time_within_a_period_has_a_symbol_that_nothing_else_has(doubt: str, s
         assert verdicts(data) == said
 
 
+@pytest.mark.parametrize("more", [0, 1, 3])
+def test_a_model_among_more_symbols_does_not_depend_on_these(more: int) -> None:
+    chance, N = np.random.default_rng(more), 3
+    model = Model(np.ones(1), chance.standard_normal((N + N * (N + 1) // 2, 1)), Above(np.full(1, 0.5)))
+    wide = model.widened(N + more)
+
+    def at(v: Model, d: Any) -> float:
+        i, j = np.triu_indices(len(d))
+        return float(v.c[0] + v.g[:, 0] @ d + v.q[:, 0] @ (d[i] * d[j]))
+
+    assert wide.symbols == N + more and wide.r.top == model.r.top
+    for _ in range(9):
+        d = chance.uniform(-1, 1, N + more)
+        assert at(wide, d) == pytest.approx(at(model, d[:N]), abs=1e-12)
+
+
+def test_on_a_ball_quantities_are_any_numbers_of_their_ranges() -> None:
+    """Within a period they may leave their cell, of which there are two."""
+    more: dict[str, Any] = {"sample": ("1/4", "1/4"), "uncertain": [("q", "-1/10", "1/10")], "cells": [2]}
+    data = fitted(linear([["+", "u", ["*", "q", "x"]]], [[0.5]], 1.0, **more))
+    for sign in ("1", "-1"):
+        for bound, said in (("1/20", ("keep", "keep")), ("1/9", ("ACCEPTED", None))):
+            g = ["-", ["*", sign, "q"], bound]
+            assert both(edited(data, "claim", lambda old, g=g: old | {"keep": ["-1", g]})) == said
+
+
+@pytest.mark.parametrize("claim", ["asymptotic", "practical"])
+def test_what_has_no_value_on_a_ball_is_refused(claim: str) -> None:
+    """Within a period x comes to 5/4 of its size at the start or more, by the a-priori bound: further than the ball."""
+    data = linear(["u"], [[0.5]], 1.0, sample=("1/4", "1/2"), claim=claim)
+    data = fitted(
+        edited(data, "levels.floor", (0.5).hex()) if claim == "practical" else data, edge=0.25 * (claim == "practical")
+    )
+    assert both(data) == ("ACCEPTED", None)
+    for wrong in (["/", "1", ["-", "x", "9/8"]], ["sqrt", ["-", "x", "-9/8"]], ["sqrt", "x"]):
+        kept = edited(data, "claim", lambda old, wrong=wrong: old | {"keep": ["-1", ["-", ["*", "0", wrong], "1"]]})
+        assert both(kept) == ("keep", "keep")
+    far = edited(data, "claim", lambda old: old | {"keep": ["-1", ["-", ["*", "0", ["sqrt", ["+", "x", "2"]]], "1"]]})
+    assert both(far) == ("ACCEPTED", None)
+
+
 # ------------------------------------------------------------------------------------------------- beyond the level set
 
 P, GAINS, ALONG = np.array([[80.0, -0.75], [-0.75, 1.0]]), np.array([1 / 16, 45 / 64]), np.array([1.0, -1 / 25])
@@ -377,7 +503,11 @@ def test_a_loop_overshoots_its_level_within_a_period() -> None:
     for bound in (most(0.0) + 1e-6, TOP - 1e-6):
         for depth in (6, 12):
             assert both(overshooting(bound, depth)) == ("keep", "keep")
-    assert both(overshooting(1.1 * TOP)) == ("ACCEPTED", None)
+    kept, violated = overshooting(1.1 * TOP), overshooting(TOP - 1e-6, 6)
+    assert both(kept) == ("ACCEPTED", None)
+    (g,), (h,) = (data["claim"]["keep"] for data in (kept, violated))
+    for some in ([h, g, g], [g, h, g], [g, g, h]):
+        assert both(edited(kept, "claim.keep", some)) == ("keep", "keep")
 
 
 def test_v_in_a_gap_is_that_of_the_sampling_instant(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -413,7 +543,7 @@ def test_v_in_a_gap_is_that_of_the_sampling_instant(monkeypatch: pytest.MonkeyPa
 
 def test_a_gap_counts_with_one_sign_and_leaves_inside_are_asked() -> None:
     """1/2 - V is positive near the origin, and with -1 times the gap 1 - V more it would be -1/2; 1/64 - V is so where
-    V is below c0 alone."""
+    V is below c0 alone. What fails is said of its leaf."""
     data = make(
         ["u"], [([[-1.0]], [0.0])], [[1.0]], (0.25, 1.0), domain=FAR, input_bounds=[("-99", "99")],
         squash="identity", centre="none", scale=(1.0,), claim="practical",
@@ -426,3 +556,9 @@ def test_a_gap_counts_with_one_sign_and_leaves_inside_are_asked() -> None:
         (["-", "1/64", ["*", "x", "x"]], ("keep", "keep")),
     ):
         assert both(edited(data, "claim", lambda claim, g=g: claim | {"keep": [g]})) == said
+    for leaf in range(8):
+        near = ["-", "1/1000", ["**", ["-", "x", str(Fraction(2 * leaf - 7, 8))], 2]]
+        hole = edited(data, "claim", lambda claim, near=near: claim | {"keep": ["-1", near]})
+        with pytest.raises(Rejected) as refused:
+            rules.check(parse(hole))
+        assert refused.value.at == str(reference_rules.judge(dump(hole)).at) == f"leaf {leaf}"

@@ -20,6 +20,9 @@ from certify.certificates.checking import command
 from certify.checker import document, limits, rules
 from certify.checker.case import Case
 from certify.checker.errors import Rejected
+from certify.checker.outer import Beyond
+from certify.checker.ranks import Steps
+from certify.checker.ring import Ring
 from certify.reference import document as reference_document
 from certify.reference import limits as reference_limits
 from certify.reference import rules as reference_rules
@@ -27,6 +30,7 @@ from tests.checker.test_networks import hash_of
 from tests.checker.test_uncertain_tube import decay
 from tests.support.certificates import LEAF, Document, dump, edited, encode, make
 from tests.support.earlier import newer
+from tests.support.ranked import Loop, affine
 
 PROGRAMS = ("checker", "reference")
 CHAPTER = (Path(document.__file__).parent / "format" / "limits.md").read_text()
@@ -214,6 +218,30 @@ def counts(data: Document, folder: Path) -> tuple[int, int]:
     own = sizes.numbers(), sizes.work()
     assert own == (reference_limits.numbers(other), reference_limits.operations(other))
     return own
+
+
+def long(count: int) -> Any:
+    """A constraint of some four times so many operations, which is -1."""
+    return ["-", ["*", "0", ["+", *(["*", "x0", ["+", "x0", str(k + 1)]] for k in range(count))]], "1"]
+
+
+@pytest.mark.parametrize("count", [100, 1000, 3000])
+@pytest.mark.parametrize("what", ["ring", "outer", "constraints of ranks", "target"])
+def test_constraints_count_where_leaves_are_examined_together(what: str, count: int) -> None:
+    """All values of an expression are held on all leaves of a batch: 4096 leaves made 2,000 operations a gigabyte."""
+    keep, comb = [long(count)], bytes([0, LEAF] * 4999 + [LEAF])
+    if what in ("ring", "outer"):
+        data = edited(with_outer("expression") if what == "outer" else loop(), "claim", lambda c: c | {"keep": keep})
+        for at in ("evidence", "evidence.outer")[: 1 + (what == "outer")]:
+            data = edited(data, f"{at}.tree", base64.b64encode(comb).decode())
+    else:
+        target, kept = (keep, None) if what == "target" else ([["-", "x0", "1"]], keep)
+        stepping = Loop([["*", "1/2", "x0"]], [affine([[0.0]])], target, ("x0",), keep=kept)
+        data = stepping.document([-1.0], [1.0], comb, bytes(10_000), bytes(5000))
+    case = Case(document.certificate(json.loads(dump(data)), "0" * 64))
+    boxes = Ring(case) if what == "ring" else Beyond(case) if what == "outer" else Steps(case)
+    _, lo, _ = next(boxes.leaves())
+    assert (2 if count == 100 else 1) <= lo.shape[1] <= limits.MOST_NUMBERS // (4 * count * (boxes.symbols + 1) ** 2)
 
 
 @pytest.mark.parametrize("name", HONEST)

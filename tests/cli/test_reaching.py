@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from certify.analysis.reaching.options import steps_within
 from certify.cli.main import _run
+from certify.errors import OptionError
+from certify.loop.plants import get_system
 from certify.loop.policies import Policy, PolicyNetwork, save_policy
 from certify.report.reached import summary
 
@@ -172,6 +176,15 @@ def test_a_share_is_rounded_down(asked: list[str], capsys: pytest.CaptureFixture
     assert ", 99.99 % of the box that was cut, volume" in console.file.getvalue()  # type: ignore[attr-defined]
 
 
+@pytest.mark.parametrize(("text", "steps"), [("7", 7), ("0.6s", 3), ("0.59 s", 2), ("1s", 5), ("0.2s", 1)])
+def test_a_time_has_as_many_steps_as_fit(text: str, steps: int) -> None:
+    """Of the longest period, in rationals: 0.6/0.2 is 3, though not in floats."""
+    plant = get_system("pendulum").with_sample((Fraction(1, 10), Fraction(1, 5)))
+    assert steps_within(text, plant) == steps
+    with pytest.raises(OptionError, match=r"at least a period, 0\.2 s"):
+        steps_within("0.19s", plant)
+
+
 def test_text_for_people(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert _run(asked, False) == 0
     text = " ".join(capsys.readouterr().out.split())
@@ -185,6 +198,8 @@ def test_text_for_people(asked: list[str], capsys: pytest.CaptureFixture[str]) -
         (["--target", "p < 1"], "--target takes a comparison by <= or >="),
         (["--box", "p=1"], "--box is about a tube"),
         (["--within", "0"], "--within must be 1 to"),
+        (["--within", "2.5s"], "which in cart take no time"),
+        (["--within", "2.5"], "--within must be a number of steps, or a time such as 2.5s"),
         (["--sample-time", "0.1"], "discrete"),
     ],
 )

@@ -67,6 +67,35 @@ def test_an_expression_is_proved(asked: list[str], tmp_path: Path, capsys: pytes
     assert _run(["report", certificate], False) == 0
 
 
+def test_boxes_are_proved_with_a_held_input(
+    asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    held = [*asked, "--sample-time", "0.05", "--effort", "0.05"]
+    status, data = said(capsys, [*held, "--contains", "x=0.9..1.1,y=-0.1..0.1"])
+    assert status == 0 and (data["verdict"], data["checked"]) == ("PROVED", "ACCEPTED")
+    assert (
+        data["claim"] == {"kind": "remains", "sample": ["1/20", "1/20"]} and data["contains"]["result"] == "contained"
+    )
+    assert data["simulated"]["share"] > 0.5 and data["ranks"]["covered"] > 0.4
+    certificate = str(tmp_path / "out" / "certificate.json")
+    capsys.readouterr()
+    assert _run(["check", certificate], False) == 0
+    told = capsys.readouterr().out
+    assert "in such a leaf again after" in told and "of these, at all times: " in told
+    assert _run(["contains", certificate, "x=1", "y=0"], False) == 0
+    assert "(kept along every trajectory from there: " in capsys.readouterr().out
+    assert _run(["contains", certificate, "x=0", "y=0"], False) == 1
+    assert _run(["plot", certificate, "--out", str(tmp_path / "set.svg")], False) == 0
+    drawn = (tmp_path / "set.svg").read_text("utf-8")
+    assert "proved: never left" in drawn and "a constraint is violated" in drawn
+    assert _run(["report", certificate], False) == 0
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert "is in one of them again after" in page and "Each of them holds before each" in page
+    assert _run(held, False) == 0
+    told = capsys.readouterr().out
+    assert "circle: boxes that are never left" in told and "steps is proved" in told
+
+
 def test_it_is_told_in_a_few_lines(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert _run([*asked, "--lyapunov", N, "--lyapunov-level", "0.25"], False) == 0
     told = capsys.readouterr().out
@@ -86,7 +115,9 @@ def test_unknown_says_what_to_try(asked: list[str], tmp_path: Path, capsys: pyte
     [
         (["--level", "1"], "has no ellipsoid"),
         (["--rate", "max"], "neither a rate nor a period"),
-        (["--sample-time", "0.1"], "goes in steps"),
+        (["--sample-time", "0.1", "--lyapunov", N], "without a function"),
+        (["--sample-time", "0.1", "--candidate", "neural"], "without a function"),
+        (["--sample-time", "max"], "neither a rate nor a period"),
         (["--lyapunov", "x + nothing*y"], "nothing"),
         (["--lyapunov", "missing.pt"], "missing.pt"),
         (["--lyapunov", "abs(x) + y**2"], "corner"),

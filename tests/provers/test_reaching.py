@@ -121,7 +121,12 @@ def test_a_cluster_that_lies_proves_nothing(tmp_path: Path, monkeypatch: pytest.
     vector, many = (2,), (len(COUNTS),)
     images = [("lo", "f8", many + vector), ("hi", "f8", many + vector), ("there", "u1", many)]
     row = np.dtype(
-        [*images, *((name, "u1") for name in ("inside", "meets", "loose")), ("taken", "f8"), ("steep", "f8", vector)]
+        [
+            *images,
+            *((name, "u1") for name in ("inside", "meets", "loose", "fails")),
+            ("taken", "f8"),
+            ("steep", "f8", vector),
+        ]
     )
 
     def lie(job: bytes, answer: bytes) -> bytes:

@@ -22,7 +22,7 @@ from certify.lyapunov import Symbolic
 from certify.provers.outer import Nothing, StayProof
 from certify.provers.outer.bands import aim
 from tests.support.marks import slow_after
-from tests.support.staying import ANNULUS, RADIUS, U, X, Y, obstacle, plant, planted, policy, proof, radius_at, ring
+from tests.support.staying import ANNULUS, RADIUS, X, Y, obstacle, planted, policy, proof, radius_at, ring
 
 BRAKE = policy([0.0, -1.0])
 VIOLATIONS = [what for what, *_ in planted()]
@@ -158,12 +158,6 @@ def test_a_level_that_was_asked_for_counts(tmp_path: Path) -> None:
 def test_options_of_an_ellipsoid_are_refused(odd: dict[str, object]) -> None:
     with pytest.raises(OptionError, match="`claim` invariant has no ellipsoid"):
         RoaOptions(claim="invariant", **odd)  # type: ignore[arg-type]
-
-
-def test_time_in_steps_is_refused(tmp_path: Path) -> None:
-    system = plant([-X + U / 10], ["2"]).with_sample((Fraction(1, 10), Fraction(1, 10)))
-    with pytest.raises(OptionError, match="goes in steps"):
-        certify_invariant(system, policy([-0.5]), tmp_path, RoaOptions(claim="invariant"))
 
 
 def test_pages_and_words(given: InvariantResult) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 
 from certify.certificates.claims import MOST_RANK, MOST_TARGETS
@@ -57,6 +58,27 @@ class ReachOptions:
 def is_file(target: str) -> bool:
     """True for a target that names a certificate."""
     return target.endswith(".json")
+
+
+def steps_within(text: str, system: System) -> int:
+    """The number of steps that `within` says: as it stands, or as many as a time in seconds, as in `2.5s`, has of the
+    longest period.
+
+    Raises
+    ------
+    OptionError : it is neither, or no period is as short as that time, or steps of the loop take no time.
+    """
+    found = re.fullmatch(r"(?P<number>\d{1,9}(?:\.\d{1,9})?)\s*(?P<unit>s?)", text.strip())
+    if found is None or (not found["unit"] and "." in found["number"]):
+        raise OptionError(f"`within` must be a number of steps, or a time such as 2.5s; found {text!r}.")
+    if not found["unit"]:
+        return int(found["number"])
+    if system.sample is None:
+        raise OptionError(f"`within` must be a number of steps, which in {system.name} take no time; found {text!r}.")
+    steps = int(Fraction(found["number"]) / system.sample[1])
+    if not steps:
+        raise OptionError(f"`within` must be at least a period, {float(system.sample[1]):g} s; found {text!r}.")
+    return steps
 
 
 def target_of(system: System, texts: Sequence[str]) -> tuple[Expression, ...]:

@@ -10,20 +10,20 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.analysis.acceptance import Clerk
 from certify.analysis.beyond import constraints_in_words, rank_facts
 from certify.analysis.reaching.goals import Goal, Stated, goal_of, leaves_of, with_ranks
 from certify.analysis.reaching.options import ReachOptions
 from certify.analysis.reaching.results import ReachResult
 from certify.analysis.reaching.runs import Simulation, begins, is_refuted
 from certify.analysis.stages.state import Report, effort_of
-from certify.analysis.without_v import Tools, accepted
+from certify.analysis.without_v import Tools, accepted, require_periodic
 from certify.certificates import (
     RankTree,
     earlier_aside,
@@ -33,10 +33,9 @@ from certify.certificates import (
 from certify.certificates.claims import UNPROVED, Ranks
 from certify.certificates.ellipsoids import Box
 from certify.certificates.ranked import Ranked, steps_from
-from certify.certificates.tree import LEAF
 from certify.certificates.verdict import Verdict
 from certify.effort import Effort
-from certify.errors import InputError, OptionError
+from certify.errors import OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.composition import composed
 from certify.loop.plants import System
@@ -184,7 +183,8 @@ def _proved(
         with tools.timing("ranks"):
             most = min(longest or MOST_STEPS, MOST_STEPS)
             question = with_memory(question, *_parts(options.begin), most, search)
-    _require_periodic(goal, question, clerk)
+    angles = system.angles if goal.given is None else tuple(system.states[i].name for i in goal.turned)
+    require_periodic(system, angles, question.root, partial(goal.certificate, question, provenance={}), clerk)
     with tools.timing("ranks"), runner_at(options.cluster) as runner:
         found = _searched(question, options, longest, search, runner, tools)
     evidence = None if found is None else _within(found.evidence, options.within)
@@ -243,27 +243,6 @@ def _within(evidence: RankTree, most: int | None) -> RankTree | None:
     if most is not None:
         evidence = evidence.without(evidence.ranks > most)
     return evidence if np.any(evidence.proved) else None
-
-
-def _require_periodic(goal: Goal, question: Question, clerk: Clerk) -> None:
-    """Refuse a loop or a region that is not the same after a full turn of an angle, as the checker sees it.
-
-    Raises
-    ------
-    InputError : it is not.
-    """
-    system, (lo, hi) = question.loop.system, question.root
-    angles = system.angles if goal.given is None else tuple(system.states[i].name for i in goal.turned)
-    if not angles:
-        return
-    nothing = RankTree(lo, hi, bytes([LEAF]), np.array([UNPROVED], np.uint16), np.zeros(1, np.uint8))
-    answer = clerk.tried(goal.certificate(question, nothing, Ranks(angles, 1), {}))
-    if answer.get("rule") == "angles":
-        raise InputError(
-            f"the loop, the region and the constraints must be the same after a full turn of {', '.join(angles)}"
-            f", an angle of {system.name}: {answer['at']}, {answer['detail']}. Write them with sin and cos of it, or "
-            "take the angle out of the plant's `angles`."
-        )
 
 
 def _without_leaf(certificate: Stated, at: str) -> Stated | None:

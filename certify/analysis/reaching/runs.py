@@ -79,21 +79,21 @@ class Simulation:
             there = self.beyond(self._place(x), self.flow.policy(x), ()).max(-1) <= _CLOSE
             longest = k if np.any(there) else longest
             x, alive = x[~there], alive[~there]
-            ended = self._ended(x, k)
+            ended = self.ended(x, k)
             failing += [Run(self._exact(start[alive[i]]), *end) for i, end in ended.items()]
             going = ~np.isin(np.arange(len(x)), list(ended))
             x, alive = x[going], alive[going]
             if not len(x) or k == most or effort.over:
                 break
-            effort.charge(self._each * self.flow.operations(len(x)))
-            x = self._later(x)
+            effort.charge(self.operations(len(x)))
+            x = self.later(x)
         if not effort.over:
             failing += [Run(self._exact(start[i]), "late", most) for i in alive]
         worst = ("violates", "late", "left")
         longest = None if effort.over else longest
         return Runs(len(start), longest, min(failing, key=lambda run: worst.index(run.end), default=None))
 
-    def _ended(self, x: Array, k: int) -> dict[int, tuple[End, int, str]]:
+    def ended(self, x: Array, k: int) -> dict[int, tuple[End, int, str]]:
         """The runs that end at states x (N, n) after k steps, by their numbers, and how."""
         turning = np.isin(np.arange(x.shape[-1]), self.flow.angles)
         inside = np.all(((x > self.flow.lo) & (x < self.flow.hi)) | turning, axis=-1)
@@ -115,7 +115,11 @@ class Simulation:
         """Steps of the integration in a step of the loop."""
         return 1 if self.flow.discrete else self.flow.steps_between(self.step)
 
-    def _later(self, x: Array) -> Array:
+    def operations(self, runs: int) -> float:
+        """The operations of a step of the loop of so many runs."""
+        return self._each * self.flow.operations(runs)
+
+    def later(self, x: Array) -> Array:
         """The states after a step of the loop."""
         held = None if self.flow.discrete else self.flow.policy(x)
         for _ in range(self._each):
@@ -126,6 +130,21 @@ class Simulation:
         """A state in the box, which a float may lie beside."""
         each = zip(x.tolist(), self.begin, strict=True)
         return tuple(min(max(Fraction(v), lo), hi) for v, (lo, hi) in each)
+
+
+def later(loop: ClosedLoop, x: Array, steps: int, effort: Effort) -> tuple[Array, int]:
+    """The states (N, n) after so many steps of runs from states x, (N, n), NaN of those that leave the domain or
+    violate a constraint; and the number of steps, which the effort may cut."""
+    simulation, end = Simulation(loop, (), ()), x.copy()
+    for k in range(steps):
+        alive = np.flatnonzero(np.isfinite(end).all(-1))
+        end[alive[list(simulation.ended(end[alive], k))]] = np.nan
+        alive = np.flatnonzero(np.isfinite(end).all(-1))
+        effort.charge(simulation.operations(len(alive)))
+        if effort.over:
+            return end, k
+        end[alive] = simulation.later(end[alive])
+    return end, steps
 
 
 def begins(box: Box) -> Array:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from certify.analysis.facts import OuterFacts
+from certify.analysis.facts import OuterFacts, RankFacts, StayingFacts
 from certify.analysis.options import RoaOptions
 from certify.analysis.without_v import ResultWithoutV
 
@@ -17,13 +17,16 @@ class InvariantResult(ResultWithoutV):
 
     Parameters
     ----------
-    outer : the set, if one is proved; its volume is estimated.
+    outer : the set {N <= n2}, if one is proved; its volume is estimated.
+    ranks, simulated : where time goes in steps the boxes that are, and simulated runs that stay.
     learned : how N was learned, in words; empty if it was given.
     state : values of a state that is shown to lie in the set, by the states' names.
     """
 
     options: RoaOptions
     outer: OuterFacts | None = None
+    ranks: RankFacts | None = None
+    simulated: StayingFacts | None = None
     learned: str = ""
     state: Mapping[str, float] = field(default_factory=dict)
     following: tuple[str, ...] = ()
@@ -34,11 +37,17 @@ class InvariantResult(ResultWithoutV):
             "schema": "certify-invariant/1",
             "verdict": self.verdict.value,
             "reason": self.reason,
-            "claim": {"kind": "invariant"},
+            "claim": self._claim(),
             "outer": None if self.outer is None else self.outer.to_dict(),
+            "ranks": None if self.ranks is None else self.ranks.to_dict(),
+            "simulated": None if self.simulated is None else self.simulated.to_dict(),
             "learned": self.learned or None,
             "state": dict(self.state) or None,
             "constraints": dict(self.constraints),
             "next": list(self.following),
             **self.about_the_run(),
         }
+
+    def _claim(self) -> dict[str, Any]:
+        sample = {} if self.system.sample is None else {"sample": list(map(str, self.system.sample))}
+        return {"kind": "remains" if self.system.in_steps else "invariant", **sample}

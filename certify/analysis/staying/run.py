@@ -1,4 +1,5 @@
-"""`certify_invariant`: learn N unless it is given, prove a set {N <= n2} that is never left, have it accepted.
+"""`certify_invariant`: learn N unless it is given, prove a set {N <= n2} that is never left, have it accepted; where
+time goes in steps the set is one of boxes (steps.py).
 
 Nothing is PROVED before the checker, run as a process of its own, has accepted the very bytes that were written.
 """
@@ -21,6 +22,7 @@ from certify.analysis.facts import OuterFacts
 from certify.analysis.options import RoaOptions
 from certify.analysis.stages.state import Report, effort_of
 from certify.analysis.staying.results import InvariantResult
+from certify.analysis.staying.steps import proved_in_steps
 from certify.analysis.without_v import Tools, accepted
 from certify.certificates import InvariantCertificate, earlier_aside, require_within_limits, sole_writer
 from certify.certificates.claims import Invariant, Outer
@@ -53,11 +55,12 @@ def certify_invariant(
     progress: Report | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> InvariantResult:
-    """Prove that a set {N <= n2} of the domain is never left; no equilibrium is needed.
+    """Prove that a set {N <= n2} of the domain is never left, or where time goes in steps one of boxes; no equilibrium
+    is needed.
 
     Parameters
     ----------
-    system, network : the closed loop, in continuous time, its input following the state at once.
+    system, network : the closed loop.
     out : folder for `certificate.json`; it is made if it is not there.
     options : with the claim `invariant`; N is `lyapunov`, or learned as `candidate` says, by default a network.
     load_seconds : time already spent on reading, for the report.
@@ -76,11 +79,6 @@ def certify_invariant(
     system, network = composed(system, network)
     loop = ClosedLoop(system, network)
     require_within_limits(system, network)
-    if system.in_steps:
-        raise OptionError(
-            "`claim` invariant must be about a plant in continuous time whose input follows the state at once; the "
-            f"time of {system.name} goes in steps."
-        )
     if (system.measurements and system.measurements.runs) or (system.samples and system.samples.grids):
         raise OptionError(
             "`claim` invariant must be for ranges as they stand: no such claim has measurements yet; leave out `data`."
@@ -88,7 +86,8 @@ def certify_invariant(
     effort = effort_of(options.effort, options.time_limit, load_seconds)
     with one_thread(), sole_writer(out), earlier_aside(out, tell or (lambda _: None)):
         result = InvariantResult(Verdict.UNKNOWN, "", system, network, options)
-        result = _proved(result, loop, effort, tools, out / "certificate.json", provenance or {})
+        prove = proved_in_steps if system.in_steps else _proved
+        result = prove(result, loop, effort, tools, out / "certificate.json", provenance or {})
     seconds = {"load": load_seconds, **tools.seconds, "total": load_seconds + time.perf_counter() - start}
     return replace(result, seconds=seconds, notice=tools.notice(system))
 

@@ -27,7 +27,7 @@ from certify.certificates.claims.conditions import (
     Vdot,
     conditions,
 )
-from certify.certificates.claims.invariant import Invariant
+from certify.certificates.claims.invariant import Invariant, Remains
 from certify.certificates.claims.reaches import MOST_TARGETS, Reaches
 
 __all__ = [
@@ -53,6 +53,7 @@ __all__ = [
     "Ranks",
     "Reached",
     "Reaches",
+    "Remains",
     "Vdot",
     "conditions",
 ]

@@ -25,6 +25,17 @@ UNPROVED = 65_535
 MOST_RANK, MOST_KEPT = UNPROVED - 1, 64
 
 
+def require_few(keep: tuple[Expression, ...]) -> None:
+    """Refuse more constraints than a claim may have.
+
+    Raises
+    ------
+    InputError : there are more.
+    """
+    if len(keep) > MOST_KEPT:
+        raise InputError(f"`keep` must have at most {MOST_KEPT} expressions; found {len(keep)}.")
+
+
 @dataclass(frozen=True, slots=True)
 class Problem:
     """The closed loop and the Lyapunov function V of a claim, and the rate at which V has to fall.
@@ -121,8 +132,7 @@ class Claim:
     def __post_init__(self) -> None:
         if self.ranks is not None and (self.start is not None or self.outer is not None):
             raise InputError("a claim with a tube or an outer set can have no ranks.")
-        if len(self.keep) > MOST_KEPT:
-            raise InputError(f"`keep` must have at most {MOST_KEPT} expressions; found {len(self.keep)}.")
+        require_few(self.keep)
 
     @property
     def floor(self) -> float | None:

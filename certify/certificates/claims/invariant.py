@@ -1,4 +1,4 @@
-"""The claim about a set that is never left; nothing is said of where in it trajectories go, and no V is needed."""
+"""The claims about sets that are never left; nothing is said of where in one trajectories go, and no V is needed."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from certify.certificates.claims.claim import MOST_KEPT, Outer, Ranks
-from certify.errors import InputError
+from certify.certificates.claims.claim import Outer, Ranks, require_few
 from certify.loop.expressions import Expression
 
 
@@ -25,19 +24,33 @@ class Invariant:
     """
 
     kind: ClassVar[str] = "invariant"
+    levels: ClassVar[Mapping[str, float]] = {}
+    ranks: ClassVar[Ranks | None] = None
     outer: Outer
     keep: tuple[Expression, ...] = ()
 
     def __post_init__(self) -> None:
-        if len(self.keep) > MOST_KEPT:
-            raise InputError(f"`keep` must have at most {MOST_KEPT} expressions; found {len(self.keep)}.")
+        require_few(self.keep)
 
-    @property
-    def levels(self) -> Mapping[str, float]:
-        """The section `levels` of the certificate: there are none."""
-        return {}
 
-    @property
-    def ranks(self) -> Ranks | None:
-        """None: nothing is said of boxes."""
-        return None
+@dataclass(frozen=True, slots=True)
+class Remains:
+    """Every trajectory from a leaf of finite rank is in such a leaf again after `ranks.steps` steps at most, and so on
+    for ever.
+
+    Along it g < 0 for each g of `keep`, expressions in states, inputs and uncertain quantities, inputs keep their
+    bounds, and states but for angles are in the interior of the domain.
+
+    Raises
+    ------
+    InputError : `keep` has too many expressions.
+    """
+
+    kind: ClassVar[str] = "remains"
+    levels: ClassVar[Mapping[str, float]] = {}
+    outer: ClassVar[Outer | None] = None
+    ranks: Ranks
+    keep: tuple[Expression, ...] = ()
+
+    def __post_init__(self) -> None:
+        require_few(self.keep)

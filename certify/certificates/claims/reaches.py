@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from certify.certificates.claims.claim import MOST_KEPT, Ranks
+from certify.certificates.claims.claim import Ranks, require_few
 from certify.errors import InputError
 from certify.loop.expressions import Expression
 
@@ -27,6 +27,7 @@ class Reaches:
     """
 
     kind: ClassVar[str] = "reaches"
+    levels: ClassVar[Mapping[str, float]] = {}
     target: tuple[Expression, ...]
     ranks: Ranks
     keep: tuple[Expression, ...] = ()
@@ -34,10 +35,4 @@ class Reaches:
     def __post_init__(self) -> None:
         if not 1 <= len(self.target) <= MOST_TARGETS:
             raise InputError(f"`target` must have 1 to {MOST_TARGETS} expressions; found {len(self.target)}.")
-        if len(self.keep) > MOST_KEPT:
-            raise InputError(f"`keep` must have at most {MOST_KEPT} expressions; found {len(self.keep)}.")
-
-    @property
-    def levels(self) -> Mapping[str, float]:
-        """The section `levels` of the certificate: there are none."""
-        return {}
+        require_few(self.keep)

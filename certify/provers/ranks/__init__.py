@@ -7,23 +7,26 @@ from certify.provers.ranks.prove import (
     Question,
     RankProof,
     prove_ranks,
+    prove_remaining,
     root_box,
     turning,
     with_frame,
     with_memory,
     with_order,
 )
-from certify.provers.ranks.targets import Region, Sublevel
+from certify.provers.ranks.targets import Nothing, Region, Sublevel
 from certify.provers.ranks.wanted import MOST_STEPS, Wanted
 
 __all__ = [
     "MOST_STEPS",
+    "Nothing",
     "Question",
     "RankProof",
     "Region",
     "Sublevel",
     "Wanted",
     "prove_ranks",
+    "prove_remaining",
     "root_box",
     "turning",
     "with_frame",

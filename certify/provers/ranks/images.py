@@ -43,6 +43,7 @@ class Images(NamedTuple):
     there : (K, B), the image lies in the target.
     inside, meets : (B,), the box itself does; it may have states there.
     loose : (B,), all that is asked for in the first step may hold in a part of the box, though not in all of it.
+    fails : (B,), the first step violates a constraint from everywhere in the box, or leaves the domain.
     taken : (B,), the steps that were followed.
     steep : (n, B), by how much each axis of the box widens its first image that reaches far, relative to the root.
     """
@@ -53,6 +54,7 @@ class Images(NamedTuple):
     inside: Mask
     meets: Mask
     loose: Mask
+    fails: Mask
     taken: Array
     steep: Array
 
@@ -142,6 +144,7 @@ class Course:
             self.is_there(form),
             ~self.target.misses(form.x, self.angles),
             np.zeros(batch, dtype=bool),
+            np.zeros(batch, dtype=bool),
             np.zeros(batch),
             np.abs(slopes).sum(0) / self.root[:, None],
         )
@@ -155,6 +158,8 @@ class Course:
             below, above = form.box
             if count == 1:
                 found.loose[left] = ~(kept | lost) & self.in_domain(above, below)  # the image meets the domain
+                (least, most), seen = self.ends[:, self.straight], (below[self.straight], above[self.straight])
+                found.fails[left] = lost | ((seen[1] < least) | (seen[0] > most)).any(0)
             width = ((above - below) / self.root[:, None]).max(0)
             good = kept & (width < _WIDEST)
             if count in self.counts:

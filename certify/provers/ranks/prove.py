@@ -18,6 +18,7 @@ from certify.provers.bounds.arrays import Array
 from certify.provers.execution import Runner
 from certify.provers.execution.shared import shared
 from certify.provers.ranks.images import Course, Images
+from certify.provers.ranks.remaining import Remaining
 from certify.provers.ranks.search import COUNTS, Promising, Search
 from certify.provers.ranks.targets import TURN, Target
 from certify.provers.ranks.wanted import Direct, SearchFrom, Wanted
@@ -32,6 +33,7 @@ _SMALL, _LOST = 0.002, 1e3  # half-width of a box, as a share of the root box's 
 _DEPENDENT = 1e8  # condition of a frame that is of no use
 _MEMORIES = (1, 2, 4, 8)
 _THERE = 1e-6  # width of an image in the target, as a share of the root box's
+_COUNTS_BACK = COUNTS[:7]  # the leaf itself or its neighbours are not far away
 _AT_FIRST = 0.1  # share of the effort for the first tree
 
 
@@ -228,11 +230,54 @@ def prove_ranks(
             if done or effort.over:
                 break
     search.tighten()
-    tree, states = search.evidence(), question.loop.system.states
+    tree = search.evidence()
     if not np.any(tree.steps if wanted is None else tree.proved):
         return None
-    ranks = Ranks(tuple(states[i].name for i in course.angles), max(1, tree.most))
-    return RankProof(ranks, tree, search.share, int(tree.proved.sum()), boxes, rounds, done)
+    return RankProof(_ranks(question, tree), tree, search.share, int(tree.proved.sum()), boxes, rounds, done)
+
+
+def prove_remaining(
+    question: Question,
+    seeds: Array,
+    effort: Effort,
+    runner: Runner,
+    report: Callable[[float, int, int], None] | None = None,
+) -> tuple[RankProof, Callable[[int], tuple[RankTree, Ranks] | None]] | None:
+    """Prove which leaves of a box are never left; the target of the question is nothing.
+
+    Parameters
+    ----------
+    seeds : states (n, N) that runs come to.
+    report : as that of `prove_ranks`.
+
+    Returns
+    -------
+    tuple[RankProof, Callable] | None : the leaves, and what is left of them without the one of this number; None if
+        there are no such leaves.
+    """
+    course = question.course(_COUNTS_BACK)
+    search = Remaining(course, *question.root, seeds)
+    with shared(runner, course) as bound:
+        rounds, done = _grow(search, bound, effort, report, 1.0)
+    search.tighten()
+    tree = search.evidence()
+    if not np.any(tree.proved):
+        return None
+
+    def without(leaf: int) -> tuple[RankTree, Ranks] | None:
+        if not search.without(leaf):
+            return None
+        left = search.evidence()
+        return left, _ranks(question, left)
+
+    found = RankProof(_ranks(question, tree), tree, search.share, int(tree.proved.sum()), search.boxes, rounds, done)
+    return found, without
+
+
+def _ranks(question: Question, tree: RankTree) -> Ranks:
+    """The claim's part on the leaves of a tree."""
+    states, angles = question.loop.system.states, turning(question.loop)
+    return Ranks(tuple(states[i].name for i in angles), max(1, tree.most))
 
 
 def _grow(

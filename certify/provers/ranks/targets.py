@@ -90,6 +90,19 @@ class Region:
         return [evaluate(expression, values, Models(models[0]), known) for expression in self.expressions]
 
 
+@dataclass(frozen=True, slots=True)
+class Nothing:
+    """The empty set, the target of boxes that are never left."""
+
+    def holds(self, x: Array, angles: Sequence[int]) -> Mask:
+        """False."""
+        return np.zeros(x.shape[2], dtype=bool)
+
+    def misses(self, x: Array, angles: Sequence[int]) -> Mask:
+        """True."""
+        return np.ones(x.shape[2], dtype=bool)
+
+
 def _models(x: Array, error: Array) -> list[Taylor]:
     """The states as models in these symbols, within an error of each."""
     N = x.shape[1] - 1

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from certify.certificates import AnyCertificate, InvariantCertificate, ReachCertificate
+from certify.certificates import AnyCertificate, InvariantCertificate, ReachCertificate, RemainCertificate
 from certify.errors import InputError
 from certify.loop.plants import System
 from certify.report.figures import region_of, simulated_roa
@@ -101,7 +101,7 @@ def set_figure(certificate: AnyCertificate, accepted: bool, options: PaperOption
     with matplotlib.rc_context({**RC, **_SMALL}):
         if isinstance(certificate, ReachCertificate):
             return _reach_figure(certificate, accepted, options)
-        if isinstance(certificate, InvariantCertificate):
+        if isinstance(certificate, InvariantCertificate | RemainCertificate):
             return _staying_figure(certificate, accepted, options)
         scene = Scene(certificate, accepted, named_pairs(certificate.system, options.pairs) or None)
         figure, panels, height = _panels(1 if scene.n == 1 else len(scene.pairs), options)
@@ -153,7 +153,9 @@ def _reach_figure(certificate: ReachCertificate, accepted: bool, options: PaperO
     return figure
 
 
-def _staying_figure(certificate: InvariantCertificate, accepted: bool, options: PaperOptions) -> Figure:
+def _staying_figure(
+    certificate: InvariantCertificate | RemainCertificate, accepted: bool, options: PaperOptions
+) -> Figure:
     """The extent of a set that is never left."""
     planes, stage = _planes(certificate.system, options), Stage.of(certificate)
     figure, panels, height = _panels(len(planes), options)

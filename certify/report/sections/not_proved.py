@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from certify.certificates import AnyCertificate, Certificate, InvariantCertificate, ReachCertificate
+from certify.certificates import AnyCertificate, Certificate, InvariantCertificate, ReachCertificate, RemainCertificate
 from certify.loop.plants import System, input_errors
 from certify.report.claims import Words
 from certify.report.measured import Measured
@@ -74,7 +74,7 @@ def not_reached_of(certificate: ReachCertificate) -> list[tuple[str, str]]:
     ]
 
 
-def not_staying_of(certificate: InvariantCertificate) -> list[tuple[str, str]]:
+def not_staying_of(certificate: InvariantCertificate | RemainCertificate) -> list[tuple[str, str]]:
     """Heads and texts of the gaps of a claim that a set is never left."""
     system, timing = certificate.system, timing_of(certificate)
     return [

@@ -123,7 +123,7 @@ def _sizes(certificate: Certificate, sets: Sequence[Ellipsoid]) -> Rows:
     ]
 
 
-def ranked_rows(certificate: AnyCertificate, target: str = "{V ≤ c₂}") -> Rows:
+def ranked_rows(certificate: AnyCertificate, target: str = "to {V ≤ c₂}", boxes: str = "boxes with ranks") -> Rows:
     """The boxes with ranks: how many, how large, how far away."""
     found, tree, system = ranks_of(certificate), tree_of(certificate), certificate.system
     if found is None or tree is None:
@@ -137,8 +137,8 @@ def ranked_rows(certificate: AnyCertificate, target: str = "{V ≤ c₂}") -> Ro
     steps = "steps" if system.sample is None else "sampling instants"
     size = f"{below(found.volume)} {_unit_of(certificate)}".rstrip()
     return [
-        ("boxes with ranks", f"{found.proved:,} of {found.leaves:,}"),
-        (f"most {steps} to {target}", f"{found.steps:,}"),
+        (boxes, f"{found.proved:,} of {found.leaves:,}"),
+        (f"most {steps} {target}", f"{found.steps:,}"),
         (f"{volume_name(system.n)} of these boxes", size),
         ("share of the box that was cut", f"{below(100 * found.share, 4)} %"),
         ("that box", ", ".join(box)),
