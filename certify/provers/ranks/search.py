@@ -149,7 +149,7 @@ class Search:
         return large, self.steep[:, large].argmax(0)
 
     def _hopeful(self, near: Index) -> Index:
-        """Those of leaves that have a promising state among a few; all of them if none has."""
+        """The leaves that have a promising state among a few; all of them if none has."""
         if self.promising is None:
             return near
         new = near[np.isnan(self.hope[near])]
