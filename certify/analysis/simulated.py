@@ -1,5 +1,5 @@
 """The simulated region of attraction: drawn states of the domain from which runs converge without leaving it, and
-without violating a constraint.
+without violating a constraint or an input's bounds.
 
 It says how much of what is there has been proved, and so if more is worth its effort. Nothing in it is part of a proof.
 The same loop and effort draw the same states, whatever machine simulates them.
@@ -7,6 +7,7 @@ The same loop and effort draw the same states, whatever machine simulates them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,12 +18,15 @@ from certify.certificates.membership import Region
 from certify.effort import Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import System
+from certify.loop.policies import bounded_by_form
 from certify.lyapunov.function import Quadratic
 from certify.provers.ranks import root_box, turning
 from certify.report.flow import Flow, time_scales
 from certify.report.sampling import run_until_near
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 FEW = 3
 """States of a plant up to which drawn states meet the region often enough to tell its share."""
 MOST, NEARLY_ALL = 0.8, 0.9
@@ -30,6 +34,7 @@ MOST, NEARLY_ALL = 0.8, 0.9
 with the second hardly more is to be proved in this domain."""
 _LEAST, _ENOUGH, _MOST = 250, 1000, 4000  # states drawn at once at least, that converge, and in all
 _QUICK = 10.0  # multiplications of many runs at once that are worth an operation
+_ROUNDING = 1e-9  # of an input, relative to its bounds
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,37 +59,72 @@ class SimulatedRegion:
         return SimulatedFacts(self.runs, len(self.converging), int(region.holds_in_floats(self.converging).sum()))
 
 
-def simulated_region(loop: ClosedLoop, V: Quadratic, level: float, effort: Effort) -> SimulatedRegion | None:
-    """Simulate from states drawn uniformly from the domain, until enough of them converge: they enter {V <= level}.
+class Simulator:
+    """Runs of a loop until they enter {V <= level}.
 
     Parameters
     ----------
     loop : of what is uncertain it has the nominal values, of several periods the longest.
-    effort : None is returned if it ends before the first states are decided.
 
     Notes
     -----
-    Where boxes may have ranks, one turn of each angle is drawn from, and full turns count as the same place. A run that
-    violates a constraint at one of its steps does not count, a held input being taken as a new one there.
+    Where boxes may have ranks, full turns of an angle count as the same place. A run that violates a constraint at one
+    of its steps does not converge, a held input being taken as a new one there; nor does one with a command outside of
+    the input's bounds, outside of {V <= level}: of such states nothing is ever proved.
     """
-    flow = Flow.of(loop.system, loop.network)
-    if loop.system.in_steps:
-        lo, hi = root_box(loop)
-        flow = replace(flow, lo=lo, hi=hi, angles=tuple(turning(loop)))
-    else:
-        flow = replace(flow, angles=())
-    step, horizon = time_scales(flow)
-    step, generator = flow.fitting(step), np.random.default_rng(0)
-    left = Effort(_QUICK * effort.left)
-    dear = left.left / ((flow.operations(2) - flow.operations(1)) * horizon / step)  # states that may stay undecided
+
+    def __init__(self, loop: ClosedLoop, V: Quadratic, level: float) -> None:
+        flow = Flow.of(loop.system, loop.network)
+        if loop.system.in_steps:
+            lo, hi = root_box(loop)
+            flow = replace(flow, lo=lo, hi=hi, angles=tuple(turning(loop)))
+        else:
+            flow = replace(flow, angles=())
+        if not bounded_by_form(loop.network, loop.system.input_bounds):
+            flow = replace(flow, commands=_within(loop.system, flow))
+        step, self.horizon = time_scales(flow)
+        self.flow, self.step, self.V, self.level = flow, flow.fitting(step), V, level
+
+    @property
+    def operations(self) -> float:
+        """Multiplications' worth of one run among many."""
+        return (self.flow.operations(2) - self.flow.operations(1)) * self.horizon / self.step
+
+    def converge(self, x: Array, effort: Effort) -> Mask:
+        """True (N,) for states (N, n) whose runs converge before the effort, an operation of which is worth several
+        multiplications here, is over."""
+        left = Effort(_QUICK * effort.left)
+        found, _, _ = run_until_near(self.flow, x, self.V.P, self.level, self.step, self.horizon, left)
+        effort.charge(left.spent / _QUICK)
+        return found
+
+
+def simulated_region(runs: Simulator, effort: Effort) -> SimulatedRegion | None:
+    """Simulate from states drawn uniformly from the domain, of angles from one turn, until enough of them converge.
+
+    None is returned if the effort ends before the first states are decided.
+    """
+    generator, flow = np.random.default_rng(0), runs.flow
+    dear = _QUICK * effort.left / runs.operations  # states that may stay undecided
     batch = int(min(max(dear, _LEAST), _ENOUGH))
-    found, runs = list[Array](), 0
-    while runs < _MOST and sum(map(len, found)) < _ENOUGH:
-        x = generator.uniform(flow.lo, flow.hi, (batch, loop.system.n))
-        converge, _, _ = run_until_near(flow, x, V.P, level, step, horizon, left)
-        if left.over:
+    found, drawn = list[Array](), 0
+    while drawn < _MOST and sum(map(len, found)) < _ENOUGH:
+        x = generator.uniform(flow.lo, flow.hi, (batch, len(flow.lo)))
+        converge = runs.converge(x, effort)
+        if effort.over:
             break
         found.append(x[converge])
-        runs += batch
-    effort.charge(left.spent / _QUICK)
-    return SimulatedRegion(np.concatenate(found), runs) if runs else None
+        drawn += batch
+    return SimulatedRegion(np.concatenate(found), drawn) if drawn else None
+
+
+def _within(system: System, flow: Flow) -> Callable[[Array], Mask]:
+    """The test of states (..., n) for a command within the bounds of all inputs, but for rounding."""
+    lo, hi = np.array([[float(end) for end in pair] for pair in system.input_bounds]).T
+    slack = _ROUNDING * (np.abs(lo) + np.abs(hi))
+
+    def within(x: Array) -> Mask:
+        u = flow.policy(x)
+        return np.asarray(np.all((u >= lo - slack) & (u <= hi + slack), axis=-1))
+
+    return within

@@ -13,7 +13,7 @@ import numpy as np
 from certify.analysis.facts import Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
-from certify.analysis.simulated import FEW, MOST, NEARLY_ALL, simulated_region
+from certify.analysis.simulated import FEW, MOST, NEARLY_ALL, Simulator, simulated_region
 from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT, Effort
 from certify.errors import InputError
@@ -172,7 +172,7 @@ def _in_a_wider_domain(result: RoaResult, effort: Effort) -> Step | None:
 
 def _share(loop: ClosedLoop, V: Quadratic, level: float, effort: Effort) -> float | None:
     """The share of the domain's states from which runs come to {V <= level}; None if the effort ends before."""
-    found = simulated_region(loop, V, level, effort.part(_LOOK, even_if_over=True))
+    found = simulated_region(Simulator(loop, V, level), effort.part(_LOOK, even_if_over=True))
     return None if found is None else len(found.converging) / found.runs
 
 

@@ -50,6 +50,8 @@ class Flow:
     discrete : whether F(x) is the state one step later, and not the rate of change.
     cost : of F at one state, in multiplications' worth.
     kept : whether states (..., n) and their inputs keep all constraints, (...); None without constraints.
+    commands : whether the policy commands an input within its bounds at states (..., n), (...); None where it may
+        command any.
     angles : the numbers of states in which full turns are the same place: they are kept within half a turn of 0.
     """
 
@@ -63,6 +65,7 @@ class Flow:
     cost: float = 0.0
     angles: tuple[int, ...] = ()
     kept: Callable[[Array], NDArray[np.bool_]] | None = None
+    commands: Callable[[Array], NDArray[np.bool_]] | None = None
 
     @classmethod
     def of(cls, system: System, network: PolicyNetwork) -> Flow:

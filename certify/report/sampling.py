@@ -219,8 +219,8 @@ def simulated_roa_fraction(
 def run_until_near(
     flow: Flow, x: Array, P: Array, target: float, step: float, horizon: float, effort: Effort = UNLIMITED
 ) -> tuple[Mask, Mask, float]:
-    """Simulate; return the runs that reached `V <= target`, those that left the domain or what is kept, and the
-    simulated seconds."""
+    """Simulate; return the runs that reached `V <= target`, those that left the domain, what is kept or the bounds of
+    inputs, and the simulated seconds."""
     attracted, left = np.zeros((2, len(x)), dtype=np.bool_)
     keeps = flow.keeps(x)
     alive, x, apart = np.flatnonzero(keeps), x[keeps], flow.steps_between(step)
@@ -232,6 +232,10 @@ def run_until_near(
                 near = quadratic(P, x) <= target
                 attracted[alive[near]] = True
                 x, alive, u = x[~near], alive[~near], None
+                if flow.commands is not None:
+                    within = flow.commands(x)
+                    left[alive[~within]] = True
+                    x, alive = x[within], alive[within]
             if not alive.size:
                 break
             if effort.over:

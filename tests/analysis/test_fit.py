@@ -284,6 +284,11 @@ def test_samples_that_are_none(
         ("[unknown.v]", "[unknown.y]", "is no state"),
         ('x = "v"', 'x = "v"\nv = "u"', "not both"),
         ("u = 0\n[domain]", "u = 1\n[domain]", "must have x_eq and u_eq 0"),
+        (
+            "x = [-1, 1]",
+            f"x = ['-1.{40 * '0'}1', '1']",
+            "domain and the input bounds of x, v, u must have some 35 digits",
+        ),
     ],
 )
 def test_structures_that_are_none(
@@ -401,6 +406,15 @@ def test_scattered_samples_that_bound_nothing(
     Path(asked[1]).write_text("\n".join(["x,v,u,v_rate", *rows]))
     assert _run(asked, False) == 2
     assert said in capsys.readouterr().err
+
+
+def test_more_samples_than_a_certificate_holds(
+    asked: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Commas and brackets of a file are 10^6 at most; a sample of three variables and its weights have some 15."""
+    monkeypatch.setattr("certify.analysis.fitting.samples._MOST_PARTS", 15 * 20)
+    assert _run(asked, False) == 2
+    assert "must have a header and 1 to 20 rows; found" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("noise", ["1e400", "1e-40", "-1", "v=1,v=2", "x=1"])

@@ -19,7 +19,7 @@ from certify.analysis.acceptance import Clerk
 from certify.analysis.facts import SimulatedFacts, Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
-from certify.analysis.simulated import simulated_region
+from certify.analysis.simulated import Simulator, simulated_region
 from certify.analysis.stages import simulation
 from certify.analysis.suggested import beyond_the_ellipsoid
 from certify.certificates import Certificate
@@ -71,15 +71,30 @@ def by_default(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
 
 
 def test_states_that_converge_are_those_of_the_region(tmp_path: Path) -> None:
-    found = simulated_region(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 0.5, Effort(10 * UNIT))
+    found = simulated_region(Simulator(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 0.5), Effort(10 * UNIT))
     assert found is not None and found.runs >= 1000
     assert np.all((found.converging > -3.001) & (found.converging < 1.001))
     share = len(found.converging) / found.runs
     assert abs(share - 4 / 6) < 4 * (share * (1 - share) / found.runs) ** 0.5
 
 
+@pytest.mark.parametrize("period", [None, 0.01])
+def test_states_from_which_an_input_leaves_its_bounds_do_not_count(period: float | None) -> None:
+    """The policy commands u = x, and |u| <= 1 is allowed; so no claim holds for runs from below -1, as for others."""
+    follows = PolicyNetwork.of_layers((np.ones((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    system = plant()
+    if period is not None:
+        system = replace(system, sample=(Fraction(period), Fraction(period)))
+    found = simulated_region(Simulator(ClosedLoop(system, follows), Quadratic(np.eye(1)), 0.5), Effort(10 * UNIT))
+    assert found is not None and found.runs >= 1000
+    assert found.converging.min() >= -1.001 and found.converging.min() < -0.9
+    clipped = replace(follows, clip=(-np.ones(1), np.ones(1)))
+    found = simulated_region(Simulator(ClosedLoop(system, clipped), Quadratic(np.eye(1)), 0.5), Effort(10 * UNIT))
+    assert found is not None and found.converging.min() < -1.5
+
+
 def test_runs_that_cannot_be_decided_tell_nothing() -> None:
-    assert simulated_region(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 0.5, Effort(1.0)) is None
+    assert simulated_region(Simulator(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 0.5), Effort(1.0)) is None
 
 
 def test_the_default_goes_beyond_the_ellipsoid(by_default: RoaResult) -> None:
@@ -241,7 +256,8 @@ def test_a_share_is_that_of_the_accepted_set(by_default: RoaResult) -> None:
     assert by_default.checker["certificate_sha256"] == hashlib.sha256(by_default.raw).hexdigest()
     loop = ClosedLoop(by_default.system, by_default.network)
     assert by_default.problem is not None and by_default.levels.roa is not None
-    found = simulated_region(loop, by_default.problem.V, by_default.levels.roa, Effort(10 * UNIT))
+    runs = Simulator(loop, by_default.problem.V, by_default.levels.roa)
+    found = simulated_region(runs, Effort(10 * UNIT))
     assert found is not None and by_default.simulated is not None
     exact = np.asarray(by_default.contains(found.converging, deviations=True))
     assert int(exact.sum()) == by_default.simulated.proved

@@ -398,3 +398,44 @@ def test_ranks_need_steps(tmp_path: Path) -> None:
         certify_roa(replace(system, sample=None), network, out=tmp_path, ranks=True)
     with pytest.raises(OptionError, match="without a tube"):
         certify_roa(system, network, out=tmp_path, ranks=True, enlarge=True)
+
+
+def sheared() -> tuple[System, PolicyNetwork]:
+    """Trajectories with |x| < 1 and |y| < 1 end at 0, others leave; x and y are seen as their half sum and half
+    difference, so that no box of a tree is their region."""
+    a, b, u = symbols("a b u")
+    pulled = [v * v * v - v for v in (a + b, a - b)]
+    system = System(
+        name="sheared",
+        states=(a, b),
+        inputs=(u,),
+        parameters={},
+        dynamics=(a + (pulled[0] + pulled[1]) / 10 + u, b + (pulled[0] - pulled[1]) / 10),
+        u_eq=(Number(0),),
+        domain=box(2, 2),
+        input_bounds=box(1),
+        time="discrete",
+    )
+    return system, PolicyNetwork.of_layers(
+        (np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none"
+    )
+
+
+def converge(x: np.ndarray) -> np.ndarray:
+    """True for the states of that region."""
+    return np.asarray(np.abs(x).sum(-1) < 1)
+
+
+def test_leaves_without_a_promising_state_wait() -> None:
+    """The same effort leaves less of the region, which a guide that knows nothing does not change."""
+    asked = question(sheared(), 0.01)
+    plain, guided, blind = (
+        prove_ranks(asked, Effort(0.5 * UNIT), ThreadRunner(), promising=promising)
+        for promising in (None, converge, lambda x: np.zeros(len(x), dtype=bool))
+    )
+    assert plain is not None and guided is not None and blind is not None
+    region = 2 / 16  # as a share of the root box
+    assert 0 < region - guided.share < 0.8 * (region - plain.share)
+    assert guided.boxes < plain.boxes and blind.evidence.tree == plain.evidence.tree
+    corners = np.array(leaves_of(guided.evidence))[guided.evidence.proved]
+    assert np.all(converge(corners.mean(1)))

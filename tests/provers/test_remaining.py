@@ -163,7 +163,11 @@ def test_a_constraint_that_counts_turns_is_refused(tmp_path: Path) -> None:
 
 def test_unknown_says_what_to_try(tmp_path: Path) -> None:
     found = proved(steps((2 * X + U, 2 * Y)), tmp_path)
-    assert found.verdict is Verdict.UNKNOWN and "never left" in found.reason and found.following
+    assert found.verdict is Verdict.UNKNOWN and "the effort is over" in found.reason
+    assert found.following == ("--effort 0.2", "a smaller --domain")
+    gone = proved(steps((X + Number(5) + U, Y)), tmp_path)  # all of it leaves at once
+    assert gone.verdict is Verdict.UNKNOWN and "no box is left" in gone.reason
+    assert gone.following == ("another --domain",)
     assert not (tmp_path / "certificate.json").exists()
 
 

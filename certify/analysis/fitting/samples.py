@@ -19,7 +19,8 @@ from certify.loop.plants.equations import decimal
 from certify.loop.plants.samples import Point, Sampled, Samples, Unknown
 from certify.loop.plants.system import Interval, System
 
-_MOST_SAMPLES, _MOST_BITS = 200_000, 2**7  # bits of a number, as the checkers read them
+_MOST_BITS = 2**7  # of a number, as the checkers read them
+_MOST_PARTS, _OF_A_SAMPLE = 900_000, 12  # commas and brackets of a certificate; of a sample, beside its variables
 _LENGTH = "some 35 digits at most"
 
 
@@ -39,8 +40,9 @@ def read_samples(path: Path, unknowns: Sequence[Unknown], suffix: str) -> tuple[
         raise InputError(f"samples {path} cannot be read: {error.strerror}.") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"samples {path} must be CSV, which is UTF-8 text: {error}.") from error
-    if not 2 <= len(rows) <= _MOST_SAMPLES + 1:
-        raise InputError(f"samples {path} must have a header and 1 to {_MOST_SAMPLES:,} rows; found {len(rows)} lines.")
+    most = _MOST_PARTS // sum(len(one.variables) + _OF_A_SAMPLE for one in unknowns)
+    if not 2 <= len(rows) <= most + 1:
+        raise InputError(f"samples {path} must have a header and 1 to {most:,} rows; found {len(rows):,} lines.")
     header = [name.strip() for name in rows[0]]
     wanted = {name for one in unknowns for name in (*one.variables, f"{one.state}{suffix}")}
     odd = next((name for name in sorted(wanted) if header.count(name) != 1), None)
@@ -74,6 +76,8 @@ def require_within(system: System, one: Unknown, noise: Fraction) -> None:
     bounds = bounds_of(system)
     if any(map(_is_long, (noise, *chain(*one.curvature)))):
         raise InputError(f"bounds of the noise and of second derivatives of {one.state} must have {_LENGTH}.")
+    if any(map(_is_long, chain(*one.box))):
+        raise InputError(f"the domain and the input bounds of {', '.join(one.variables)} must have {_LENGTH}.")
     for name, (first, last) in zip(one.variables, one.box, strict=True):
         lo, hi = bounds[name]
         if not (first <= lo and hi <= last):

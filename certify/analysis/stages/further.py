@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from certify.analysis.asked import ellipsoid_in
 from certify.analysis.facts import TubeFacts
+from certify.analysis.simulated import Simulator
 from certify.analysis.stages.state import State, Tools
 from certify.certificates.claims import Claim, Problem
 from certify.certificates.tree import LEAF
@@ -28,7 +29,7 @@ _FOR_CELLS = 0.7  # the same for a search of boxes with ranks, of which only tho
 _FOR_RANKS = 0.35  # share of the whole effort, even if the search has left less
 _FOR_LEARNING = 0.6  # share of the effort that is left, the rest being for the proof and its check
 _PROBES = 30  # states at which the order of the series in time is chosen, and the frame of errors
-_LITTLE = 1e-4  # share of the root box that an error of the series may be
+_LITTLE = 2e-3  # share of the root box that an error of the series may be
 _FOR_RING = 0.05  # share of the whole effort for the check of the ring, if it takes a series of a higher order
 
 
@@ -201,7 +202,8 @@ class ByRanks:
             question = Question(problem.loop, target, claim.keep, root, evidence.order)
             ring, most = evidence.tree.count(LEAF), _FOR_RING * tools.whole
             question = with_frame(with_order(question, probes, share, _LITTLE, ring, most), probes, share)
-            found = prove_ranks(question, share, tools.runner, told, enough=enough)
+            promising = partial(Simulator(problem.loop, problem.V, claim.roa).converge, effort=share)
+            found = prove_ranks(question, share, tools.runner, told, enough=enough, promising=promising)
         if found is None:
             return state.noting("no box of the domain beyond the set is proved to lead into it")
         return replace(

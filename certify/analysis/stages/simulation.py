@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from certify.analysis.simulated import FEW, MOST, SimulatedRegion, simulated_region
+from certify.analysis.simulated import FEW, MOST, SimulatedRegion, Simulator, simulated_region
 from certify.analysis.stages.further import Beyond, ByRanks, Equilibrium
 from certify.analysis.stages.ring import Ring
 from certify.analysis.stages.state import State, Tools
@@ -95,7 +95,7 @@ def _simulated(state: State, tools: Tools, effort: Effort) -> State:
     with tools.timing("simulate"):
         tools.tell("simulate")
         share = effort.part(_FOR_RUNS * tools.whole)
-        return replace(state, simulated=simulated_region(problem.loop, problem.V, claim.roa, share))
+        return replace(state, simulated=simulated_region(Simulator(problem.loop, problem.V, claim.roa), share))
 
 
 def _enough(simulated: SimulatedRegion | None) -> float:

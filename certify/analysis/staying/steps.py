@@ -25,7 +25,7 @@ from certify.certificates.verdict import Verdict
 from certify.effort import Effort
 from certify.errors import OptionError
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.plants import kept_constraints
+from certify.loop.plants import System, kept_constraints
 from certify.provers.base import Progress
 from certify.provers.execution import ThreadRunner
 from certify.provers.ranks import Nothing, Question, prove_remaining, root_box, turning, with_frame, with_order
@@ -78,7 +78,7 @@ def proved_in_steps(
     with tools.timing("search"):
         found = prove_remaining(question, seeds, search, ThreadRunner(), report)
     if found is None:
-        return replace(result, reason=_nothing(search.over), following=_following(options, search.over))
+        return replace(result, reason=_nothing(search.over), following=_following(options, system, search.over))
     proof, without = found
 
     def mended(_: RemainCertificate, at: str) -> RemainCertificate | None:
@@ -114,11 +114,11 @@ def _require_no_function(options: RoaOptions) -> None:
             )
 
 
-def _following(options: RoaOptions, over: bool) -> tuple[str, ...]:
+def _following(options: RoaOptions, system: System, over: bool) -> tuple[str, ...]:
     """Options that may help where nothing is proved."""
     if over:
         return (f"--effort {4 * options.effort:g}", "a smaller --domain")
-    return ("another --domain", "a shorter --sample-time")
+    return ("another --domain", *(() if system.sample is None else ("a shorter --sample-time",)))
 
 
 def _nothing(over: bool) -> str:

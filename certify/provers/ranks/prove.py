@@ -19,7 +19,7 @@ from certify.provers.execution import Runner
 from certify.provers.execution.shared import shared
 from certify.provers.ranks.images import Course, Images
 from certify.provers.ranks.remaining import Remaining
-from certify.provers.ranks.search import COUNTS, Search
+from certify.provers.ranks.search import COUNTS, Promising, Search
 from certify.provers.ranks.targets import TURN, Target
 from certify.provers.ranks.wanted import Direct, SearchFrom, Wanted
 
@@ -201,6 +201,7 @@ def prove_ranks(
     report: Callable[[float, int, int], None] | None = None,
     wanted: Wanted | None = None,
     enough: float = 1.0,
+    promising: Promising | None = None,
 ) -> RankProof | None:
     """Prove from which leaves of a box trajectories reach a target.
 
@@ -209,13 +210,16 @@ def prove_ranks(
     report : called after every round with the share that is proved, the boxes looked at, and the leaves that wait.
     wanted : a box on which alone it depends; the search ends once it is proved.
     enough : share of the root box, at which the search ends.
+    promising : says which states (N, n) seem to reach the target, so that leaves without any wait.
 
     Returns
     -------
     RankProof | None : None if no leaf beyond the target has a rank, and no leaf of a box that was wanted.
     """
     course = question.course(COUNTS if wanted is None else wanted.counts)
-    searches = [Search(course, *question.root) if wanted is None else SearchFrom(course, *question.root, wanted)]
+    searches = [
+        Search(course, *question.root, promising) if wanted is None else SearchFrom(course, *question.root, wanted)
+    ]
     if wanted is not None and wanted.direct:
         searches.insert(0, Direct(course, *question.root, wanted))
     boxes = rounds = 0

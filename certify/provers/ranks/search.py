@@ -8,13 +8,14 @@ networks). What has a rank keeps it; so the search may end at any time.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from certify.certificates import RankTree
 from certify.certificates.claims import UNPROVED
-from certify.provers.bounds.arrays import Array, Index
+from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.ranks.cover import Cover
 from certify.provers.ranks.images import Course, Images
 
@@ -22,12 +23,16 @@ COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 _FIRST = 2**10  # leaves of the first tree
 _ROUNDS, _GAIN = 6, 1e-4  # relative growth of what is proved, in so many rounds, below which the search ends
 _LARGEST = 0.7  # share of the leaves to be halved that are, the largest ones
+_POINTS = 5  # of a leaf, from which it is seen if the target may be reached
+Promising = Callable[[Array], Mask]
+"""True (N,) for states (N, n) that seem to reach the target."""
 
 
 class Search:
-    """Ranks of the leaves of a tree that grows."""
+    """Ranks of the leaves of a tree that grows; leaves with no `promising` state are halved last."""
 
-    def __init__(self, course: Course, lo: Array, hi: Array) -> None:
+    def __init__(self, course: Course, lo: Array, hi: Array, promising: Promising | None = None) -> None:
+        self.promising, self.hope = promising, np.full(1, np.nan)
         self.course, self.cover = course, Cover(lo, hi, course.angles)
         K, n = len(course.counts), len(lo)
         self.rank, self.steps = np.full(1, UNPROVED), np.zeros(1, dtype=np.int64)
@@ -85,6 +90,7 @@ class Search:
         self.lo, self.hi = longer(self.lo, np.nan), longer(self.hi, np.nan)
         self.there, self.steep = longer(self.there, False), longer(self.steep, 0.0)
         self.meets, self.loose = longer(self.meets, False), longer(self.loose, False)
+        self.hope = longer(self.hope, np.nan)
         return halves
 
     def take(self, nodes: Index, found: Images) -> None:
@@ -137,9 +143,22 @@ class Search:
 
     def next(self, near: Index) -> tuple[Index, Index]:
         """The leaves to halve next, and their axes."""
+        near = self._hopeful(near)
         volumes = self.cover.widths(near).prod(0)
         large = near[volumes >= np.quantile(volumes, 1 - _LARGEST)]
         return large, self.steep[:, large].argmax(0)
+
+    def _hopeful(self, near: Index) -> Index:
+        """The leaves that have a promising state among a few; all of them if none has."""
+        if self.promising is None:
+            return near
+        new = near[np.isnan(self.hope[near])]
+        low, high = self.cover.low[:, new], self.cover.high[:, new]
+        at = np.random.default_rng(0).uniform(size=(_POINTS, len(low), 1))
+        states = (low + at * (high - low)).transpose(0, 2, 1)
+        self.hope[new] = self.promising(states.reshape(-1, len(low))).reshape(_POINTS, -1).any(0)
+        found: Index = near[self.hope[near] > 0]
+        return found if len(found) else near
 
     def tighten(self) -> None:
         """Give all leaves the lowest ranks that their images show: some had a rank before others had a lower one."""
