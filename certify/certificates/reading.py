@@ -225,7 +225,7 @@ def _with_data(system: System, data: Mapping[str, Any]) -> tuple[System, DataBou
         measured = read_measurements(claim["data"], system.n, system.m)
         return replace(system, measurements=measured), read_data_bounds(evidence["data"], measured)
     if "samples" in claim:
-        samples, bounds = read_samples(claim["samples"], evidence["samples"])
+        samples, bounds = read_samples(claim["samples"], evidence["samples"], system)
         return replace(system, samples=samples), bounds
     return system, None
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from certify.errors import InputError
-from certify.loop.plants import Sampled, Samples, Unknown
+from certify.errors import CertificateFormatError, InputError
+from certify.loop.plants import Sampled, Samples, System, Unknown
+from certify.loop.plants.unknown import residual_name, standing_names
 
 Weights = tuple[tuple[int, Fraction], ...]
 """Numbers of samples, and the weight of each."""
@@ -73,8 +74,15 @@ def samples_evidence(bounds: SampleBounds) -> list[dict[str, Any]]:
     ]
 
 
-def read_samples(claim: Mapping[str, Any], evidence: Sequence[Mapping[str, Any]]) -> tuple[Samples, SampleBounds]:
-    """The samples of both entries, and what stands for the functions."""
+def read_samples(
+    claim: Mapping[str, Any], evidence: Sequence[Mapping[str, Any]], system: System
+) -> tuple[Samples, SampleBounds]:
+    """The samples of both entries, and what stands for the functions.
+
+    Raises
+    ------
+    CertificateFormatError : the equations' quantities have other names than those by which pages know them.
+    """
     unknowns, taken = list[Unknown](), dict[str, Sampled]()
     for f in claim["functions"]:
         taken[f["state"]] = Sampled(tuple(map(_numbers, f["points"])), _numbers(f["values"]))
@@ -87,6 +95,12 @@ def read_samples(claim: Mapping[str, Any], evidence: Sequence[Mapping[str, Any]]
     )
     if len(bounds) != len(unknowns) or len(taken) != len(unknowns):
         raise InputError("samples must have an entry of the evidence for each function, of different states.")
+    for one, by in zip(unknowns, bounds, strict=True):
+        if (by.error, by.slopes) != standing_names(one, system.ranges) or any(system.exact_x_eq()):
+            raise CertificateFormatError(
+                f"the samples of {one.state} can be shown only around 0, with quantities by the names that certify fit "
+                f"gives them, such as {residual_name(one.state)}. certify check takes this certificate."
+            )
     return Samples(str(claim["sha256"]), tuple(unknowns), noise, taken), bounds
 
 

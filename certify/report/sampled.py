@@ -9,8 +9,7 @@ from itertools import combinations_with_replacement
 from typing import Any, Self
 
 from certify.loop.plants import System
-from certify.loop.plants.samples import slope_name
-from certify.loop.plants.unknown import residual_name
+from certify.loop.plants.unknown import standing_names
 from certify.report.words import Varying, above, below, listed, symbol
 
 
@@ -21,9 +20,7 @@ def described(system: System) -> dict[str, Any] | None:
         return None
     functions = []
     for one in samples.unknowns:
-        slopes = [slope_name(one.state, v) for v in one.variables]
-        vanishes = all(name in system.ranges for name in slopes)
-        own = [*(slopes if vanishes else []), residual_name(one.state)]
+        error, slopes = standing_names(one, system.ranges)
         functions.append(
             {
                 "state": one.state,
@@ -32,8 +29,8 @@ def described(system: System) -> dict[str, Any] | None:
                 "curvature": [[str(q) for q in row] for row in one.curvature],
                 "noise": str(samples.noise[one.state]),
                 "samples": len(samples.taken[one.state].values),
-                "vanishes": vanishes,
-                "quantities": [name for name in own if name in system.ranges],
+                "vanishes": bool(slopes),
+                "quantities": [*slopes, *([] if error is None else [error])],
             }
         )
     return {"sha256": samples.sha256, "functions": functions}

@@ -24,11 +24,12 @@ from certify.analysis.fitting.run import Fitted, fit_plant
 from certify.analysis.stated import stated
 from certify.certificates import Certificate, parse_certificate
 from certify.cli.main import _run
-from certify.errors import InputError
+from certify.errors import CertificateFormatError, InputError
 from certify.loop.plants import Sampled, Unknown, load_system
 from certify.loop.plants.samples import Point
 from certify.loop.policies import Policy, PolicyNetwork, save_policy
 from certify.report.drawn import page_of
+from tests.checker.test_handover import verdicts
 from tests.support.marks import slow_after
 
 STRUCTURE = """
@@ -564,6 +565,23 @@ def test_samples_are_a_part_of_the_claim(fitted_box: Path, capsys: pytest.Captur
     said = capsys.readouterr().out
     assert "for every function v′ = g(x, v, u) with which 54 samples are consistent, every trajectory" in said
     assert "checker      ACCEPTED, reference ACCEPTED" in said
+
+
+@pytest.mark.parametrize(("old", "new"), [("slope_v_x", "a"), ("residual_v", "r")])
+def test_pages_know_quantities_by_their_names(fitted_box: Path, old: str, new: str) -> None:
+    """Both programs take others, but a page would not say of such a function that it is 0 at 0."""
+    assert proved(fitted_box, "near").verdict == "PROVED"
+    raw = (fitted_box / "near" / "certificate.json").read_bytes()
+    for other in (raw.replace(old.encode(), new.encode()), moved(raw)):
+        assert verdicts(json.loads(other)) == (None, None)
+        with pytest.raises(CertificateFormatError, match="such as residual_v"):
+            parse_certificate(other, "near")
+
+
+def moved(raw: bytes) -> bytes:
+    """The certificate, as if its page had to show values that are not deviations."""
+    data = json.loads(raw)
+    return json.dumps({**data, "provenance": {**data["provenance"], "x_eq": {"x": "1"}}}).encode()
 
 
 def test_scattered_samples_are_a_part_of_the_claim(

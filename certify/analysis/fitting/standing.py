@@ -20,8 +20,7 @@ from certify.certificates.samples import SampleBounds, Standing, Weights
 from certify.errors import InputError
 from certify.loop.expressions import to_tree
 from certify.loop.plants import Sampled, Samples, System, Unknown
-from certify.loop.plants.samples import slope_name
-from certify.loop.plants.unknown import residual_name
+from certify.loop.plants.unknown import standing_names
 
 Powers = tuple[int, ...]
 
@@ -103,9 +102,7 @@ def _equation(system: System, one: Unknown) -> Equation:
     from sympy import QQ
     from sympy.polys.rings import ring
 
-    d, own = len(one.variables), tuple(slope_name(one.state, v) for v in one.variables)
-    own = own if all(name in system.ranges for name in own) else ()
-    error = residual_name(one.state) if residual_name(one.state) in system.ranges else None
+    d, (error, own) = len(one.variables), standing_names(one, system.ranges)
     names = [*one.variables, *own, *([] if error is None else [error])]
     R, *symbols = ring(names, QQ)
     tree = to_tree(system.uncertain_dynamics()[[s.name for s in system.states].index(one.state)])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 from certify.loop.expressions import Expression, Operation, Symbol
 from certify.loop.plants.axes import axes_of
 from certify.loop.plants.measurements import Axis, Measurements
-from certify.loop.plants.samples import Box, Samples, Unknown
+from certify.loop.plants.samples import Box, Samples, Unknown, slope_name
 from certify.loop.plants.source import PlantFile, interval_at, interval_in, number_at
 from certify.loop.plants.system import Interval
 
@@ -87,6 +87,14 @@ def residual_names(state: str, ranges: Mapping[str, Interval]) -> list[str]:
     """The names of the disturbances with ranges around 0 that bound what a state's equation lacks."""
     own = [residual_name(state), *(beyond_name(state, k + 1) for k in range(len(ranges)))]
     return [name for name in own if name in ranges and ranges[name][0] == -ranges[name][1]]
+
+
+def standing_names(one: Unknown, ranges: Collection[str]) -> tuple[str | None, tuple[str, ...]]:
+    """The names of the disturbance and of the slopes in an equation that stands for an unknown function, of those that
+    have ranges: None and () where it has none."""
+    slopes = tuple(slope_name(one.state, v) for v in one.variables)
+    error = residual_name(one.state)
+    return error if error in ranges else None, slopes if all(name in ranges for name in slopes) else ()
 
 
 def measurements_in(
