@@ -48,6 +48,7 @@ def is_bearable_on_a_ball(network: Network, operations: int, n: int) -> bool:
         dynamics=SimpleNamespace(size=operations, entries=0, called=[]),
         policy=SimpleNamespace(network=network),
         evidence=Partition(np.eye(n), np.ones(n), b"", 1, (), local),
+        stated=0,
         c1=1.0,
         c2=1.0,
     )
