@@ -233,7 +233,7 @@ def prove_ranks(
     tree = search.evidence()
     if not np.any(tree.steps if wanted is None else tree.proved):
         return None
-    return RankProof(_ranks(question, tree), tree, search.share, int(tree.proved.sum()), boxes, rounds, done)
+    return _proof(search, tree, boxes, rounds, done)
 
 
 def prove_remaining(
@@ -268,16 +268,20 @@ def prove_remaining(
         if not search.without(leaf):
             return None
         left = search.evidence()
-        return left, _ranks(question, left)
+        return left, _ranks(search, left)
 
-    found = RankProof(_ranks(question, tree), tree, search.share, int(tree.proved.sum()), search.boxes, rounds, done)
-    return found, without
+    return _proof(search, tree, search.boxes, rounds, done), without
 
 
-def _ranks(question: Question, tree: RankTree) -> Ranks:
+def _proof(search: Search, tree: RankTree, boxes: int, rounds: int, done: bool) -> RankProof:
+    """The proof that a search ends with, whose evidence is this tree."""
+    return RankProof(_ranks(search, tree), tree, search.share, int(tree.proved.sum()), boxes, rounds, done)
+
+
+def _ranks(search: Search, tree: RankTree) -> Ranks:
     """The claim's part on the leaves of a tree."""
-    states, angles = question.loop.system.states, turning(question.loop)
-    return Ranks(tuple(states[i].name for i in angles), max(1, tree.most))
+    states = search.course.system.states
+    return Ranks(tuple(states[i].name for i in search.course.angles), max(1, tree.most))
 
 
 def _grow(

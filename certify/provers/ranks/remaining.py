@@ -95,7 +95,6 @@ class Remaining(SearchFrom):
         _, leaves = self.cover.preorder(self._known)
         self.lost[leaves[leaf]] = True
         self._again(np.setdiff1d(leaves, leaves[leaf]))
-        self.rank[leaves[leaf]] = UNPROVED
         return bool(np.any(self._known))
 
     @property
