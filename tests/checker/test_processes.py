@@ -447,6 +447,24 @@ def test_an_answer_that_nobody_hears_is_no_refusal(tmp_path: Path) -> None:
     assert subprocess.run(["sh", "-c", shell], stderr=subprocess.DEVNULL, check=False).returncode == 70
 
 
+@pytest.mark.parametrize("count", [100, 1000, 3000])
+@pytest.mark.parametrize("name", ["scalar", "outer, a network"])
+def test_constraints_count_where_leaves_are_examined_together(
+    name: str, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All values of an expression are held on all leaves of a batch: 4096 leaves made 2,000 operations a gigabyte."""
+    monkeypatch.undo()  # batches as large as they are
+    terms = [["*", "0", "x", ["+", "x", str(k + 1)]] for k in range(count)]
+    data = edited(honest(name), "claim", lambda c: c | {"keep": [["-", ["+", *terms], "1"]]})
+    data = with_tree(data, uniform([0], 13))
+    if name != "scalar":
+        data = edited(data, "evidence.outer.tree", data["evidence"]["tree"])
+    case = Case(parse(data))
+    leaves = Ring.of(case) if name == "scalar" else outer.Beyond(case)
+    _, lo, _ = next(leaves.leaves())
+    assert (2 if count == 100 else 1) <= lo.shape[1] <= 2**25 // (4 * count * (leaves.symbols + 1) ** 2)
+
+
 PROGRAMS = ["checker", "reference"]
 
 
