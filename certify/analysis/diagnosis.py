@@ -21,7 +21,14 @@ from certify.analysis.facts import Diagnosis, Share, Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
 from certify.analysis.simulated import NEARLY_ALL
-from certify.analysis.suggested import beyond_the_ellipsoid, by_centring, by_clipping, by_learning, side
+from certify.analysis.suggested import (
+    beyond_the_ellipsoid,
+    by_centring,
+    by_clipping,
+    by_learning,
+    clipped_outside,
+    side,
+)
 from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT, UNLIMITED, WHOLE, Effort
 from certify.errors import InputError
@@ -177,6 +184,9 @@ def _next(
         return correction
     if (boxes := _boxes(result, options)) is not None:
         return boxes
+    ended = result.stop in (Stop.INPUTS, Stop.BOXES, Stop.STALLED) or result.stop.ran_out
+    if ended and (outside := clipped_outside(*asked)) is not None:
+        return Step((), outside)
     weaker = result.claim in ("practical", "nearby")
     if weaker and (centred := by_centring(result, options, asked, effort)) is not None:
         return centred

@@ -28,6 +28,7 @@ WIDER = Fraction(3, 2)
 """Factor of the side of the domain that is tried."""
 _WORTH = 1.1  # growth of the simulated region that is worth a word
 _NEAR = 1e-3  # of the largest level in the domain: a run that comes so low has converged
+_ROUNDING = Fraction(2) ** -23  # of a number: where single precision rounds it
 _ENDED = ("effort", "boxes")  # limits of an outer set that more effort lifts
 _LOOK = 3 * UNIT  # operations for one look
 
@@ -82,6 +83,23 @@ def _rests(loop: ClosedLoop) -> bool:
     return True
 
 
+def clipped_outside(system: System, network: PolicyNetwork) -> str | None:
+    """Say which input is clipped beyond its bound by a rounding, as float32's 0.4 is beyond 2/5, and how to mend it."""
+    for one, bounds, *clip in zip(system.inputs, system.input_bounds, *(network.clip or ((), ())), strict=False):
+        for sign, end, bound in zip((-1, 1), clip, bounds, strict=True):
+            if 0 < sign * (Fraction(float(end)) - bound) <= _ROUNDING * abs(bound):
+                return (
+                    f"{one.name} is clipped at {float(end):.17g}, by a rounding beyond its bound {float(bound):g}, so "
+                    f"that nothing can be proved where it saturates there: clip it at {_bounds(system)} (--clip, where "
+                    "the file of another program is read), or widen the bound a little"
+                )
+    return None
+
+
+def _bounds(system: System) -> str:
+    return ",".join(f"{float(least):g}..{float(most):g}" for least, most in system.input_bounds)
+
+
 def by_clipping(result: RoaResult, asked: tuple[System, PolicyNetwork], effort: Effort) -> Step | None:
     """The step of a policy that asks for more than the actuator gives, where one that is clipped at the input bounds
     converges from as many states in simulation."""
@@ -98,9 +116,9 @@ def by_clipping(result: RoaResult, asked: tuple[System, PolicyNetwork], effort: 
     here = _converging(result)
     if there is None or here is None or there < here:
         return None
-    ends = ",".join(f"{float(least):g}..{float(most):g}" for least, most in system.input_bounds)
     why = (
-        f"the policy asks for more than the actuator gives; if the actuator saturates there, clip the policy at {ends}"
+        "the policy asks for more than the actuator gives; if the actuator saturates there, clip the policy at "
+        f"{_bounds(system)}"
     )
     return Step((), f"{why} (--clip, where the file of another program is read), and the larger set can be tried")
 

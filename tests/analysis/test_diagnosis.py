@@ -125,6 +125,18 @@ def test_an_unstable_loop_needs_another_policy(
     assert result.diagnosis.next.why.startswith("another policy") and said in result.diagnosis.next.why
 
 
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+def test_a_clip_that_a_rounding_puts_out_of_bounds_is_named(tmp_path: Path, precision: Any) -> None:
+    """The policy saturates at 0.4, in both precisions above 2/5; clipped inside, the whole domain is proved."""
+    system, network = chain(1, [-1.0])
+    bounded = replace(system, input_bounds=((Fraction(-2, 5), Fraction(2, 5)),))
+    most = np.array([float(precision(0.4))])
+    result = certify_roa(bounded, replace(network, clip=(-most, most)), tmp_path, LITTLE)
+    assert result.diagnosis is not None and result.diagnosis.next.why.startswith("u is clipped at -0.4")
+    inside = np.nextafter([0.4], 0)
+    assert certify_roa(bounded, replace(network, clip=(-inside, inside)), tmp_path, LITTLE).stop is Stop.DOMAIN
+
+
 @pytest.mark.parametrize("claim", ["asymptotic", "practical"])
 def test_a_period_that_is_too_long_is_to_be_shorter(tmp_path: Path, claim: Literal["asymptotic", "practical"]) -> None:
     """x' = u with u = -x held over 5 s: a step multiplies by 1 - h, which is -1/4 at a quarter and -3/2 at a half."""
