@@ -257,7 +257,8 @@ def _require_answers(kind: Content, reading: Reading, options: ImportOptions, pl
 
 def _are_bounds(action: Sequence[tuple[Fraction, Fraction]] | None, plant: System) -> bool:
     """True if an action space has the plant's input bounds, in single precision, which it usually is in."""
-    return action is not None and np.array_equal(*(np.array(b, dtype=np.float32) for b in (action, plant.input_bounds)))
+    single = [np.array(bounds, dtype=np.float32) for bounds in (action or (), plant.input_bounds)]
+    return np.array_equal(single[0], single[1])
 
 
 def _normaliser(reading: Reading, options: ImportOptions, n: int) -> tuple[Step, ...]:
