@@ -27,6 +27,7 @@ from certify.analysis.suggested import (
     by_clipping,
     by_learning,
     clipped_outside,
+    commands_too_much,
     side,
 )
 from certify.certificates.verdict import Stop, Verdict
@@ -184,6 +185,8 @@ def _next(
         return correction
     if (boxes := _boxes(result, options)) is not None:
         return boxes
+    if (amiss := commands_too_much(*asked)) is not None:
+        return Step((), amiss)
     ended = result.stop in (Stop.INPUTS, Stop.BOXES, Stop.STALLED) or result.stop.ran_out
     if ended and (outside := clipped_outside(*asked)) is not None:
         return Step((), outside)

@@ -81,7 +81,7 @@ def plant_of(stored: Policy, system: System | str | None, changes: PlantChanges,
     ------
     InputError : there is no such plant, or the plant cannot have a change.
     """
-    from certify.analysis.suggested import clipped_outside
+    from certify.analysis.suggested import clipped_outside, commands_too_much
     from certify.loop.plants import System
 
     plant, own = (system, False) if isinstance(system, System) else named_plant(stored, system)
@@ -89,8 +89,9 @@ def plant_of(stored: Policy, system: System | str | None, changes: PlantChanges,
     if not own:
         tell_of_other(stored, plant, tell)
     plant = where_valid(stored, plant, tell)
-    if outside := clipped_outside(plant, stored.network):
-        tell(outside)
+    for notice in (commands_too_much(plant, stored.network), clipped_outside(plant, stored.network)):
+        if notice is not None:
+            tell(notice)
     if shift := stored.beta_shift(plant.exact_u_eq()):
         tell(f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}")
     return plant

@@ -83,6 +83,21 @@ def _rests(loop: ClosedLoop) -> bool:
     return True
 
 
+def commands_too_much(system: System, network: PolicyNetwork) -> str | None:
+    """Say which input is out of its bounds at the operating point already: likely the policy was read amiss."""
+    if not all(lo < 0 < hi for lo, hi in system.domain):  # a plant without an operating point
+        return None
+    u = network(np.zeros((1, system.n)), system.exact_u_eq())[0]
+    for one, value, (lo, hi) in zip(system.inputs, u.tolist(), system.input_bounds, strict=True):
+        if not float(lo) <= value <= float(hi):
+            return (
+                f"at the operating point the policy commands {one.name} = {value:.6g}, outside of "
+                f"{float(lo):g}..{float(hi):g}: see what it reads and commands, of another program's file --states, "
+                "--observes, --normaliser, --action-scale and --squash, then the plant's bounds"
+            )
+    return None
+
+
 def clipped_outside(system: System, network: PolicyNetwork) -> str | None:
     """Say which input is clipped beyond its bound by a rounding, as float32's 0.4 is beyond 2/5, and how to mend it."""
     for one, bounds, *clip in zip(system.inputs, system.input_bounds, *(network.clip or ((), ())), strict=False):

@@ -164,3 +164,12 @@ def test_a_level_that_is_refuted_is_to_be_left_out(pendulum_result: RoaResult, t
     refuted = certify_roa(pendulum_result.system, pendulum_result.network, tmp_path, options)
     assert refuted.verdict is Verdict.REFUTED and refuted.diagnosis is not None
     assert refuted.diagnosis.next.why.startswith("leave --level out")
+
+
+def test_a_policy_that_is_out_of_bounds_at_rest_is_to_be_read_again(tmp_path: Path) -> None:
+    """Not to be shifted by 50, though that centres it: its observations or its action's scale were misread."""
+    system, network = chain(1, [-1.0])
+    bounded = replace(system, input_bounds=((Fraction(-1), Fraction(1)),))
+    result = certify_roa(bounded, network.with_layers(biases=(np.array([50.0]),)), tmp_path, RoaOptions(effort=0.01))
+    assert result.diagnosis is not None and result.diagnosis.next.options == ()
+    assert "commands u = 50, outside of -1..1" in result.diagnosis.next.why
