@@ -300,7 +300,7 @@ def test_an_error_names_file_line_and_symbol(tmp_path: Path, old: str, new: str,
             'inputs = ["level"]',
             "names of states, inputs, parameters and disturbances must differ; found 'level' twice",
         ),
-        ('name = "tank"', 'name = "a tank"', "identifiers"),
+        ('name = "tank"', 'name = "a tank"', "an identifier"),
         ("tau = 2", "tau = 0", "positive"),
         ('[u_eq]\nu = "rest**3"\n', "", "missing keys: a plant must have u_eq"),
         ('name = "tank"', 'name = "tank', "not valid TOML"),
@@ -332,7 +332,7 @@ def test_lines_are_found_under_dotted_keys_and_beside_comments(tmp_path: Path) -
     [
         ({'flow = "rest**3"': "flow = 0"}, ["level' = -0.037037 (exactly -1/27) in m per second", "flow' = 0.0185185"]),
         ({'u = "rest**3"': "u = 0"}, ["flow' = -0.0185185 (exactly -1/54)"]),
-        ({"level**3": "sin(level)"}, ["level' = -0.290158", "u: it rests at level = 0.0786"]),
+        ({"level**3": "sin(level)"}, ["level' = -0.290158", "u_eq: it rests at level = 0.0786"]),
         ({'flow = "(u - flow)/tau"': 'flow = "u/(flow - rest**3)"'}, ["flow' = nan"]),
     ],
 )
