@@ -91,7 +91,7 @@ def test_a_level_without_kinks_is_kept_where_the_effort_ends_with_them(monkeypat
 
 def test_a_candidate_leaves_half_of_the_effort_to_its_only_heat() -> None:
     """Beside a function to be learned, a quarter of the whole is there for both; a candidate alone may take as much."""
-    state: Any = SimpleNamespace(interruptible=False)
+    state: Any = SimpleNamespace(interruptible=False, options=RoaOptions(candidate="neural"))
     tools: Any = SimpleNamespace(whole=100.0)
     effort = Effort(25.0)
     granted = _Choice(state, tools, effort, race=cast(Any, None))._granted()
