@@ -173,3 +173,14 @@ def test_a_policy_that_is_out_of_bounds_at_rest_is_to_be_read_again(tmp_path: Pa
     result = certify_roa(bounded, network.with_layers(biases=(np.array([50.0]),)), tmp_path, RoaOptions(effort=0.01))
     assert result.diagnosis is not None and result.diagnosis.next.options == ()
     assert "commands u = 50, outside of -1..1" in result.diagnosis.next.why
+
+
+@pytest.mark.parametrize(("rate", "suggested"), [(0.8, None), (1.5, "0.9")])
+def test_a_rate_below_the_slowest_mode_is_proved_and_one_above_it_is_to_be_lower(
+    tmp_path: Path, rate: float, suggested: str | None
+) -> None:
+    """The modes are -1 and -2; the V of Q = I falls at 0.38 alone near the origin."""
+    system, network = chain(2, [-1.0, -2.0])
+    result = certify_roa(system, network, tmp_path, RoaOptions(rate=rate, effort=0.05))
+    assert (result.verdict is Verdict.PROVED) == (suggested is None) and result.diagnosis is not None
+    assert dict(result.diagnosis.next.options).get("--rate") == suggested
