@@ -75,7 +75,9 @@ class Desk:
         if (answer.get("rule"), answer.get("at")) == ("limits", "operations"):
             answer = self._answered(path, patient=True)
             if answer["result"] != "REJECTED":
-                self.remarks.append("its check may take more than ten minutes: to repeat it, type `certify check --patient`")
+                self.remarks.append(
+                    "its check may take more than ten minutes: to repeat it type `certify check --patient`"
+                )
         elif answer["result"] == "ACCEPTED":
             return self._twice(path, answer)
         return answer
