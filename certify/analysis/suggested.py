@@ -85,7 +85,8 @@ def _rests(loop: ClosedLoop) -> bool:
 
 def commands_too_much(system: System, network: PolicyNetwork) -> str | None:
     """Say which input is out of its bounds at the operating point already: likely the policy was read amiss."""
-    if not all(lo < 0 < hi for lo, hi in system.domain):  # a plant without an operating point
+    fits = (network.n, network.m) == (system.n, system.m)  # who asks for the loop says what does not
+    if not fits or not all(lo < 0 < hi for lo, hi in system.domain):  # or there is no operating point
         return None
     u = network(np.zeros((1, system.n)), system.exact_u_eq())[0]
     for one, value, (lo, hi) in zip(system.inputs, u.tolist(), system.input_bounds, strict=True):
