@@ -128,13 +128,13 @@ def test_an_unstable_loop_needs_another_policy(
 @pytest.mark.parametrize("precision", [np.float32, np.float64])
 def test_a_clip_that_a_rounding_puts_out_of_bounds_is_named(tmp_path: Path, precision: Any) -> None:
     """The policy saturates at 0.4, in both precisions above 2/5; clipped inside, the whole domain is proved."""
-    system, network = chain(1, [-1.0])
+    (system, network), quick = chain(1, [-1.0]), RoaOptions(effort=0.01, candidate="lyapunov")
     bounded = replace(system, input_bounds=((Fraction(-2, 5), Fraction(2, 5)),))
     most = np.array([float(precision(0.4))])
-    result = certify_roa(bounded, replace(network, clip=(-most, most)), tmp_path, LITTLE)
+    result = certify_roa(bounded, replace(network, clip=(-most, most)), tmp_path, quick)
     assert result.diagnosis is not None and result.diagnosis.next.why.startswith("u is clipped at -0.4")
     inside = np.nextafter([0.4], 0)
-    assert certify_roa(bounded, replace(network, clip=(-inside, inside)), tmp_path, LITTLE).stop is Stop.DOMAIN
+    assert certify_roa(bounded, replace(network, clip=(-inside, inside)), tmp_path, quick).stop is Stop.DOMAIN
 
 
 @pytest.mark.parametrize("claim", ["asymptotic", "practical"])
@@ -175,12 +175,6 @@ def test_a_policy_that_is_out_of_bounds_at_rest_is_to_be_read_again(tmp_path: Pa
     assert "commands u = 50, outside of -1..1" in result.diagnosis.next.why
 
 
-@pytest.mark.parametrize(("rate", "suggested"), [(0.8, None), (1.5, "0.9")])
-def test_a_rate_below_the_slowest_mode_is_proved_and_one_above_it_is_to_be_lower(
-    tmp_path: Path, rate: float, suggested: str | None
-) -> None:
+def test_a_rate_below_the_slowest_mode_is_proved(tmp_path: Path) -> None:
     """The modes are -1 and -2; the V of Q = I falls at 0.38 alone near the origin."""
-    system, network = chain(2, [-1.0, -2.0])
-    result = certify_roa(system, network, tmp_path, RoaOptions(rate=rate, effort=0.05))
-    assert (result.verdict is Verdict.PROVED) == (suggested is None) and result.diagnosis is not None
-    assert dict(result.diagnosis.next.options).get("--rate") == suggested
+    assert certify_roa(*chain(2, [-1.0, -2.0]), tmp_path, RoaOptions(rate=0.8, effort=0.02)).verdict is Verdict.PROVED
