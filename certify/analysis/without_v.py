@@ -109,7 +109,7 @@ class Tools:
     def notice(self, system: System) -> str | None:
         """The notice about a run for a plant."""
         rests = [] if system.measurements is None and system.samples is None else [AS_THEY_STAND]
-        return "; ".join([*rests, *self.remarks]) or None
+        return "; ".join(dict.fromkeys([*rests, *self.remarks])) or None
 
     def clerk(self, path: Path, jobs: int | None, many: bool, cluster: str | None = None) -> Clerk:
         """Somebody who writes certificates and has them checked; by several processes where leaves are `many`."""
