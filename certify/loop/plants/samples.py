@@ -20,12 +20,18 @@ class Unknown:
     variables : names of the states and inputs that g depends on, and of no others.
     curvature : bounds of the absolute second derivatives of g on the box, (d, d), symmetric.
     box : the interval of each variable on which they hold; () before there are samples.
+    error, slopes : names of the uncertain quantities r and a in the equation P + r E or a z + r E that stands for g;
+        None and () where it has none.
+    vanishes : True if g(0) = 0 is assumed.
     """
 
     state: str
     variables: tuple[str, ...]
     curvature: tuple[Point, ...]
     box: Box = ()
+    error: str | None = None
+    slopes: tuple[str, ...] = ()
+    vanishes: bool = False
 
 
 @dataclass(frozen=True, slots=True)

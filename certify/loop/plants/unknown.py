@@ -89,12 +89,12 @@ def residual_names(state: str, ranges: Mapping[str, Interval]) -> list[str]:
     return [name for name in own if name in ranges and ranges[name][0] == -ranges[name][1]]
 
 
-def standing_names(one: Unknown, ranges: Collection[str]) -> tuple[str | None, tuple[str, ...]]:
-    """The names of the disturbance and of the slopes in an equation that stands for an unknown function, of those that
-    have ranges: None and () where it has none."""
-    slopes = tuple(slope_name(one.state, v) for v in one.variables)
-    error = residual_name(one.state)
-    return error if error in ranges else None, slopes if all(name in ranges for name in slopes) else ()
+def _standing(one: Unknown, ranges: Collection[str]) -> Unknown:
+    """The unknown with the names of the disturbance and of the slopes that have ranges, as `certify fit` writes them;
+    where there are slopes it vanishes."""
+    slopes, error = tuple(slope_name(one.state, v) for v in one.variables), residual_name(one.state)
+    own = slopes if all(name in ranges for name in slopes) else ()
+    return replace(one, error=error if error in ranges else None, slopes=own, vanishes=bool(own))
 
 
 def measurements_in(
@@ -190,7 +190,9 @@ def _unknown(file: PlantFile, state: str, names: Sequence[str]) -> Unknown:
     return Unknown(state, variables, rows)
 
 
-def samples_in(file: PlantFile, states: Sequence[str], inputs: Sequence[str]) -> Samples | None:
+def samples_in(
+    file: PlantFile, states: Sequence[str], inputs: Sequence[str], ranges: Collection[str]
+) -> Samples | None:
     """The tables `samples` and `unknown`, without the sampled numbers, which another file has; None without them.
 
     Raises
@@ -213,7 +215,7 @@ def samples_in(file: PlantFile, states: Sequence[str], inputs: Sequence[str]) ->
     if min(bounds.values()) < 0:
         raise file.refuse("must be at least 0.", "samples", "noise")
     _inner(file, "samples", "box", named, "unknown function")
-    boxed = tuple(replace(one, box=_box(file, one)) for one in unknowns)
+    boxed = tuple(_standing(replace(one, box=_box(file, one)), ranges) for one in unknowns)
     return Samples(_file_of(file, "samples"), boxed, bounds, {})
 
 
