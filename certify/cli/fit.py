@@ -5,21 +5,28 @@ from __future__ import annotations
 import json
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from certify.analysis.arguments import bound_or_bounds
-from certify.cli.shared import Json
+from certify.cli.environment import of_environment, recorded
+from certify.cli.options import takes
+from certify.cli.shared import Json, Quiet, noting
 from certify.cli.terminal import say
 from certify.errors import InputError
 
 if TYPE_CHECKING:
     from certify.analysis.fitting.run import FitResult, Fitted
+    from certify.loop.plants import System
 
 
+@takes(environment=of_environment())
 def fit(
-    samples: Annotated[Path, typer.Argument(help="Samples, on a grid or scattered: .csv.")],
+    samples: Annotated[
+        Path | None, typer.Argument(help="Samples, on a grid or scattered: .csv, .npz or .parquet.")
+    ] = None,
+    *,
     structure: Annotated[
         Path, typer.Option(metavar="PLANT.toml", help="The plant, with a table [unknown.STATE] for each unknown.")
     ],
@@ -28,7 +35,9 @@ def fit(
     ],
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of far.toml and near.toml.")] = Path("out/fitted"),
     degree: Annotated[int, typer.Option(min=1, max=20, help="Degree of the polynomial in a variable.")] = 9,
+    environment: dict[str, Any],
     as_json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Fit functions that nobody wrote down, with bounds of what they may be off by.
 
@@ -36,7 +45,7 @@ def fit(
     beyond as far as a grid of samples reaches. The exit status is 1 if the samples refute them.
     """
     from certify.analysis.fitting.linear import Contradicted
-    from certify.analysis.fitting.run import fit_plant
+    from certify.analysis.fitting.run import fit_plant, structure_in
 
     said = bound_or_bounds(noise, "noise")
 
@@ -46,6 +55,13 @@ def fit(
             raise InputError(f"--noise must have a bound for {state}; found {noise}.")
         return Fraction(str(bound))
 
+    def plant() -> System:
+        system = structure_in(structure)[1]
+        if system.time != "discrete":
+            raise InputError('an environment has steps and no rates: write time = "discrete" in the structure.')
+        return system
+
+    samples = recorded(samples, environment, plant, out / "samples.csv", noting(quiet))
     try:
         result = fit_plant(samples, structure, of, out, degree)
     except Contradicted as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from collections.abc import Mapping
@@ -21,7 +22,8 @@ from certify.analysis.fitting.grid import Grid, enclosed
 from certify.analysis.fitting.linear import Bounds, Contradicted, Sampling, beyond
 from certify.analysis.fitting.polynomial import bounded, errors, fitted
 from certify.analysis.fitting.possible import require_possible
-from certify.analysis.fitting.run import Fitted, fit_plant
+from certify.analysis.fitting.run import Fitted, fit_plant, structure_in
+from certify.analysis.fitting.samples import read_samples
 from certify.analysis.stated import stated
 from certify.certificates import Certificate, parse_certificate
 from certify.cli.main import _run
@@ -259,10 +261,11 @@ def test_two_plants_are_written(asked: list[str], tmp_path: Path, capsys: pytest
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("x,v,u,v_rate", "x,v,w,v_rate", "must have the column u once"),
-        ("x,v,u,v_rate", "x,v,u,rate", "must have the column v_rate once"),
-        ("-1.0,-1,-1,", "-1.0,-1,nan,", "must be a decimal number"),
-        ("-1.0,-1,-1,", "-1.0,-1,,", "must be a decimal number"),
+        ("x,v,u,v_rate", "x,v,w,v_rate", "must have the columns x, v, u, v_rate; u is missing among"),
+        ("x,v,u,v_rate", "x,v,u,rate", "v_rate is missing among x, v, u, rate"),
+        ("-1.0,-1,-1,", "-1.0,-1,nan,", "line 2, column u: there must be a finite number; found 'nan'"),
+        ("-1.0,-1,-1,", "-1.0,-1,,", "line 2, column u: there must be a finite number; found ''"),
+        ("-1.0,-1,-1,", f"-1.{40 * '1'},-1,-1,", "line 2, column x: a number must have some 35 digits"),
     ],
 )
 def test_samples_that_are_none(
@@ -272,6 +275,76 @@ def test_samples_that_are_none(
     path.write_text(path.read_text().replace(old, new, 1))
     assert _run(asked, False) == 2
     assert said in capsys.readouterr().err
+
+
+def fitted_to(path: Path, asked: list[str]) -> dict[str, Any]:
+    """What is found from another file, without its hash."""
+    unknowns, system = structure_in(Path(asked[3]))
+    taken, sha256 = read_samples(path, unknowns, system)
+    assert sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    return taken
+
+
+def test_files_of_every_form_are_read(asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Decimals of CSV, and of other files what binary64 holds, exactly."""
+    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    names = ["x", "v", "u", "v_rate"]
+    rows = np.loadtxt(asked[1], delimiter=",", skiprows=1)
+    columns = dict(zip(names, rows.T.tolist(), strict=True))
+    parquet.write_table(pyarrow.table(columns), tmp_path / "a.parquet")
+    np.savez(tmp_path / "a.npz", **columns)
+    rates = np.column_stack([np.zeros(len(rows)), rows[:, 3]])
+    np.savez(tmp_path / "b.npz", x=rows[:, :2], u=rows[:, 2:3], x_rate=rates)
+    exact = Sampled(
+        tuple(tuple(map(Fraction, row[:3])) for row in rows.tolist()), tuple(map(Fraction, columns["v_rate"]))
+    )
+    for name in ("a.parquet", "a.npz", "b.npz"):
+        assert fitted_to(tmp_path / name, asked) == {"v": exact}
+    assert fitted_to(Path(asked[1]), asked)["v"].values[0] == Fraction(repr(rows[0, 3]))
+    assert _run([asked[0], str(tmp_path / "b.npz"), *asked[2:]], False) == 0
+    assert "FITTED  v: 54 samples" in capsys.readouterr().out
+    columns["v_rate"][3] = np.nan
+    np.savez(tmp_path / "a.npz", **columns)
+    with pytest.raises(InputError, match=r"array v_rate: numbers must be finite; found nan at \[3\]"):
+        fitted_to(tmp_path / "a.npz", asked)
+    np.savez(tmp_path / "a.npz", **columns | {"v_rate": [1.0]})
+    with pytest.raises(InputError, match="arrays must have as many rows"):
+        fitted_to(tmp_path / "a.npz", asked)
+
+
+def test_steps_of_runs_are_samples(asked: list[str], tmp_path: Path) -> None:
+    """Rows in time order, and arrays of runs: the last row of each has no next one."""
+    Path(asked[3]).write_text('time = "discrete"\n' + STRUCTURE)
+    x = np.arange(12.0).reshape(2, 3, 2)
+    np.savez(tmp_path / "a.npz", states=x, inputs=np.ones((2, 2, 1)))
+    rows = [f"{run},{x[run, t, 0]},{x[run, t, 1]},1" for run in range(2) for t in range(3)]
+    (tmp_path / "a.csv").write_text("\n".join(["run,x,v,u", *rows]))
+    single = [f"{x[r, t, 0]},{x[r, t, 1]},1,{x[r, t + 1, 1]}" for r in range(2) for t in range(2)]
+    (tmp_path / "b.csv").write_text("\n".join(["x,v,u,v_next", *single]))
+    found = [fitted_to(tmp_path / name, asked)["v"] for name in ("a.npz", "a.csv", "b.csv")]
+    assert found[0] == found[1] == found[2]
+    assert found[0].values == (3, 5, 9, 11) and found[0].points[1] == (2, 3, 1)
+
+
+def test_an_environment_is_recorded_into_samples(
+    asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Gymnasium's pendulum, whose next velocity is a function that nobody wrote down."""
+    pytest.importorskip("gymnasium")
+    structure = STRUCTURE.replace('"x*x" = 2', '"x*x" = 0.76')
+    given = ["fit", "--env", "Pendulum-v1", "--episodes", "2", "--observed", "cos(x),sin(x),v", "--noise", "1e-5", *asked[2:4],
+             "--out", str(tmp_path / "out")]  # fmt: skip
+    Path(asked[3]).write_text(structure)
+    assert _run(given, False) == 2 and 'write time = "discrete"' in capsys.readouterr().err
+    Path(asked[3]).write_text('time = "discrete"\n' + structure)
+    assert _run([*given, "--json"], True) == 0
+    found = json.loads(capsys.readouterr().out)
+    raw = (tmp_path / "out" / "samples.csv").read_bytes()
+    assert found["data"]["sha256"] == hashlib.sha256(raw).hexdigest()
+    for name, true in (("x", 0.75), ("v", 1), ("u", 0.15)):
+        lo, hi = map(Fraction, found["unknown"]["v"]["slopes"][name])
+        assert lo <= true <= hi
+    assert _run([*given[:1], asked[1], *given[1:]], False) == 2 and "one of the two" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -415,7 +488,7 @@ def test_more_samples_than_a_certificate_holds(
     """Commas and brackets of a file are 10^6 at most; a sample of three variables and its weights have some 15."""
     monkeypatch.setattr("certify.analysis.fitting.samples._MOST_PARTS", 15 * 20)
     assert _run(asked, False) == 2
-    assert "must have a header and 1 to 20 rows; found" in capsys.readouterr().err
+    assert "must be of 1 to 20 rows; found 54" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("noise", ["1e400", "1e-40", "-1", "v=1,v=2", "x=1"])
