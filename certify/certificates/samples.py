@@ -16,7 +16,7 @@ Weights = tuple[tuple[int, Fraction], ...]
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """What shows that an equation P + r E stands for an unknown function.
+    """Evidence that an equation P + r E stands for an unknown function.
 
     Parameters
     ----------

@@ -300,7 +300,7 @@ def test_files_of_every_form_are_read(asked: list[str], tmp_path: Path, capsys: 
     )
     for name in ("a.parquet", "a.npz", "b.npz"):
         assert fitted_to(tmp_path / name, asked) == {"v": exact}
-    assert fitted_to(Path(asked[1]), asked)["v"].values[0] == Fraction(repr(rows[0, 3]))
+    assert fitted_to(Path(asked[1]), asked)["v"].values[0] == Fraction(repr(columns["v_rate"][0]))
     assert _run([asked[0], str(tmp_path / "b.npz"), *asked[2:]], False) == 0
     assert "FITTED  v: 54 samples" in capsys.readouterr().out
     columns["v_rate"][3] = np.nan
@@ -332,8 +332,8 @@ def test_an_environment_is_recorded_into_samples(
     """Gymnasium's pendulum, whose next velocity is a function that nobody wrote down."""
     pytest.importorskip("gymnasium")
     structure = STRUCTURE.replace('"x*x" = 2', '"x*x" = 0.76')
-    given = ["fit", "--env", "Pendulum-v1", "--episodes", "2", "--observed", "cos(x),sin(x),v", "--noise", "1e-5", *asked[2:4],
-             "--out", str(tmp_path / "out")]  # fmt: skip
+    given = ["fit", "--env", "Pendulum-v1", "--episodes", "2", "--observed", "cos(x),sin(x),v", "--noise", "1e-5"]
+    given += [*asked[2:4], "--out", str(tmp_path / "out")]
     Path(asked[3]).write_text(structure)
     assert _run(given, False) == 2 and 'write time = "discrete"' in capsys.readouterr().err
     Path(asked[3]).write_text('time = "discrete"\n' + structure)
