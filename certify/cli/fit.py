@@ -35,6 +35,9 @@ def fit(
     ],
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of far.toml and near.toml.")] = Path("out/fitted"),
     degree: Annotated[int, typer.Option(min=1, max=20, help="Degree of the polynomial in a variable.")] = 9,
+    near_origin: Annotated[
+        float, typer.Option(min=0, max=4, help="How much more a low error counts near the origin, for a low floor.")
+    ] = 0,
     environment: dict[str, Any],
     as_json: Json = False,
     quiet: Quiet = False,
@@ -63,7 +66,7 @@ def fit(
 
     samples = recorded(samples, environment, plant, out / "samples.csv", noting(quiet))
     try:
-        result = fit_plant(samples, structure, of, out, degree)
+        result = fit_plant(samples, structure, of, out, degree, near_origin)
     except Contradicted as error:
         what = "these samples refute the bounds of second derivatives and of the noise, or that 0 is an equilibrium"
         found = {"verdict": "REFUTED", "reason": f"{what}: {error}"}

@@ -117,7 +117,7 @@ def within(truth: Truth, share: float = 1.0, scattered: bool = False) -> tuple[b
     sampling = Sampling(one, truth.samples(scattered), noise)
     grid = enclosed(sampling)
     p = fitted(one, grid, 5)
-    bound = bounded(one.variables, errors(p, one, grid))
+    bound = bounded(one, errors(p, one, grid))
     z = truth.draw.uniform(-2, 2, (200, truth.d))
     said = np.array([float(p.at(tuple(map(Fraction, point)))) for point in z.tolist()])
     most = float(bound.constant) + z**2 @ np.array([float(k) for k in bound.rise])
@@ -690,6 +690,21 @@ def test_scattered_samples_are_a_part_of_the_claim(
     paths = [str(fitted_box / name / "certificate.json") for name in ("far", "near")]
     assert _run(["compose", *paths, "--out", str(fitted_box / "both")], False) == 0
     assert "for every function v′ = g(x, v, u) with which 122 samples are consistent" in capsys.readouterr().out
+
+
+def test_the_error_may_count_more_near_the_origin(asked: list[str], fitted_box: Path) -> None:
+    """The plant's file says so, and the grid is chosen again as it was."""
+    Path(asked[1]).write_text(scattered_rows(120))
+    constants = []
+    for power in ("0", "2"):
+        assert _run([*asked, "--near-origin", power], False) == 0
+        said = (fitted_box / "out" / "far.toml").read_text()
+        assert ("near_origin = 2" in said) is (power == "2")
+        constants.append(float(Fraction(re.findall(r'"\(([0-9/]+)\)', said.split("[residual]")[1])[0])))
+    assert constants[1] < 0.9 * constants[0]
+    result = proved(fitted_box, "far", claim="practical")
+    assert result.verdict == "PROVED" and (result.checker or {})["reference"]["result"] == "ACCEPTED"
+    assert _run([*asked, "--near-origin", "-1"], False) == 2
 
 
 def test_two_that_are_of_other_plants_are_not_joined_in_words(

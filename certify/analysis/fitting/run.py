@@ -97,7 +97,12 @@ class FitResult:
 
 
 def fit_plant(
-    samples: Path, structure: Path, noise: Callable[[str], Fraction], out: Path, degree: int = 9
+    samples: Path,
+    structure: Path,
+    noise: Callable[[str], Fraction],
+    out: Path,
+    degree: int = 9,
+    near_origin: float = 0.0,
 ) -> FitResult:
     """Fit the unknown functions of a structure, and write `far.toml` and `near.toml` into a folder.
 
@@ -108,6 +113,7 @@ def fit_plant(
     structure : a plant's file in which some states have a table `unknown.STATE` instead of an equation.
     noise : the bound of the error of a sampled value, by the state's name.
     degree : of the polynomial in each variable.
+    near_origin : how much more a low error counts near the origin, as a power of the distance.
 
     Raises
     ------
@@ -116,11 +122,11 @@ def fit_plant(
     """
     unknowns, system = structure_in(structure)
     taken, sha256 = read_samples(samples, unknowns, system)
-    found = tuple(_fitted(one, taken[one.state], noise(one.state), system, degree) for one in unknowns)
+    found = tuple(_fitted(one, taken[one.state], noise(one.state), system, degree, near_origin) for one in unknowns)
     said = [f'file = "{samples.name}"', f'sha256 = "{sha256}"']
     bounds = ", ".join(f'{one.state} = "{noise(one.state)}"' for one in unknowns)
     boxes = ", ".join(f"{one.unknown.state} = {{ {_sides(one.unknown)} }}" for one in found)
-    said += [f"noise = {{ {bounds} }}", f"box = {{ {boxes} }}"]
+    said += [f"noise = {{ {bounds} }}", f"box = {{ {boxes} }}", *([f"near_origin = {near_origin}"] * (near_origin > 0))]
     text = "\n".join(_into(structure.read_text(encoding="utf-8").splitlines(), "samples", said))
     out.mkdir(parents=True, exist_ok=True)
     far = {one.unknown.state: (one.polynomial.text(), one.error.text()) for one in found}
@@ -152,14 +158,14 @@ def structure_in(path: Path) -> tuple[tuple[Unknown, ...], System]:
     return unknowns, system
 
 
-def _fitted(one: Unknown, taken: Sampled, noise: Fraction, system: System, degree: int) -> Fitted:
+def _fitted(one: Unknown, taken: Sampled, noise: Fraction, system: System, degree: int, near_origin: float) -> Fitted:
     if noise < 0:
         raise InputError(f"the bound of the noise must be at least 0; found {float(noise):g} for {one.state}.")
     axes = axes_of(taken)
     one = boxed(system, one, axes)
     require_within(system, one, noise)
     sampling = Sampling(one, taken.within(one.box), noise)
-    grid = enclosed(sampling)
+    grid = enclosed(sampling, near_origin)
     if grid.axes == axes:
         require_possible(one, grid, noise)
     p = fitted(one, grid, degree)
@@ -169,7 +175,7 @@ def _fitted(one: Unknown, taken: Sampled, noise: Fraction, system: System, degre
     each = errors(p, one, grid)
     a = tuple((slope.lo, slope.hi) for slope in sampling.slopes())
     more = Missing() if grid.axes == axes else missing(p, grid, each, noise)
-    bound, beyond = bounded(one.variables, each), residual_text(one, sizes)
+    bound, beyond = bounded(one, each, near_origin), residual_text(one, sizes)
     return Fitted(sampling, len(taken.points), grid, p, bound, max(each.values()), a, beyond, more)
 
 

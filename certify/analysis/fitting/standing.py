@@ -19,7 +19,7 @@ from certify.analysis.fitting.samples import bounds_of, require_within
 from certify.certificates.samples import SampleBounds, Standing, Weights
 from certify.errors import InputError
 from certify.loop.expressions import to_tree
-from certify.loop.plants import Sampled, Samples, System, Unknown
+from certify.loop.plants import Samples, System, Unknown
 
 Powers = tuple[int, ...]
 
@@ -51,10 +51,11 @@ def standing_for(system: System, samples: Samples) -> SampleBounds:
     InputError : an equation is not as `certify fit` writes it, a range or a bound does not hold all that the samples
         leave, or the domain or the input bounds reach beyond the box.
     """
-    return tuple(_standing(system, one, samples.taken[one.state], samples.noise[one.state]) for one in samples.unknowns)
+    return tuple(_standing(system, samples, one) for one in samples.unknowns)
 
 
-def _standing(system: System, one: Unknown, taken: Sampled, noise: Fraction) -> Standing:
+def _standing(system: System, samples: Samples, one: Unknown) -> Standing:
+    taken, noise = samples.taken[one.state], samples.noise[one.state]
     require_within(system, one, noise)
     fixed = next((name for name in (one.error, *one.slopes) if name and name not in system.ranges), None)
     if fixed is not None:
@@ -66,7 +67,7 @@ def _standing(system: System, one: Unknown, taken: Sampled, noise: Fraction) -> 
     if one.slopes:
         return Standing((), _of_slopes(system, found, sampling))
     p = Polynomial(one.variables, (Fraction(1),) * len(one.variables), tuple(found.P), tuple(found.P.values()))
-    grid = enclosed(sampling)
+    grid = enclosed(sampling, samples.near_origin)
     if any(e > found.E.least(cell) for cell, e in errors(p, one, grid).items()):
         raise found.refused("a bound [residual] that holds all that the samples allow")
     return Standing(grid.axes, tuple((each.lower, each.upper) for each in grid.bounds.values()))

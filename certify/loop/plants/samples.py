@@ -63,12 +63,14 @@ class Samples:
     unknowns : the functions.
     noise : the bound of a sample's error, by the state's name.
     taken : the samples, by the state's name; empty where only the file is known.
+    near_origin : how much more the error near the origin counted where a grid was chosen among the samples.
     """
 
     sha256: str
     unknowns: tuple[Unknown, ...]
     noise: Mapping[str, Fraction]
     taken: Mapping[str, Sampled]
+    near_origin: float = 0.0
 
 
 def slope_name(state: str, variable: str) -> str:

@@ -15,7 +15,7 @@ from certify.loop.plants.source import PlantFile, interval_at, interval_in, numb
 from certify.loop.plants.system import Interval
 
 _DATA = ("file", "sha256", "period", "noise", "priors", "axes")
-_SAMPLES = ("file", "sha256", "noise", "box")
+_SAMPLES = ("file", "sha256", "noise", "box", "near_origin")
 _DIGITS = frozenset("0123456789abcdef")
 
 
@@ -202,7 +202,7 @@ def samples_in(
     if "samples" not in file.data:
         return None
     file.require_known("samples", list(_SAMPLES), "entry of a plant's samples")
-    missing = [key for key in _SAMPLES if key not in file.table("samples")]
+    missing = [key for key in _SAMPLES[:-1] if key not in file.table("samples")]
     if missing:
         raise file.refuse(f"must have {', '.join(missing)}. `certify fit` writes this table.", "samples")
     unknowns = unknowns_in(file, [*states, *inputs], states)
@@ -216,7 +216,8 @@ def samples_in(
         raise file.refuse("must be at least 0.", "samples", "noise")
     _inner(file, "samples", "box", named, "unknown function")
     boxed = tuple(_standing(replace(one, box=_box(file, one)), ranges) for one in unknowns)
-    return Samples(_file_of(file, "samples"), boxed, bounds, {})
+    near_origin = float(number_at(file, file.table("samples").get("near_origin", 0), "samples", "near_origin"))
+    return Samples(_file_of(file, "samples"), boxed, bounds, {}, near_origin)
 
 
 def _box(file: PlantFile, one: Unknown) -> Box:
