@@ -51,7 +51,7 @@ def recorded(
     InputError : both are given, or neither, or the environment shows other numbers than the plant's states.
     """
     if (data is None) is ("env" not in environment):
-        raise InputError("name a file of measured transitions, or an environment with --env; one of the two.")
+        raise InputError("name a file of data, or an environment with --env; one of the two.")
     if data is not None:
         if environment:
             raise InputError(f"--{next(iter(environment))} must be left out: it is for an environment, with --env.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -104,7 +105,8 @@ def _lines(result: FitResult) -> list[str]:
         lines.append(f"error        at most {above(bound.constant)}{more}, on every cell at most {above(one.largest)}")
         for v, (lo, hi) in zip(one.unknown.variables, one.slopes, strict=True):
             lines.append(f"slope        {v}: {below(lo)} to {above(hi)}")
-        lines.append(f"beyond       at most {one.beyond}")
+        beyond = re.sub(r"\(([0-9]+/?[0-9]*)\)\*(\w+)\*\*2", lambda k: f"{above(Fraction(k[1]))} {k[2]}^2", one.beyond)
+        lines.append(f"beyond       at most {beyond}")
         lines += _scattered(one)
     assumed = "the bounds of second derivatives and of the noise, as far as a grid of samples or the domain reaches"
     lines.append(f"assumed      {assumed}, and that 0 is an equilibrium")

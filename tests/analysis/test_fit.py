@@ -256,13 +256,15 @@ def test_two_plants_are_written(asked: list[str], tmp_path: Path, capsys: pytest
     assert _run(asked, False) == 0
     said = capsys.readouterr().out
     assert "assumed      the bounds of second derivatives and of the noise, as far as a grid of samples or" in said
+    assert "beyond       at most 1 x^2\n" in said
 
 
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
         ("x,v,u,v_rate", "x,v,w,v_rate", "must have the columns x, v, u, v_rate; u is missing among"),
-        ("x,v,u,v_rate", "x,v,u,rate", "v_rate is missing among x, v, u, rate"),
+        ("x,v,u,v_rate", "x,v,u,rate", "Rows of states and inputs alone are for certify identify"),
+        ("x,v,u,v_rate", "x,v,u,w_rate", "v_rate is missing among x, v, u, w_rate"),
         ("-1.0,-1,-1,", "-1.0,-1,nan,", "line 2, column u: there must be a finite number; found 'nan'"),
         ("-1.0,-1,-1,", "-1.0,-1,,", "line 2, column u: there must be a finite number; found ''"),
         ("-1.0,-1,-1,", f"-1.{40 * '1'},-1,-1,", "line 2, column x: a number must have some 35 digits"),

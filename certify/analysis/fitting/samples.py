@@ -40,6 +40,12 @@ def read_samples(path: Path, unknowns: Sequence[Unknown], system: System) -> tup
     if in_order:
         suffix, rows = "", [k for first, last in table.stretches() for k in range(first, last - 1)]
     wanted = list(dict.fromkeys(name for one in unknowns for name in (*one.variables, f"{one.state}{suffix}")))
+    if suffix == RATE and not any(name.endswith(RATE) for name in table.columns):
+        raise InputError(
+            f"data file {path} must have rates, in columns such as {unknowns[0].state}{RATE}; it has "
+            f"{', '.join(table.columns)}. Rows of states and inputs alone are for certify identify, or for a structure "
+            'with time = "discrete", whose functions give the next row.'
+        )
     table.require(wanted)
     most = _MOST_PARTS // sum(len(one.variables) + _OF_A_SAMPLE for one in unknowns)
     if len(rows) > most:
