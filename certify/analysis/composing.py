@@ -110,7 +110,7 @@ def compose(outer: Path | str, inner: Path | str, out: Path | str, jobs: int | N
     if not most < 1:
         reason = (
             f"the floor of {outer} reaches {most:.4g} times the level of {inner}: prove a lower floor, or a larger set "
-            "near the origin"
+            "near the origin" + ("; certify fit --near-origin makes the floor lower" if one.system.samples else "")
         )
         return ComposeResult(Verdict.UNKNOWN, reason, one, other, most)
     folder, remarks, data = Path(out), list[str](), joined(first, second)
