@@ -62,7 +62,7 @@ u = [-1, 1]
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Grids among scattered samples of fewer points, that a test may end soon."""
-    monkeypatch.setattr("certify.analysis.fitting.grid._MOST", 300)
+    monkeypatch.setattr("certify.analysis.fitting.grid._MOST", 150)
 
 
 def grid_of(values: Mapping[Point, Fraction], noise: Fraction = Fraction(0)) -> Grid:
