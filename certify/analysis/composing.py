@@ -80,7 +80,10 @@ def _known(system: System, found: Mapping[str, Any]) -> dict[str, Any]:
     if samples is None or {*system.ranges} - {name for f in found["functions"] for name in f["quantities"]}:
         return {}
     equations: dict[str, Any] = {s.name: e for s, e in zip(system.states, system.uncertain_dynamics(), strict=True)}
-    functions = {one.state: (one, samples.noise[one.state], samples.taken[one.state]) for one in samples.unknowns}
+    functions = {
+        f.state: (f.variables, f.curvature, f.box, samples.noise[f.state], samples.taken[f.state])
+        for f in samples.unknowns
+    }
     return {"sha256": samples.sha256, **equations, **functions}
 
 
@@ -105,7 +108,7 @@ def compose(outer: Path | str, inner: Path | str, out: Path | str, jobs: int | N
     if not most < 1:
         reason = (
             f"the floor of {outer} reaches {most:.4g} times the level of {inner}: prove a lower floor, or a larger set "
-            "near the origin"
+            "near the origin" + ("; certify fit --near-origin makes the floor lower" if one.system.samples else "")
         )
         return ComposeResult(Verdict.UNKNOWN, reason, one, other, most)
     folder, data = Path(out), joined(first, second)

@@ -165,7 +165,7 @@ class Certificate(_Stated):
         if isinstance(by, DataBounds) and measured is not None:
             return {"data": data_claim(measured, self.system)}, {"data": data_evidence(by)}
         if isinstance(by, tuple) and sampled is not None:
-            return {"samples": samples_claim(sampled, by)}, {"samples": samples_evidence(by)}
+            return {"samples": samples_claim(sampled)}, {"samples": samples_evidence(sampled, by)}
         return {}, {}
 
 

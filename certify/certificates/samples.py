@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from certify.errors import CertificateFormatError, InputError
-from certify.loop.plants import Sampled, Samples, System, Unknown
-from certify.loop.plants.unknown import residual_name, standing_names
+from certify.errors import InputError
+from certify.loop.plants import Sampled, Samples, Unknown
 
 Weights = tuple[tuple[int, Fraction], ...]
 """Numbers of samples, and the weight of each."""
@@ -17,33 +16,28 @@ Weights = tuple[tuple[int, Fraction], ...]
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """The quantities of an equation P + r E that stands for an unknown function.
+    """Evidence that an equation P + r E stands for an unknown function.
 
     Parameters
     ----------
-    error : the name of r; None where E is 0.
-    slopes : names of the slopes at the origin of which P is made, one for each variable; none where P is of variables.
     axes : of a grid over the box, without slopes.
     weights : of samples that bound each slope, or g at each point of the grid, from below and from above.
     """
 
-    error: str | None
-    slopes: tuple[str, ...] = ()
     axes: tuple[tuple[Fraction, ...], ...] = ()
     weights: tuple[tuple[Weights, Weights], ...] = ()
 
 
 SampleBounds = tuple[Standing, ...]
-"""The equations' quantities for each of the functions, in their order."""
+"""The evidence of each of the functions, in their order."""
 
 
-def samples_claim(samples: Samples, bounds: SampleBounds) -> dict[str, Any]:
+def samples_claim(samples: Samples) -> dict[str, Any]:
     """The entry `samples` of a claim."""
-    each = zip(samples.unknowns, bounds, strict=True)
-    return {"sha256": samples.sha256, "functions": [_function(one, samples, bool(by.slopes)) for one, by in each]}
+    return {"sha256": samples.sha256, "functions": [_function(one, samples) for one in samples.unknowns]}
 
 
-def _function(one: Unknown, samples: Samples, vanishes: bool) -> dict[str, Any]:
+def _function(one: Unknown, samples: Samples) -> dict[str, Any]:
     taken = samples.taken[one.state]
     return {
         "state": one.state,
@@ -51,7 +45,7 @@ def _function(one: Unknown, samples: Samples, vanishes: bool) -> dict[str, Any]:
         "box": list(map(_texts, one.box)),
         "curvature": list(map(_texts, one.curvature)),
         "noise": str(samples.noise[one.state]),
-        "vanishes": vanishes,
+        "vanishes": one.vanishes,
         "points": list(map(_texts, taken.points)),
         "values": _texts(taken.values),
     }
@@ -61,46 +55,31 @@ def _texts(numbers: Sequence[Fraction]) -> list[str]:
     return list(map(str, numbers))
 
 
-def samples_evidence(bounds: SampleBounds) -> list[dict[str, Any]]:
+def samples_evidence(samples: Samples, bounds: SampleBounds) -> list[dict[str, Any]]:
     """The entry `samples` of the evidence."""
     return [
         {
-            "error": by.error,
-            "slopes": list(by.slopes),
+            "error": one.error,
+            "slopes": list(one.slopes),
             "axes": list(map(_texts, by.axes)),
             "weights": [[[[k, str(v)] for k, v in weights] for weights in ends] for ends in by.weights],
         }
-        for by in bounds
+        for one, by in zip(samples.unknowns, bounds, strict=True)
     ]
 
 
-def read_samples(
-    claim: Mapping[str, Any], evidence: Sequence[Mapping[str, Any]], system: System
-) -> tuple[Samples, SampleBounds]:
-    """The samples of both entries, and what stands for the functions.
-
-    Raises
-    ------
-    CertificateFormatError : the equations' quantities have other names than those by which pages know them.
-    """
+def read_samples(claim: Mapping[str, Any], evidence: Sequence[Mapping[str, Any]]) -> tuple[Samples, SampleBounds]:
+    """The samples of both entries, and what shows that equations stand for the functions."""
     unknowns, taken = list[Unknown](), dict[str, Sampled]()
-    for f in claim["functions"]:
+    for f, by in zip(claim["functions"], evidence, strict=True):
         taken[f["state"]] = Sampled(tuple(map(_numbers, f["points"])), _numbers(f["values"]))
         box = tuple((Fraction(lo), Fraction(hi)) for lo, hi in f["box"])
-        unknowns.append(Unknown(f["state"], tuple(f["variables"]), tuple(map(_numbers, f["curvature"])), box))
+        curvature, of = tuple(map(_numbers, f["curvature"])), (by["error"], tuple(by["slopes"]), f["vanishes"])
+        unknowns.append(Unknown(f["state"], tuple(f["variables"]), curvature, box, *of))
     noise = {f["state"]: Fraction(f["noise"]) for f in claim["functions"]}
-    bounds = tuple(
-        Standing(e["error"], tuple(e["slopes"]), tuple(map(_numbers, e["axes"])), tuple(map(_ends, e["weights"])))
-        for e in evidence
-    )
-    if len(bounds) != len(unknowns) or len(taken) != len(unknowns):
-        raise InputError("samples must have an entry of the evidence for each function, of different states.")
-    for one, by in zip(unknowns, bounds, strict=True):
-        if (by.error, by.slopes) != standing_names(one, system.ranges) or any(system.exact_x_eq()):
-            raise CertificateFormatError(
-                f"the samples of {one.state} can be shown only around 0, with quantities by the names that certify fit "
-                f"gives them, such as {residual_name(one.state)}. certify check takes this certificate."
-            )
+    if len(taken) != len(unknowns):
+        raise InputError("samples must have functions of different states.")
+    bounds = tuple(Standing(tuple(map(_numbers, e["axes"])), tuple(map(_ends, e["weights"]))) for e in evidence)
     return Samples(str(claim["sha256"]), tuple(unknowns), noise, taken), bounds
 
 

@@ -3,23 +3,31 @@
 from __future__ import annotations
 
 import json
+import re
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from certify.analysis.arguments import bound_or_bounds
-from certify.cli.shared import Json
+from certify.cli.environment import of_environment, recorded
+from certify.cli.options import takes
+from certify.cli.shared import Json, Quiet, noting
 from certify.cli.terminal import say
 from certify.errors import InputError
 
 if TYPE_CHECKING:
     from certify.analysis.fitting.run import FitResult, Fitted
+    from certify.loop.plants import System
 
 
+@takes(environment=of_environment())
 def fit(
-    samples: Annotated[Path, typer.Argument(help="Samples, on a grid or scattered: .csv.")],
+    samples: Annotated[
+        Path | None, typer.Argument(help="Samples, on a grid or scattered: .csv, .npz or .parquet.")
+    ] = None,
+    *,
     structure: Annotated[
         Path, typer.Option(metavar="PLANT.toml", help="The plant, with a table [unknown.STATE] for each unknown.")
     ],
@@ -28,7 +36,12 @@ def fit(
     ],
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of far.toml and near.toml.")] = Path("out/fitted"),
     degree: Annotated[int, typer.Option(min=1, max=20, help="Degree of the polynomial in a variable.")] = 9,
+    near_origin: Annotated[
+        float, typer.Option(min=0, max=4, help="How much more a low error counts near the origin, for a low floor.")
+    ] = 0,
+    environment: dict[str, Any],
     as_json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Fit functions that nobody wrote down, with bounds of what they may be off by.
 
@@ -36,7 +49,7 @@ def fit(
     beyond as far as a grid of samples reaches. The exit status is 1 if the samples refute them.
     """
     from certify.analysis.fitting.linear import Contradicted
-    from certify.analysis.fitting.run import fit_plant
+    from certify.analysis.fitting.run import fit_plant, structure_in
 
     said = bound_or_bounds(noise, "noise")
 
@@ -46,8 +59,15 @@ def fit(
             raise InputError(f"--noise must have a bound for {state}; found {noise}.")
         return Fraction(str(bound))
 
+    def plant() -> System:
+        system = structure_in(structure)[1]
+        if system.time != "discrete":
+            raise InputError('an environment has steps and no rates: write time = "discrete" in the structure.')
+        return system
+
+    samples = recorded(samples, environment, plant, out / "samples.csv", noting(quiet))
     try:
-        result = fit_plant(samples, structure, of, out, degree)
+        result = fit_plant(samples, structure, of, out, degree, near_origin)
     except Contradicted as error:
         what = "these samples refute the bounds of second derivatives and of the noise, or that 0 is an equilibrium"
         found = {"verdict": "REFUTED", "reason": f"{what}: {error}"}
@@ -85,7 +105,8 @@ def _lines(result: FitResult) -> list[str]:
         lines.append(f"error        at most {above(bound.constant)}{more}, on every cell at most {above(one.largest)}")
         for v, (lo, hi) in zip(one.unknown.variables, one.slopes, strict=True):
             lines.append(f"slope        {v}: {below(lo)} to {above(hi)}")
-        lines.append(f"beyond       at most {one.beyond}")
+        beyond = re.sub(r"\(([0-9]+/?[0-9]*)\)\*(\w+)\*\*2", lambda k: f"{above(Fraction(k[1]))} {k[2]}^2", one.beyond)
+        lines.append(f"beyond       at most {beyond}")
         lines += _scattered(one)
     assumed = "the bounds of second derivatives and of the noise, as far as a grid of samples or the domain reaches"
     lines.append(f"assumed      {assumed}, and that 0 is an equilibrium")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from certify.analysis.arguments import bound_or_bounds, linear_from, value_or_range
+from certify.cli.environment import of_environment, recorded
 from certify.cli.options import Bundle, parameter, takes
 from certify.cli.shared import Json, Quiet, noting, write
 from certify.cli.terminal import say, show
@@ -22,36 +22,8 @@ if TYPE_CHECKING:
 
     from certify.analysis.identifying.reading import Readings
     from certify.analysis.identifying.run import IdentifyResult
-    from certify.analysis.inputs import Tell
     from certify.loop.plants import System
     from certify.provers.data import Contradiction
-
-
-def _of_environment() -> Bundle:
-    """The options of an environment; the command receives those that are given, by name."""
-    shown: dict[str, Any] = {"rich_help_panel": "An environment"}
-    options = (
-        parameter(
-            "env",
-            "--env",
-            "Environment of Gymnasium, or FILE.py:NAME, to take the data from; they are written beside the plant.",
-            metavar="ID",
-            **shown,
-        ),
-        parameter("episodes", "--episodes", "Episodes. [default: 10]", int, min=1, **shown),
-        parameter(
-            "policy", "--policy", "Policy that acts; by default actions are random.", Path, metavar="FILE", **shown
-        ),
-        parameter(
-            "observed",
-            "--observed",
-            "What the environment shows, by states: 'cos(theta),sin(theta),theta_dot'. By default the states.",
-            metavar="LIST",
-            **shown,
-        ),
-        parameter("seed", "--seed", "Seed of episodes and actions. [default: 0]", int, **shown),
-    )
-    return Bundle({one.name: one for one in options}, dict)
 
 
 def _without_a_model() -> Bundle:
@@ -83,7 +55,7 @@ Rotate = Annotated[
 ]
 
 
-@takes(environment=_of_environment(), linear=_without_a_model())
+@takes(environment=of_environment(), linear=_without_a_model())
 def identify(
     data: Annotated[
         Path | None, typer.Argument(metavar="DATA", help="Measured transitions: .csv, .npz or .parquet.")
@@ -130,7 +102,7 @@ def identify(
     bounds = bound_or_bounds(noise, "noise")
     structure = structure_for(data, structure, linear, out, period, bounds)
     system = load_system(structure)
-    source = _recorded(data, environment, system, out, note)
+    source = recorded(data, environment, lambda: system, out.with_name(f"{out.stem}_data.csv"), note)
     measured, readings = read_and_measure(source, system, period, bounds)
     for line in readings.notes:
         note(line)
@@ -146,23 +118,6 @@ def identify(
     else:
         show(_summary(result))
         say(f"plant  {out}\npage   {out.with_suffix('.html')}")
-
-
-def _recorded(data: Path | None, environment: Mapping[str, Any], system: System, out: Path, note: Tell) -> Path:
-    """The file of measurements: the one that is given, or that of an environment, which is written first."""
-    if (data is None) is ("env" not in environment):
-        raise InputError("name a file of measured transitions, or an environment with --env; one of the two.")
-    if data is not None:
-        if environment:
-            raise InputError(f"--{next(iter(environment))} must be left out: it is for an environment, with --env.")
-        return data
-    from certify.analysis.identifying.environments import Black, record
-
-    found = {"episodes": 10} | dict(environment)
-    black, path = Black(found.pop("env"), **found), out.with_name(f"{out.stem}_data.csv")
-    record(black, system, path)
-    note(f"data     {path}, from {black.episodes} episodes of {black.name}")
-    return path
 
 
 def _refuted(error: Contradiction, measured: System, readings: Readings, data: Path, as_json: bool) -> None:

@@ -9,7 +9,6 @@ from itertools import combinations_with_replacement
 from typing import Any, Self
 
 from certify.loop.plants import System
-from certify.loop.plants.unknown import standing_names
 from certify.report.words import Varying, above, below, listed, symbol
 
 
@@ -20,7 +19,6 @@ def described(system: System) -> dict[str, Any] | None:
         return None
     functions = []
     for one in samples.unknowns:
-        error, slopes = standing_names(one, system.ranges)
         functions.append(
             {
                 "state": one.state,
@@ -29,8 +27,8 @@ def described(system: System) -> dict[str, Any] | None:
                 "curvature": [[str(q) for q in row] for row in one.curvature],
                 "noise": str(samples.noise[one.state]),
                 "samples": len(samples.taken[one.state].values),
-                "vanishes": bool(slopes),
-                "quantities": [*slopes, *([] if error is None else [error])],
+                "vanishes": one.vanishes,
+                "quantities": [*one.slopes, *([] if one.error is None else [one.error])],
             }
         )
     return {"sha256": samples.sha256, "functions": functions}

@@ -1,7 +1,7 @@
 """Samples of a plant that ships, in place of an experiment: states, an input, and the rate of a state.
 
 `python examples/unknown/sample.py pendulum samples.csv` takes them on a grid, `--scattered 525` at random points, half
-of them close to the origin by a random factor. Each rate is off by at most the noise; `certify fit` is told
+of them closer to the origin by a random factor. Each rate is off by at most the noise; `certify fit` is told
 the noise and bounds of second derivatives, and nothing of the plant's equations.
 """
 
@@ -43,6 +43,7 @@ def main() -> None:
     parser.add_argument("out")
     parser.add_argument("--noise", type=float, default=1e-2)
     parser.add_argument("--scattered", type=int, metavar="N", help="N random points instead of a grid")
+    parser.add_argument("--even", action="store_true", help="that factor is drawn evenly, and not its logarithm")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     name, state, axes = GRIDS[given.plant]
@@ -51,7 +52,8 @@ def main() -> None:
     z = np.array(list(product(*axes)), dtype=float)
     if given.scattered:
         z = draw.uniform(-1, 1, (given.scattered, len(axes))) * z.max(axis=0)
-        z[::2, :n] *= 10 ** draw.uniform(-2.5, 0, (len(z[::2]), 1))
+        shape = len(z[::2]), 1
+        z[::2, :n] *= draw.uniform(0, 1, shape) if given.even else 10 ** draw.uniform(-2.5, 0, shape)
         z = z.round(6)
     row = [s.name for s in plant.states].index(state)
     rates = plant.function()(z[:, :n], z[:, n:])[:, row]

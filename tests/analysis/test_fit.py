@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
+import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from fractions import Fraction
+from functools import reduce
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -20,11 +23,12 @@ from certify.analysis.fitting.grid import Grid, enclosed
 from certify.analysis.fitting.linear import Bounds, Contradicted, Sampling, beyond
 from certify.analysis.fitting.polynomial import bounded, errors, fitted
 from certify.analysis.fitting.possible import require_possible
-from certify.analysis.fitting.run import Fitted, fit_plant
+from certify.analysis.fitting.run import Fitted, fit_plant, structure_in
+from certify.analysis.fitting.samples import read_samples
 from certify.analysis.stated import stated
 from certify.certificates import Certificate, parse_certificate
 from certify.cli.main import _run
-from certify.errors import CertificateFormatError, InputError
+from certify.errors import InputError
 from certify.loop.plants import Sampled, Unknown, load_system
 from certify.loop.plants.samples import Point
 from certify.loop.policies import Policy, PolicyNetwork, save_policy
@@ -58,7 +62,7 @@ u = [-1, 1]
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Grids among scattered samples of fewer points, that a test may end soon."""
-    monkeypatch.setattr("certify.analysis.fitting.grid._MOST", 300)
+    monkeypatch.setattr("certify.analysis.fitting.grid._MOST", 150)
 
 
 def grid_of(values: Mapping[Point, Fraction], noise: Fraction = Fraction(0)) -> Grid:
@@ -114,7 +118,7 @@ def within(truth: Truth, share: float = 1.0, scattered: bool = False) -> tuple[b
     sampling = Sampling(one, truth.samples(scattered), noise)
     grid = enclosed(sampling)
     p = fitted(one, grid, 5)
-    bound = bounded(one.variables, errors(p, one, grid))
+    bound = bounded(one, errors(p, one, grid))
     z = truth.draw.uniform(-2, 2, (200, truth.d))
     said = np.array([float(p.at(tuple(map(Fraction, point)))) for point in z.tolist()])
     most = float(bound.constant) + z**2 @ np.array([float(k) for k in bound.rise])
@@ -230,13 +234,18 @@ def test_a_bend_is_bounded_on_cells() -> None:
 
 @pytest.fixture
 def asked(tmp_path: Path) -> list[str]:
-    (tmp_path / "box.toml").write_text(STRUCTURE)
+    return box_in(tmp_path)
+
+
+def box_in(folder: Path) -> list[str]:
+    """The command that fits a structure to samples on a grid, and both files."""
+    (folder / "box.toml").write_text(STRUCTURE)
     rows = ["x,v,u,v_rate"]
     for x, v, u in product(np.linspace(-1, 1, 9), (-1, 0, 1), (-1, 1)):
         rows.append(f"{x},{v},{u},{float(-2 * np.sin(x) - v + u)!r}")
-    (tmp_path / "samples.csv").write_text("\n".join(rows))
-    return ["fit", str(tmp_path / "samples.csv"), "--structure", str(tmp_path / "box.toml"), "--noise", "1e-9",
-            "--out", str(tmp_path / "out")]  # fmt: skip
+    (folder / "samples.csv").write_text("\n".join(rows))
+    return ["fit", str(folder / "samples.csv"), "--structure", str(folder / "box.toml"), "--noise", "1e-9",
+            "--out", str(folder / "out")]  # fmt: skip
 
 
 def test_two_plants_are_written(asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -253,15 +262,18 @@ def test_two_plants_are_written(asked: list[str], tmp_path: Path, capsys: pytest
     assert _run(asked, False) == 0
     said = capsys.readouterr().out
     assert "assumed      the bounds of second derivatives and of the noise, as far as a grid of samples or" in said
+    assert "beyond       at most 1 x^2\n" in said
 
 
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("x,v,u,v_rate", "x,v,w,v_rate", "must have the column u once"),
-        ("x,v,u,v_rate", "x,v,u,rate", "must have the column v_rate once"),
-        ("-1.0,-1,-1,", "-1.0,-1,nan,", "must be a decimal number"),
-        ("-1.0,-1,-1,", "-1.0,-1,,", "must be a decimal number"),
+        ("x,v,u,v_rate", "x,v,w,v_rate", "must have the columns x, v, u, v_rate; u is missing among"),
+        ("x,v,u,v_rate", "x,v,u,rate", "Rows of states and inputs alone are for certify identify"),
+        ("x,v,u,v_rate", "x,v,u,w_rate", "v_rate is missing among x, v, u, w_rate"),
+        ("-1.0,-1,-1,", "-1.0,-1,nan,", "line 2, column u: there must be a finite number; found 'nan'"),
+        ("-1.0,-1,-1,", "-1.0,-1,,", "line 2, column u: there must be a finite number; found ''"),
+        ("-1.0,-1,-1,", f"-1.{40 * '1'},-1,-1,", "line 2, column x: a number must have some 35 digits"),
     ],
 )
 def test_samples_that_are_none(
@@ -271,6 +283,76 @@ def test_samples_that_are_none(
     path.write_text(path.read_text().replace(old, new, 1))
     assert _run(asked, False) == 2
     assert said in capsys.readouterr().err
+
+
+def fitted_to(path: Path, asked: list[str]) -> dict[str, Any]:
+    """What is found from another file, without its hash."""
+    unknowns, system = structure_in(Path(asked[3]))
+    taken, sha256 = read_samples(path, unknowns, system)
+    assert sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    return taken
+
+
+def test_files_of_every_form_are_read(asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Decimals of CSV, and of other files what binary64 holds, exactly."""
+    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    names = ["x", "v", "u", "v_rate"]
+    rows = np.loadtxt(asked[1], delimiter=",", skiprows=1)
+    columns = dict(zip(names, rows.T.tolist(), strict=True))
+    parquet.write_table(pyarrow.table(columns), tmp_path / "a.parquet")
+    np.savez(tmp_path / "a.npz", **columns)
+    rates = np.column_stack([np.zeros(len(rows)), rows[:, 3]])
+    np.savez(tmp_path / "b.npz", x=rows[:, :2], u=rows[:, 2:3], x_rate=rates)
+    exact = Sampled(
+        tuple(tuple(map(Fraction, row[:3])) for row in rows.tolist()), tuple(map(Fraction, columns["v_rate"]))
+    )
+    for name in ("a.parquet", "a.npz", "b.npz"):
+        assert fitted_to(tmp_path / name, asked) == {"v": exact}
+    assert fitted_to(Path(asked[1]), asked)["v"].values[0] == Fraction(repr(columns["v_rate"][0]))
+    assert _run([asked[0], str(tmp_path / "b.npz"), *asked[2:]], False) == 0
+    assert "FITTED  v: 54 samples" in capsys.readouterr().out
+    columns["v_rate"][3] = np.nan
+    np.savez(tmp_path / "a.npz", **columns)
+    with pytest.raises(InputError, match=r"array v_rate: numbers must be finite; found nan at \[3\]"):
+        fitted_to(tmp_path / "a.npz", asked)
+    np.savez(tmp_path / "a.npz", **columns | {"v_rate": [1.0]})
+    with pytest.raises(InputError, match="arrays must have as many rows"):
+        fitted_to(tmp_path / "a.npz", asked)
+
+
+def test_steps_of_runs_are_samples(asked: list[str], tmp_path: Path) -> None:
+    """Rows in time order, and arrays of runs: the last row of each has no next one."""
+    Path(asked[3]).write_text('time = "discrete"\n' + STRUCTURE)
+    x = np.arange(12.0).reshape(2, 3, 2)
+    np.savez(tmp_path / "a.npz", states=x, inputs=np.ones((2, 2, 1)))
+    rows = [f"{run},{x[run, t, 0]},{x[run, t, 1]},1" for run in range(2) for t in range(3)]
+    (tmp_path / "a.csv").write_text("\n".join(["run,x,v,u", *rows]))
+    single = [f"{x[r, t, 0]},{x[r, t, 1]},1,{x[r, t + 1, 1]}" for r in range(2) for t in range(2)]
+    (tmp_path / "b.csv").write_text("\n".join(["x,v,u,v_next", *single]))
+    found = [fitted_to(tmp_path / name, asked)["v"] for name in ("a.npz", "a.csv", "b.csv")]
+    assert found[0] == found[1] == found[2]
+    assert found[0].values == (3, 5, 9, 11) and found[0].points[1] == (2, 3, 1)
+
+
+def test_an_environment_is_recorded_into_samples(
+    asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Gymnasium's pendulum, whose next velocity is a function that nobody wrote down."""
+    pytest.importorskip("gymnasium")
+    structure = STRUCTURE.replace('"x*x" = 2', '"x*x" = 0.76')
+    given = ["fit", "--env", "Pendulum-v1", "--episodes", "2", "--observed", "cos(x),sin(x),v", "--noise", "1e-5"]
+    given += [*asked[2:4], "--out", str(tmp_path / "out")]
+    Path(asked[3]).write_text(structure)
+    assert _run(given, False) == 2 and 'write time = "discrete"' in capsys.readouterr().err
+    Path(asked[3]).write_text('time = "discrete"\n' + structure)
+    assert _run([*given, "--json"], True) == 0
+    found = json.loads(capsys.readouterr().out)
+    raw = (tmp_path / "out" / "samples.csv").read_bytes()
+    assert found["data"]["sha256"] == hashlib.sha256(raw).hexdigest()
+    for name, true in (("x", 0.75), ("v", 1), ("u", 0.15)):
+        lo, hi = map(Fraction, found["unknown"]["v"]["slopes"][name])
+        assert lo <= true <= hi
+    assert _run([*given[:1], asked[1], *given[1:]], False) == 2 and "one of the two" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -414,7 +496,7 @@ def test_more_samples_than_a_certificate_holds(
     """Commas and brackets of a file are 10^6 at most; a sample of three variables and its weights have some 15."""
     monkeypatch.setattr("certify.analysis.fitting.samples._MOST_PARTS", 15 * 20)
     assert _run(asked, False) == 2
-    assert "must have a header and 1 to 20 rows; found" in capsys.readouterr().err
+    assert "must be of 1 to 20 rows; found 54" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("noise", ["1e400", "1e-40", "-1", "v=1,v=2", "x=1"])
@@ -532,10 +614,31 @@ def test_a_contradiction_is_shown_in_rationals(seed: int, monkeypatch: pytest.Mo
 @pytest.fixture
 def fitted_box(asked: list[str], tmp_path: Path) -> Path:
     """The folder with both plants of the box, its samples and a policy."""
+    return fitted_in(tmp_path, asked)
+
+
+def fitted_in(folder: Path, asked: list[str]) -> Path:
     assert _run(asked, False) == 0
     policy = PolicyNetwork.of_layers([np.array([[0.5, 0.5]])], [np.zeros(1)], [-1.0], [0.0], centre="none")
-    save_policy(tmp_path / "box.pt", Policy(policy, "box", {}))
-    return tmp_path
+    save_policy(folder / "box.pt", Policy(policy, "box", {}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def once(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, RoaResult]]:
+    """Such a folder with a certificate about each plant, and the results."""
+    folder = tmp_path_factory.mktemp("box")
+    fitted_in(folder, box_in(folder))
+    return folder, {name: proved(folder, name, claim=claim) for name, claim in CLAIMS}
+
+
+@pytest.fixture
+def certified(once: tuple[Path, dict[str, RoaResult]], tmp_path: Path) -> Path:
+    """A copy of the folder, which a test may change."""
+    return shutil.copytree(once[0], tmp_path / "certified")
+
+
+CLAIMS = (("far", "practical"), ("near", "asymptotic"))
 
 
 def proved(folder: Path, name: str, **more: Any) -> RoaResult:
@@ -543,45 +646,60 @@ def proved(folder: Path, name: str, **more: Any) -> RoaResult:
     return certify_roa(folder / "out" / f"{name}.toml", folder / "box.pt", folder / name, **options)
 
 
-def test_samples_are_a_part_of_the_claim(fitted_box: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_samples_are_a_part_of_the_claim(
+    once: tuple[Path, dict[str, RoaResult]], certified: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Of both certificates and of the two joined; both checkers are asked."""
-    for name, claim, zero in (("far", "practical", False), ("near", "asymptotic", True)):
-        result = proved(fitted_box, name, claim=claim)
+    for name, zero in (("far", False), ("near", True)):
+        result = once[1][name]
         assert result.verdict == "PROVED", result.reason
         assert (result.checker or {})["reference"]["result"] == "ACCEPTED"
         said = result.to_dict()["samples"]
         assert said["functions"][0]["samples"] == 54 and said["functions"][0]["vanishes"] is zero
         assert dict(stated(result))["for every"] == "function v′ = g(x, v, u) with which 54 samples are consistent"
-        raw = (fitted_box / name / "certificate.json").read_bytes()
+        raw = (certified / name / "certificate.json").read_bytes()
         c = parse_certificate(raw, name)
         again = Certificate(c.system, c.network, c.V, c.claim, c.evidence, c.provenance, c.data).document()
         assert {**again, "provenance": {}} == {**json.loads(raw), "provenance": {}}
-        page = page_of(raw, fitted_box / name / "certificate.json", dict(result.checker or {}), None)
+        page = page_of(raw, certified / name / "certificate.json", dict(result.checker or {}), None)
         assert "For every function v′ = g(x, v, u) with which 54 samples are consistent" in page
         assert "The equation stands for v′ = g(x, v, u): whatever the function is" in page
         assert ("and 0 at the origin" in page) is zero and "a corner between two samples" in page
-    paths = [str(fitted_box / name / "certificate.json") for name in ("far", "near")]
-    assert _run(["compose", *paths, "--out", str(fitted_box / "both")], False) == 0
+    paths = [str(certified / name / "certificate.json") for name in ("far", "near")]
+    assert _run(["compose", *paths, "--out", str(certified / "both")], False) == 0
     said = capsys.readouterr().out
     assert "for every function v′ = g(x, v, u) with which 54 samples are consistent, every trajectory" in said
     assert "checker      ACCEPTED, reference ACCEPTED" in said
 
 
-@pytest.mark.parametrize(("old", "new"), [("slope_v_x", "a"), ("residual_v", "r")])
-def test_pages_know_quantities_by_their_names(fitted_box: Path, old: str, new: str) -> None:
-    """Both programs take others, but a page would not say of such a function that it is 0 at 0."""
-    assert proved(fitted_box, "near").verdict == "PROVED"
-    raw = (fitted_box / "near" / "certificate.json").read_bytes()
-    for other in (raw.replace(old.encode(), new.encode()), moved(raw)):
-        assert verdicts(json.loads(other)) == (None, None)
-        with pytest.raises(CertificateFormatError, match="such as residual_v"):
-            parse_certificate(other, "near")
+NAMES = {"slope_v_x": "a", "slope_v_v": "b", "slope_v_u": "c", "residual_v": "r"}
 
 
-def moved(raw: bytes) -> bytes:
-    """The certificate, as if its page had to show values that are not deviations."""
-    data = json.loads(raw)
-    return json.dumps({**data, "provenance": {**data["provenance"], "x_eq": {"x": "1"}}}).encode()
+def test_pages_show_quantities_of_any_names(certified: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Numbers are as the checkers see them, whatever operating point a file says to people; that a function is 0 at 0
+    is a part of the claim, which needs no slopes."""
+    page, paths = certified / "page.html", list[str]()
+    for name, _ in CLAIMS:
+        path = certified / name / "certificate.json"
+        own = reduce(lambda text, names: text.replace(*map(str.encode, names)), NAMES.items(), path.read_bytes())
+        path.write_bytes(own)
+        paths.append(str(path))
+        data = json.loads(own)
+        data["claim"]["samples"]["functions"][0]["vanishes"] = True
+        data["provenance"]["x_eq"] = {"x": "1"}
+        changed = certified / f"{name}.json"
+        changed.write_text(json.dumps(data))
+        assert verdicts(data) == (None, None)
+        c = parse_certificate(changed.read_bytes(), name)
+        assert {**c.document(), "provenance": {}} == {**data, "provenance": {}}
+        assert _run(["report", str(changed), "--out", str(page)], False) == 0
+        said = page.read_text()
+        assert "For every function v′ = g(x, v, u) with which 54 samples are consistent" in said
+        assert "and 0 at the origin" in said and "range of r" not in said
+        assert _run(["contains", str(changed), "x=0.5"], False) == 0
+        assert "CONTAINED  x = 0.5, v = 0" in capsys.readouterr().out
+    assert _run(["compose", *paths, "--out", str(certified / "both")], False) == 0
+    assert "for every function v′ = g(x, v, u) with which 54 samples are consistent" in capsys.readouterr().out
 
 
 def test_scattered_samples_are_a_part_of_the_claim(
@@ -604,32 +722,47 @@ def test_scattered_samples_are_a_part_of_the_claim(
     assert "for every function v′ = g(x, v, u) with which 122 samples are consistent" in capsys.readouterr().out
 
 
+def test_the_error_may_count_more_near_the_origin(
+    asked: list[str], fitted_box: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The plant's file says so, and the grid is chosen again as it was."""
+    monkeypatch.setattr("certify.analysis.fitting.grid._MOST", 120)
+    Path(asked[1]).write_text(scattered_rows(120))
+    constants = []
+    for power in ("0", "2"):
+        assert _run([*asked, "--near-origin", power], False) == 0
+        said = (fitted_box / "out" / "far.toml").read_text()
+        assert ("near_origin = 2" in said) is (power == "2")
+        constants.append(float(Fraction(re.findall(r'"\(([0-9/]+)\)', said.split("[residual]")[1])[0])))
+    assert constants[1] < 0.9 * constants[0]
+    result = proved(fitted_box, "far", claim="practical")
+    assert result.verdict == "PROVED" and (result.checker or {})["reference"]["result"] == "ACCEPTED"
+    assert _run([*asked, "--near-origin", "-1"], False) == 2
+
+
 def test_two_that_are_of_other_plants_are_not_joined_in_words(
-    fitted_box: Path, capsys: pytest.CaptureFixture[str]
+    certified: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The second has another known equation: then the words are of plants that are one of both."""
-    proved(fitted_box, "far", claim="practical")
-    near = fitted_box / "out" / "near.toml"
+    near = certified / "out" / "near.toml"
     near.write_text(near.read_text().replace('x = "v"', 'x = "v*9/10"'))
-    assert proved(fitted_box, "near").verdict == "PROVED"
-    paths = [str(fitted_box / name / "certificate.json") for name in ("far", "near")]
-    assert _run(["compose", *paths, "--out", str(fitted_box / "both")], False) == 0
+    assert proved(certified, "near").verdict == "PROVED"
+    paths = [str(certified / name / "certificate.json") for name in ("far", "near")]
+    assert _run(["compose", *paths, "--out", str(certified / "both")], False) == 0
     assert "of every plant that is one of both" in capsys.readouterr().out
 
 
-def test_two_of_other_samples_are_not_joined_in_words(fitted_box: Path) -> None:
+def test_two_of_other_samples_are_not_joined_in_words(certified: Path) -> None:
     """Both state the same sha256, which nobody compares with the numbers; in the second those are others where no slope
     rests on them. A function near these is far from the samples of the first, and that claims nothing of it."""
-    for name, claim in (("far", "practical"), ("near", "asymptotic")):
-        assert proved(fitted_box, name, claim=claim).verdict == "PROVED"
-    far, near = (fitted_box / name / "certificate.json" for name in ("far", "near"))
-    assert compose(far, near, fitted_box / "same").to_dict()["samples"] is not None
+    far, near = (certified / name / "certificate.json" for name in ("far", "near"))
+    assert compose(far, near, certified / "same").to_dict()["samples"] is not None
     data = json.loads(near.read_bytes())
     rests = {k for ends in data["evidence"]["samples"][0]["weights"] for end in ends for k, _ in end}
     values = data["claim"]["samples"]["functions"][0]["values"]
     values[next(k for k in range(len(values)) if k not in rests)] = "5"
     near.write_text(json.dumps(data))
-    both = compose(far, near, fitted_box / "both")
+    both = compose(far, near, certified / "both")
     assert both.verdict == "PROVED" and both.to_dict()["samples"] is None
 
 
@@ -728,8 +861,7 @@ def test_an_angle_is_no_number(fitted_box: Path) -> None:
         proved(fitted_box, "near")
 
 
-def test_coq_takes_no_samples(fitted_box: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    proved(fitted_box, "near")
-    path = str(fitted_box / "near" / "certificate.json")
-    assert _run(["prove-in-coq", path, "--out", str(fitted_box / "coq")], False) == 2
+def test_coq_takes_no_samples(certified: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = str(certified / "near" / "certificate.json")
+    assert _run(["prove-in-coq", path, "--out", str(certified / "coq")], False) == 2
     assert "Coq's statement covers; found" in capsys.readouterr().err

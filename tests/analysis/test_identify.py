@@ -152,10 +152,14 @@ def arrays(kind: str) -> dict[str, Any]:
     rows = transitions(6)
     if kind == "single":
         return {"x": rows[:, :2], "u": rows[:, 2:3], "x_next": rows[:, 3:]}
+    if kind == "columns":
+        return dict(zip(COLUMNS.split(","), rows.T, strict=True))
     return {"states": rows[:, :2].reshape(2, 3, 2), "inputs": rows[:4, 2].reshape(2, 2, 1)}
 
 
-@pytest.mark.parametrize(("kind", "count", "place"), [("single", 6, "row 3"), ("runs", 4, "run 1, step 1")])
+@pytest.mark.parametrize(
+    ("kind", "count", "place"), [("single", 6, "row 3"), ("columns", 6, "row 3"), ("runs", 4, "run 1, step 1")]
+)
 def test_arrays_are_read(tmp_path: Path, kind: str, count: int, place: str) -> None:
     np.savez(tmp_path / "a.npz", **arrays(kind))
     found = read_data(tmp_path / "a.npz", system())

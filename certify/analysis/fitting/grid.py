@@ -2,7 +2,7 @@
 
 Samples on a grid are such a grid themselves. Among scattered ones it is chosen: an axis is halved between two values
 where second derivatives add much, or where the intervals at one are much wider than at the other, for the error on a
-cell is that of its worst corner.
+cell is that of its worst corner. Cells near the origin may count more: there an error moves a plant most.
 """
 
 from __future__ import annotations
@@ -15,12 +15,14 @@ from itertools import pairwise, product
 from math import floor, log10, prod
 
 import numpy as np
+from numpy.typing import NDArray
 
 from certify.analysis.fitting.linear import Bounds, Sampling
 from certify.loop.plants.samples import Box, Point, Sampled, Unknown
 
-_MOST = 1000  # points of a grid that is chosen
+_FEW, _MOST = 1000, 2000  # points of a grid that is chosen; in between as many as there are samples
 _SHARE = 0.5  # of the error between two values that second derivatives and differences of half widths may make
+_NEAR = 0.05  # distance to the origin, in half widths of the box, below which all is as near
 Interval = tuple[Fraction, Fraction]
 
 
@@ -50,8 +52,8 @@ def axes_of(taken: Sampled) -> tuple[Point, ...] | None:
     return axes if whole else None
 
 
-def enclosed(sampling: Sampling) -> Grid:
-    """A grid over the box: that of the samples, or one that is chosen.
+def enclosed(sampling: Sampling, near_origin: float = 0.0) -> Grid:
+    """A grid over the box: that of the samples, or one that is chosen, with weights of `nearness` to this power.
 
     Raises
     ------
@@ -65,18 +67,30 @@ def enclosed(sampling: Sampling) -> Grid:
         value = dict(zip(taken.points, taken.values, strict=True))
         return Grid(axes, {z: Bounds(value[z] - noise, value[z] + noise, one_of[z], one_of[z]) for z in product(*axes)})
     found = dict[Point, Bounds]()
-    finer: tuple[Point, ...] | None = one.box
+    most = min(max(_FEW, len(taken.values)), _MOST)
+    sides = zip(one.box, one.curvature, strict=True)
+    with_0 = tuple((lo, Fraction(0), hi) if lo < 0 < hi and any(row) else (lo, hi) for (lo, hi), row in sides)
+    finer: tuple[Point, ...] | None = with_0 if near_origin and prod(map(len, with_0)) <= most else one.box
     while finer is not None:
         axes = finer
         for p in product(*axes):
             if p not in found:
                 found[p] = _outwards(sampling.at(p))
-        finer = _finer(one, axes, found)
+        finer = _finer(one, axes, found, most, near_origin)
     return Grid(axes or (), {p: found[p] for p in product(*(axes or ()))})
 
 
 def _reach(axes: tuple[Point, ...]) -> Box:
     return tuple((axis[0], axis[-1]) for axis in axes)
+
+
+def nearness(one: Unknown, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The weight of each of the points (N, d): one by its distance to the origin, in half widths of the box along the
+    variables in which the function is bent."""
+    bent = [any(row) for row in one.curvature]
+    half = [max(abs(float(lo)), abs(float(hi))) for lo, hi in one.box]
+    found: NDArray[np.float64] = 1 / np.maximum(np.linalg.norm((points / half)[:, bent], axis=1), _NEAR)
+    return found
 
 
 def _outwards(found: Bounds) -> Bounds:
@@ -88,21 +102,27 @@ def _outwards(found: Bounds) -> Bounds:
     return found._replace(lo=found.lo // unit * unit, hi=-(-found.hi // unit) * unit)
 
 
-def _finer(one: Unknown, axes: tuple[Point, ...], found: Mapping[Point, Bounds]) -> tuple[Point, ...] | None:
+def _finer(
+    one: Unknown, axes: tuple[Point, ...], found: Mapping[Point, Bounds], most: int, near_origin: float
+) -> tuple[Point, ...] | None:
     """The axes with the middles of all pairs of values between which the error changes too much, those first that do
-    most, as long as the grid is small; None if nothing changes."""
+    most, as long as the grid has `most` points; None if nothing changes."""
     half = np.array([float(found[p].hi - found[p].lo) / 2 for p in product(*axes)]).reshape([len(a) for a in axes])
     bent = list[tuple[float, int, Fraction]]()
     for j, axis in enumerate(axes):
+        if not any(one.curvature[j]):
+            continue
         for i, (lo, hi) in enumerate(pairwise(axis)):
             a, b, bend = half.take(i, axis=j), half.take(i + 1, axis=j), float(one.curvature[j][j] * (hi - lo) ** 2) / 8
-            most = np.maximum(a, b) + bend
-            share = float(np.mean(np.divide(np.abs(a - b) + bend, most, out=np.zeros_like(most), where=most > 0)))
-            if share > _SHARE:
-                bent.append((share, j, (lo + hi) / 2))
+            error = np.maximum(a, b) + bend
+            share = np.divide(np.abs(a - b) + bend, error, out=np.zeros_like(error), where=error > 0)
+            middles = np.array(list(product(*axes[:j], [(lo + hi) / 2], *axes[j + 1 :])), dtype=float)
+            mean = float(np.average(share.ravel(), weights=nearness(one, middles) ** near_origin))
+            if mean > _SHARE:
+                bent.append((mean, j, (lo + hi) / 2))
     more = [list(axis) for axis in axes]
     for _, j, middle in sorted(bent, key=lambda each: each[0], reverse=True):
-        if prod(len(axis) + (k == j) for k, axis in enumerate(more)) <= _MOST:
+        if prod(len(axis) + (k == j) for k, axis in enumerate(more)) <= most:
             more[j].append(middle)
     finer = tuple(tuple(sorted(axis)) for axis in more)
     return None if finer == axes else finer

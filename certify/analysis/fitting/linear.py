@@ -29,7 +29,7 @@ class Contradicted(CertifyError):
     """The samples are of no function with these bounds of second derivatives, this noise and the value 0 at 0."""
 
 
-_MOST = 200  # samples, those of the least bounds, that the programs see
+_MOST = 100  # samples, those of the least bounds, that the programs see
 
 
 def beyond(one: Unknown, z: Point) -> Fraction:

@@ -22,7 +22,7 @@ from math import comb, frexp, prod
 import numpy as np
 from scipy.optimize import linprog
 
-from certify.analysis.fitting.grid import Grid
+from certify.analysis.fitting.grid import Grid, nearness
 from certify.errors import InputError
 from certify.loop.plants.samples import Point, Unknown
 
@@ -159,16 +159,19 @@ class Bound:
         return " + ".join([*constant, *(f"({k})*{v}**2" for v, k in each if k)]) or "0"
 
 
-def bounded(variables: tuple[str, ...], each: Mapping[Cell, Fraction], flat: bool = False) -> Bound:
-    """A bound of so simple a form of what is known cell by cell, `flat` a constant: by a linear program that asks for
-    the least mean of its ratios to these, then raised by as much as it misses in rationals. A constant too if some of
-    these are 0."""
-    rise = [Fraction(0)] * len(variables)
+def bounded(one: Unknown, each: Mapping[Cell, Fraction], near_origin: float = 0.0) -> Bound:
+    """A bound of so simple a form of what is known cell by cell: by a linear program that asks for the least mean of
+    its ratios to these, with weights of `nearness` to the power `near_origin`, then raised by as much as it misses in
+    rationals. A constant if some of these are 0."""
+    variables, rise = one.variables, [Fraction(0)] * len(one.variables)
     least = {cell: [Fraction(0) if lo <= 0 <= hi else min(lo * lo, hi * hi) for lo, hi in cell] for cell in each}
-    if not flat and all(each.values()):
+    if all(each.values()):
         rows = np.array([[1.0, *map(float, squares)] for squares in least.values()])
         sizes = np.array([float(e) for e in each.values()])
-        solved = linprog((rows / sizes[:, None]).mean(axis=0), A_ub=-rows, b_ub=-sizes)
+        weights = (
+            nearness(one, np.array([[float(lo + hi) / 2 for lo, hi in cell] for cell in each])) ** near_origin / sizes
+        )
+        solved = linprog(weights @ rows / weights.sum(), A_ub=-rows, b_ub=-sizes)
         if solved.status == 0:
             rise = [max(Fraction(0), round(Fraction(float(k)) * _HELD) / Fraction(_HELD)) for k in solved.x[1:]]
     missed = max(

@@ -21,12 +21,12 @@ from certify.analysis.fitting.grid import Grid, axes_of, enclosed
 from certify.analysis.fitting.linear import Sampling, residual_text
 from certify.analysis.fitting.polynomial import Bound, Missing, Polynomial, bounded, errors, fitted, missing
 from certify.analysis.fitting.possible import require_consistent, require_possible
-from certify.analysis.fitting.samples import bounds_of, boxed, read_samples, require_within, suffix_of
+from certify.analysis.fitting.samples import bounds_of, boxed, read_samples, require_within
 from certify.certificates import write_atomically
 from certify.errors import InputError
 from certify.loop.plants import Sampled, System, Unknown, load_system
 from certify.loop.plants.samples import slope_name
-from certify.loop.plants.source import PlantFile, read_plant_file
+from certify.loop.plants.source import read_plant_file
 from certify.loop.plants.toml import build_system
 from certify.loop.plants.unknown import unknowns_in
 
@@ -97,39 +97,36 @@ class FitResult:
 
 
 def fit_plant(
-    samples: Path, structure: Path, noise: Callable[[str], Fraction], out: Path, degree: int = 9
+    samples: Path,
+    structure: Path,
+    noise: Callable[[str], Fraction],
+    out: Path,
+    degree: int = 9,
+    near_origin: float = 0.0,
 ) -> FitResult:
     """Fit the unknown functions of a structure, and write `far.toml` and `near.toml` into a folder.
 
     Parameters
     ----------
-    samples : CSV with the columns of variables, and `NAME_rate` (in discrete time `NAME_next`) of each unknown.
+    samples : .csv, .npz or .parquet with the columns of variables, and `NAME_rate` (in discrete time `NAME_next`) of
+        each unknown; see `certify.analysis.tables`.
     structure : a plant's file in which some states have a table `unknown.STATE` instead of an equation.
     noise : the bound of the error of a sampled value, by the state's name.
     degree : of the polynomial in each variable.
+    near_origin : how much more a low error counts near the origin, as a power of the distance.
 
     Raises
     ------
     InputError : a file cannot be read, or the samples do not bound a function on the domain and the input bounds.
     Contradicted : no function with the bounds has these samples.
     """
-    file = read_plant_file(structure)
-    table = file.table("dynamics")
-    states = [str(name) for name in file.data.get("states", ())]
-    unknowns = unknowns_in(file, [*states, *map(str, file.data.get("inputs", ()))], states)
-    twice = next((one.state for one in unknowns if one.state in table), None)
-    if twice is not None:
-        raise file.refuse("must have an equation or a table [unknown], not both.", "dynamics", twice)
-    known = {key: value for key, value in file.data.items() if key != "unknown"}
-    zeros = {**known, "dynamics": {**table, **{one.state: "0" for one in unknowns}}}
-    system = build_system(replace(file, data=zeros))
-    _require_at_rest(system, file)
-    taken, sha256 = read_samples(samples, unknowns, suffix_of(system))
-    found = tuple(_fitted(one, taken[one.state], noise(one.state), system, degree) for one in unknowns)
+    unknowns, system = structure_in(structure)
+    taken, sha256 = read_samples(samples, unknowns, system)
+    found = tuple(_fitted(one, taken[one.state], noise(one.state), system, degree, near_origin) for one in unknowns)
     said = [f'file = "{samples.name}"', f'sha256 = "{sha256}"']
     bounds = ", ".join(f'{one.state} = "{noise(one.state)}"' for one in unknowns)
     boxes = ", ".join(f"{one.unknown.state} = {{ {_sides(one.unknown)} }}" for one in found)
-    said += [f"noise = {{ {bounds} }}", f"box = {{ {boxes} }}"]
+    said += [f"noise = {{ {bounds} }}", f"box = {{ {boxes} }}", *([f"near_origin = {near_origin}"] * (near_origin > 0))]
     text = "\n".join(_into(structure.read_text(encoding="utf-8").splitlines(), "samples", said))
     out.mkdir(parents=True, exist_ok=True)
     far = {one.unknown.state: (one.polynomial.text(), one.error.text()) for one in found}
@@ -140,20 +137,35 @@ def fit_plant(
     return FitResult(found, out / "far.toml", out / "near.toml", sha256)
 
 
-def _require_at_rest(system: System, file: PlantFile) -> None:
-    """The functions are 0 at the origin, which is 0 in the states' and inputs' values."""
+def structure_in(path: Path) -> tuple[tuple[Unknown, ...], System]:
+    """The unknown functions of a structure, and the plant with 0 in their place.
+
+    Raises
+    ------
+    InputError : the file cannot be read, or is no such structure, at rest where states and inputs are 0.
+    """
+    file = read_plant_file(path)
+    table, states = file.table("dynamics"), [str(name) for name in file.data.get("states", ())]
+    unknowns = unknowns_in(file, [*states, *map(str, file.data.get("inputs", ()))], states)
+    twice = next((one.state for one in unknowns if one.state in table), None)
+    if twice is not None:
+        raise file.refuse("must have an equation or a table [unknown], not both.", "dynamics", twice)
+    known = {key: value for key, value in file.data.items() if key != "unknown"}
+    zeros = {**known, "dynamics": {**table, **{one.state: "0" for one in unknowns}}}
+    system = build_system(replace(file, data=zeros))
     if any(system.exact_x_eq()) or any(system.exact_u_eq()):
         raise file.refuse("a structure with unknown functions must have x_eq and u_eq 0; found another.", "x_eq")
+    return unknowns, system
 
 
-def _fitted(one: Unknown, taken: Sampled, noise: Fraction, system: System, degree: int) -> Fitted:
+def _fitted(one: Unknown, taken: Sampled, noise: Fraction, system: System, degree: int, near_origin: float) -> Fitted:
     if noise < 0:
         raise InputError(f"the bound of the noise must be at least 0; found {float(noise):g} for {one.state}.")
     axes = axes_of(taken)
     one = boxed(system, one, axes)
     require_within(system, one, noise)
     sampling = Sampling(one, taken.within(one.box), noise)
-    grid = enclosed(sampling)
+    grid = enclosed(sampling, near_origin)
     if grid.axes == axes:
         require_possible(one, grid, noise)
     p = fitted(one, grid, degree)
@@ -163,7 +175,7 @@ def _fitted(one: Unknown, taken: Sampled, noise: Fraction, system: System, degre
     each = errors(p, one, grid)
     a = tuple((slope.lo, slope.hi) for slope in sampling.slopes())
     more = Missing() if grid.axes == axes else missing(p, grid, each, noise)
-    bound, beyond = bounded(one.variables, each), residual_text(one, sizes)
+    bound, beyond = bounded(one, each, near_origin), residual_text(one, sizes)
     return Fitted(sampling, len(taken.points), grid, p, bound, max(each.values()), a, beyond, more)
 
 

@@ -1,19 +1,18 @@
 """Samples of an unknown right-hand side, from a file.
 
-Numbers are the decimals of the file, as exact fractions: nothing here is rounded.
+Numbers are the file's own as exact fractions, decimals of CSV and binary values of other files: nothing is rounded.
 """
 
 from __future__ import annotations
 
-import csv
-import hashlib
-import io
 from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
+from certify.analysis.tables import NEXT, RATE, read_table
 from certify.errors import InputError
 from certify.loop.plants.equations import decimal
 from certify.loop.plants.samples import Point, Sampled, Samples, Unknown
@@ -24,40 +23,39 @@ _MOST_PARTS, _OF_A_SAMPLE = 900_000, 12  # commas and brackets of a certificate;
 _LENGTH = "some 35 digits at most"
 
 
-def read_samples(path: Path, unknowns: Sequence[Unknown], suffix: str) -> tuple[dict[str, Sampled], str]:
-    """The samples of each unknown, by its state, from a CSV file; and the sha256 of the file.
+def read_samples(path: Path, unknowns: Sequence[Unknown], system: System) -> tuple[dict[str, Sampled], str]:
+    """The samples of each unknown, by its state, from a file; and the sha256 of the file.
 
-    A column `NAME_rate` (`suffix`; in discrete time `NAME_next`) has the values of each unknown.
+    A column `NAME_rate`, in discrete time `NAME_next`, has the values of each unknown. In discrete time rows may also
+    be in time order, and the next row has them.
 
     Raises
     ------
-    InputError : the file cannot be read, or a column or a number is missing.
+    InputError : the file cannot be read, a column is missing, or an entry is no number.
     """
-    try:
-        raw = path.read_bytes()
-        rows = [row for row in csv.reader(io.StringIO(raw.decode("utf-8-sig"), newline=""), strict=True) if row]
-    except OSError as error:
-        raise InputError(f"samples {path} cannot be read: {error.strerror}.") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"samples {path} must be CSV, which is UTF-8 text: {error}.") from error
-    most = _MOST_PARTS // sum(len(one.variables) + _OF_A_SAMPLE for one in unknowns)
-    if not 2 <= len(rows) <= most + 1:
-        raise InputError(f"samples {path} must have a header and 1 to {most:,} rows; found {len(rows):,} lines.")
-    header = [name.strip() for name in rows[0]]
-    wanted = {name for one in unknowns for name in (*one.variables, f"{one.state}{suffix}")}
-    odd = next((name for name in sorted(wanted) if header.count(name) != 1), None)
-    if odd is not None:
-        raise InputError(f"samples {path} must have the column {odd} once; its columns are {', '.join(header)}.")
-    columns = {
-        name: [_number(row, header.index(name), path, k) for k, row in enumerate(rows[1:], 2)] for name in wanted
-    }
-    taken = {
-        one.state: Sampled(
-            tuple(zip(*(columns[v] for v in one.variables), strict=True)), tuple(columns[f"{one.state}{suffix}"])
+    table = read_table(path, [s.name for s in system.states], [u.name for u in system.inputs])
+    suffix = NEXT if system.time == "discrete" else RATE
+    in_order = suffix == NEXT and not any(name.endswith(NEXT) for name in table.columns)
+    rows = list(range(len(table.places)))
+    if in_order:
+        suffix, rows = "", [k for first, last in table.stretches() for k in range(first, last - 1)]
+    wanted = list(dict.fromkeys(name for one in unknowns for name in (*one.variables, f"{one.state}{suffix}")))
+    if suffix == RATE and not any(name.endswith(RATE) for name in table.columns):
+        raise InputError(
+            f"data file {path} must have rates, in columns such as {unknowns[0].state}{RATE}; it has "
+            f"{', '.join(table.columns)}. Rows of states and inputs alone are for certify identify, or for a structure "
+            'with time = "discrete", whose functions give the next row.'
         )
-        for one in unknowns
-    }
-    return taken, hashlib.sha256(raw).hexdigest()
+    table.require(wanted)
+    most = _MOST_PARTS // sum(len(one.variables) + _OF_A_SAMPLE for one in unknowns)
+    if len(rows) > most:
+        raise InputError(f"samples {path} must be of 1 to {most:,} rows; found {len(rows):,}.")
+    columns = {name: [_number(entry, where) for entry, where in table.entries(name)] for name in wanted}
+    taken = dict[str, Sampled]()
+    for one in unknowns:
+        points = tuple(zip(*([columns[v][k] for k in rows] for v in one.variables), strict=True))
+        taken[one.state] = Sampled(points, tuple(columns[f"{one.state}{suffix}"][k + in_order] for k in rows))
+    return taken, table.sha256
 
 
 def boxed(system: System, one: Unknown, axes: tuple[Point, ...] | None) -> Unknown:
@@ -100,7 +98,7 @@ def with_samples(system: System, samples: Samples, path: Path) -> System:
     ------
     InputError : the file is another one or cannot be read.
     """
-    taken, sha256 = read_samples(path, samples.unknowns, suffix_of(system))
+    taken, sha256 = read_samples(path, samples.unknowns, system)
     if sha256 != samples.sha256:
         raise InputError(
             f"data file {path} must be the one to which the plant was fitted, of sha256 {samples.sha256}; found "
@@ -110,18 +108,16 @@ def with_samples(system: System, samples: Samples, path: Path) -> System:
     return replace(system, samples=replace(samples, taken=taken))
 
 
-def suffix_of(system: System) -> str:
-    """The end of the name of a column of values."""
-    return "_next" if system.time == "discrete" else "_rate"
-
-
-def _number(row: Sequence[str], at: int, path: Path, line: int) -> Fraction:
+def _number(entry: Any, where: str) -> Fraction:
+    """A decimal of a text, or the value of a float."""
     try:
-        found = Fraction(decimal(row[at].strip()))
-    except (IndexError, ValueError) as error:
-        raise InputError(f"samples {path}, line {line}: entry {at + 1} must be a decimal number.") from error
+        if isinstance(entry, bool):
+            raise TypeError(entry)
+        found = decimal(entry) if isinstance(entry, str) else Fraction(entry)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise InputError(f"{where}: there must be a finite number; found {entry!r:.40}.") from error
     if _is_long(found):
-        raise InputError(f"samples {path}, line {line}: entry {at + 1} must have {_LENGTH}.")
+        raise InputError(f"{where}: a number must have {_LENGTH}; found {entry}. Round it.")
     return found
 
 

@@ -19,8 +19,7 @@ from certify.analysis.fitting.samples import bounds_of, require_within
 from certify.certificates.samples import SampleBounds, Standing, Weights
 from certify.errors import InputError
 from certify.loop.expressions import to_tree
-from certify.loop.plants import Sampled, Samples, System, Unknown
-from certify.loop.plants.unknown import standing_names
+from certify.loop.plants import Samples, System, Unknown
 
 Powers = tuple[int, ...]
 
@@ -32,14 +31,11 @@ class Equation:
     Parameters
     ----------
     unknown : the function.
-    error, slopes : the names of r and of the slopes; None and () where it has none.
     P : coefficients by the powers of variables and slopes.
     E : of the variables.
     """
 
     unknown: Unknown
-    error: str | None
-    slopes: tuple[str, ...]
     P: Mapping[Powers, Fraction]
     E: Bound
 
@@ -55,34 +51,38 @@ def standing_for(system: System, samples: Samples) -> SampleBounds:
     InputError : an equation is not as `certify fit` writes it, a range or a bound does not hold all that the samples
         leave, or the domain or the input bounds reach beyond the box.
     """
-    return tuple(_standing(system, one, samples.taken[one.state], samples.noise[one.state]) for one in samples.unknowns)
+    return tuple(_standing(system, samples, one) for one in samples.unknowns)
 
 
-def _standing(system: System, one: Unknown, taken: Sampled, noise: Fraction) -> Standing:
+def _standing(system: System, samples: Samples, one: Unknown) -> Standing:
+    taken, noise = samples.taken[one.state], samples.noise[one.state]
     require_within(system, one, noise)
+    fixed = next((name for name in (one.error, *one.slopes) if name and name not in system.ranges), None)
+    if fixed is not None:
+        raise InputError(f"{fixed} must have a range, as certify fit writes it; found one value.")
     sampling = Sampling(one, taken, noise)
     found = _equation(system, one)
-    if found.error is not None and not (system.ranges[found.error][0] <= -1 and system.ranges[found.error][1] >= 1):
-        raise InputError(f"the range of {found.error} must hold [-1, 1], as certify fit writes it.")
-    if found.slopes:
-        return Standing(found.error, found.slopes, (), _of_slopes(system, found, sampling))
+    if one.error is not None and not (system.ranges[one.error][0] <= -1 and system.ranges[one.error][1] >= 1):
+        raise InputError(f"the range of {one.error} must hold [-1, 1], as certify fit writes it.")
+    if one.slopes:
+        return Standing((), _of_slopes(system, found, sampling))
     p = Polynomial(one.variables, (Fraction(1),) * len(one.variables), tuple(found.P), tuple(found.P.values()))
-    grid = enclosed(sampling)
+    grid = enclosed(sampling, samples.near_origin)
     if any(e > found.E.least(cell) for cell, e in errors(p, one, grid).items()):
         raise found.refused("a bound [residual] that holds all that the samples allow")
-    return Standing(found.error, (), grid.axes, tuple((each.lower, each.upper) for each in grid.bounds.values()))
+    return Standing(grid.axes, tuple((each.lower, each.upper) for each in grid.bounds.values()))
 
 
 def _of_slopes(system: System, found: Equation, sampling: Sampling) -> tuple[tuple[Weights, Weights], ...]:
     """The weights of samples that show the ranges of the slopes at the origin."""
-    one, d = found.unknown, len(found.slopes)
+    one, d = found.unknown, len(found.unknown.slopes)
     if {tuple(int(i % d == j) for i in range(2 * d)): Fraction(1) for j in range(d)} != found.P:
         raise found.refused("the sum of slopes times variables")
     sizes = [max(abs(lo), abs(hi)) for lo, hi in (bounds_of(system)[name] for name in one.variables)]
     if found.E.constant or any(k < q for k, q in zip(found.E.rise, least_square(one, sizes), strict=True)):
         raise found.refused("a bound [residual] that holds what second derivatives allow beyond the linear part")
     weights = list[tuple[Weights, Weights]]()
-    for name, slope in zip(found.slopes, sampling.slopes(), strict=True):
+    for name, slope in zip(one.slopes, sampling.slopes(), strict=True):
         lo, hi = system.ranges[name]
         if not lo <= slope.lo <= slope.hi <= hi:
             raise InputError(
@@ -102,7 +102,7 @@ def _equation(system: System, one: Unknown) -> Equation:
     from sympy import QQ
     from sympy.polys.rings import ring
 
-    d, (error, own) = len(one.variables), standing_names(one, system.ranges)
+    d, error, own = len(one.variables), one.error, one.slopes
     names = [*one.variables, *own, *([] if error is None else [error])]
     R, *symbols = ring(names, QQ)
     tree = to_tree(system.uncertain_dynamics()[[s.name for s in system.states].index(one.state)])
@@ -119,7 +119,7 @@ def _equation(system: System, one: Unknown) -> Equation:
     if not {*E} <= {constant, *squares} or min(E.values(), default=Fraction(0)) < 0:
         raise _other(one, "a bound [residual] of a number and squares of variables")
     bound = Bound(one.variables, E.get(constant, Fraction(0)), tuple(E.get(k, Fraction(0)) for k in squares))
-    return Equation(one, error, own, P, bound)
+    return Equation(one, P, bound)
 
 
 def _expanded(tree: Any, names: Mapping[str, Any], R: Any, one: Unknown) -> Any:

@@ -34,7 +34,7 @@ def identify(
 
     Parameters
     ----------
-    data : a file .csv, .npz or .parquet; see `certify.analysis.identifying.reading`.
+    data : a file .csv, .npz or .parquet; see `certify.analysis.tables`.
     structure : a plant's file, or a `System`, in which each unknown parameter has a range, its prior; or a
         `LinearStructure`, of which no equation is known.
     noise : a bound of the error of each measured state, in its units: one for all, or by state.

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.analysis.identifying.reading import NEXT
+from certify.analysis.tables import NEXT
 from certify.certificates import write_atomically
 from certify.errors import InputError
 from certify.loop.plants import System

@@ -7,21 +7,17 @@ functions: |r_i| <= sum_k |e_ik(x, u)|, where half of a bound of the second deri
 
 from __future__ import annotations
 
-import csv
-import io
-import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.analysis.identifying.reading import NEXT, RUN
+from certify.analysis.identifying.reading import numbers
 from certify.analysis.identifying.writing import pair_text
+from certify.analysis.tables import NEXT, RUN, read_table
 from certify.certificates import write_atomically
 from certify.errors import InputError, OptionError
 from certify.loop.expressions import Expression, Operation, numerical, symbols
@@ -222,51 +218,21 @@ def _smooth(e: Expression) -> Expression:
 
 
 def _columns(data: Path, given: LinearStructure) -> _Columns:
-    try:
-        if data.suffix.lower() == ".npz":
-            return _of_arrays(data, given)
-        if data.suffix.lower() == ".csv":
-            rows = list(csv.reader(io.StringIO(data.read_text(encoding="utf-8-sig"), newline="")))
-            table: dict[str, Any] = {
-                name.strip(): [row[k] for row in rows[1:] if row] for k, name in enumerate(rows[0])
-            }
-        else:
-            import pyarrow.parquet
-
-            table = pyarrow.parquet.read_table(data).to_pydict()
-        numbers = {name: np.array(v, dtype=np.float64) for name, v in table.items() if name != RUN}
-    except (OSError, ValueError, IndexError, TypeError, ImportError, zipfile.BadZipFile) as error:
-        raise InputError(f"data file {data} must have a header and numbers: {error}.") from error
-    states = [name for name in numbers if f"{name}{NEXT}" in numbers]
-    own = [name for name in numbers if not name.endswith(NEXT)]
-    if not states and not given.inputs:
+    table = read_table(data, given.states, given.inputs)
+    own = [name for name in table.columns if name != RUN and not name.endswith(NEXT)]
+    states = [name for name in own if f"{name}{NEXT}" in table.columns]
+    if not (states or given.inputs or table.inputs):
         raise OptionError(f"`inputs` must say which columns of {data.name} are inputs, of {', '.join(own)}.")
-    inputs = list(given.inputs) or [name for name in own if name not in states]
+    inputs = list(given.inputs or table.inputs) or [name for name in own if name not in states]
     odd = next((name for name in inputs if name not in own), None)
     if odd is not None:
         raise OptionError(f"`inputs` names {odd!r}; {data.name} has the columns {', '.join(own)}.")
     single, states = bool(states), states or [name for name in own if name not in inputs]
-    x, u = (np.column_stack([numbers[name] for name in names]) for names in (states, inputs))
+    x, u = numbers(table, states), numbers(table, inputs)
     if single:
-        return _Columns(states, inputs, x, u, np.column_stack([numbers[f"{s}{NEXT}"] for s in states]))
-    runs = table.get(RUN, [""] * len(x))
-    same = np.array([a == b for a, b in pairwise(runs)], dtype=bool)
-    return _Columns(states, inputs, x[:-1][same], u[:-1][same], x[1:][same])
-
-
-def _of_arrays(data: Path, given: LinearStructure) -> _Columns:
-    with np.load(data, allow_pickle=False) as arrays:
-        runs = "states" in arrays
-        x, u = (arrays[name] for name in (("states", "inputs") if runs else ("x", "u")))
-        after = x[:, 1:] if runs else arrays["x_next"]
-    before, n, m = (x[:, :-1] if runs else x), x.shape[-1], u.shape[-1]
-    names = [
-        list(given.states) or [f"x{k + 1}" for k in range(n)],
-        list(given.inputs) or [f"u{k + 1}" for k in range(m)],
-    ]
-    if (len(names[0]), len(names[1])) != (n, m):
-        raise OptionError(f"{data.name} has {n} states and {m} inputs; found {', '.join(names[0] + names[1])}.")
-    return _Columns(names[0], names[1], before.reshape(-1, n), u.reshape(-1, m), after.reshape(-1, n))
+        return _Columns(states, inputs, x, u, numbers(table, [f"{s}{NEXT}" for s in states]))
+    kept = [k for first, last in table.stretches() for k in range(first, last - 1)]
+    return _Columns(states, inputs, x[kept], u[kept], x[[k + 1 for k in kept]])
 
 
 def _above(size: float) -> Fraction:

@@ -20,12 +20,18 @@ class Unknown:
     variables : names of the states and inputs that g depends on, and of no others.
     curvature : bounds of the absolute second derivatives of g on the box, (d, d), symmetric.
     box : the interval of each variable on which they hold; () before there are samples.
+    error, slopes : names of the uncertain quantities r and a in the equation P + r E or a z + r E that stands for g;
+        None and () where it has none.
+    vanishes : True if g(0) = 0 is assumed.
     """
 
     state: str
     variables: tuple[str, ...]
     curvature: tuple[Point, ...]
     box: Box = ()
+    error: str | None = None
+    slopes: tuple[str, ...] = ()
+    vanishes: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,12 +63,14 @@ class Samples:
     unknowns : the functions.
     noise : the bound of a sample's error, by the state's name.
     taken : the samples, by the state's name; empty where only the file is known.
+    near_origin : how much more the error near the origin counted where a grid was chosen among the samples.
     """
 
     sha256: str
     unknowns: tuple[Unknown, ...]
     noise: Mapping[str, Fraction]
     taken: Mapping[str, Sampled]
+    near_origin: float = 0.0
 
 
 def slope_name(state: str, variable: str) -> str:

@@ -116,7 +116,7 @@ def build_system(file: PlantFile) -> System:
             constraints=dict(zip(constraints, in_deviations(list(constraints.values()), *at), strict=True)),
             observations=tuple(_observations(file, {s: symbol[s] for s in (*states, *parameters)})),
             measurements=measurements_in(file, states, ranges, time),
-            samples=samples_in(file, states, inputs),
+            samples=samples_in(file, states, inputs, {*ranges, *acting}),
         )
     except InputError as error:
         if str(file.path) in str(error):

@@ -15,7 +15,7 @@ from certify.loop.plants.source import PlantFile, interval_at, interval_in, numb
 from certify.loop.plants.system import Interval
 
 _DATA = ("file", "sha256", "period", "noise", "priors", "axes")
-_SAMPLES = ("file", "sha256", "noise", "box")
+_SAMPLES = ("file", "sha256", "noise", "box", "near_origin")
 _DIGITS = frozenset("0123456789abcdef")
 
 
@@ -89,12 +89,12 @@ def residual_names(state: str, ranges: Mapping[str, Interval]) -> list[str]:
     return [name for name in own if name in ranges and ranges[name][0] == -ranges[name][1]]
 
 
-def standing_names(one: Unknown, ranges: Collection[str]) -> tuple[str | None, tuple[str, ...]]:
-    """The names of the disturbance and of the slopes in an equation that stands for an unknown function, of those that
-    have ranges: None and () where it has none."""
-    slopes = tuple(slope_name(one.state, v) for v in one.variables)
-    error = residual_name(one.state)
-    return error if error in ranges else None, slopes if all(name in ranges for name in slopes) else ()
+def _standing(one: Unknown, ranges: Collection[str]) -> Unknown:
+    """The unknown with the names of the disturbance and of the slopes that have ranges, as `certify fit` writes them;
+    where there are slopes it vanishes."""
+    slopes, error = tuple(slope_name(one.state, v) for v in one.variables), residual_name(one.state)
+    own = slopes if all(name in ranges for name in slopes) else ()
+    return replace(one, error=error if error in ranges else None, slopes=own, vanishes=bool(own))
 
 
 def measurements_in(
@@ -190,7 +190,9 @@ def _unknown(file: PlantFile, state: str, names: Sequence[str]) -> Unknown:
     return Unknown(state, variables, rows)
 
 
-def samples_in(file: PlantFile, states: Sequence[str], inputs: Sequence[str]) -> Samples | None:
+def samples_in(
+    file: PlantFile, states: Sequence[str], inputs: Sequence[str], ranges: Collection[str]
+) -> Samples | None:
     """The tables `samples` and `unknown`, without the sampled numbers, which another file has; None without them.
 
     Raises
@@ -200,7 +202,7 @@ def samples_in(file: PlantFile, states: Sequence[str], inputs: Sequence[str]) ->
     if "samples" not in file.data:
         return None
     file.require_known("samples", list(_SAMPLES), "entry of a plant's samples")
-    missing = [key for key in _SAMPLES if key not in file.table("samples")]
+    missing = [key for key in _SAMPLES[:-1] if key not in file.table("samples")]
     if missing:
         raise file.refuse(f"must have {', '.join(missing)}. `certify fit` writes this table.", "samples")
     unknowns = unknowns_in(file, [*states, *inputs], states)
@@ -213,8 +215,9 @@ def samples_in(file: PlantFile, states: Sequence[str], inputs: Sequence[str]) ->
     if min(bounds.values()) < 0:
         raise file.refuse("must be at least 0.", "samples", "noise")
     _inner(file, "samples", "box", named, "unknown function")
-    boxed = tuple(replace(one, box=_box(file, one)) for one in unknowns)
-    return Samples(_file_of(file, "samples"), boxed, bounds, {})
+    boxed = tuple(_standing(replace(one, box=_box(file, one)), ranges) for one in unknowns)
+    near_origin = float(number_at(file, file.table("samples").get("near_origin", 0), "samples", "near_origin"))
+    return Samples(_file_of(file, "samples"), boxed, bounds, {}, near_origin)
 
 
 def _box(file: PlantFile, one: Unknown) -> Box:
