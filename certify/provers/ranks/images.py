@@ -161,7 +161,7 @@ class Course:
                 (least, most), seen = self.ends[:, self.straight], (below[self.straight], above[self.straight])
                 found.fails[left] = lost | ((seen[1] < least) | (seen[0] > most)).any(0)
             width = ((above - below) / self.root[:, None]).max(0)
-            good = kept & (width < _WIDEST)
+            good = kept & ((width < _WIDEST) | (count == 1))
             if count in self.counts:
                 k = self.counts.index(count)
                 there = good & self.is_there(form)
