@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -38,7 +39,7 @@ SHIPPED = Path(__file__).parent.parent.parent / "examples" / "policies" / "pendu
 class Reaches:
     """An attempt that proves a share of what is asked for in its first heat, and of that one by the local rule."""
 
-    boxes, expected, gained, done = 1, 0.0, True, True
+    boxes, expected, gained, done, reach = 1, 0.0, True, True, math.inf
 
     def __init__(self, target: float, share: float, local: float) -> None:
         self.target, self.share, self.local, self.level = target, share, local, None

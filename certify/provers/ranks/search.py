@@ -2,8 +2,9 @@
 
 A leaf has its rank as soon as an image lies in the target, or meets leaves of known ranks alone: the number of the
 steps to that image, and the highest of those ranks. Leaves without a rank whose images meet some leaf with one are
-halved, the largest first, and looked at again (Kalies, Mischaikow, VanderVorst 2005 do this without images of
-networks). What has a rank keeps it; so the search may end at any time.
+halved and looked at again (Kalies, Mischaikow, VanderVorst 2005 do this without images of networks), first those whose
+halves promise the most volume: large ones, of which some image lies in leaves with a rank for a large part. What has a
+rank keeps it; so the search may end at any time.
 """
 
 from __future__ import annotations
@@ -18,11 +19,14 @@ from certify.certificates.claims import UNPROVED
 from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.ranks.cover import Cover
 from certify.provers.ranks.images import Course, Images
+from certify.provers.ranks.targets import TURN
 
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 _FIRST = 2**10  # leaves of the first tree
-_ROUNDS, _GAIN = 6, 1e-4  # relative growth of what is proved, in so many rounds, below which the search ends
-_LARGEST = 0.7  # share of the leaves to be halved that are, the largest ones
+_BEFORE, _GAIN = 1 / 8, 1e-4  # relative growth of what is proved, since so few boxes, below which the search ends
+_SHARE = 0.5  # share of all promise in the leaves that are halved next
+_ANYWAY = 0.05  # share of a leaf that may gain a rank though its images lie elsewhere
+_POINT = 1e-300  # width of a point
 _POINTS = 5  # of a leaf, from which it is seen if the target may be reached
 Promising = Callable[[Array], Mask]
 """True (N,) for states (N, n) that seem to reach the target."""
@@ -39,7 +43,8 @@ class Search:
         self.lo, self.hi = np.full((K, n, 1), np.nan), np.full((K, n, 1), np.nan)
         self.there, self.steep = np.zeros((K, 1), dtype=bool), np.zeros((n, 1))
         self.meets, self.loose = np.zeros(1, dtype=bool), np.zeros(1, dtype=bool)
-        self.boxes, self.pairs, self.shares = 0, 0, list[float]()
+        self.part = np.zeros(1)
+        self.boxes, self.pairs, self.stands = 0, 0, list[tuple[int, float]]()
 
     def begin(self, most: float) -> Index:
         """The leaves of a first tree, all of one size, so many at most."""
@@ -51,10 +56,12 @@ class Search:
         return new
 
     def is_done(self, near: Index) -> bool:
-        """True if no leaf is left whose halves could gain anything, or the last rounds have gained next to nothing."""
-        self.shares.append(self.share)
-        stalled = len(self.shares) > _ROUNDS and 0 < self.shares[-1] <= (1 + _GAIN) * self.shares[-1 - _ROUNDS]
-        return not len(near) or stalled
+        """True if no leaf is left whose halves could gain anything, or the last boxes have gained next to nothing."""
+        share = self.share
+        before = [earlier for boxes, earlier in self.stands if boxes <= _BEFORE * self.boxes]
+        self.stands.append((self.boxes, share))
+        stalled = before and 0 < share <= (1 + _GAIN) * before[-1]
+        return bool(not len(near) or stalled)
 
     @property
     def gives_up(self) -> bool:
@@ -62,8 +69,13 @@ class Search:
         return False
 
     def further(self, near: Index) -> Index:
-        """The leaves to look at next."""
-        return self.halve(*self.next(near))
+        """The leaves to look at next: halves of the fewest that have their share of all promise."""
+        near = self._hopeful(near)
+        promise = self.cover.widths(near).prod(0) * (_ANYWAY + self.part[near])
+        order = np.argsort(-promise, kind="stable")
+        sums = np.cumsum(promise[order])
+        first = near[order[: 1 + int(np.searchsorted(sums, _SHARE * sums[-1]))]]
+        return self.halve(first, self.steep[:, first].argmax(0))
 
     @property
     def unknown(self) -> Index:
@@ -90,7 +102,7 @@ class Search:
         self.lo, self.hi = longer(self.lo, np.nan), longer(self.hi, np.nan)
         self.there, self.steep = longer(self.there, False), longer(self.steep, 0.0)
         self.meets, self.loose = longer(self.meets, False), longer(self.loose, False)
-        self.hope = longer(self.hope, np.nan)
+        self.hope, self.part = longer(self.hope, np.nan), longer(self.part, 0.0)
         return halves
 
     def take(self, nodes: Index, found: Images) -> None:
@@ -132,7 +144,21 @@ class Search:
         apart = unknown[self.meets[unknown] | self.loose[unknown]]
         near: Index = np.unique(np.concatenate([owners[some], apart, node[sticks]]))
         waiting: Index = near[self.rank[near] == UNPROVED]
+        self.part[unknown] = 0.0
+        if len(starts):
+            overlap = self._overlap(self.lo[k[pair], :, node[pair]].T, self.hi[k[pair], :, node[pair]].T, leaf)
+            np.maximum.at(self.part, owners, np.add.reduceat(overlap * (self.rank[leaf] < UNPROVED), starts))
         return waiting
+
+    def _overlap(self, lo: Array, hi: Array, leaf: Index) -> Array:
+        """The shares of boxes (n, B) of places that lie in these leaves, one for each."""
+        low, high = self.cover.low[:, leaf], self.cover.high[:, leaf]
+        for i in self.cover.angles:
+            turns = TURN * np.rint((low[i] + high[i] - lo[i] - hi[i]) / (2 * TURN))
+            low[i], high[i] = low[i] - turns, high[i] - turns
+        both = np.maximum(np.minimum(hi, high) - np.maximum(lo, low), 0.0)
+        shares: Array = ((both + _POINT) / (hi - lo + _POINT)).prod(0)
+        return shares
 
     def _better(self, best: Index, by: Index, nodes: Index, ranks: Index, steps: Index) -> None:
         """Keep the lowest rank of each node, and its steps."""
@@ -140,13 +166,6 @@ class Search:
         nodes, ranks, steps = nodes[order], ranks[order], steps[order]
         lower = ranks < best[nodes]
         best[nodes[lower]], by[nodes[lower]] = ranks[lower], steps[lower]  # of several the last, the lowest, stays
-
-    def next(self, near: Index) -> tuple[Index, Index]:
-        """The leaves to halve next, and their axes."""
-        near = self._hopeful(near)
-        volumes = self.cover.widths(near).prod(0)
-        large = near[volumes >= np.quantile(volumes, 1 - _LARGEST)]
-        return large, self.steep[:, large].argmax(0)
 
     def _hopeful(self, near: Index) -> Index:
         """The leaves that have a promising state among a few; all of them if none has."""
