@@ -25,7 +25,7 @@ COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 _FIRST = 2**10  # leaves of the first tree
 _BEFORE, _GAIN = 1 / 8, 1e-4  # relative growth of what is proved, since so few boxes, below which the search ends
 _SHARE = 0.5  # share of all promise in the leaves that are halved next
-_ANYWAY = 0.05  # share of a leaf that may gain a rank though its images lie elsewhere
+_ANYWAY = 0.05  # share of a leaf that may gain a rank where its image, or a few of its states, say that nothing does
 _POINT = 1e-300  # width of a point
 _POINTS = 5  # of a leaf, from which it is seen if the target may be reached
 Promising = Callable[[Array], Mask]
@@ -70,8 +70,7 @@ class Search:
 
     def further(self, near: Index) -> Index:
         """The leaves to look at next: halves of the fewest that have their share of all promise."""
-        near = self._hopeful(near)
-        promise = self.cover.widths(near).prod(0) * (_ANYWAY + self.part[near])
+        promise = self.cover.widths(near).prod(0) * (_ANYWAY + self.part[near]) * (_ANYWAY + self._hope(near))
         order = np.argsort(-promise, kind="stable")
         sums = np.cumsum(promise[order])
         first = near[order[: 1 + int(np.searchsorted(sums, _SHARE * sums[-1]))]]
@@ -89,6 +88,11 @@ class Search:
         """The share of the root box's volume in leaves with a rank."""
         leaves = self.cover.leaves
         return float(self.cover.widths(leaves[self.rank[leaves] < UNPROVED]).prod(0).sum())
+
+    def counted(self, x: Array) -> int:
+        """The number of states (n, N) in leaves with a rank."""
+        _, states, leaves = self.cover.met_by(x, x)
+        return len(np.unique(states[self.rank[leaves] < UNPROVED]))
 
     def halve(self, nodes: Index, axes: Index) -> Index:
         """Halve leaves; their halves, of which nothing is known yet."""
@@ -167,17 +171,16 @@ class Search:
         lower = ranks < best[nodes]
         best[nodes[lower]], by[nodes[lower]] = ranks[lower], steps[lower]  # of several the last, the lowest, stays
 
-    def _hopeful(self, near: Index) -> Index:
-        """The leaves that have a promising state among a few; all of them if none has."""
+    def _hope(self, nodes: Index) -> Array:
+        """The shares of promising states among a few of each of these leaves; 1 if nothing says which are."""
         if self.promising is None:
-            return near
-        new = near[np.isnan(self.hope[near])]
+            return np.ones(len(nodes))
+        new = nodes[np.isnan(self.hope[nodes])]
         low, high = self.cover.low[:, new], self.cover.high[:, new]
         at = np.random.default_rng(0).uniform(size=(_POINTS, len(low), 1))
         states = (low + at * (high - low)).transpose(0, 2, 1)
-        self.hope[new] = self.promising(states.reshape(-1, len(low))).reshape(_POINTS, -1).any(0)
-        found: Index = near[self.hope[near] > 0]
-        return found if len(found) else near
+        self.hope[new] = self.promising(states.reshape(-1, len(low))).reshape(_POINTS, -1).mean(0)
+        return self.hope[nodes]
 
     def tighten(self) -> None:
         """Give all leaves the lowest ranks that their images show: some had a rank before others had a lower one."""
