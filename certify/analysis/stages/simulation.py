@@ -25,7 +25,7 @@ _FOR_RUNS = 0.06  # share of the whole effort for simulated runs
 _FOR_MORE = 0.35  # share of the whole effort that the ring leaves, for what lies beyond
 _FOR_RING = 0.5  # share of the effort that is left which the ring has in any case
 _LEAST = 0.04  # share of the whole effort, with less of which nothing more is begun
-_WANTED = 0.95  # share of it in the proved set, with which the search for ranks ends
+_WANTED = 0.98  # share of it in the proved set, with which the search for ranks ends
 
 
 def goes_on(state: State) -> bool:

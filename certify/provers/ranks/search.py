@@ -43,7 +43,7 @@ class Search:
         self.lo, self.hi = np.full((K, n, 1), np.nan), np.full((K, n, 1), np.nan)
         self.there, self.steep = np.zeros((K, 1), dtype=bool), np.zeros((n, 1))
         self.meets, self.loose = np.zeros(1, dtype=bool), np.zeros(1, dtype=bool)
-        self.part = np.zeros(1)
+        self.part, self.first = np.zeros(1), np.full((2, n, 1), np.nan)
         self.boxes, self.pairs, self.stands = 0, 0, list[tuple[int, float]]()
 
     def begin(self, most: float) -> Index:
@@ -107,6 +107,7 @@ class Search:
         self.there, self.steep = longer(self.there, False), longer(self.steep, 0.0)
         self.meets, self.loose = longer(self.meets, False), longer(self.loose, False)
         self.hope, self.part = longer(self.hope, np.nan), longer(self.part, 0.0)
+        self.first = longer(self.first, np.nan)
         return halves
 
     def take(self, nodes: Index, found: Images) -> None:
@@ -114,6 +115,7 @@ class Search:
         self.lo[..., nodes], self.hi[..., nodes] = found.lo, found.hi
         self.there[:, nodes], self.steep[:, nodes] = found.there, found.steep
         self.meets[nodes], self.loose[nodes] = found.meets, found.loose
+        self.first[..., nodes] = found.first
         self.rank[nodes[found.inside]] = 0
         self.boxes += len(nodes)
 
@@ -142,17 +144,33 @@ class Search:
             if not len(new):
                 break
             self.rank[new], self.steps[new] = best[new], by[new]
-        some = np.logical_or.reduceat(self.rank[leaf] < UNPROVED, starts) if len(starts) else np.zeros(0, dtype=bool)
         (low, high), first = self.cover.root, k == 0
         sticks = first & ~inside & ((high > self.lo[k, :, node].T) & (low < self.hi[k, :, node].T)).all(0)
-        apart = unknown[self.meets[unknown] | self.loose[unknown]]
-        near: Index = np.unique(np.concatenate([owners[some], apart, node[sticks]]))
-        waiting: Index = near[self.rank[near] == UNPROVED]
         self.part[unknown] = 0.0
-        if len(starts):
-            overlap = self._overlap(self.lo[k[pair], :, node[pair]].T, self.hi[k[pair], :, node[pair]].T, leaf)
-            np.maximum.at(self.part, owners, np.add.reduceat(overlap * (self.rank[leaf] < UNPROVED), starts))
+        beside = self._toward(self.lo[k, :, node].T, self.hi[k, :, node].T, node, pair, leaf)
+        near: Index = np.unique(np.concatenate([beside, self._loosely(), unknown[self.meets[unknown]], node[sticks]]))
+        waiting: Index = near[self.rank[near] == UNPROVED]
         return waiting
+
+    def _loosely(self) -> Index:
+        """The leaves of which a part may pass, whose states after the first step are in part where leaves have a rank."""
+        loose = self.unknown
+        loose = loose[self.loose[loose] & np.isfinite(self.first[..., loose]).all((0, 1))]
+        (least, most), (lo, hi) = self.cover.root, self.first[..., loose]
+        turn = np.isin(np.arange(len(lo)), self.cover.angles)[:, None]
+        lo, hi = np.where(turn, lo, lo.clip(least, most)), np.where(turn, hi, hi.clip(least, most))
+        _, box, leaf = self.cover.met_by(lo, hi)
+        return self._toward(lo, hi, loose, box, leaf)
+
+    def _toward(self, lo: Array, hi: Array, owners: Index, box: Index, leaf: Index) -> Index:
+        """The owners (B,) of boxes (n, B) of places that meet leaves with a rank, by the pairs of a box and a leaf; the
+        part of each box that lies in such leaves is noted."""
+        known = self.rank[leaf] < UNPROVED
+        box, leaf = box[known], leaf[known]
+        parts = np.bincount(box, self._overlap(lo[:, box], hi[:, box], leaf), minlength=len(owners))
+        np.maximum.at(self.part, owners, parts)
+        found: Index = owners[np.unique(box)]
+        return found
 
     def _overlap(self, lo: Array, hi: Array, leaf: Index) -> Array:
         """The shares of boxes (n, B) of places that lie in these leaves, one for each."""
