@@ -117,6 +117,17 @@ def test_a_race_that_is_not_settled_goes_on_as_if_it_began() -> None:
     assert began == ["large", "small"] and again.contenders[0] is early
 
 
+def test_a_contender_that_a_violation_leaves_less_than_is_proved_is_out() -> None:
+    run, _ = race(0.4)
+    run.enter(trials())
+    small = run.contenders[-1]
+    for contender in run.contenders:
+        contender.attempt.done = False  # type: ignore[misc]
+    assert small.trial.name == "small" and small in run.open
+    small.attempt.reach = 0.45 * small.trial.task.target  # type: ignore[misc]
+    assert 0 < small.reach < run.best.proved and run.open == [run.best]
+
+
 @pytest.mark.slow
 def test_no_candidate_is_made_that_could_not_win(
     tmp_path: Path, pendulum: System, monkeypatch: pytest.MonkeyPatch

@@ -161,9 +161,9 @@ class Course:
             below, above = form.box
             if count == 1:
                 found.first[..., left] = below, above
-                found.loose[left] = ~(kept | lost) & self.in_domain(above, below)  # the image meets the domain
                 (least, most), seen = self.ends[:, self.straight], (below[self.straight], above[self.straight])
-                found.fails[left] = lost | ((seen[1] < least) | (seen[0] > most)).any(0)
+                found.fails[left] = fails = lost | ((seen[1] < least) | (seen[0] > most)).any(0)
+                found.loose[left] = ~(kept | fails)
             width = ((above - below) / self.root[:, None]).max(0)
             good = kept & ((width < _WIDEST) | (count == 1))
             if count in self.counts:

@@ -153,14 +153,15 @@ class Search:
         return waiting
 
     def _loosely(self) -> Index:
-        """The leaves of which a part may pass, whose states after the first step are in part where leaves have a rank."""
-        loose = self.unknown
-        loose = loose[self.loose[loose] & np.isfinite(self.first[..., loose]).all((0, 1))]
+        """The leaves of which a part may pass, and whose first step leads in part to leaves with a rank or anywhere."""
+        loose = self.unknown[self.loose[self.unknown]]
+        known = np.isfinite(self.first[..., loose]).all((0, 1))
+        anywhere, loose = loose[~known], loose[known]
         (least, most), (lo, hi) = self.cover.root, self.first[..., loose]
         turn = np.isin(np.arange(len(lo)), self.cover.angles)[:, None]
         lo, hi = np.where(turn, lo, lo.clip(least, most)), np.where(turn, hi, hi.clip(least, most))
         _, box, leaf = self.cover.met_by(lo, hi)
-        return self._toward(lo, hi, loose, box, leaf)
+        return np.append(anywhere, self._toward(lo, hi, loose, box, leaf))
 
     def _toward(self, lo: Array, hi: Array, owners: Index, box: Index, leaf: Index) -> Index:
         """The owners (B,) of boxes (n, B) of places that meet leaves with a rank, by the pairs of a box and a leaf; the
