@@ -7,7 +7,6 @@ The same loop and effort draw the same states, whatever machine simulates them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,8 +17,6 @@ from certify.certificates.membership import Region
 from certify.effort import Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.plants import System
-from certify.loop.policies import bounded_by_form
 from certify.lyapunov.function import Quadratic
 from certify.provers.ranks import root_box, turning
 from certify.report.flow import Flow, time_scales
@@ -34,7 +31,6 @@ MOST, NEARLY_ALL = 0.8, 0.9
 with the second hardly more is to be proved in this domain."""
 _LEAST, _ENOUGH, _MOST = 250, 1000, 4000  # states drawn at once at least, that converge, and in all
 _QUICK = 10.0  # multiplications of many runs at once that are worth an operation
-_ROUNDING = 1e-9  # of an input, relative to its bounds
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +76,6 @@ class Simulator:
             flow = replace(flow, lo=lo, hi=hi, angles=tuple(turning(loop)))
         else:
             flow = replace(flow, angles=())
-        if not bounded_by_form(loop.network, loop.system.input_bounds):
-            flow = replace(flow, commands=_within(loop.system, flow))
         step, self.horizon = time_scales(flow)
         self.flow, self.step, self.V, self.level = flow, flow.fitting(step), V, level
 
@@ -116,15 +110,3 @@ def simulated_region(runs: Simulator, effort: Effort) -> SimulatedRegion | None:
         found.append(x[converge])
         drawn += batch
     return SimulatedRegion(np.concatenate(found), drawn) if drawn else None
-
-
-def _within(system: System, flow: Flow) -> Callable[[Array], Mask]:
-    """The test of states (..., n) for a command within the bounds of all inputs, but for rounding."""
-    lo, hi = np.array([[float(end) for end in pair] for pair in system.input_bounds]).T
-    slack = _ROUNDING * (np.abs(lo) + np.abs(hi))
-
-    def within(x: Array) -> Mask:
-        u = flow.policy(x)
-        return np.asarray(np.all((u >= lo - slack) & (u <= hi + slack), axis=-1))
-
-    return within

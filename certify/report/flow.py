@@ -21,7 +21,7 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.constraints import keeping
 from certify.loop.plants import System
 from certify.loop.plants.ode import eigenvalues_of, rk4_step
-from certify.loop.policies import PolicyNetwork
+from certify.loop.policies import PolicyNetwork, bounded_by_form
 
 Array = NDArray[np.float64]
 Field = Callable[[Array], Array]
@@ -32,6 +32,7 @@ _STAGES = 4  # evaluations in a step of Runge and Kutta
 _RATE_SAMPLES = 200
 _TANH = 30  # multiplications' worth
 _EQUATIONS = 500  # multiplications' worth of one evaluation, and of what surrounds it
+_ROUNDING = 1e-9  # of an input, relative to its bounds
 _AROUND = 1_000_000  # multiplications' worth of what surrounds a step, of however many states
 
 
@@ -50,8 +51,8 @@ class Flow:
     discrete : whether F(x) is the state one step later, and not the rate of change.
     cost : of F at one state, in multiplications' worth.
     kept : whether states (..., n) and their inputs keep all constraints, (...); None without constraints.
-    commands : whether the policy commands an input within its bounds at states (..., n), (...); None where it may
-        command any.
+    commands : whether the policy commands inputs within their bounds, but for rounding, at states (..., n), (...); None
+        where its form says so.
     angles : the numbers of states in which full turns are the same place: they are kept within half a turn of 0.
     """
 
@@ -94,7 +95,8 @@ class Flow:
 
         period = 0.0 if system.sample is None else float(system.sample[1])
         steps, angles, kept = system.time == "discrete", angles_in(system), keeping(ClosedLoop(system, network))
-        return cls(field, policy, *domain_bounds(system), plant, period, steps, cost_of(network), angles, kept)
+        within = None if bounded_by_form(network, system.input_bounds) else _within(system, policy)
+        return cls(field, policy, *domain_bounds(system), plant, period, steps, cost_of(network), angles, kept, within)
 
     def keeps(self, x: Array) -> NDArray[np.bool_]:
         """True for each state (..., n) that keeps all constraints with the input that the policy has there."""
@@ -129,6 +131,17 @@ class Flow:
         for i in self.angles:
             after[..., i] -= 2 * np.pi * np.round(after[..., i] / (2 * np.pi))
         return after
+
+
+def _within(system: System, policy: Field) -> Callable[[Array], NDArray[np.bool_]]:
+    lo, hi = np.array([[float(end) for end in pair] for pair in system.input_bounds]).T
+    slack = _ROUNDING * (np.abs(lo) + np.abs(hi))
+
+    def within(x: Array) -> NDArray[np.bool_]:
+        u = policy(x)
+        return np.asarray(np.all((u >= lo - slack) & (u <= hi + slack), axis=-1))
+
+    return within
 
 
 def cost_of(network: PolicyNetwork) -> float:

@@ -133,6 +133,17 @@ def test_the_edge_of_the_simulated_region_is_smooth_and_where_it_is() -> None:
                               certified=roa.certified[0]), P, 1e-3)  # fmt: skip
 
 
+def test_states_from_which_an_input_leaves_its_bounds_are_outside_the_simulated_region() -> None:
+    """x' = -x, y' = u with u = -y, |u| <= 1: all states converge, but the loop is this only where |y| <= 1."""
+    system = plane("-x", "-y", 2)
+    follows = PolicyNetwork.of_layers((np.array([[0.0, -1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity",
+                                      "none")  # fmt: skip
+    roa = simulated_roa_fraction(system, follows, np.eye(2), 0.5)
+    (bound,) = system.input_bounds
+    assert np.array_equal(roa.attracted, np.broadcast_to(np.abs(roa.axes[1]) <= float(bound[1]), roa.attracted.shape))
+    assert not roa.attracted.all() and roa.attracted.any()
+
+
 def test_a_curved_edge_is_found_as_if_the_whole_grid_were_fine() -> None:
     """The unit circle is the edge: r' = r^3 - r, turning."""
     system = plane("(x**2 + y**2 - 1)*x - y", "(x**2 + y**2 - 1)*y + x", 2)
