@@ -9,8 +9,7 @@ equations without numbers. The policy is the saturated LQR of the middle of the 
 What is proved is about the differential equation of the structure. MuJoCo's Runge-Kutta steps are not its flow: the
 difference at the recorded transitions is printed, and the declared noise has to cover it beside the measurements'
 errors, which are drawn within 0.95 of the noise. The numbers in MuJoCo's own model are used only for that, to say
-whether the ranges hold them, and for the plant beside which the sets are compared. The second checker
-counts the operations of a certificate first and refuses many: `certify.reference --patient` allows those of the data.
+whether the ranges hold them, and for the plant beside which the sets are compared.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ def test_the_wheel_holds_everything(wheel: Path) -> None:
         for path in (ROOT / name).rglob("*"):
             if path.is_file() and "__pycache__" not in path.parts:
                 assert path.relative_to(ROOT).as_posix() in files, path
-    assert {"certify/checker/FORMAT.md", "certify/checker/format/limits.md"} <= files
+    assert {"certify/checker/FORMAT.md", "certify/checker/format/ranges.md"} <= files
     assert {"certify/report/template.html", "certify/py.typed"} <= files
     assert {name.split("/")[0] for name in files if ".dist-info/" not in name} == {"certify", "controllers"}
 
@@ -108,7 +108,7 @@ def test_the_source_distribution_holds_what_a_wheel_needs_and_what_a_reader_want
     with tarfile.open(sdist) as archive:
         files = {name.partition("/")[2] for name in archive.getnames()}
     wanted = {"README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff", "pyproject.toml", "constraints.txt"}
-    wanted |= {"certify/checker/FORMAT.md", "certify/checker/format/limits.md"}
+    wanted |= {"certify/checker/FORMAT.md", "certify/checker/format/ranges.md"}
     assert wanted | {"certify/certificates/coq/theory/_CoqProject"} <= files
     assert not any(name.startswith(("tests/", "docs/", "examples/")) for name in files)
 

@@ -25,7 +25,7 @@ from certify.certificates import (
     write_beside,
 )
 from certify.certificates.claims import Claim, Problem
-from certify.errors import BackendError, InputError, SoundnessError
+from certify.errors import BackendError, SoundnessError
 from certify.provers.ball.contraction import contraction
 from certify.provers.boxes.mend import below_leaves, split_again
 from certify.provers.ranks import without_leaf
@@ -35,8 +35,8 @@ _BELOW_LEAVES, _LEVELS = 2, 5  # weaker certificates: below a refused leaf so lo
 _MOST_LEAVES = 1000  # that are split again
 _LONG = 1_000_000  # bytes of a certificate, from which on several processes check it
 _MOST_JOBS = 64
-_QUICK = 2**27  # operations of the reference, as docs/mathematics/limits.md counts: at most some five seconds
-_NEWEST = {b'"directions"': 2**31, b'"samples"': 2**34}  # the same of the newest rules: about a minute at most
+_QUICK, _LEAVES, _BYTES = 5, 200, 200_000  # seconds of the reference; where there is more to examine it needs longer
+_NEWEST, _MINUTE = (b'"directions"', b'"samples"'), 60  # certificates by the newest rules, and seconds for them
 _HIGHER = 1.5  # the next floor, after one that is refused
 
 
@@ -58,44 +58,35 @@ class Desk:
     Parameters
     ----------
     jobs : processes of the checker; by default one for each core where there is much to do, as with ranks.
-    remarks : takes what a person should know of the check.
     """
 
     jobs: int | None
     ranked: bool
-    remarks: list[str]
 
     def checked(self, path: Path) -> Mapping[str, Any]:
-        """The checker's answer about a file, patient if the file needs more work than the checker allows otherwise.
+        """The checker's answer about a file; where there are many leaves, several processes share them.
 
         Where the checker accepts and the reference is quick, the reference is asked too: the answer then has its own as
         `reference`, or is its refusal, and says so.
         """
-        answer = self._answered(path, patient=False)
-        if (answer.get("rule"), answer.get("at")) == ("limits", "operations"):
-            answer = self._answered(path, patient=True)
-            if answer["result"] != "REJECTED":
-                self.remarks.append("its check takes more than ten minutes: type `certify check --patient` for another")
-        elif answer["result"] == "ACCEPTED":
-            return self._twice(path, answer)
-        return answer
+        cores = len(os.sched_getaffinity(0)) if self.ranked or path.stat().st_size > _LONG else 1
+        answer = run_checker(path, jobs=self.jobs or min(cores, _MOST_JOBS), every=True)
+        return self._twice(path, answer) if answer["result"] == "ACCEPTED" else answer
 
     def _twice(self, path: Path, answer: Mapping[str, Any]) -> Mapping[str, Any]:
         """The checker's answer with the reference's, or that alone if it refuses; the checker's if it needs long.
 
         Of kinks on a ball and samples, the newest rules, the reference is asked although it may need a minute.
         """
-        raw = path.read_bytes()
-        quick = max([_QUICK, *(most for mark, most in _NEWEST.items() if mark in raw)])
-        second = run_checker(path, program="reference", operations=quick)
-        if (second.get("rule"), second.get("at")) == ("limits", "operations"):
+        raw, leaves = path.read_bytes(), sum(answer["rules"][rule] for rule in ("ring", "outer", "faces", "ranks"))
+        newest = any(mark in raw for mark in _NEWEST)
+        if not newest and (leaves > _LEAVES or len(raw) > _BYTES):
+            return answer
+        try:
+            second = run_checker(path, program="reference", seconds=_MINUTE if newest else _QUICK)
+        except TimeoutError:
             return answer
         return {**answer, "reference": second} if second["result"] == "ACCEPTED" else {**second, "by": "reference"}
-
-    def _answered(self, path: Path, patient: bool) -> Mapping[str, Any]:
-        """The checker's answer; where there are many leaves, several processes share them."""
-        cores = len(os.sched_getaffinity(0)) if self.ranked or path.stat().st_size > _LONG else 1
-        return run_checker(path, jobs=self.jobs or min(cores, _MOST_JOBS), patient=patient, every=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +114,6 @@ class Clerk:
 
         Raises
         ------
-        InputError : the checker takes none of this size.
         SoundnessError : the checker refuses what cannot be mended so.
         BackendError : the same, where a cluster had a part in it.
         """
@@ -140,11 +130,6 @@ class Clerk:
             elif (lower := _lowered(certificate, answer, problem, lowerings)) is not None and lowerings < _LOWERINGS:
                 lowerings += 1
                 certificate = lower
-            elif answer.get("rule") == "limits":
-                raise InputError(
-                    f"the checkers take no certificate of this size: {answer['detail']} (rule limits, {answer['at']}). "
-                    "Try a lower --level, a smaller policy, or fewer ranges and cells."
-                )
             else:
                 reproduces = write_beside(self.path, first.to_json().encode(), ".unchecked.json")
                 if self.cluster is not None:
@@ -323,9 +308,8 @@ def _local_only(refused: _Refused) -> Certificate | None:
 
 
 def _without_ranks(refused: _Refused) -> Certificate | None:
-    """The claim without boxes with ranks, if it is refused under their rules, as where the loop has no such angles, or
-    as too large."""
-    if refused.rule not in ("angles", "ranks", "limits"):
+    """The claim without boxes with ranks, if it is refused under their rules, as where the loop has no such angles."""
+    if refused.rule not in ("angles", "ranks"):
         return None
     return refused.with_claim(refused.claim.without_ranks(), ranks=None)
 

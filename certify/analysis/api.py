@@ -307,7 +307,7 @@ def _policy(
     else:
         raise InputError(
             "`policy` must be the path of a policy file, a Policy, a PolicyNetwork, a torch.nn.Module or a state_dict; "
-            f"found {kind_of(given)}."
+            f"found {kind_of(given)}. A gain K, u = -K x, is the state_dict {{'0.weight': -K}}."
         )
     for line in lines(imported):
         tell(line)

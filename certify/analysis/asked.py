@@ -53,9 +53,12 @@ def require_one_that_knows(system: System, options: RoaOptions) -> None:
     if system.in_steps:
         what = "a tube" if options.enlarges else "dReal's question"
         found = "its time is discrete" if system.time == "discrete" else "its input is held over a period"
+        instead = "ask for the set with the engine bounds, and --ranks for what leads into it"
+        if options.reach_from is not None:
+            instead = "name what is to be reached with --target: a region, or the certificate of a set (certify roa)"
         raise InputError(
             f"{what} must be about a plant in continuous time whose input follows the state at once; of {system.name} "
-            f"{found}. Ask for the set with the engine bounds, without a tube."
+            f"{found}. In steps {instead}."
         )
     if not system.ranges:
         return

@@ -32,7 +32,6 @@ class ComposeResult:
     outer, inner : the practical one, and the one that takes over.
     share : the largest V' on the floor of the first, by the level of the second; above 1 it does not take over.
     certificate, raw, checker : the file, its bytes, and the checker's answer about them; None where there is none.
-    remarks : what a person should know of the check.
     """
 
     verdict: Verdict
@@ -43,7 +42,6 @@ class ComposeResult:
     certificate: Path | None = None
     raw: bytes | None = field(default=None, repr=False)
     checker: Mapping[str, Any] | None = None
-    remarks: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON object."""
@@ -110,18 +108,18 @@ def compose(outer: Path | str, inner: Path | str, out: Path | str, jobs: int | N
             "near the origin"
         )
         return ComposeResult(Verdict.UNKNOWN, reason, one, other, most)
-    folder, remarks, data = Path(out), list[str](), joined(first, second)
+    folder, data = Path(out), joined(first, second)
     with sole_writer(folder):
         unchecked = write_beside(folder / "certificate.json", data, ".unchecked.json")
         try:
-            answer = Desk(jobs, False, remarks).checked(unchecked)
+            answer = Desk(jobs, False).checked(unchecked)
             if answer["result"] == "ACCEPTED":
                 if answer["certificate_sha256"] != hashlib.sha256(data).hexdigest():
                     raise SoundnessError(f"the checker's answer is about other bytes than were written: {answer}.")
                 unchecked.replace(folder / "certificate.json")
         finally:
             unchecked.unlink(missing_ok=True)
-    found = ComposeResult(Verdict.UNKNOWN, "", one, other, most, checker=answer, remarks=tuple(remarks))
+    found = ComposeResult(Verdict.UNKNOWN, "", one, other, most, checker=answer)
     return _ended(found, folder / "certificate.json", data)
 
 

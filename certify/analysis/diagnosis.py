@@ -21,7 +21,15 @@ from certify.analysis.facts import Diagnosis, Share, Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
 from certify.analysis.simulated import NEARLY_ALL
-from certify.analysis.suggested import beyond_the_ellipsoid, by_centring, by_clipping, by_learning, side
+from certify.analysis.suggested import (
+    beyond_the_ellipsoid,
+    by_centring,
+    by_clipping,
+    by_learning,
+    clipped_outside,
+    commands_too_much,
+    side,
+)
 from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT, UNLIMITED, WHOLE, Effort
 from certify.errors import InputError
@@ -44,6 +52,7 @@ _LONGER, _LOOK = 1.1, 2 * UNIT  # a tube's start relative to the proved set; ope
 _LITTLE = 25.0  # per cent of the volume that sampling allows, below which the bounds are to blame
 _BENT = 1.0  # bends of the hidden units, as a share of the linear part, that are worth flattening
 _TELLING = 1000  # boxes: a limit below it is what ended the search, and says nothing of the policy
+_FASTEST = 0.9  # of the slowest mode's decay: a V that falls so fast may still have a set
 _SAME, _BELOW = 1e-6, 0.99  # relative: rates that are as good as equal; a rate that is safely below another
 _FEW = 3  # states, for which a function beyond the ellipsoid is suggested
 _ALL = 0.995  # share of the box that has ranks: more effort gains little
@@ -177,6 +186,11 @@ def _next(
         return correction
     if (boxes := _boxes(result, options)) is not None:
         return boxes
+    if (amiss := commands_too_much(*asked)) is not None:
+        return Step((), amiss)
+    ended = result.stop in (Stop.INPUTS, Stop.BOXES, Stop.STALLED) or result.stop.ran_out
+    if ended and (outside := clipped_outside(*asked)) is not None:
+        return Step((), outside)
     weaker = result.claim in ("practical", "nearby")
     if weaker and (centred := by_centring(result, options, asked, effort)) is not None:
         return centred
@@ -383,17 +397,20 @@ def _shorter_period(result: RoaResult) -> Step | None:
 
 
 def _slower(result: RoaResult, options: RoaOptions) -> Step | None:
-    """A rate below the one at which V falls near the origin, if that is no faster than was asked for; else None."""
+    """A rate below the one at which V falls near the origin, or any V if none is given, if that is no faster than was
+    asked for; else None."""
     if not options.rate or result.P is None or result.levels.roa is not None or result.claim != "asymptotic":
         return None
     loop, P = ClosedLoop(result.system, result.network), result.P
-    D = increment_matrix(P, loop.mean_rate(), loop.step)
-    falls = -float(np.max(np.linalg.eigvals(np.linalg.solve(P, D)).real)) / 2
+    A, any_v = loop.mean_rate(), options.P is None and options.only is None
+    D = increment_matrix(P, A, loop.step)
+    falls = slowest_decay(A, loop.step) if any_v else -float(np.max(np.linalg.eigvals(np.linalg.solve(P, D)).real)) / 2
     if not 0 < falls <= (1 + _SAME) * options.rate:
         return None
     fastest = f"{number(falls, 4)} {TimingInWords.of(result.system).per_time}"
-    why = f"near the origin this V falls at the rate {fastest} at most, and equality is not enough"
-    return Step((("--rate", f"{_BELOW * falls:.3g}"),), why)
+    which, below = ("every", _FASTEST) if any_v else ("this", _BELOW)
+    why = f"near the origin {which} V falls at the rate {fastest} at most, and equality is not enough"
+    return Step((("--rate", f"{below * falls:.3g}"),), why)
 
 
 def _hurting(result: RoaResult, proof: Proof | None) -> list[tuple[str, float]]:

@@ -81,6 +81,7 @@ def plant_of(stored: Policy, system: System | str | None, changes: PlantChanges,
     ------
     InputError : there is no such plant, or the plant cannot have a change.
     """
+    from certify.analysis.suggested import clipped_outside, commands_too_much
     from certify.loop.plants import System
 
     plant, own = (system, False) if isinstance(system, System) else named_plant(stored, system)
@@ -88,6 +89,9 @@ def plant_of(stored: Policy, system: System | str | None, changes: PlantChanges,
     if not own:
         tell_of_other(stored, plant, tell)
     plant = where_valid(stored, plant, tell)
+    for notice in (commands_too_much(plant, stored.network), clipped_outside(plant, stored.network)):
+        if notice is not None:
+            tell(notice)
     if shift := stored.beta_shift(plant.exact_u_eq()):
         tell(f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}")
     return plant
@@ -271,7 +275,7 @@ def lines(imported: Imported) -> list[str]:
         said.append(f"valid    where no observation is clipped: {_box(found)}")
     said.append(
         "proved   is the folded policy: it differs from the file's real-number policy by the rounding of folded "
-        "numbers, half a unit in the last place of each at most"
+        "numbers, half a unit in the last place of each at most (of a clip's ends one, inwards)"
     )
     return said
 

@@ -28,6 +28,7 @@ WIDER = Fraction(3, 2)
 """Factor of the side of the domain that is tried."""
 _WORTH = 1.1  # growth of the simulated region that is worth a word
 _NEAR = 1e-3  # of the largest level in the domain: a run that comes so low has converged
+_ROUNDING = Fraction(2) ** -23  # of a number: where single precision rounds it
 _ENDED = ("effort", "boxes")  # limits of an outer set that more effort lifts
 _LOOK = 3 * UNIT  # operations for one look
 
@@ -82,6 +83,39 @@ def _rests(loop: ClosedLoop) -> bool:
     return True
 
 
+def commands_too_much(system: System, network: PolicyNetwork) -> str | None:
+    """Say which input is out of its bounds at the operating point already: likely the policy was read amiss."""
+    fits = (network.n, network.m) == (system.n, system.m)  # who asks for the loop says what does not
+    if not fits or not all(lo < 0 < hi for lo, hi in system.domain):  # or there is no operating point
+        return None
+    u = network(np.zeros((1, system.n)), system.exact_u_eq())[0]
+    for one, value, (lo, hi) in zip(system.inputs, u.tolist(), system.input_bounds, strict=True):
+        if not float(lo) <= value <= float(hi):
+            return (
+                f"at the operating point the policy commands {one.name} = {value:.6g}, outside of "
+                f"{float(lo):g}..{float(hi):g}: see what it reads and commands, of another program's file --states, "
+                "--observes, --normaliser, --action-scale and --squash, then the plant's bounds"
+            )
+    return None
+
+
+def clipped_outside(system: System, network: PolicyNetwork) -> str | None:
+    """Say which input is clipped beyond its bound by a rounding, as float32's 0.4 is beyond 2/5, and how to mend it."""
+    for one, bounds, *clip in zip(system.inputs, system.input_bounds, *(network.clip or ((), ())), strict=False):
+        for sign, end, bound in zip((-1, 1), clip, bounds, strict=True):
+            if 0 < sign * (Fraction(float(end)) - bound) <= _ROUNDING * abs(bound):
+                return (
+                    f"{one.name} is clipped at {float(end):.17g}, by a rounding beyond its bound {float(bound):g}, so "
+                    f"that nothing can be proved where it saturates there: clip it at {_bounds(system)} (--clip, where "
+                    "the file of another program is read), or widen the bound a little"
+                )
+    return None
+
+
+def _bounds(system: System) -> str:
+    return ",".join(f"{float(least):g}..{float(most):g}" for least, most in system.input_bounds)
+
+
 def by_clipping(result: RoaResult, asked: tuple[System, PolicyNetwork], effort: Effort) -> Step | None:
     """The step of a policy that asks for more than the actuator gives, where one that is clipped at the input bounds
     converges from as many states in simulation."""
@@ -98,9 +132,9 @@ def by_clipping(result: RoaResult, asked: tuple[System, PolicyNetwork], effort: 
     here = _converging(result)
     if there is None or here is None or there < here:
         return None
-    ends = ",".join(f"{float(least):g}..{float(most):g}" for least, most in system.input_bounds)
     why = (
-        f"the policy asks for more than the actuator gives; if the actuator saturates there, clip the policy at {ends}"
+        "the policy asks for more than the actuator gives; if the actuator saturates there, clip the policy at "
+        f"{_bounds(system)}"
     )
     return Step((), f"{why} (--clip, where the file of another program is read), and the larger set can be tried")
 

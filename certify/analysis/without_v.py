@@ -109,12 +109,12 @@ class Tools:
     def notice(self, system: System) -> str | None:
         """The notice about a run for a plant."""
         rests = [] if system.measurements is None and system.samples is None else [AS_THEY_STAND]
-        return "; ".join([*rests, *self.remarks]) or None
+        return "; ".join(dict.fromkeys([*rests, *self.remarks])) or None
 
     def clerk(self, path: Path, jobs: int | None, many: bool, cluster: str | None = None) -> Clerk:
         """Somebody who writes certificates and has them checked; by several processes where leaves are `many`."""
-        desk = Desk(jobs, many, self.remarks)
-        return Clerk(path, self.timing, lambda: self.tell("check"), lambda _: None, desk.checked, cluster)
+        checked = Desk(jobs, many).checked
+        return Clerk(path, self.timing, lambda: self.tell("check"), lambda _: None, checked, cluster)
 
 
 def accepted(
@@ -125,7 +125,6 @@ def accepted(
 
     Raises
     ------
-    InputError : the checker takes none of this size.
     SoundnessError : the checker refuses what cannot be mended.
     BackendError : the same, where a cluster had a part in it.
     """
@@ -137,8 +136,6 @@ def accepted(
         if other is None:
             break
         certificate = other
-    if answer.get("rule") == "limits":
-        raise InputError(f"the checkers take no certificate of this size: {answer['detail']}. Try a smaller --effort.")
     if clerk.cluster is not None:
         raise BackendError(
             f"the checker rejects what was proved with the workers of {clerk.cluster}, who may be at fault: {answer}. "

@@ -7,6 +7,7 @@ under `-I`, so that neither the current folder nor the environment supplies a mo
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -22,7 +23,9 @@ name, folder = sys.argv[1:3]
 spec = importlib.util.spec_from_file_location(name, folder + "/__init__.py", submodule_search_locations=[folder])
 sys.modules[name] = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(sys.modules[name])
-sys.exit(importlib.import_module(name + ".__main__").main(sys.argv[3:]))
+program = importlib.import_module(name + ".__main__")
+program.bound_memory()
+sys.exit(program.main(sys.argv[3:]))
 """
 
 
@@ -36,9 +39,8 @@ def ask(
     path: Path,
     program: Program = "checker",
     jobs: int = 1,
-    patient: bool = False,
-    operations: int | None = None,
     every: bool = False,
+    seconds: int | None = None,
 ) -> tuple[int, dict[str, Any]]:
     """Run a checker on a file in a separate process; return its exit status and its JSON answer.
 
@@ -47,20 +49,21 @@ def ask(
     path : the certificate.
     program : the checker or the reference.
     jobs : number of processes that examine the leaves.
-    patient : True to accept a file that needs hours, which its rule `limits` refuses otherwise.
-    operations : the most that rule `limits` of the reference allows; None for its own limit.
     every : True if the checker's refusal of leaves should have their places, as `every`: under rule `ring` of all.
+    seconds : of processor time, after which the reference ends without a verdict; None if it may take any time.
 
     Raises
     ------
+    TimeoutError : it ended so.
     BackendError : it printed no JSON object, or its status is not the answer's.
     """
     options = [] if jobs == 1 else ["--jobs", str(jobs)]
-    options += ["--patient"] if patient else []
     options += ["--every"] if every else []
-    options += [] if operations is None else ["--operations", str(operations)]
+    options += [] if seconds is None else ["--seconds", str(seconds)]
     line = command(program, ["--json", *options, "--", str(path)])
     done = subprocess.run(line, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
+    if seconds is not None and done.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+        raise TimeoutError(f"the {program} had no verdict after {seconds} s.")
     try:
         answer = dict(json.loads(done.stdout))
     except (ValueError, TypeError) as error:
@@ -75,18 +78,17 @@ def run_checker(
     path: Path,
     program: Program = "checker",
     jobs: int = 1,
-    patient: bool = False,
-    operations: int | None = None,
     every: bool = False,
+    seconds: int | None = None,
 ) -> dict[str, Any]:
-    """The JSON answer of a checker that reached a verdict, with `patient` if it was asked so; the parameters are those
-    of `ask`.
+    """The JSON answer of a checker that reached a verdict; the parameters are those of `ask`.
 
     Raises
     ------
+    TimeoutError : it ended without one after `seconds`.
     BackendError : it ended with neither ACCEPTED, nor TRUSTED, nor REJECTED.
     """
-    status, answer = ask(path, program, jobs, patient, operations, every)
+    status, answer = ask(path, program, jobs, every, seconds)
     if "error" in answer:
         raise BackendError(f"the {program} ended with status {status} and no verdict: {answer['error']}")
-    return answer | ({"patient": True} if patient else {})
+    return answer

@@ -1,6 +1,6 @@
 """The limits of the certificate format; a plant or policy beyond them is rejected before any work is done.
 
-The checkers have the same limits, so that no file can exhaust their time or memory; a test compares the numbers.
+The checkers have the same limits of sizes; a test compares the numbers.
 """
 
 from __future__ import annotations

@@ -196,20 +196,19 @@ class ProvedSet(Region):
         return [[Fraction(v) - q for v, q in zip(x, at, strict=True)] for x in states]
 
 
-def proved_set(path: Path, patient: bool = False) -> ProvedSet:
-    """The set of a certificate that the checker accepts; `patient` takes one whose check may need hours.
+def proved_set(path: Path) -> ProvedSet:
+    """The set of a certificate that the checker accepts.
 
     Raises
     ------
     InputError : the checker does not accept it.
     CertificateFormatError : the file cannot be read.
     """
-    return set_of(accepted_bytes(path, patient), str(path))
+    return set_of(accepted_bytes(path), str(path))
 
 
-def accepted_bytes(path: Path, patient: bool = False) -> bytes:
-    """The bytes of a certificate, after a check of exactly them, as `certify check` does it; `patient` takes one whose
-    check may need hours.
+def accepted_bytes(path: Path) -> bytes:
+    """The bytes of a certificate, after a check of exactly them, as `certify check` does it.
 
     Raises
     ------
@@ -220,7 +219,7 @@ def accepted_bytes(path: Path, patient: bool = False) -> bytes:
     with tempfile.TemporaryDirectory() as folder:  # whatever happens to the path meanwhile
         private = Path(folder) / "certificate.json"
         private.write_bytes(raw)
-        answer = run_checker(private, patient=patient)
+        answer = run_checker(private)
     if answer["result"] != "ACCEPTED":
         old = version_in(raw)
         why = f" rule={answer['rule']} at={answer['at']}: {answer['detail']}" if "rule" in answer else ""

@@ -1,4 +1,4 @@
-"""`python -I -m certify.checker FILE [--json] [--jobs N] [--patient] [--every]`: check one certificate.
+"""`python -I -m certify.checker FILE [--json] [--jobs N] [--every]`: check one certificate.
 
 Exit status: 0 accepted, 1 rejected, 2 usage or unreadable file, 3 trusted (the evidence is a solver's answer, which
 cannot be checked; all else was), 70 internal error.
@@ -11,11 +11,13 @@ import json
 import os
 import sys
 import time
+from contextlib import suppress
 from typing import Any
 
 from .errors import Rejected, Unreadable
 
 _MOST_JOBS = 2**8
+_MEMORY = 2**32  # bytes that a process may have
 
 
 def main(arguments: list[str]) -> int:
@@ -24,7 +26,6 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("file", metavar="FILE", help="the certificate to check")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--jobs", metavar="N", type=_jobs, default=1, help="examine the leaves in N processes")
-    parser.add_argument("--patient", action="store_true", help="take a file that may need hours")
     parser.add_argument("--every", action="store_true", help="name each leaf that rule ring refuses (with --json)")
     try:
         options = parser.parse_args(arguments)
@@ -33,12 +34,14 @@ def main(arguments: list[str]) -> int:
     # Threads of several processes would wait for each other. numpy reads this when it is first imported: below.
     os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     try:
-        status, answer = _examine(options.file, options.jobs, options.patient, options.every)
+        status, answer = _examine(options.file, options.jobs, options.every)
     except Rejected as no:
         status, answer = 1, {"result": "REJECTED", "rule": no.rule, "at": no.at, "detail": no.detail, "text": [str(no)]}
         answer |= {"every": no.every} if no.every else {}
     except Unreadable as error:
         status, answer = 2, {"error": str(error), "text": []}
+    except MemoryError:
+        status, answer = 70, {"error": "the check needs more memory than there is", "text": []}
     except Exception as error:
         status, answer = 70, {"error": f"internal error of the checker: {type(error).__name__}: {error}", "text": []}
     lines = [json.dumps(answer)] if options.json else answer["text"]
@@ -58,7 +61,7 @@ def _jobs(text: str) -> int:
     return jobs
 
 
-def _examine(path: str, jobs: int, patient: bool, every: bool) -> tuple[int, dict[str, Any]]:
+def _examine(path: str, jobs: int, every: bool) -> tuple[int, dict[str, Any]]:
     """Status and answer of a certificate that no rule rejects."""
     from . import document, words
 
@@ -67,7 +70,7 @@ def _examine(path: str, jobs: int, patient: bool, every: bool) -> tuple[int, dic
     from . import rules  # after parsing: a malformed file needs no tables
 
     ready = time.perf_counter()
-    tally = rules.check(c, jobs, patient, every)
+    tally = rules.check(c, jobs, every)
     seconds = {"start": ready - start, "check": time.perf_counter() - ready}
     answer: dict[str, Any] = {"certificate_sha256": c.sha256, "policy_sha256": c.policy.sha256(), "claim": c.claim}
     sample = None if c.sample is None else [str(h) for h in c.sample]
@@ -90,5 +93,14 @@ def _modules() -> list[str]:
     return sorted(name.rpartition(".")[2] for name in sys.modules if name.startswith(f"{__package__}."))
 
 
+def bound_memory() -> None:
+    """Keep this process from filling the machine: a small file may ask for much. Some systems have no such limit."""
+    with suppress(ImportError, OSError, ValueError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, resource.getrlimit(resource.RLIMIT_AS)[1]))
+
+
 if __name__ == "__main__":
+    bound_memory()
     sys.exit(main(sys.argv[1:]))

@@ -23,7 +23,6 @@ from .taylor import Taylor, affine, combination, constants, pairs, upper_bound
 
 LEAF = 255
 MAX_DEPTH = 4096
-MORE = 16  # times as many numbers at once are those of constraints and of a target, of which most files have few
 
 
 Batch = tuple[int, Array, Array]  # the number of the first leaf, and their corners (n, B)

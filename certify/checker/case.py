@@ -29,7 +29,6 @@ class Case:
 
     c: Certificate
     jobs: int = 1  # processes that examine the leaves
-    patient: bool = False  # True if the check may take hours
 
     @property
     def partition(self) -> Partition:

@@ -168,7 +168,7 @@ class Certificate:
         return self.claim in WITHOUT_V
 
     @property
-    def stated(self) -> int:
+    def comparisons(self) -> int:
         """The number of operations of constraints and of the target."""
         return sum(tape.size for tape in (self.keep, self.target) if tape is not None)
 

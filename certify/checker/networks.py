@@ -39,11 +39,6 @@ class Step:
         return ()
 
     @property
-    def units(self) -> int:
-        """Entries that add something to their tangents on a ball, at most."""
-        return self.size
-
-    @property
     def kind(self) -> str:
         """The word for it in the file, and the name of an algebra's method."""
         return type(self).__name__.lower()
@@ -62,7 +57,6 @@ class Step:
 class Affine(Step):
     """`W h + b`."""
 
-    units = 0
     weight: Array
     bias: Array
 
@@ -111,27 +105,6 @@ class Network:
     def operations(self) -> int:
         """Operations of all expressions of `observe`."""
         return sum(len(step.tape.operations) for step in self.steps if hasattr(step, "tape"))
-
-    @cached_property
-    def shapes(self) -> list[tuple[int, int, int]]:
-        """For rule `limits`, steps with their rows, columns, and the units before them.
-
-        A step that is not `affine` has its entries as rows, the vectors that it reads as columns. A `map` of what an
-        `affine` step has just made is part of that.
-        """
-        found, before, last = list[tuple[int, int, int]](), 0, None
-        for k, step in enumerate(self.steps):
-            if isinstance(step, Affine):
-                found.append((*step.weight.shape, before))
-            elif not (isinstance(step, Map) and isinstance(last, Affine) and step.of == (k,)):
-                found.append((step.size, len(step.of), before))
-            before, last = before + step.units, step
-        return found
-
-    @property
-    def kept(self) -> int:
-        """The entries of vectors that a step reads which is not the next."""
-        return sum(self.sizes[i] for i in {i for k, step in enumerate(self.steps) for i in step.of if i < k})
 
     @property
     def is_chain(self) -> bool:

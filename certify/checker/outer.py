@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from flint import fmpq, fmpq_mat
 
-from .boxes import LEAF, MORE, Batch, Boxes, Leaves, batches, in_order, is_whole, keeps_inputs, middle
+from .boxes import LEAF, Batch, Boxes, Leaves, batches, in_order, is_whole, keeps_inputs, middle
 from .calls import entries
 from .case import Case, Failures, given, only_where
 from .exact import exactly, inverse, quotient
@@ -235,7 +235,7 @@ class Beyond(Boxes):
 
     def leaves(self) -> Iterator[Batch]:
         """The tree's leaves in batches."""
-        values = max(self.function.values, self.c.dynamics.size, self.c.stated // MORE)
+        values = max(self.function.values, self.c.dynamics.size) + self.c.comparisons
         size = _batch(max(self.symbols**2 * values, (self.symbols + 4) * self.width))
         return batches(self.outer.tree, -self.outer.root, self.outer.root, size)
 

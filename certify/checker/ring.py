@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from flint import fmpq
 
-from .boxes import MORE, Batch, Boxes, Leaves, batches, is_whole, middle
+from .boxes import Batch, Boxes, Leaves, batches, is_whole, middle
 from .case import Case, Failures
 from .exact import fraction, quotient, root_above
 from .near import Array, near
@@ -48,7 +48,7 @@ class Moving(Boxes):
     @property
     def batch(self) -> int:
         """The number of leaves per batch."""
-        values = max(self.c.dynamics.size * (self.order + 1), self.c.stated // MORE)
+        values = self.c.dynamics.size * (self.order + 1) + self.c.comparisons
         numbers = max(self.width * (self.symbols + 4), self.symbols * self.symbols * (values + 4))
         return int(max(1, min(4096, _BATCH_NUMBERS // numbers)))
 

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from . import ball, boxes, limits, local, ring
+from . import ball, boxes, local, ring
 from .boxes import in_order
 from .case import Case, Failures, only_where
 from .document import Certificate, Partition
@@ -91,8 +91,8 @@ def centring(case: Case) -> Failures:
     if policy.centre == "preactivation" and not all(-1 < q < 1 for q in reaches(policy, u_eq)):
         yield "policy.offset", "u_eq must lie strictly inside offset +- scale"
     if policy.centre != "none" and policy.clip:
-        limits = zip(*(end.tolist() for end in policy.clip), u_eq, strict=True)
-        if not all(Fraction(lo) < u < Fraction(hi) for lo, hi, u in limits):
+        ends = zip(*(end.tolist() for end in policy.clip), u_eq, strict=True)
+        if not all(Fraction(lo) < u < Fraction(hi) for lo, hi, u in ends):
             yield "policy.clip", "u_eq must lie strictly inside the clip"
     if policy.centre == "none" and not (case.c.practical or case.c.without_V):
         try:
@@ -107,10 +107,9 @@ def centring(case: Case) -> Failures:
 Subject = TypeVar("Subject")
 Table = Sequence[tuple[str, Callable[[Subject], Failures]]]
 
-STATED: Table[Case] = (
-    ("limits", limits.is_bearable),
-    *((rule.__name__, rule) for rule in (levels, lyapunov, equilibrium, domain, coordinates, root, centring)),
-)
+STATED: Table[Case] = [
+    (rule.__name__, rule) for rule in (levels, lyapunov, equilibrium, domain, coordinates, root, centring)
+]
 ON_THE_BALL: Table[local.Local] = (
     ("local", local.fits),
     ("inputs", ball.keeps_inputs),
@@ -194,13 +193,13 @@ class Tally:
         return least if least < np.inf else None
 
 
-def check(c: Certificate, jobs: int = 1, patient: bool = False, every: bool = False) -> Tally:
+def check(c: Certificate, jobs: int = 1, every: bool = False) -> Tally:
     """Check every rule, those for leaves in so many processes; returns the tally, raises `Rejected` at the first rule
     that fails.
 
     Where evidence cannot be replayed, only the rules about what is stated are checked, and the caller must not say
-    ACCEPTED; the tally then has no leaves. Rule `limits` takes files that need hours if the caller is `patient`.
-    If `every` leaf that fails is wanted, a refusal names them: all under rule `ring`, else the first of each batch.
+    ACCEPTED; the tally then has no leaves. If `every` leaf that fails is wanted, a refusal names them: all under rule
+    `ring`, else the first of each batch.
     """
     self_test()
     np.empty(_KEPT)  # given back at once: an allocator that adapts then keeps arrays, and need not ask for each anew
@@ -208,7 +207,7 @@ def check(c: Certificate, jobs: int = 1, patient: bool = False, every: bool = Fa
     spared = {"equilibrium": c.practical, "coordinates": not replayed, "root": not replayed}
     spared |= dict.fromkeys(("levels", "lyapunov", "equilibrium", "domain"), True) if c.without_V else {}
     with np.errstate(all="ignore"):  # overflow becomes infinity or NaN, and every test then fails
-        tally, case = Tally(every=every), Case(c, jobs, patient)
+        tally, case = Tally(every=every), Case(c, jobs)
         tally.hold([(name, rule) for name, rule in STATED if not spared.get(name)], case)
         for module, needs in OTHERS:
             if needs(c):
@@ -216,7 +215,7 @@ def check(c: Certificate, jobs: int = 1, patient: bool = False, every: bool = Fa
                 examine(tally, case)
     if c.then is not None:
         try:
-            tally.then = check(c.then, jobs, patient)
+            tally.then = check(c.then, jobs)
         except Rejected as no:
             raise Rejected(no.rule, f"then.{no.at}", no.detail) from None
     return tally

@@ -45,13 +45,9 @@ class Clip(Step):
 class Sum(Step):
     """The sum of vectors, from left to right."""
 
-    units = 0
-
 
 class Concat(Step):
     """Vectors one behind the other."""
-
-    units = 0
 
 
 class Product(Step):

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from certify.cli.checked import checked
-from certify.cli.shared import Json, Patient
+from certify.cli.shared import Json
 
 
 def check(
@@ -20,8 +20,7 @@ def check(
         bool, typer.Option("--reference", help="Use the second checker (fractions, Arb balls): slower, shares no code.")
     ] = False,
     jobs: Annotated[int, typer.Option(min=1, max=256, help="Processes that examine the leaves.")] = 1,
-    patient: Patient = False,
     as_json: Json = False,
 ) -> None:
     """Check a certificate with the independent checker, in a process of its own."""
-    raise typer.Exit(checked(certificate, policy, reference, jobs, patient, as_json))
+    raise typer.Exit(checked(certificate, policy, reference, jobs, as_json))

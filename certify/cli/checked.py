@@ -14,7 +14,6 @@ def checked(
     policy: Path | None = None,
     reference: bool = False,
     jobs: int = 1,
-    patient: bool = False,
     as_json: bool = False,
 ) -> int:
     """Check a certificate, print the answer, and return the exit status; the parameters are the command's."""
@@ -25,7 +24,7 @@ def checked(
         from certify.loop.policies import load_policy
 
         wanted = load_policy(policy).network.sha256()
-    status, answer = ask(certificate, "reference" if reference else "checker", jobs, patient)
+    status, answer = ask(certificate, "reference" if reference else "checker", jobs)
     lines = answer.pop("text", [])
     if wanted is not None and "policy_sha256" in answer and answer["policy_sha256"] != wanted:
         detail = f"the certificate is about policy {answer['policy_sha256']}, not about {policy} ({wanted})"

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from certify.cli.shared import Json, Quiet, noting, page_of, write
+from certify.cli.shared import Json, page_of, write
 from certify.cli.terminal import say
 
 
@@ -21,15 +21,12 @@ def compose(
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the results.")] = Path("out/composed"),
     jobs: Annotated[int | None, typer.Option(min=1, max=64, help="Processes of the checker.")] = None,
     as_json: Json = False,
-    quiet: Quiet = False,
 ) -> None:
     """Join two certificates: where a practical claim ends, another about the same loop takes over."""
     from certify.analysis.composing import compose as composed
     from certify.report.handover import summary_lines
 
     result = composed(outer, inner, out, jobs)
-    for remark in result.remarks:
-        noting(quiet)(remark)
     data = result.to_dict()
     if result.certificate is not None and result.raw is not None:
         write(out / "report.html", page_of(result.raw, result.certificate, dict(result.checker or {}), None))

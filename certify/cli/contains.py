@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from certify.analysis.arguments import region
-from certify.cli.shared import Json, Patient
+from certify.cli.shared import Json
 from certify.cli.terminal import say
 
 if TYPE_CHECKING:
@@ -29,7 +29,6 @@ def contains(
     deviations: Annotated[
         bool, typer.Option("--deviations", help="Read the numbers as deviations from the operating point.")
     ] = False,
-    patient: Patient = False,
     as_json: Json = False,
 ) -> None:
     """Check a certificate and decide exactly whether a state, or every state of a box, lies in the proved set."""
@@ -39,7 +38,7 @@ def contains(
     from certify.certificates.ranked import steps_from
     from certify.loop.plants.constraints import in_words
 
-    proved = proved_set(certificate, patient)
+    proved = proved_set(certificate)
     box = region(" ".join(states), proved.system, "STATES", deviations)
     found = proved.locate(box)
     data = {

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from certify.cli.shared import Json, Patient
+from certify.cli.shared import Json
 from certify.cli.terminal import say
 
 
@@ -22,7 +22,6 @@ def plot(
             help="Two states to draw against each other, as in x,x_dot; repeatable; default: chosen by the equations."
         ),
     ] = None,
-    patient: Patient = False,
     as_json: Json = False,
 ) -> None:
     """Check a certificate and draw its set for a paper."""
@@ -36,7 +35,7 @@ def plot(
     with tempfile.TemporaryDirectory() as folder:  # the bytes drawn are the bytes checked, whatever happens to the path
         private = Path(folder) / "certificate.json"
         private.write_bytes(raw)
-        answer = run_checker(private, patient=patient)
+        answer = run_checker(private)
     accepted = answer["result"] == "ACCEPTED"
     write_atomically(out, paper_figure(parse_any(raw, str(certificate)), accepted, options))
     stated = {"figure": str(out), "result": answer["result"]}

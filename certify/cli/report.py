@@ -8,14 +8,13 @@ from typing import Annotated
 
 import typer
 
-from certify.cli.shared import Json, Patient, page_of, write
+from certify.cli.shared import Json, page_of, write
 from certify.cli.terminal import say
 
 
 def report(
     certificate: Annotated[Path, typer.Argument(help="Certificate file.")],
     out: Annotated[Path | None, typer.Option(help="HTML file; default: report.html beside the certificate.")] = None,
-    patient: Patient = False,
     as_json: Json = False,
 ) -> None:
     """Check a certificate and draw its report."""
@@ -28,7 +27,7 @@ def report(
     with tempfile.TemporaryDirectory() as folder:  # the bytes drawn are the bytes checked, whatever happens to the path
         private = Path(folder) / "certificate.json"
         private.write_bytes(raw)
-        answer = run_checker(private, patient=patient)
+        answer = run_checker(private)
     write(target, page_of(raw, certificate, answer, None))
     stated = {"report": str(target), "result": answer["result"]}
     say(json.dumps(stated) if as_json else f"{answer['result']}  {target}")

@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from certify.loop.plants import Measurements, System
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.", rich_help_panel=FIRST)]
-Patient = Annotated[
-    bool, typer.Option("--patient", help="Accept a certificate whose check may take hours; by default it is refused.")
-]
 PolicyFile = Annotated[
     Path | None,
     typer.Option("--policy", metavar="FILE", help="The policy file, as the argument FILE.", rich_help_panel=LOOP),

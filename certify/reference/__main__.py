@@ -1,4 +1,4 @@
-"""The command line: `python -I -m certify.reference FILE [--json] [--jobs N] [--patient] [--operations N]`.
+"""The command line: `python -I -m certify.reference FILE [--json] [--jobs N] [--seconds N]`.
 
 The claim in words and the verdict. Exit status 0 accepted, 1 rejected, 2 usage or an unreadable file, 3 trusted,
 70 an error of this program.
@@ -21,11 +21,11 @@ from flint import arb, fmpq
 
 from .document import MAX_BYTES, Certificate, Data
 from .evidence import INVARIANT, REMAINS, WITHOUT_V, Tree
-from .limits import MAX_IN_PATIENCE
 from .rules import Verdict, judge
 
 STATUS = {"ACCEPTED": 0, "REJECTED": 1, "TRUSTED": 3}
 UNUSABLE, INTERNAL, MAX_JOBS = 2, 70, 256
+MOST_BYTES = 2**32
 
 
 def read_once(path: str) -> bytes:
@@ -348,11 +348,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("file", metavar="FILE")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="examine the leaves in N processes")
-    parser.add_argument("--patient", action="store_true", help="take files that may keep this program for hours")
-    parser.add_argument("--operations", type=int, metavar="N", help="reject files that ask for more")
+    parser.add_argument("--seconds", type=int, metavar="N", help="end without a verdict after so long on the processor")
     options = parser.parse_args(given)
     if not 1 <= options.jobs <= MAX_JOBS:
         parser.error(f"argument --jobs: 1 to {MAX_JOBS} processes are allowed")
+
+    if options.seconds is not None:
+        from resource import RLIMIT_CPU, setrlimit
+
+        setrlimit(RLIMIT_CPU, (options.seconds, options.seconds + 1))
 
     def failed(message: str, status: int) -> int:
         if options.json:
@@ -367,7 +371,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (OSError, ValueError) as error:
         return failed(f"{options.file} cannot be read: {getattr(error, 'strerror', None) or error}", UNUSABLE)
     try:
-        verdict = judge(raw, MAX_IN_PATIENCE if options.patient else options.operations, options.jobs)
+        verdict = judge(raw, options.jobs)
+    except MemoryError:
+        return failed("this needs more memory than there is", INTERNAL)
     except Exception as error:  # whatever it is, it must not look like a verdict
         return failed(f"internal error of the reference: {type(error).__name__}: {error}", INTERNAL)
     seconds = time.perf_counter() - start
@@ -380,5 +386,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return STATUS[verdict.result]
 
 
+def bound_memory() -> None:
+    """A few kilobytes may describe a loop that fills all memory; a system without this limit is left as it is."""
+    try:
+        from resource import RLIMIT_AS, getrlimit, setrlimit
+
+        setrlimit(RLIMIT_AS, (MOST_BYTES, getrlimit(RLIMIT_AS)[1]))
+    except (ImportError, OSError, ValueError):
+        return
+
+
 if __name__ == "__main__":
+    bound_memory()
     sys.exit(main())

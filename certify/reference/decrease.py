@@ -27,7 +27,6 @@ from .balls import ONE, ZERO, certainly_definite, columns_scaled, finite, identi
 from .evidence import Ball, Path
 from .fields import exact
 from .kinks import Cone, multiplier
-from .limits import AT_CORNERS
 from .loop import Field
 from .model import Model
 from .rational import positive_definite
@@ -35,6 +34,7 @@ from .refusal import require
 from .symmetric import orders, pairs, places
 from .tangents import Units
 
+AT_CORNERS = 6  # uncertain quantities whose corners are all asked
 MAX_CORNERS = 2**16  # of one cell
 NO_STEP = fmpq(0)
 

@@ -42,10 +42,6 @@ class Expansion:
         return replace(self, at=(*self.at[:2], ZERO, ZERO), moved=(*self.moved[:2], ZERO, ZERO), cut=False)
 
     @cached_property
-    def steepest(self) -> arb:
-        return abs(self.at[1]) + self.moved[1]
-
-    @cached_property
     def bent(self) -> arb:
         return abs(self.at[2]) + self.moved[2]
 

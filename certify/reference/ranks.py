@@ -22,11 +22,13 @@ from .evidence import REMAINS, Ranked, Ranking, Tree
 from .keep import kept
 from .leaves import LEAF, Box, cut, structure
 from .motion import Motion, Stage
+from .rational import bits
 from .refusal import Refused, require, under
 from .taylor import Taylor, constant
 
 RULE, UNRANKED = "ranks", 65_535
 MAX_MET = 2**14  # nodes of the tree that one image meets
+MAX_FRAME_BITS = 2**14  # of its longest number, times its rows
 Rows = list[list[arb]]  # for each state the constant, the coefficients of the leaf's symbols, and those of errors
 Range = tuple[float, float]
 
@@ -157,7 +159,8 @@ class Walk(Motion):
         self.domain = [(arb(lo), arb(hi)) for lo, hi in c.plant.domain]
         one = fmpq_mat([[int(i == k) for k in range(c.n)] for i in range(c.n)])
         exact = one if ranking.frame is None else ranking.frame
-        require(exact.det() != 0, RULE, "frame", "the matrix has no inverse")
+        short = exact.nrows() * bits(exact) <= MAX_FRAME_BITS
+        require(short and exact.det() != 0, RULE, "frame", "the matrix has no inverse, or one that takes minutes")
         self.frame, self.back = (arb_mat(M).tolist() for M in (exact, exact.inv()))
 
     def start(self, box: Box) -> Rows:

@@ -16,7 +16,6 @@ from .evidence import WITH_TUBE, Covering, Ranked, Tree, Trusted
 from .handover import handover
 from .invariant import invariant
 from .leaves import Leaves, check_leaves, structure
-from .limits import limits
 from .local import local
 from .loop import Loop
 from .outer import outer
@@ -40,16 +39,12 @@ class Verdict:
     leaves: int | None = None
 
 
-def judge(raw: bytes, operations: int | None = None, jobs: int = 1) -> Verdict:
-    """The verdict on a file that asks for no more operations; so many processes examine its leaves.
-
-    Its hash is taken over the very bytes that are judged.
-    """
+def judge(raw: bytes, jobs: int = 1) -> Verdict:
+    """The verdict on a file; so many processes examine its leaves. Its hash is taken over the very bytes."""
     sha256, c, leaves = hashlib.sha256(raw).hexdigest(), None, None
     try:
         with ctx.workprec(PRECISION):
             c = read(raw)
-            limits(c, operations)
             leaves = check(c, jobs)
             if c.then is not None:
                 check_after(c.then, jobs)

@@ -35,12 +35,13 @@ _NO_GAIN = ": its own gain does not do the same"
 def symbol(name: str) -> str:
     """A name as a symbol: Greek letters, subscripts, a dot for `_dot`.
 
-    >>> symbol("theta"), symbol("x1"), symbol("speed"), symbol("residual_x_dot")
-    ('θ', 'x₁', 'speed', 'residual_x_dot')
+    >>> symbol("theta"), symbol("x1"), symbol("speed"), symbol("residual_x_dot"), symbol("th_dot")
+    ('θ', 'x₁', 'speed', 'residual_x_dot', 'th_dot')
     """
     if name.endswith("_dot") and len(name) > len("_dot"):
         base = symbol(name.removesuffix("_dot"))
-        return base[:1] + _DOT + base[1:] if "_" not in base else name  # residual_theta_dot is no rate
+        several = any(c.isalpha() or c == "_" for c in base[1:])  # residual_theta_dot is no rate
+        return name if several else base[:1] + _DOT + base[1:]
     match = re.fullmatch(r"([A-Za-z]+?)_?(\d*)", name)
     if match is None:
         return name

@@ -125,6 +125,18 @@ def test_an_unstable_loop_needs_another_policy(
     assert result.diagnosis.next.why.startswith("another policy") and said in result.diagnosis.next.why
 
 
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+def test_a_clip_that_a_rounding_puts_out_of_bounds_is_named(tmp_path: Path, precision: Any) -> None:
+    """The policy saturates at 0.4, in both precisions above 2/5; clipped inside, the whole domain is proved."""
+    (system, network), quick = chain(1, [-1.0]), RoaOptions(effort=0.01, candidate="lyapunov")
+    bounded = replace(system, input_bounds=((Fraction(-2, 5), Fraction(2, 5)),))
+    most = np.array([float(precision(0.4))])
+    result = certify_roa(bounded, replace(network, clip=(-most, most)), tmp_path, quick)
+    assert result.diagnosis is not None and result.diagnosis.next.why.startswith("u is clipped at -0.4")
+    inside = np.nextafter([0.4], 0)
+    assert certify_roa(bounded, replace(network, clip=(-inside, inside)), tmp_path, quick).stop is Stop.DOMAIN
+
+
 @pytest.mark.parametrize("claim", ["asymptotic", "practical"])
 def test_a_period_that_is_too_long_is_to_be_shorter(tmp_path: Path, claim: Literal["asymptotic", "practical"]) -> None:
     """x' = u with u = -x held over 5 s: a step multiplies by 1 - h, which is -1/4 at a quarter and -3/2 at a half."""
@@ -152,3 +164,17 @@ def test_a_level_that_is_refuted_is_to_be_left_out(pendulum_result: RoaResult, t
     refuted = certify_roa(pendulum_result.system, pendulum_result.network, tmp_path, options)
     assert refuted.verdict is Verdict.REFUTED and refuted.diagnosis is not None
     assert refuted.diagnosis.next.why.startswith("leave --level out")
+
+
+def test_a_policy_that_is_out_of_bounds_at_rest_is_to_be_read_again(tmp_path: Path) -> None:
+    """Not to be shifted by 50, though that centres it: its observations or its action's scale were misread."""
+    system, network = chain(1, [-1.0])
+    bounded = replace(system, input_bounds=((Fraction(-1), Fraction(1)),))
+    result = certify_roa(bounded, network.with_layers(biases=(np.array([50.0]),)), tmp_path, RoaOptions(effort=0.01))
+    assert result.diagnosis is not None and result.diagnosis.next.options == ()
+    assert "commands u = 50, outside of -1..1" in result.diagnosis.next.why
+
+
+def test_a_rate_below_the_slowest_mode_is_proved(tmp_path: Path) -> None:
+    """The modes are -1 and -2; the V of Q = I falls at 0.38 alone near the origin."""
+    assert certify_roa(*chain(2, [-1.0, -2.0]), tmp_path, RoaOptions(rate=0.8, effort=0.02)).verdict is Verdict.PROVED

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from certify import RoaOptions, System, Verdict, certify_roa, symbols
+from certify.analysis.stages.candidate import _Choice
 from certify.certificates import Certificate, PartitionTree
 from certify.certificates.checking import run_checker
 from certify.certificates.claims import Practical, Problem
@@ -85,6 +87,16 @@ def test_a_level_without_kinks_is_kept_where_the_effort_ends_with_them(monkeypat
     found: Any = prove_band(problem, np.eye(1), 1.0, effort=effort)
     assert found is not None and found[0] < found[1] < 0.011  # the first kink is at 0.1
     assert 0 < effort.left < 6e8  # half of it was for kinks
+
+
+def test_a_candidate_leaves_half_of_the_effort_to_its_only_heat() -> None:
+    """Beside a function to be learned, a quarter of the whole is there for both; a candidate alone may take as much."""
+    state: Any = SimpleNamespace(interruptible=False, options=RoaOptions(candidate="neural"))
+    tools: Any = SimpleNamespace(whole=100.0)
+    effort = Effort(25.0)
+    granted = _Choice(state, tools, effort, race=cast(Any, None))._granted()
+    granted.charge(granted.left)
+    assert effort.left == 12.5
 
 
 def test_a_look_at_a_step_is_no_dearer_than_a_step() -> None:

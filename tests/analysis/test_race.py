@@ -221,7 +221,7 @@ def test_a_large_margin_is_tried_where_ranges_leave_next_to_nothing_of_the_large
     between = replace(largest, name="between")
     monkeypatch.setattr(certify.analysis.stages.candidate, "blends", lambda *_: [between])
     run = Race(begin, effort, 0.04 * UNIT, 100)  # type: ignore[arg-type]
-    state: Any = SimpleNamespace(loop=loop, options=options)
+    state: Any = SimpleNamespace(loop=loop, options=options, interruptible=True)
     _Choice(state, tools, effort, run)._among([largest], largest)
     assert names == began
 

@@ -13,19 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from certify.analysis import acceptance as roa
 from certify.analysis.run import RoaOptions, certify_roa
 from certify.certificates import limits, read_certificate, run_checker
-from certify.certificates.verdict import Verdict
 from certify.checker import document as checker_document
 from certify.checker import exact as checker_exact
 from certify.checker import expression as checker_expression
-from certify.checker import limits as checker_limits
 from certify.checker import networks as checker_networks
-from certify.errors import CertificateFormatError, InputError
+from certify.errors import CertificateFormatError
 from certify.loop.expressions import Number, from_tree, symbols, tan, to_tree
 from certify.loop.plants import available_systems, get_system
-from certify.provers.ball import models as producer_models
 from tests.support.loops import pendulum_network, scalar_tanh
 
 Document = dict[str, Any]
@@ -215,33 +211,6 @@ def test_bytes_that_are_no_certificate(
     assert any(word in got["detail"] for word in detail.split("|")), got
 
 
-@pytest.mark.parametrize("at", ["numbers", "operations"])
-def test_what_no_checker_takes_ends_in_words(at: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run asks again with patience where that may help, lowers the level, and leaves no certificate behind."""
-    asked = []
-
-    def too_large(path: Path, jobs: int = 1, patient: bool = False, every: bool = False) -> dict[str, Any]:
-        asked.append(patient)
-        return {"result": "REJECTED", "rule": "limits", "at": at, "detail": "the file asks for 1e20"}
-
-    monkeypatch.setattr(roa, "run_checker", too_large)
-    with pytest.raises(InputError, match=f"take no certificate of this size: the file asks for 1e20.*{at}"):
-        certify_roa(*scalar_tanh(), tmp_path)
-    assert (True in asked) is (at == "operations") and not list(tmp_path.glob("certificate.json"))
-
-
-def test_a_check_that_needs_patience_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def slow(path: Path, jobs: int = 1, patient: bool = False, every: bool = False) -> dict[str, Any]:
-        if patient:
-            return run_checker(path, patient=patient)
-        return {"result": "REJECTED", "rule": "limits", "at": "operations", "detail": "the file asks for 1e20"}
-
-    monkeypatch.setattr(roa, "run_checker", slow)
-    result = certify_roa(*scalar_tanh(), tmp_path)
-    assert result.verdict is Verdict.PROVED and "certify check --patient" in str(result.notice)
-    assert result.checker is not None and result.checker["patient"] is True
-
-
 def test_the_limits_are_the_checker_s() -> None:
     """The producer names what the checker would refuse; the two share no line, so the numbers are compared."""
     assert (limits.MOST_STATES, limits.MOST_STEPS, limits.MOST_ROWS) == (
@@ -255,8 +224,6 @@ def test_the_limits_are_the_checker_s() -> None:
         checker_expression.MAX_EXPONENT,
     )
     assert limits.MOST_MATRIX_BITS == checker_exact.MAX_MATRIX_BITS
-    assert producer_models._MOST_NUMBERS == checker_limits.MOST_NUMBERS == limits.MOST_NUMBERS // 2
-    assert producer_models._MOST_PRODUCTS <= checker_limits.MOST_WORK
     page = (Path(checker_document.__file__).parent / "FORMAT.md").read_text()
     assert f"at most {limits.MOST_DIGITS:,} digits" in page and f"at most {limits.MOST_NODES:,} nodes" in page
 

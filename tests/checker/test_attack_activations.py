@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
-from certify.checker import ball, contraction, document, limits, rules
+from certify.checker import ball, contraction, document, rules
 from certify.checker.activations import add as add_activations
 from certify.checker.ball import Ball
 from certify.checker.case import Case
@@ -26,7 +26,6 @@ from certify.checker.jets import Jet, Units, constant
 from certify.checker.near import Near, Vector, triples
 from certify.checker.networks import FUNCTIONS as MAPS
 from certify.checker.networks import Affine, Map, Network, Step
-from certify.checker.ring import Ring
 from certify.checker.smooth import add as add_smooth
 from certify.checker.wiring import Concat, Observe, Sum
 from certify.reference import contraction as other
@@ -607,32 +606,3 @@ def test_a_function_with_a_kink_has_no_derivative(function: str, program: Callab
 
 
 # ------------------------------------------------------------------------------------------------- faults, as found
-
-
-def many_arguments(n: int, reads: int) -> Case:
-    """A network without units that reads many numbers, one of which bends."""
-    names = [f"x{i}" for i in range(n)]
-    data = newer(make(
-        [["-", name] for name in names], [(np.zeros((1, n)), [0.0])], np.eye(n), (1.0, 1.0), states=names,
-        domain=[("-3", "3")] * n, squash="identity", centre="none", scale=[1.0],
-    ))  # fmt: skip
-    data["networks"].append(net("f", affine(0, np.zeros((1, reads))), reads=reads))
-    arguments = [["*", "x0", "x0"], *["x0"] * (reads - 1)]
-    data["plant"]["dynamics"][0] = ["+", ["-", "x0"], ["*", "0", "u"], ["*", "0", call("f", *arguments)]]
-    data["policy"]["sha256"] = hash_of(data)
-    return Case(document.certificate(json.loads(json.dumps(data)), ""))
-
-
-def test_units_of_arguments_are_counted() -> None:
-    """Each argument has H, C and R on a ball: 0.9e9 numbers of 3.4e7 that are allowed; with copies some 20 GB."""
-    case = many_arguments(64, 2**14)
-    assert [at for at, _ in limits.is_bearable(case)] != []
-
-
-def test_arguments_on_leaves_are_counted() -> None:
-    """One array of a batch has four times as many numbers as may be held in all."""
-    case = many_arguments(1, 2**14)
-    case = Case(replace(case.c, levels={"local": 0.25, "roa": 1.0}))
-    ring = Ring.of(case)
-    held = (1 + ring.symbols) * 2**14 * ring.batch
-    assert held <= limits.MOST_NUMBERS or [at for at, _ in limits.is_bearable(case)] != []

@@ -31,7 +31,7 @@ from tests.checker.test_ball import curved as every_function
 from tests.checker.test_path import linear as along
 from tests.checker.test_path import placed
 from tests.checker.test_rules import honest
-from tests.support.balls import is_bearable_on_a_ball, with_ball
+from tests.support.balls import with_ball
 from tests.support.certificates import Document, edited, encode, make, parse, verdict
 from tests.support.jets import (
     Jet,
@@ -48,7 +48,7 @@ from tests.support.jets import (
 )
 from tests.support.marks import slow_after
 from tests.support.oracle import policy_in_arb, quadratic, value_of
-from tests.support.plain import chain, elementary, layers
+from tests.support.plain import elementary, layers
 
 Generator = np.random.Generator
 JUST = 1 - 2.0**-40
@@ -507,12 +507,6 @@ def test_a_subnormal_scale_of_an_input_that_bends_much_contains(scale: float) ->
     assert quotient(u.E[0, 0]) >= least
     off = abs(quotient(found.units.reach[0, 0]) - quotient(scale) * quotient(2.0**-20))
     assert quotient(u.E[0, 0]) >= off * quotient(2.0**400)
-
-
-def test_the_largest_network_of_the_tables_is_not_too_large() -> None:
-    weights = [np.zeros((out, into)) for into, out in itertools.pairwise([12, *[256] * 5, 4])]
-    net = chain(weights, [np.zeros(len(W)) for W in weights])
-    assert is_bearable_on_a_ball(net, 10_000, 13) and not is_bearable_on_a_ball(net, 10**6, 13)
 
 
 # ---------------------------------------------------------------------------------------------------------------- pairs

@@ -22,12 +22,9 @@ from hypothesis import strategies as st
 from certify.checker import near
 from certify.checker.document import MAX_STATES, Policy
 from certify.checker.exact import contains_ball, gershgorin_lower, inverse_diagonal, is_definite, root_above
-from certify.checker.limits import MOST_NUMBERS
 from certify.checker.near import ZERO, Above, self_test
 from certify.checker.network import fold
-from certify.checker.networks import Network
 from certify.checker.ring import Ring
-from tests.support.balls import is_bearable_on_a_ball
 from tests.support.jets import Jet, changed, curved, enclose_on_ball, members, plain
 from tests.support.jets import constant as constant_jet
 from tests.support.marks import slow_after
@@ -533,7 +530,7 @@ def test_an_inner_product_in_many_symbols_fills_no_memory() -> None:
     inner_product([model] * 2, [model] * 2)
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert most < 8 * MOST_NUMBERS
+    assert most < 2**28
 
 
 @pytest.mark.parametrize("spread", [-40, -6, -2, 0, 3])
@@ -1104,23 +1101,6 @@ def test_the_policy_at_the_origin(radius: float) -> None:
                         d,
                     )
     assert finite > len(POLICIES) // 2
-
-
-def test_what_is_too_large_for_the_local_rule_is_refused_at_once() -> None:
-    """Files of some hundred KiB whose bounds would take gigabytes; a network a little smaller is enclosed."""
-
-    def network(widths: list[int]) -> Network:
-        weights = tuple(np.full((out, into), 1e-9) for into, out in itertools.pairwise(widths))
-        return chain(weights, tuple(np.zeros(out) for out in widths[1:]))
-
-    wide = 6000
-    for widths in ([1, wide, 1, wide, 1], [64, *[1] * 9000, 1]):
-        assert not is_bearable_on_a_ball(network(widths), 1, widths[0])
-    assert not is_bearable_on_a_ball(network([64, 1]), 10_000, 64)
-    small = network([1, wide // 12, 1, wide // 12, 1])
-    assert is_bearable_on_a_ball(small, 1, 1)
-    policy = Policy(small, np.ones(1), np.zeros(1), "tanh", "preactivation")
-    enclose_on_ball(fold(policy, (Fraction(0),)), [v.model for v in at_rest(np.ones((1, 1)))])
 
 
 @pytest.mark.parametrize("seed", range(10))

@@ -13,11 +13,10 @@ import numpy as np
 import pytest
 from flint import fmpq
 
-from certify.checker import demands, document, handover, limits, rules
+from certify.checker import document, handover, rules
 from certify.checker.case import Case
 from certify.checker.errors import Rejected
 from certify.checker.words import report
-from certify.reference import limits as reference_limits
 from certify.reference import rules as reference_rules
 from certify.reference.__main__ import in_words
 from certify.reference.document import read
@@ -362,20 +361,6 @@ def test_the_same_section_plant_may_call_other_networks() -> None:
 
 
 # ---------------------------------------------------------------------------------------------- limits, words, truth
-
-
-def test_both_certificates_count() -> None:
-    """In both programs the sums are of both, and a file of two that are each within the limits may be beyond."""
-    raw = dumped(plain())
-    c, other = document.certificate(json.loads(raw), ""), read(raw)
-    assert c.then is not None and other.then is not None
-    sizes = [limits.Sizes(one) for one in (c, c.then)]
-    own = sum(each.work() for each in sizes) + demands.of_handover(sizes[0], c.then)
-    theirs = sum(map(reference_limits.operations, (other, other.then))) + reference_limits.handing_over(other)
-    assert own == theirs > sizes[0].work() + sizes[1].work()
-    reference_limits.limits(other, theirs)
-    with pytest.raises(Refused):
-        reference_limits.limits(other, theirs - 1)
 
 
 def test_the_words() -> None:

@@ -12,11 +12,8 @@ from certify.certificates import InvariantCertificate, OuterTree, parse_any
 from certify.certificates.claims import Invariant, Outer
 from certify.checker import invariant, words
 from certify.checker.boxes import Boxes
-from certify.checker.limits import Sizes
 from certify.loop.plants.system import System
 from certify.lyapunov import Symbolic
-from certify.reference import limits as reference_limits
-from certify.reference.document import read
 from tests.support.certificates import LEAF, Document, dump, edited, parse, verdict
 from tests.support.marks import slow_after
 from tests.support.outer import packed, unpacked
@@ -174,24 +171,6 @@ def test_a_rest_is_not_needed() -> None:
     data = document(system, network, proof(system, network, (X - 1) ** 2, 0.5))
     assert verdict(data) == "ACCEPTED" and judge(data) is None
     assert RADIUS == X**2 + Y**2
-
-
-@pytest.mark.parametrize("name", BASES)
-def test_both_count_the_same_work(name: str) -> None:
-    """The sums of FORMAT.md's last chapter, by both."""
-    data = base(name)
-    mine, other = Sizes(parse(data)), read(dump(data))
-    assert (mine.numbers(), mine.work()) == (reference_limits.numbers(other), reference_limits.operations(other))
-
-
-def test_too_much_work_is_refused_before_it_is_done() -> None:
-    """N of many powers on a tree of many leaves."""
-    data, tree = base("an annulus"), bytes([LEAF])
-    for k in range(17):
-        tree = bytes([k % 2]) + 2 * tree
-    powers = [["**", ["+", "x", str(k)], 63] for k in range(900)]
-    data = edited(edited(data, "evidence.outer.tree", packed(tree)), "claim.outer.expression", ["+", *powers])
-    assert verdict(data) == judge(data) == "limits"
 
 
 def _of_chance(generator: np.random.Generator) -> tuple[Document, bool]:

@@ -20,7 +20,7 @@ from certify.checker.exact import exactly
 from certify.checker.stepping import size_beyond
 from certify.provers.ball.models import AT_CORNERS as PRODUCER_S
 from certify.reference import decrease as reference
-from certify.reference.limits import AT_CORNERS as REFERENCE_S
+from certify.reference.decrease import AT_CORNERS as REFERENCE_S
 from tests.checker.test_flow import beyond, models_of, numbers, q, stepped
 from tests.support.balls import with_ball
 from tests.support.certificates import Document, edited, encode, grow, make, verdict

@@ -33,6 +33,7 @@ from certify.checker.case import Case
 from certify.checker.errors import Rejected
 from certify.checker.ring import Ring
 from certify.errors import BackendError
+from certify.reference import __main__ as second
 from tests.checker.test_rules import HONEST, honest, scalar_claim
 from tests.support import network_loops
 from tests.support.balls import with_ball
@@ -182,7 +183,7 @@ def _leaves_quietly() -> None:
 
 
 def _raises() -> None:
-    raise MemoryError
+    raise RuntimeError
 
 
 def _exits() -> None:
@@ -446,6 +447,64 @@ def test_an_answer_that_nobody_hears_is_no_refusal(tmp_path: Path) -> None:
     assert subprocess.run(["sh", "-c", shell], stderr=subprocess.DEVNULL, check=False).returncode == 70
 
 
+@pytest.mark.parametrize("count", [100, 1000, 3000])
+@pytest.mark.parametrize("name", ["scalar", "outer, a network"])
+def test_constraints_count_where_leaves_are_examined_together(
+    name: str, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All values of an expression are held on all leaves of a batch: 4096 leaves made 2,000 operations a gigabyte."""
+    monkeypatch.undo()  # batches as large as they are
+    terms = [["*", "0", "x", ["+", "x", str(k + 1)]] for k in range(count)]
+    data = edited(honest(name), "claim", lambda c: c | {"keep": [["-", ["+", *terms], "1"]]})
+    data = with_tree(data, uniform([0], 13))
+    if name != "scalar":
+        data = edited(data, "evidence.outer.tree", data["evidence"]["tree"])
+    case = Case(parse(data))
+    leaves = Ring.of(case) if name == "scalar" else outer.Beyond(case)
+    _, lo, _ = next(leaves.leaves())
+    assert (2 if count == 100 else 1) <= lo.shape[1] <= 2**25 // (4 * count * (leaves.symbols + 1) ** 2)
+
+
+PROGRAMS = ["checker", "reference"]
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_a_program_of_its_own_may_not_fill_the_machine(program: str) -> None:
+    """8 GiB are refused to a process that is bound as `python -m` binds it; who calls `main` alone is not bound."""
+    lines = ["import numpy", f"from certify.{program}.__main__ import bound_memory", "numpy.empty(2**30)"]
+    for bound, status in (("", 0), ("bound_memory()", 1)):
+        done = subprocess.run(
+            [sys.executable, "-I", "-c", "; ".join([*lines[:2], *([bound] if bound else []), lines[2]])],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == status and ("MemoryError" in done.stderr) is bool(status), done.stderr
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_a_check_without_memory_ends_without_a_verdict(
+    program: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fails(*arguments: Any) -> Any:
+        raise MemoryError
+
+    place, name, run = {"checker": (rules, "check", main), "reference": (second, "judge", second.main)}[program]
+    monkeypatch.setattr(place, name, fails)
+    path = str(write(honest("scalar"), tmp_path))
+    assert run([path]) == run([path, "--json"]) == 70
+    said = capsys.readouterr()
+    assert "more memory than there is" in said.err and "error" in json.loads(said.out)
+
+
+def test_the_reference_ends_after_seconds_without_a_verdict(tmp_path: Path) -> None:
+    """A true certificate of 65,536 leaves; all that is asked about, and of one leaf, needs less than a minute."""
+    path = write(with_tree(honest("scalar"), uniform([0], 16)), tmp_path)
+    with pytest.raises(TimeoutError, match="no verdict after 1 s"):
+        run_checker(path, "reference", seconds=1)
+    assert run_checker(write(honest("scalar"), tmp_path), "reference", seconds=60)["result"] == "ACCEPTED"
+
+
 PACKAGE = Path(boxes.__file__).parent
 CHAPTERS = {  # the core page's table: the modules that a chapter is about
     name: set(re.findall(r"`(\w+)`", modules))
@@ -453,7 +512,7 @@ CHAPTERS = {  # the core page's table: the modules that a chapter is about
         r"^\| \[(\w+)\]\(format/\1\.md\) \| [^|]* \|([^|]*)\|$", (PACKAGE / "FORMAT.md").read_text(), re.M
     )
 }
-SHARED = {"sections", "clauses", "demands", "processes"}  # by several features
+SHARED = {"sections", "clauses", "processes"}  # by several features
 FEATURES = SHARED.union(*CHAPTERS.values())
 
 
@@ -488,9 +547,9 @@ def _names(node: ast.ImportFrom) -> list[str]:
     ("name", "used"),
     [
         ("rotor", set()),
-        ("enlarged", {"tube", "sections", "demands"}),
+        ("enlarged", {"tube", "sections"}),
         ("sampled", {"flow", "ranges", "sections", "stepping"}),
-        ("outer, a network", {"outer", "sections", "demands", "wiring", "elementary", "calls"}),
+        ("outer, a network", {"outer", "sections", "wiring", "elementary", "calls"}),
     ],
 )
 def test_an_answer_rests_on_the_modules_that_it_needs(name: str, used: set[str], tmp_path: Path) -> None:

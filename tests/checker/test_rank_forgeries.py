@@ -17,7 +17,7 @@ from certify.reference import rules as reference_rules
 from certify.reference.__main__ import in_words as said
 from tests.support import ranks as made
 from tests.support.marks import slow_after
-from tests.support.rank_forgeries import Draw, Forger, Forgery, by_checker, by_reference, verdicts
+from tests.support.rank_forgeries import Draw, Forger, Forgery, by_checker, verdicts
 from tests.support.rank_truth import Truth, numbers
 from tests.support.ranked import (
     UNRANKED,
@@ -50,15 +50,17 @@ def test_many_angles_that_are_cut_in_two_do_not_take_hours(n: int) -> None:
     assert verdicts(standing(n, near=True)) == (None, None)
 
 
-@pytest.mark.parametrize(("digits", "rules"), [(0, (None, None)), (300, ("ranks",)), (2000, ("limits", "limits"))])
-def test_a_frame_with_many_digits_does_not_take_minutes(digits: int, rules: tuple[str | None, ...]) -> None:
-    """Its inverse has as many times 64; the reference counts it, and takes a quarter of a minute at most."""
+@pytest.mark.parametrize(
+    ("digits", "rules"), [(0, (None, None)), (300, ("ranks", "ranks")), (2000, ("ranks", "ranks"))]
+)
+def test_a_frame_with_many_digits_does_not_take_minutes(digits: int, rule: str | None) -> None:
+    """Its inverse has as many times 64."""
     chance = np.random.default_rng(0)
     rows = chance.integers(-4, 5, (64, 64)) + 20 * np.eye(64)
     data = standing(64, near=True)
     powers = chance.integers(-digits // 2, digits // 2 + 1, (64, 64))
     data["evidence"]["ranks"]["frame"] = encode(*np.ldexp(rows, powers).ravel().tolist())
-    assert tuple(judge(data) for judge, _ in zip((by_checker, by_reference), rules, strict=False)) == rules
+    assert verdicts(data) == (rule, rule)
 
 
 def covered(chance: np.random.Generator, n: int, angles: tuple[int, ...]) -> tuple[Cover, Any, Any]:

@@ -8,16 +8,13 @@ from dataclasses import replace
 from fractions import Fraction
 from functools import cache
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from certify.checker import limits
 from certify.reference.__main__ import in_words
 from certify.reference.document import read
-from tests.checker.test_limits import counts
 from tests.checker.test_reference_ranks import certificate, scaled, within
 from tests.checker.test_uncertain import scaled_claim, spring_claim
 from tests.support.certificates import Document, decode, dump, edited, encode, grow, make
@@ -130,25 +127,6 @@ def weights_of(data: Document) -> str:
     """Those of some round."""
     fit = found(data, FIT)
     return str((fit["rounds"] or fit["leaves"][0])[0]["weights"])
-
-
-@pytest.mark.parametrize("name", TRUE)
-def test_both_programs_count_the_same(name: str, tmp_path: Path) -> None:
-    """Operations grow with rounds, numbers do not."""
-    data = true(name)
-    numbers, work = counts(data, tmp_path)
-    more = {"box": encode([0.0] * 2 * len(TRUE[name][0].names)), "weights": weights_of(data)}
-    for path in (f"{FIT}.rounds", f"{FIT}.leaves.0"):
-        larger = counts(edited(data, path, lambda rounds: [*rounds, more]), tmp_path)
-        assert larger[0] == numbers and larger[1] > work
-
-
-def test_many_rounds_of_few_transitions_are_counted(tmp_path: Path) -> None:
-    """A round has a cost of its own: 200,000 of them in 64 pieces each would take hours."""
-    data = with_data(of_scalar([("0", "1")]), replace(SCALAR, order=1, pieces=64, steps=1, starts=((1.0,),)))
-    each = {"box": encode([0.0, 1.0]), "weights": encode([1.0, 0.0])}
-    none, work = (counts(edited(data, f"{FIT}.rounds", [each] * k), tmp_path)[1] for k in (0, 64))
-    assert 3000 * (work - none) > limits.MOST_WORK
 
 
 def test_the_words() -> None:

@@ -807,14 +807,6 @@ def test_the_command_and_its_words(tmp_path: Path) -> None:
     assert done.returncode == 1 and "REJECTED rule=ranks at=ranks leaf 0" in done.stdout
 
 
-def test_limits_count_steps() -> None:
-    data, ranks, steps = halving()
-    short = dumped(data)
-    most = next(n for n in range(10, 60) if rules.judge(short, 2**n).rule != "limits")
-    longer = dumped(reranked(data, [255 * r for r in ranks], [255 * k for k in steps]))
-    assert rules.judge(longer, 2**most).rule == "limits"
-
-
 # -------------------------------------------------------------------------------------------------------------- chance
 
 

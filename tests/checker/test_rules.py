@@ -18,7 +18,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -327,14 +326,6 @@ def multipliers(where: str, place: tuple[int, int], value: float) -> Edit:
     return array(f"evidence.{where}.multipliers", change)
 
 
-def deep() -> list[Any]:
-    """As wide as it is deep: of each layer the paths from all layers before it are needed."""
-    sizes = [1, *[256] * 17, 1]
-    return [
-        {"shape": [q, p], "weight": encode(np.zeros((q, p))), "bias": encode(np.zeros(q))} for p, q in pairwise(sizes)
-    ]
-
-
 MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("format", "scalar", "schema", at("schema", "certify-certificate/2")),
     ("format", "clipped", "origin where pi(0) is u_eq by form", at("policy.origin", encode([0.25]))),
@@ -509,7 +500,6 @@ MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("root", "scalar", "negative", array("evidence.root", lambda a: -a)),
     ("root", "scalar", "roa raised", level("roa", 3.6)),
     ("root", "linear", "T shrunk", array("evidence.T", lambda a: a * 0.9)),
-    ("limits", "scalar", "policy too deep", lambda d: rehash(edited(d, "policy.layers", deep()))),
     ("local", "scalar", "local too large", level("local", 3.0)),
     ("local", "scalar", "sign of the scale", policy_array("scale", lambda a: -a)),
     ("local", "scalar", "sign of the weight", policy_array("layers.0.weight", lambda a: -a)),
@@ -903,20 +893,9 @@ def held_near_a_face() -> Document:
     )  # fmt: skip
 
 
-def sprawling() -> Document:
-    """xdot = -x + 0 + 0 + ..., under 64 ranges: each operation is a model in 66 symbols, were all of them kept."""
-    plant = ["+", ["-", "x"], *(["*", "0", "x", f"1/{i}"] for i in range(2, 2600))]
-    return make(
-        [plant], [([[0.0]], [0.0])], 1.0, (1.0, 1.0), claim="practical", centre="none",
-        tree=bytes([0, LEAF, 0, LEAF, LEAF]),
-        uncertain=[(f"q{i}", "-1", "1") for i in range(64)], input_bounds=[("-2", "2")],
-    )  # fmt: skip
-
-
 ABLATED: dict[str, Callable[[], Document]] = {
     "format": lambda: honest("scalar") | {"comment": "unknown key"},
     "hash": lambda: array("policy.layers.0.bias", nudged(0))(honest("scalar")),
-    "limits": sprawling,
     "levels": lambda: with_ball(level("local", 3.1)(honest("linear"))),
     "lyapunov": lambda: unsymmetric(honest("linear")),
     "equilibrium": lambda: edited(honest("rotor"), "plant.dynamics.1.4", "-500000001/1000000000"),

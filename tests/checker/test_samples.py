@@ -23,7 +23,6 @@ from certify.loop.plants import Sampled, Unknown
 from certify.reference.__main__ import in_words
 from certify.reference.document import read
 from tests.checker.test_handover import dumped, joined, nearby, verdicts
-from tests.checker.test_limits import counts
 from tests.checker.test_reference_data import true
 from tests.support.certificates import Document, edited, encode, grow, make
 from tests.support.earlier import newer
@@ -769,11 +768,3 @@ def test_the_words() -> None:
     words = in_words(read(dumped(near())))
     assert "values within 1/1000 of the 25 that the certificate states, is 0 at 0" in words
     assert "is 0 at 0" not in in_words(read(dumped(far())))
-
-
-@pytest.mark.parametrize("name", ["far", "near", "two"])
-def test_both_programs_count_the_same(name: str, tmp_path: Any) -> None:
-    data = TRUE[name]()
-    plain = {part: {k: v for k, v in data[part].items() if k != "samples"} for part in ("claim", "evidence")}
-    less, more = counts({**data, **plain}, tmp_path), counts(data, tmp_path)
-    assert less[0] == more[0] and less[1] < more[1]

@@ -30,6 +30,7 @@ from certify.errors import InputError, OptionError
 from certify.loop.plants import System
 from certify.loop.policies import Policy, PolicyNetwork, save_policy
 from tests.support.loops import chain
+from tests.support.marks import slow_after
 
 PLANT = """
 name = "cart"
@@ -244,7 +245,7 @@ def steps_of(result: RoaResult, options: RoaOptions, monkeypatch: pytest.MonkeyP
     return found
 
 
-@pytest.mark.parametrize("name", ["plain", "held", "aside"])
+@pytest.mark.parametrize("name", slow_after(1, ["held", "plain", "aside"]))
 def test_an_advice_can_be_followed_and_changes_something(
     results: Mapping[str, RoaResult], name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -105,7 +105,7 @@ def test_constraints_follow_what_changes_the_plant(tmp_path: Path) -> None:
         ("[constraints]\nwall = 3", "must be a comparison as text"),
         ('[constraints]\nwall = "p <= (1"', "cannot be read"),
         ('[constraints]\nwall = "p <= 1 if p else 2"', "no cases"),
-        ('[constraints]\n"a b" = "p <= 1"', "must be identifiers"),
+        ('[constraints]\n"a b" = "p <= 1"', "must be an identifier"),
     ],
 )
 def test_other_tables_are_refused_with_their_line(tmp_path: Path, more: str, said: str) -> None:

@@ -171,6 +171,10 @@ ONE = Affine(np.ones((1, 1)), np.zeros(1))
         ([Tanh(), Clip((Fraction(0),), (None,)), Diagonal((Fraction(-6),), (Fraction(1),))], ([-5.0], [1.0])),
         ([Clip((Fraction(-1),), (Fraction(1),)), Diagonal((Fraction(-2),), (Fraction(1),))], ([-1.0], [3.0])),
         ([Clip((Fraction(-1),), (Fraction(1),)), Clip((Fraction(0),), (Fraction(5),))], ([0.0], [1.0])),
+        ([Clip((Fraction(-1),), (None,)), Clip((None,), (Fraction(1),))], ([-1.0], [1.0])),  # max, then min
+        # Inwards: an actuator's bound of 2/5 is below 0.4.
+        ([Clip((Fraction(-2, 5),), (Fraction(2, 5),))], ([-math.nextafter(0.4, 0)], [math.nextafter(0.4, 0)])),
+        ([Clip((Fraction(-1),), (Fraction(1),)), Diagonal((Fraction(3, 5),), (Fraction(0),))], ([-0.6], [0.6])),
     ],
 )
 def test_clips_of_the_action(tail: list[Step], expected: Any) -> None:

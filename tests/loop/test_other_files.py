@@ -10,6 +10,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -59,6 +60,11 @@ def certificate(folder: Path) -> Path:
     return path
 
 
+def gain(folder: Path) -> Path:
+    np.save(folder / "K.npy", np.eye(2))
+    return folder / "K.npy"
+
+
 COMMAND = r"certify import .*{} --system PLANT --out {}-policy\.pt"
 OTHERS: dict[str, tuple[Callable[[Path], Path], str]] = {
     "stable-baselines3": (zipped, r"a zip file of stable-baselines3.*" + COMMAND.format(r"PPO\.zip", "PPO")),
@@ -69,6 +75,7 @@ OTHERS: dict[str, tuple[Callable[[Path], Path], str]] = {
     "safetensors": (tensors, "a file of safetensors.*certify import"),
     "onnx": (graph, "an ONNX model.*certify import"),
     "a certificate": (certificate, "it is a certificate, which has a policy inside.*Name the policy file"),
+    "a gain": (gain, "it is one array of numpy.*numpy.savez"),
     "text": (text, "must hold a policy; it is text.*controllers train.*certify import"),
 }
 

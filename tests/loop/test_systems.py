@@ -178,7 +178,7 @@ def test_the_grammar_is_closed(build: object, message: str) -> None:
 @pytest.mark.parametrize("name", ["x y", "", "1x", "x'", "y" * 65])
 def test_names_are_identifiers(name: str) -> None:
     u = Symbol("u")
-    with pytest.raises(InputError, match="identifiers"):
+    with pytest.raises(InputError, match="an identifier"):
         System("s", (Symbol(name),), (u,), {}, (u,), (Number(0),), box(1), box(1))
 
 

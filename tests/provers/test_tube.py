@@ -22,11 +22,6 @@ from certify.analysis.run import RoaOptions, certify_roa
 from certify.certificates import PartitionTree, read_certificate
 from certify.certificates.claims import Enlarged, Problem
 from certify.certificates.verdict import Stop, Verdict
-from certify.checker import limits as checker_limits
-from certify.checker.document import read
-from certify.checker.errors import Rejected
-from certify.checker.limits import Sizes
-from certify.checker.rules import check
 from certify.effort import UNIT, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
@@ -39,7 +34,6 @@ from certify.provers.ball.decrease import Multipliers, best_multipliers, decay_o
 from certify.provers.ball.local import ball_around, local_margin, prove_local
 from certify.provers.ball.models import paths
 from certify.provers.tube import enlarge as enlarging
-from certify.provers.tube import tube as tubes
 from certify.provers.tube.enlarge import enlarge
 from certify.provers.tube.tube import Around, Tube, find_tube
 from tests.support.cases import Case, case_of
@@ -444,21 +438,6 @@ def test_where_boxes_gain_nothing_the_next_step_is_a_tube(result: RoaResult) -> 
     assert step.options == (("--enlarge", ""),) and "1.1 times" in step.why
     largest = replace(stalled, levels=replace(stalled.levels, roa=domain_limit(result.P, result.system.domain)))
     assert diagnose(largest, RoaOptions(), None).next.options == ()
-
-
-def test_a_tube_is_no_longer_than_the_checker_takes(result: RoaResult, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The producer stops before the checker would refuse, and the checker refuses by its own count."""
-    assert result.certificate is not None and result.tube is not None
-    c = read(str(result.certificate))
-    work = Sizes(c).work()
-    monkeypatch.setattr(checker_limits, "MOST_WORK", work)
-    check(c)
-    monkeypatch.setattr(checker_limits, "MOST_WORK", work - 1)
-    with pytest.raises(Rejected, match=r"rule=limits at=operations"):
-        check(c)
-    case, goal = pendulum()
-    monkeypatch.setattr(tubes, "MOST_WORK", 16 * (len(enlarged().slabs) - 1))
-    assert find_tube(Around.of(case.loop, ()), goal / 1.3**2, goal) is None
 
 
 def test_errors_beyond_binary64_are_not_shown() -> None:

@@ -23,7 +23,6 @@ from certify.reference import contraction, decrease, kinks, local, tangents
 from certify.reference.decrease import positive_on
 from certify.reference.document import read
 from certify.reference.kinks import Cone, Entry, entry, sector
-from certify.reference.limits import operations
 from certify.reference.local import cones
 from certify.reference.loop import Loop
 from certify.reference.model import Model
@@ -630,18 +629,3 @@ def test_models_on_a_cone_hold_the_truth(kind: str, steady: bool) -> None:
 
 
 # -------------------------------------------------------------------------------------------------------------- limits
-
-
-def test_the_count_of_operations() -> None:
-    """k (K + w Z + C (I + 2^8 (y n + H)(d + 1)^2)) and 2^8 a byte of the trees, by hand for the planar loop."""
-
-    def count(directions: Any) -> int:
-        return operations(read(dump(loop(PLANAR, TWO, P, directions=directions))))
-
-    t, H, d, shapes = 2 * 4 + 4, 2, 2, ((2, 2, 0), (1, 2, 2))
-    K = sum(p * (q * (d + g) + g * t) + 2**21 for p, q, g in shapes) + 64 * H * t
-    Z = len(read(dump(planar(0))).plant.dynamics.steps) * (2**17 + 64 * t + 16 * d**2)
-    inequality = 2**23 + 2**12 * 3**4 + 8 * d**5 + 4 * H * d**3 + 2**14 * 3**3
-    one = K + Z + inequality + 2**8 * H * 9
-    assert count([]) - count(None) == one
-    assert count(trees(2, 2)) - count(None) == 16 * one + 2**8 * 4 * 7

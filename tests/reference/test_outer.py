@@ -756,13 +756,6 @@ def test_equal_levels_excuse_no_leaf() -> None:
     assert judge(edited(data, "plant.input_bounds", [["-1/2", "1/2"]])) == "inputs"
 
 
-def test_what_is_too_large_is_refused_before_the_faces() -> None:
-    wide = network([(np.ones((2**11, 1)), np.zeros(2**11)), (np.ones((2**11, 2**11)), np.zeros(2**11)),
-                    (np.ones((1, 2**11)), [0.0])], 9.0)  # fmt: skip
-    answer = rules.judge(dump(stated(HONEST["a state"](), wide)))
-    assert (answer.rule, answer.at) == ("limits", "operations")
-
-
 # -------------------------------------------------------------------------------------------------------------- words
 
 

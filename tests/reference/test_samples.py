@@ -9,19 +9,17 @@ from collections.abc import Callable, Sequence
 from fractions import Fraction
 from functools import cache
 from itertools import pairwise, product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from flint import fmpq, fmpq_mat
 
-from certify.reference import document, limits
+from certify.reference import document
 from certify.reference.__main__ import in_words
 from certify.reference.refusal import Refused
 from certify.reference.samples import ONE, Sampled, interval, read_samples
 from tests.checker.test_handover import dumped, verdicts
-from tests.checker.test_limits import counts
 from tests.support.certificates import Document, edited, grow, make
 from tests.support.earlier import newer
 from tests.support.marks import slow_after
@@ -475,41 +473,7 @@ def test_no_variable_is_an_angle() -> None:
         read_samples(stated, shown, document.SHA256, c.plant, ("x",))
 
 
-# ------------------------------------------------------------------------------------------------- the count, the words
-
-
-def of_samples(data: Document) -> int:
-    """Rule `limits` counts this."""
-    a = len(document.read(dumped(data)).plant.dynamics.steps)
-    work = 2**24 * a
-    for f, by in zip(data["claim"]["samples"]["functions"], data["evidence"]["samples"], strict=True):
-        d = len(f["variables"])
-        for weights in (weights for both in by["weights"] for weights in both):
-            L, b = len(weights), longest(v for _, v in weights)
-            work += 8 * d * L * (2048 * d + L * b)
-        if not by["slopes"]:
-            b, cells = longest(q for axis in by["axes"] for q in axis), 1
-            for axis in by["axes"]:
-                cells *= len(axis) - 1
-            work += 4096 * b * d * len(by["weights"]) + cells * (2**18 * b * d + 1024 * 2**d)
-    return work
-
-
-def longest(numbers: Any) -> int:
-    each = [Fraction(q) for q in numbers]
-    return max(max(abs(q.numerator).bit_length(), q.denominator.bit_length()) for q in each)
-
-
-@pytest.mark.parametrize("name", ["far", "near", "long"])
-def test_the_count_is_that_of_the_text_and_of_both(name: str, tmp_path: Path) -> None:
-    data = near() if name == "near" else far()
-    if name == "long":
-        data = edited(data, f"{BY}.axes.0.1", f"-{10**9 + 7}/{10**18 + 9}")
-        data = edited(data, f"{BY}.weights.3.1", [[1, f"1/{3**500}"], [2, "7"], [1, f"-{5**300}"]])
-    assert limits.of_samples(document.read(dumped(data))) == of_samples(data)
-    plain = {part: {k: v for k, v in data[part].items() if k != "samples"} for part in ("claim", "evidence")}
-    less, more = counts({**data, **plain}, tmp_path), counts(data, tmp_path)
-    assert less[0] == more[0] and more[1] - less[1] == of_samples(data)
+# ------------------------------------------------------------------------------------------------- the words
 
 
 def test_the_words() -> None:

@@ -427,14 +427,6 @@ def test_the_checkers_modules_are_named_where_it_answered(pendulum_case: Case) -
         assert "modules of the checker" not in Page(html).text
 
 
-def test_a_file_that_needs_patience_says_so_in_the_command(pendulum_case: Case) -> None:
-    """Without it the checker would refuse the file by rule `limits`."""
-    for said, wanted in ({}, 0), ({"patient": True}, 2):
-        answer = pendulum_case.answer | said
-        html = render_html(pendulum_case.certificate, answer, None, pendulum_case.path, sha256=pendulum_case.sha256)
-        assert Page(html).text.count("certificate.json --patient") == wanted
-
-
 def test_every_simulated_figure_says_so(pendulum_case: Case, scalar_case: Case, chain_case: Case) -> None:
     for case in (pendulum_case, scalar_case, chain_case):
         pictures, _ = draw(case.certificate, accepted=True)

@@ -392,7 +392,7 @@ def test_a_discrete_plant_takes_its_own_steps() -> None:
     )
     step, horizon = time_scales(flow)
     assert step == 1.0 and horizon == pytest.approx(math.ceil(15 / -math.log(0.98)), abs=1)
-    roa = simulated_roa_fraction(integrator(timing), gain("5", 2), np.eye(2), 1.0, points=5)
+    roa = simulated_roa_fraction(integrator(timing), gain("1", 2), np.eye(2), 1.0, points=5)
     assert roa.step == 1.0 and roa.attracted.all()
 
 

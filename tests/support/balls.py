@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,10 +16,7 @@ from flint import fmpq, fmpq_mat
 
 from certify.checker.ball import Ball
 from certify.checker.case import Case
-from certify.checker.document import LocalBall, Partition
 from certify.checker.errors import Rejected
-from certify.checker.limits import MOST_NUMBERS, Sizes
-from certify.checker.networks import Network
 from tests.support.certificates import ASYMPTOTIC, Document, decode, edited, encode, parse
 from tests.support.jets import seen
 
@@ -33,26 +29,6 @@ def with_ball(data: Document) -> Document:
     if "floor" in data["levels"] and data["levels"]["floor"] == data["levels"]["local"]:
         return data
     return edited(data, "evidence.local", local_ball(data))
-
-
-def is_bearable_on_a_ball(network: Network, operations: int, n: int) -> bool:
-    """True if rule `limits` takes the numbers of a certificate of a ball alone, of which these sizes are known."""
-    none = dict.fromkeys(("sample", "keep", "target", "outer", "ranks", "data", "samples", "tube", "contraction"))
-    local = LocalBall(np.eye(n), ((), (), ()), np.eye(n), 0.0, 1)
-    c = SimpleNamespace(
-        **none,
-        claim="asymptotic",
-        states=range(n),
-        inputs=range(network.gives),
-        uncertain=(),
-        dynamics=SimpleNamespace(size=operations, entries=0, called=[]),
-        policy=SimpleNamespace(network=network),
-        evidence=Partition(np.eye(n), np.ones(n), b"", 1, (), local),
-        stated=0,
-        c1=1.0,
-        c2=1.0,
-    )
-    return Sizes(c).numbers() <= MOST_NUMBERS  # type: ignore[arg-type]
 
 
 def square(text: str) -> np.ndarray:

@@ -132,7 +132,7 @@ class Simulation:
         return tuple(min(max(Fraction(v), lo), hi) for v, (lo, hi) in each)
 
 
-def later(loop: ClosedLoop, x: Array, steps: int, effort: Effort) -> tuple[Array, int]:
+def ends_of_runs(loop: ClosedLoop, x: Array, steps: int, effort: Effort) -> tuple[Array, int]:
     """The states (N, n) after so many steps of runs from states x, (N, n), NaN of those that leave the domain or
     violate a constraint; and the number of steps, which the effort may cut."""
     simulation, end = Simulation(loop, (), ()), x.copy()

@@ -68,7 +68,7 @@ class _Desk:
             tools.timing,
             partial(tools.tell, "check"),
             tools.show,
-            Desk(self.state.options.jobs, ranked, tools.remarks).checked,
+            Desk(self.state.options.jobs, ranked).checked,
             self.state.options.cluster,
         )
 

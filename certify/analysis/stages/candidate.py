@@ -54,6 +54,7 @@ from certify.provers.falsify import Witness
 _HEAT = 0.04  # share of the effort for a candidate's first heat
 _SEARCH = 0.6  # share of the effort that is left for a search that cannot be interrupted
 _AROUND_FIRST = 0.3  # the same in many states, for the first of several, of which the later ones are to be the larger
+_TO_FIND = 0.5  # share of the effort before an outer set for a candidate, where its one heat gets the rest
 _GRACE, _LEAST = 1.0 * UNIT, 0.05  # operations, or of the whole, for a local level where nothing is proved yet
 _FOR_BALL = 0.2  # of the whole, for a set from a ball around the equilibrium, even if no effort is left
 _LITTLE = 0.01  # share of the domain's ellipsoid: a smaller set counts for less than a claim of convergence
@@ -180,7 +181,8 @@ class _Trials:
         return made
 
     def _granted(self, share: float = OPTIMISING) -> Effort:
-        return _granted(self.effort, self.tools.whole, share)
+        alone = self.state.interruptible or not self.state.options.goes_beyond
+        return _granted(self.effort if alone else self.effort.share(_TO_FIND), self.tools.whole, share)
 
     def _enter_alone(self, trial: Trial, share: float = _SEARCH) -> Contender | None:
         """Enter a trial with a heat of this share of the effort that is left; None if its reach is not worth one."""

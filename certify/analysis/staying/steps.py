@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from certify.analysis.beyond import constraints_in_words, rank_facts
 from certify.analysis.facts import StayingFacts
 from certify.analysis.options import RoaOptions
-from certify.analysis.reaching.runs import later
+from certify.analysis.reaching.runs import ends_of_runs
 from certify.analysis.staying.results import InvariantResult
 from certify.analysis.without_v import Tools, accepted, require_periodic
 from certify.certificates import RanksAlone, RankTree, RemainCertificate, leaves_within
@@ -57,7 +57,7 @@ def proved_in_steps(
     root = root_box(loop)
     with tools.timing("simulate"):
         begins = np.random.default_rng(0).uniform(*root, (_RUNS, system.n))
-        ends, count = later(loop, begins, _STEPS, Effort(_OF_RUNS))
+        ends, count = ends_of_runs(loop, begins, _STEPS, Effort(_OF_RUNS))
     search = effort.share(_FOR_SEARCH)
 
     def report(share: float, boxes: int, waiting: int) -> None:

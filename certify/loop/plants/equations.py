@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import difflib
+import keyword
 import re
 from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
@@ -56,6 +57,8 @@ def parse_expression(
             raise
         hint = "; for a power write **, not ^" if "^" in source else ""
         hint = "; there are no cases: write one formula" if re.search(r"\bif\b", source) else hint
+        if not hint and (word := next(filter(keyword.iskeyword, re.findall(r"\w+", source)), None)):
+            hint = f"; {word!r} is a word of Python's: take another name"
         reason = error.msg if isinstance(error, SyntaxError) else str(error)
         raise InputError(f"equation {source!r} cannot be read: {reason}{hint}.") from error
     if found.depth > _MOST_DEPTH:
@@ -250,6 +253,11 @@ class _Reader:
             raise self._refuse(
                 f"the exponent of {self._text(node)!r} must be an integer of at most {MOST_EXPONENT}; "
                 f"found {self._text(node.right) if exponent is None else exponent}"
+                + (
+                    "; a root is sqrt(x), and a power 3/2 is x*sqrt(x)"
+                    if exponent and exponent.denominator == 2
+                    else ""
+                )
             )
         if exponent == 0:
             raise self._refuse(f"{self._text(node)!r} is 1 wherever it has a value; write 1")

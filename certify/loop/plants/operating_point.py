@@ -9,10 +9,11 @@ from fractions import Fraction
 import numpy as np
 
 from certify.errors import InputError
-from certify.loop.expressions import Symbol, evaluate_exactly, numerical
+from certify.loop.expressions import Symbol, differentiate, evaluate_exactly, numerical
 from certify.loop.plants.system import System
 
 _ROUNDED = 1e-12  # of a residual with functions at other points than 0, which rationals do not decide
+_STEPS = 20
 
 
 def residuals(system: System) -> dict[str, Fraction | float]:
@@ -51,8 +52,36 @@ def require_equilibrium(
         shown = ", ".join(_residual(system, name, r) for name, r in off.items())
         raise refuse(
             f"x_eq of {system.name} must be an equilibrium, f(x_eq, u_eq) = {rests_where(system)}; found {shown}. "
-            "Correct x_eq or u_eq."
+            f"Correct x_eq or u_eq{_at_rest_nearby(system, off)}."
         )
+
+
+def _at_rest_nearby(system: System, off: dict[str, Fraction | float]) -> str:
+    """Name the equilibrium that Newton's method finds, each step the least one measured by domain and bounds; empty if
+    it finds none, or the residual is rational, of which no rounded number makes 0."""
+    if not all(isinstance(r, float) and math.isfinite(r) for r in off.values()):
+        return ""
+    variables, n = [*system.states, *system.inputs], system.n
+    rates = [
+        e - s if system.time == "discrete" else e for e, s in zip(system.exact_dynamics(), system.states, strict=True)
+    ]
+    widths = np.array([float(hi - lo) for lo, hi in (*system.domain, *system.input_bounds)])
+    start = np.array([0.0] * n + [float(u) for u in system.exact_u_eq()])
+    z = start
+    try:
+        f = numerical(rates, variables)
+        slopes = numerical([differentiate(e, s) for e in rates for s in variables], variables)
+        with np.errstate(all="ignore"):
+            for _ in range(_STEPS):
+                J = np.reshape(np.broadcast_arrays(*slopes(*z)), (n, -1))
+                z = z - widths * np.linalg.lstsq(J * widths, np.array(f(*z), dtype=np.float64))[0]
+            if not np.max(np.abs(f(*z))) <= _ROUNDED:
+                return ""
+    except (InputError, np.linalg.LinAlgError):
+        return ""
+    at = np.array([*map(float, system.exact_x_eq()), *[0.0] * system.m])
+    moved = [f"{s.name} = {v:.17g}" for s, v, old in zip(variables, z + at, start + at, strict=True) if v != old]
+    return f": it rests at {', '.join(moved)}"
 
 
 def _is_off(residual: Fraction | float) -> bool:

@@ -125,7 +125,9 @@ def interval_in(file: PlantFile, value: Any, *keys: str) -> Interval:
     """
     name = keys[-1]
     if not isinstance(value, list) or len(value) != 2:
-        raise file.refuse(f"the bounds of {name} must be a pair [lo, hi]; found {value!r}.", *keys)
+        is_half = isinstance(value, int | Fraction) and not isinstance(value, bool)
+        found = f"{float(value):g}; write {name} = [-{float(value):g}, {float(value):g}]" if is_half else repr(value)
+        raise file.refuse(f"the bounds of {name} must be a pair [lo, hi]; found {found}.", *keys)
     lo, hi = (number_at(file, end, *keys) for end in value)
     if not lo < hi:
         raise file.refuse(f"the bounds of {name} must satisfy lo < hi; found [{float(lo):g}, {float(hi):g}].", *keys)
@@ -152,11 +154,15 @@ def number_at(file: PlantFile, value: Any, *keys: str) -> Fraction:
 
 
 def _hint(line: str) -> str:
-    """The likely repair of a line that is no TOML: text without quotes; empty for another fault.
+    """The likely repair of a line that is no TOML: text or a fraction without quotes; empty for another fault.
 
     >>> _hint("name = ball"), _hint("x = [1, 2")
     (' Put text and equations in quotes: name = "ball".', '')
+    >>> _hint("parameters = { k = 2/3, m = 1 }")
+    ' Put fractions in quotes: "2/3".'
     """
+    if fraction := re.search(r"[=,[]\s*(-?\d+\s*/\s*\d+)\s*(?:[],}#]|$)", line):
+        return f' Put fractions in quotes: "{fraction[1]}".'
     name, equals, value = (part.strip() for part in line.partition("="))
     if not equals or not value or value[0] in "\"'[{":
         return ""

@@ -72,11 +72,16 @@ def _check_observations(system: System) -> None:
             raise InputError(f"observations of {system.name} must be of states and parameters; {e} has {odd[0]}.")
 
 
+def _check_name(what: str, name: str) -> None:
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]{0,63}", name):
+        raise InputError(f"{what} must be an identifier, at most 64 letters, digits and _; found {name!r}.")
+
+
 def _check_names(system: System) -> None:
     names = [s.name for s in (*system.states, *system.inputs, *system.disturbances)] + list(system.parameters)
-    for name in (system.name, *names):
-        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]{0,63}", name):
-            raise InputError(f"names in {system.name} must be identifiers of at most 64 letters; found {name!r}.")
+    _check_name("the plant's name", system.name)
+    for name in names:
+        _check_name(f"a name in {system.name}", name)
     if len(set(names)) != len(names):
         raise InputError(
             f"names of states, inputs, parameters and disturbances of {system.name} must differ; found {names}."
@@ -140,8 +145,7 @@ def _check_constraints(system: System) -> None:
     known = {*system.states, *system.inputs, *map(Symbol, system.parameters), *system.disturbances}
     known |= {symbol for call in system.calls for _, symbol in call.results}
     for name, e in system.constraints.items():
-        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]{0,63}", name):
-            raise InputError(f"names in {system.name} must be identifiers of at most 64 letters; found {name!r}.")
+        _check_name(f"a name in {system.name}", name)
         if not isinstance(e, Expression):
             raise InputError(f"constraint {name} of {system.name} must be an expression; found {e!r:.60}.")
         constant_of(e)

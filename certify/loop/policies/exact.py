@@ -15,6 +15,7 @@ from certify.loop.networks import Affine, Algebra, Clip, Concat, Map, Observe, P
 from certify.loop.policies.network import PolicyNetwork
 
 Exact = list[Fraction | None]
+_READ = 24  # letters of a fraction that somebody reads
 _NEAR = 1e-9
 _MOST_BITS = 2**16  # of a number, beyond which it counts as unknown: sums of fractions grow from layer to layer
 
@@ -134,7 +135,8 @@ def require_centred(network: PolicyNetwork, u_eq: Sequence[Fraction], names: Seq
 def _found(network: PolicyNetwork, value: Fraction | None, about: float, wanted: float) -> str:
     """pi(0) of an input in words, `about` being it in floats."""
     if value is not None:
-        return f"{float(value)!r}, exactly {_short(value)}"
+        exact = _short(value)
+        return f"{float(value)!r}" + (f", exactly {exact}" if len(exact) <= _READ or float(value) == wanted else "")
     near = math.isclose(about, wanted, rel_tol=_NEAR, abs_tol=_NEAR)
     why = f"{_inside(network)} at the operating point gives no fraction"
     undecided = f", and whether exactly that cannot be decided: {why}" if near else ""

@@ -234,6 +234,11 @@ def _other(path: Path) -> str | None:
             f"{_WHAT} {path} must hold a policy; it is a certificate, which has a policy inside and is no policy file. "
             f"Name the policy file from which it was made: this command proves the claim anew."
         )
+    if raw.startswith(b"\x93NUMPY"):
+        return (
+            f"{_WHAT} {path} must hold a policy; it is one array of numpy. A gain K, u = -K x, is one layer: write it "
+            "by numpy.savez('gain.npz', **{'0.weight': -K}), and name that file, with the options of certify import."
+        )
     if is_text(raw):
         return f"{_WHAT} {path} must hold a policy; it is text. {_COMES_FROM}"
     return None

@@ -34,7 +34,7 @@ from certify.provers.ball.ranged import RangedJet
 
 Array = NDArray[np.float64]
 _CALL, _EACH, _ENTRY = 3e5, 1e5, 0.12  # operations of a layer, of one of the equations, of an entry of a product
-_MOST_NUMBERS, _MOST_PRODUCTS = 2**25, 2**33  # size of the sums over paths: the checker refuses more
+_MOST_NUMBERS, _MOST_PRODUCTS = 2**25, 2**33  # size of the sums over paths
 _MARGIN = 1e-3  # share of an input's range, left to the checker's rounding where a clip begins
 _AT_CORNER = 1e-12  # what a unit reads, so near 0 that no ball of any use is free of its corner
 AT_CORNERS = 6  # uncertain quantities of which the checker decides every corner
@@ -439,8 +439,7 @@ class _Along(Algebra[_Vector]):
 
 
 def shapes(network: Network) -> list[tuple[int, int, int]]:
-    """The rows of each step that takes time, the columns that it has of its own, and the units before it
-    (docs/mathematics/limits.md)."""
+    """The rows of each step that takes time, the columns that it has of its own, and the units before it."""
     found, before = list[tuple[int, int, int]](), 0
     for k, step in enumerate(network.steps):
         rows = network.sizes[k + 1]
@@ -459,7 +458,7 @@ def paths(loop: ClosedLoop, at: Array | None = None, resting: bool = True) -> Pa
 
     Raises
     ------
-    InputError : the network is larger than the checker's rules allow.
+    InputError : the network is too large.
     """
     folded, n = loop.folded, loop.network.n
     network = folded.network

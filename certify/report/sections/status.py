@@ -22,13 +22,11 @@ class Status:
     """A certificate's status: kind is ACCEPTED, TRUSTED, REJECTED or NOT CHECKED; note says why.
 
     `modules` are those of the checker's files that were used, if it accepted or trusted; empty if its answer has none.
-    `patient` is True if it had to be asked with --patient.
     """
 
     kind: str
     note: str
     modules: tuple[str, ...] = ()
-    patient: bool = False
 
     @property
     def accepted(self) -> bool:
@@ -92,7 +90,6 @@ def status_of(certificate: AnyCertificate, sha256: str, answer: Mapping[str, Any
         "ACCEPTED",
         f"The independent checker accepted the certificate.{also}",
         _modules(answer),
-        bool(answer.get("patient")),
     )
 
 

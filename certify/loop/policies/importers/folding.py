@@ -4,7 +4,7 @@ Affine steps that follow each other become one layer, whose numbers are computed
 to the nearest binary64; where a normaliser divides by the square root of a rational that is no square, the number is
 enclosed in Arb until both ends of the enclosure round to the same binary64. So the policy that is proved is the folded
 one, and it differs from the file's real-number policy by at most half a unit in the last place of each weight, bias,
-scale and offset. A layer that stands alone keeps its numbers as they are.
+scale and offset; the ends of a clip are rounded inwards. A layer that stands alone keeps its numbers as they are.
 
 A clip of the observation is inactive on a box of states, which is returned with the network: inside the box the folded
 policy is the real one. With `keep_clips` the clip is a step of the network instead.
@@ -82,7 +82,8 @@ def fold(steps: Sequence[Step], n: int, keep_clips: bool = False, centre: Centre
     ends = [k for k, step in enumerate(steps) if isinstance(step, Tanh) and k > inner[-1]]
     body, tail = steps[: ends[-1] if ends else inner[-1] + 1], steps[ends[-1] + 1 if ends else inner[-1] + 1 :]
     squash: Squash = "tanh" if ends else "identity"
-    if not ends and any(isinstance(step, Clip) and None in (*step.lo, *step.hi) for step in tail):
+    clips = [step for step in tail if isinstance(step, Clip)]
+    if not ends and clips and any(all(None in getattr(clip, side) for clip in clips) for side in ("lo", "hi")):
         body, tail = steps, ()
     program = _Program(n)
     inactive = program.begin(body, n, keep_clips)
@@ -420,11 +421,21 @@ def _clip(
             )
     if not acts:
         return None
-    lo_hi = _numbers([v for v in lows if v is not None]), _numbers([v for v in highs if v is not None])
+    ends = [_inside(lo, hi) for lo, hi in zip(lows, highs, strict=True) if lo is not None and hi is not None]
+    lo_hi = (np.array([lo for lo, _ in ends]), np.array([hi for _, hi in ends]))
     for i, (a, b) in enumerate(zip(*lo_hi, strict=True)):
         if not a < b:
             raise InputError(f"the clips of input {i} leave nothing between them; found [{a}, {b}].")
     return lo_hi
+
+
+def _inside(lo: Fraction, hi: Fraction) -> tuple[float, float]:
+    """The largest interval of binary64 in [lo, hi]: an input that is clipped at its bound 2/5 may not reach 0.4."""
+    low, high = nearest(lo), nearest(hi)
+    return (
+        low if Fraction(low) >= lo else math.nextafter(low, math.inf),
+        high if Fraction(high) <= hi else math.nextafter(high, -math.inf),
+    )
 
 
 def _require_width(weight: Array, width: int) -> None:

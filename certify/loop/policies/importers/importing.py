@@ -1,7 +1,7 @@
 """Import another program's policy file: read it, ask for missing facts, fold, compare, and report.
 
 The bytes determine the file's kind; nothing in it is executed. Proofs are about the folded policy: each folded number
-differs from the file's real-number policy by at most half a unit in the last place.
+differs from the file's real-number policy by at most half a unit in the last place, an end of a clip by one, inwards.
 """
 
 from __future__ import annotations
@@ -235,7 +235,7 @@ def _require_answers(kind: Content, reading: Reading, options: ImportOptions, pl
         wanted.append("--squash identity, tanh or relu-tanh (after the last layer)")
     if options.normaliser is None and reading.normaliser is None and kind != "two-stage":
         wanted.append("--normaliser FILE or none (what was done to observations)")
-    if options.action_scale is None and reading.action != plant.input_bounds:
+    if options.action_scale is None and not _are_bounds(reading.action, plant):
         wanted.append("--action-scale (u = scale * action + offset in the plant's units: 1 if they are the same)")
     if options.observes is None and any(plant.exact_x_eq()) and (options.states or not plant.observations):
         wanted.append(f"--observes absolute or deviation (the operating point of {plant.name} is not 0)")
@@ -253,6 +253,12 @@ def _require_answers(kind: Content, reading: Reading, options: ImportOptions, pl
     ):
         if value is not None and not belongs:
             raise InputError(f"{option} must be left out: a file of {kind} says it itself.")
+
+
+def _are_bounds(action: Sequence[tuple[Fraction, Fraction]] | None, plant: System) -> bool:
+    """True if an action space has the plant's input bounds, in single precision, which it usually is in."""
+    single = [np.array(bounds, dtype=np.float32) for bounds in (action or (), plant.input_bounds)]
+    return np.array_equal(single[0], single[1])
 
 
 def _normaliser(reading: Reading, options: ImportOptions, n: int) -> tuple[Step, ...]:

@@ -101,7 +101,8 @@ def _traced(module: torch.nn.Module, n: int) -> bytes:
         torch.jit.save(traced, buffer)
     for warning in told:
         if issubclass(warning.category, torch.jit.TracerWarning):  # type: ignore[attr-defined]
-            raise InputError(f"it branches, or hides a number from torch. {warning.message}")
+            hint = "A constant belongs into a buffer (register_buffer), not into forward"
+            raise InputError(f"it branches, or hides a number from torch. {hint}. {warning.message}")
     return buffer.getvalue()
 
 

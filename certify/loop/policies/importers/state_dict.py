@@ -277,7 +277,8 @@ def _only(tensors: Mapping[str, Numbers], n: int, m: int) -> str:
     if not described:
         named = ", ".join(_weights(tensors))
         listed = f"layers without a number, {named}: name them in their order, as in --prefix fc1,fc2,fc3"
-        listed = listed if named else "none (layers must be called PREFIX.NUMBER.weight and PREFIX.NUMBER.bias)"
+        needed = "PREFIX.NUMBER.weight and PREFIX.NUMBER.bias; a gain K, u = -K x, is one layer, 0.weight = -K"
+        listed = listed if named else f"none (layers must be called {needed})"
     raise InputError(
         f"a file must hold one policy from {n} states to {m} inputs; it holds {len(fitting)}. "
         f"Name its keys up to their numbers with --prefix, and its states with --states. Found {listed}. "
