@@ -30,6 +30,12 @@ class Contender:
     proved: float = 0.0
 
     @property
+    def reach(self) -> float:
+        """The volume above which nothing can be proved any more."""
+        shrunk = min(1.0, self.attempt.reach / self.trial.task.target)
+        return self.trial.volume * float(shrunk ** (len(self.trial.P) / 2))
+
+    @property
     def hopeless(self) -> bool:
         """True if no effort that anybody has would gain anything."""
         return not self.attempt.gained and self.attempt.expected > _HOPELESS
@@ -76,7 +82,7 @@ class Race:
     def open(self) -> list[Contender]:
         """The contenders that more effort could make the best, the largest proved volume first."""
         most = self.best.proved
-        can = [c for c in self.contenders if c is self.best or c.trial.volume > _WORTH * most]
+        can = [c for c in self.contenders if c is self.best or c.reach > _WORTH * most]
         return sorted((c for c in can if not c.attempt.done), key=lambda c: -c.proved)
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -135,6 +136,10 @@ class Attempt(Protocol):
         """The c2 that is proved so far; None if there is none."""
 
     @property
+    def reach(self) -> float:
+        """The c2 above which nothing can be proved any more, by what the search has met so far."""
+
+    @property
     def gained(self) -> bool:
         """True if the search has added anything to what was there at its beginning."""
 
@@ -200,6 +205,11 @@ class Once:
     def level(self) -> float | None:
         """The c2 that was proved."""
         return None if self.found is None or self.found.claim is None else self.found.claim.roa
+
+    @property
+    def reach(self) -> float:
+        """Infinite: nothing is known before the end."""
+        return math.inf
 
     @property
     def gained(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -38,7 +39,7 @@ SHIPPED = Path(__file__).parent.parent.parent / "examples" / "policies" / "pendu
 class Reaches:
     """An attempt that proves a share of what is asked for in its first heat, and of that one by the local rule."""
 
-    boxes, expected, gained, done = 1, 0.0, True, True
+    boxes, expected, gained, done, reach = 1, 0.0, True, True, math.inf
 
     def __init__(self, target: float, share: float, local: float) -> None:
         self.target, self.share, self.local, self.level = target, share, local, None
@@ -114,6 +115,17 @@ def test_a_race_that_is_not_settled_goes_on_as_if_it_began() -> None:
     early = again.early
     again.enter(given)
     assert began == ["large", "small"] and again.contenders[0] is early
+
+
+def test_a_contender_that_a_violation_leaves_less_than_is_proved_is_out() -> None:
+    run, _ = race(0.4)
+    run.enter(trials())
+    small = run.contenders[-1]
+    for contender in run.contenders:
+        contender.attempt.done = False  # type: ignore[misc]
+    assert small.trial.name == "small" and small in run.open
+    small.attempt.reach = 0.45 * small.trial.task.target  # type: ignore[misc]
+    assert 0 < small.reach < run.best.proved and run.open == [run.best]
 
 
 @pytest.mark.slow

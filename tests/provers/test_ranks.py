@@ -27,6 +27,7 @@ from certify.lyapunov.function import Quadratic
 from certify.provers.bounds import Taylor
 from certify.provers.execution import Runner, ThreadRunner, rows
 from certify.provers.ranks import (
+    Enough,
     Question,
     RankProof,
     Sublevel,
@@ -38,7 +39,7 @@ from certify.provers.ranks import (
 )
 from certify.provers.ranks.cover import Cover
 from certify.provers.ranks.images import Course, Form
-from certify.provers.ranks.search import COUNTS
+from certify.provers.ranks.search import COUNTS, Search
 from certify.provers.ranks.wanted import Wanted
 from tests.support.jobs import PlayedRunner, Troupe
 from tests.support.loops import box
@@ -426,16 +427,58 @@ def converge(x: np.ndarray) -> np.ndarray:
     return np.asarray(np.abs(x).sum(-1) < 1)
 
 
+def test_the_first_image_counts_however_wide_it_is() -> None:
+    """A leaf without any image would never be halved; later images are of use for what is beside them alone."""
+    asked = question(sheared(), 0.01)
+    course = asked.course((1, 2))
+    found = course(np.full((2, 1), 0.1), np.full((2, 1), 0.9), 0.0, 0.0)
+    lo, hi = asked.root
+    assert np.any(found.hi[0, :, 0] - found.lo[0, :, 0] > 0.15 * (hi - lo))
+    assert np.all(np.isnan(found.lo[1])) and not found.loose[0] and found.taken[0] == 2
+
+
+def test_a_search_ends_where_enough_states_have_a_rank() -> None:
+    asked, states = question(sheared(), 0.01), np.random.default_rng(0).uniform(-1, 1, (2, 400))
+    states = states[:, converge(states.T)]
+
+    def of(count: int) -> RankProof:
+        found = prove_ranks(asked, Effort(0.5 * UNIT), ThreadRunner(), enough=Enough(states, count))
+        assert found is not None
+        return found
+
+    half, most = len(states.T) // 2, len(states.T) * 9 // 10
+    some, more = of(half), of(most)
+    assert some.boxes < more.boxes and not some.done
+    ranked = np.isfinite(Ranked(some.evidence, None, ()).ranks_at(states.T))
+    assert half <= ranked.sum() < most
+
+
+def test_leaves_of_which_a_part_may_pass_wait_until_their_first_step_leads_to_a_rank() -> None:
+    """Of two leaves whose steps may leave the domain one leads to a leaf with a rank, the other to itself."""
+    asked = question(sheared(), 0.01)
+    search = Search(asked.course(COUNTS), *asked.root)
+    new = search.halve(
+        search.halve(np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64)), np.zeros(2, dtype=np.int64)
+    )
+    order = new[np.argsort(search.cover.low[0, new])]
+    search.rank[order[0]] = 1
+    search.loose[order[2:]] = True
+    for leaf, towards in ((order[2], order[0]), (order[3], order[3])):
+        search.first[0, :, leaf], search.first[1, :, leaf] = search.cover.low[:, towards], search.cover.high[:, towards]
+    assert search.spread().tolist() == [order[2]] and search.part[order[2]] == 1 and search.part[order[3]] == 0
+    search.first[1, 0, order[3]] = np.inf  # it may lead anywhere
+    assert set(search.spread()) == {order[2], order[3]}
+
+
 def test_leaves_without_a_promising_state_wait() -> None:
-    """The same effort leaves less of the region, which a guide that knows nothing does not change."""
+    """The same share takes less work, which a guide that knows nothing does not change."""
     asked = question(sheared(), 0.01)
     plain, guided, blind = (
         prove_ranks(asked, Effort(0.5 * UNIT), ThreadRunner(), promising=promising)
         for promising in (None, converge, lambda x: np.zeros(len(x), dtype=bool))
     )
     assert plain is not None and guided is not None and blind is not None
-    region = 2 / 16  # as a share of the root box
-    assert 0 < region - guided.share < 0.8 * (region - plain.share)
-    assert guided.boxes < plain.boxes and blind.evidence.tree == plain.evidence.tree
+    assert 0.95 < guided.share / plain.share < 1.05 and blind.evidence.tree == plain.evidence.tree
+    assert guided.boxes < 0.9 * plain.boxes
     corners = np.array(leaves_of(guided.evidence))[guided.evidence.proved]
     assert np.all(converge(corners.mean(1)))

@@ -124,6 +124,7 @@ def test_a_cluster_that_lies_proves_nothing(tmp_path: Path, monkeypatch: pytest.
         [
             *images,
             *((name, "u1") for name in ("inside", "meets", "loose", "fails")),
+            ("first", "f8", (2, *vector)),
             ("taken", "f8"),
             ("steep", "f8", vector),
         ]

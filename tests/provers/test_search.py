@@ -17,7 +17,7 @@ from certify.provers.boxes.engine import BoundsEngine
 from certify.provers.boxes.search import outwards, prove_outwards
 from certify.provers.execution import ThreadRunner
 from tests.support.cases import case_of
-from tests.support.loops import pendulum_network
+from tests.support.loops import pendulum_network, scalar_tanh
 
 POLICIES = Path(__file__).parent.parent.parent / "examples" / "policies"
 CURVED = Path(__file__).parents[1] / "data"  # quadrotors before they were flattened
@@ -52,6 +52,16 @@ def test_a_snapshot_is_a_proof() -> None:
     lowest, highest = ring.rule.levels(lo, hi)
     meets = (lowest <= found.outer) & (highest >= found.inner)
     assert int(meets.sum()) > 5 and bool(ring.rule(lo, hi, found.inner, found.outer).proved[meets].all())
+
+
+def test_a_pass_is_done_where_a_violation_lies_at_its_inner_level() -> None:
+    """Boxes that straddle the inner level stay undecided for ever, and could add nothing to it."""
+    case = case_of(*scalar_tanh())
+    edge = float(case.problem.V.P[0, 0]) * 1.915008048**2
+    ring = outwards(case.problem, case.T, edge * (1 - 1e-6), 2 * edge, RUNNER)
+    assert ring.advance(Budget(boxes=1000)) is None and ring.done and ring.boxes < 100
+    assert ring.sweep.outer <= ring.sweep.inner and len(ring.frontier) and ring.levels[0] == ring.levels[1]
+    assert ring.proof().stop is Stop.WITNESS
 
 
 def test_the_effort_of_the_check_is_left() -> None:

@@ -22,6 +22,7 @@ from certify.errors import OptionError
 from certify.lyapunov import Neural, Polynomial, are_inside, of_polynomial, volume
 from certify.lyapunov.function import Quadratic
 from certify.provers.base import Budget, Progress
+from certify.provers.ranks import Enough, Question, Sublevel, prove_ranks, root_box, with_frame, with_order
 
 Array = NDArray[np.float64]
 _FOR_SEARCH = 0.5  # share of the effort that is left, the rest being for the check
@@ -177,12 +178,10 @@ class ByRanks:
     """The stage that proves from which boxes of the domain trajectories reach the proved set."""
 
     tools: Tools
-    enough: float | None = None  # share of the box of places, at which the search ends if nobody asked for ranks
+    enough: Enough | None = None  # ends the search, if nobody asked for ranks
 
     def extend(self, state: State, effort: Effort) -> State:
         """Add the boxes; a note says why there are none."""
-        from certify.provers.ranks import Question, Sublevel, prove_ranks, root_box, with_frame, with_order
-
         tools, (claim, evidence), trial = self.tools, state.proved, state.contest.best.trial
         problem = trial.task.problem
 
@@ -191,7 +190,7 @@ class ByRanks:
 
         with tools.timing("ranks"):
             tools.tell("ranks")
-            least, enough = _FOR_RANKS * tools.whole, 1.0 if self.enough is None else self.enough
+            least = _FOR_RANKS * tools.whole
             share = effort.part(max(least, effort.left - least), even_if_over=True)
             if self.enough is not None:
                 share = effort.share(_FOR_CELLS)
@@ -203,7 +202,7 @@ class ByRanks:
             ring, most = evidence.tree.count(LEAF), _FOR_RING * tools.whole
             question = with_frame(with_order(question, probes, share, _LITTLE, ring, most), probes, share)
             promising = partial(Simulator(problem.loop, problem.V, claim.roa).converge, effort=share)
-            found = prove_ranks(question, share, tools.runner, told, enough=enough, promising=promising)
+            found = prove_ranks(question, share, tools.runner, told, enough=self.enough, promising=promising)
         if found is None:
             return state.noting("no box of the domain beyond the set is proved to lead into it")
         return replace(

@@ -6,9 +6,12 @@ about the ellipsoid stays.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
-from certify.analysis.simulated import FEW, MOST, SimulatedRegion, Simulator, simulated_region
+import numpy as np
+
+from certify.analysis.simulated import FEW, MOST, Simulator, simulated_region
 from certify.analysis.stages.further import Beyond, ByRanks, Equilibrium
 from certify.analysis.stages.ring import Ring
 from certify.analysis.stages.state import State, Tools
@@ -16,12 +19,13 @@ from certify.certificates.ellipsoids import sublevel_set
 from certify.certificates.membership import Region, region_of
 from certify.effort import Effort
 from certify.errors import InputError
+from certify.provers.ranks import Enough
 
 _FOR_RUNS = 0.06  # share of the whole effort for simulated runs
 _FOR_MORE = 0.35  # share of the whole effort that the ring leaves, for what lies beyond
 _FOR_RING = 0.5  # share of the effort that is left which the ring has in any case
 _LEAST = 0.04  # share of the whole effort, with less of which nothing more is begun
-_WANTED = 0.95  # share of it in boxes with ranks, with which their search ends
+_WANTED = 0.98  # share of it in the proved set, with which the search for ranks ends
 
 
 def goes_on(state: State) -> bool:
@@ -56,13 +60,14 @@ class Onwards:
 
     def _with_more(self, state: State, effort: Effort) -> State:
         state = _simulated(state, self.tools, effort)
-        if state.simulated is not None:
-            problem, (claim, _) = state.contest.best.trial.task.problem, state.proved
-            share = state.simulated.facts(Region((sublevel_set(problem.V.P, claim.roa),))).share
-            if share is None or share >= MOST:
-                return state
+        problem, (claim, _) = state.contest.best.trial.task.problem, state.proved
+        runs = np.zeros((0, state.loop.system.n)) if state.simulated is None else state.simulated.converging
+        outside = runs[~Region((sublevel_set(problem.V.P, claim.roa),)).holds_in_floats(runs)]
+        if state.simulated is not None and len(outside) <= (1 - MOST) * len(runs):
+            return state
         if state.loop.system.in_steps:
-            return ByRanks(self.tools, _enough(state.simulated)).extend(state, effort)
+            wanted = math.ceil(len(outside) - (1 - _WANTED) * len(runs))
+            return ByRanks(self.tools, Enough(outside.T, max(1, wanted))).extend(state, effort)
         try:
             more = Beyond(self.tools).extend(replace(state, options=replace(state.options, candidate="neural")), effort)
         except InputError as error:  # too little converges from outside of the ellipsoid to learn from
@@ -96,8 +101,3 @@ def _simulated(state: State, tools: Tools, effort: Effort) -> State:
         tools.tell("simulate")
         share = effort.part(_FOR_RUNS * tools.whole)
         return replace(state, simulated=simulated_region(Simulator(problem.loop, problem.V, claim.roa), share))
-
-
-def _enough(simulated: SimulatedRegion | None) -> float:
-    """The share of the box of places in boxes with ranks that is nearly all of what converges."""
-    return 1.0 if simulated is None else _WANTED * len(simulated.converging) / simulated.runs

@@ -208,6 +208,10 @@ class _Outwards:
         return self.inner if self.ring is None else self.ring.levels[1]
 
     @property
+    def reach(self) -> float:
+        return self.task.target if self.ring is None else self.ring.sweep.outer
+
+    @property
     def gained(self) -> bool:
         return self.ring is None or self.ring.levels[1] > self.ring.levels[0]
 

@@ -175,8 +175,8 @@ class Pass:
 
     @property
     def done(self) -> bool:
-        """True if no box is open: the pass has nothing left to gain."""
-        return not len(self.frontier)
+        """True if the pass has nothing left to gain: no box is open, or its levels have met."""
+        return not len(self.frontier) or self.sweep.inner >= self.sweep.outer
 
     @property
     def levels(self) -> tuple[float, float]:

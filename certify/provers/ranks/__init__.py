@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from certify.provers.ranks.mend import without_leaf
 from certify.provers.ranks.prove import (
+    Enough,
     Question,
     RankProof,
     prove_ranks,
@@ -19,6 +20,7 @@ from certify.provers.ranks.wanted import MOST_STEPS, Wanted
 
 __all__ = [
     "MOST_STEPS",
+    "Enough",
     "Nothing",
     "Question",
     "RankProof",

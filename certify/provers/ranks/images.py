@@ -44,6 +44,7 @@ class Images(NamedTuple):
     inside, meets : (B,), the box itself does; it may have states there.
     loose : (B,), all that is asked for in the first step may hold in a part of the box, though not in all of it.
     fails : (B,), the first step violates a constraint from everywhere in the box, or leaves the domain.
+    first : (2, n, B), corners of the states after the first step, whatever is asked for; NaN where there are none.
     taken : (B,), the steps that were followed.
     steep : (n, B), by how much each axis of the box widens its first image that reaches far, relative to the root.
     """
@@ -55,6 +56,7 @@ class Images(NamedTuple):
     meets: Mask
     loose: Mask
     fails: Mask
+    first: Array
     taken: Array
     steep: Array
 
@@ -145,6 +147,7 @@ class Course:
             ~self.target.misses(form.x, self.angles),
             np.zeros(batch, dtype=bool),
             np.zeros(batch, dtype=bool),
+            np.full((2, n, batch), np.nan),
             np.zeros(batch),
             np.abs(slopes).sum(0) / self.root[:, None],
         )
@@ -157,11 +160,12 @@ class Course:
             found.taken[left] += 1
             below, above = form.box
             if count == 1:
-                found.loose[left] = ~(kept | lost) & self.in_domain(above, below)  # the image meets the domain
+                found.first[..., left] = below, above
                 (least, most), seen = self.ends[:, self.straight], (below[self.straight], above[self.straight])
-                found.fails[left] = lost | ((seen[1] < least) | (seen[0] > most)).any(0)
+                found.fails[left] = fails = lost | ((seen[1] < least) | (seen[0] > most)).any(0)
+                found.loose[left] = ~(kept | fails)
             width = ((above - below) / self.root[:, None]).max(0)
-            good = kept & (width < _WIDEST)
+            good = kept & ((width < _WIDEST) | (count == 1))
             if count in self.counts:
                 k = self.counts.index(count)
                 there = good & self.is_there(form)

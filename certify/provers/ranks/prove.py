@@ -152,6 +152,14 @@ def _eigenframe(loop: ClosedLoop) -> Array | None:
 
 
 @dataclass(frozen=True, slots=True)
+class Enough:
+    """The end of a search: so many of some states (n, N) have a rank."""
+
+    states: Array
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
 class RankProof:
     """Leaves from which the target is reached, with their evidence.
 
@@ -200,7 +208,7 @@ def prove_ranks(
     runner: Runner,
     report: Callable[[float, int, int], None] | None = None,
     wanted: Wanted | None = None,
-    enough: float = 1.0,
+    enough: Enough | None = None,
     promising: Promising | None = None,
 ) -> RankProof | None:
     """Prove from which leaves of a box trajectories reach a target.
@@ -209,7 +217,7 @@ def prove_ranks(
     ----------
     report : called after every round with the share that is proved, the boxes looked at, and the leaves that wait.
     wanted : a box on which alone it depends; the search ends once it is proved.
-    enough : share of the root box, at which the search ends.
+    enough : ends the search before nothing is left to gain.
     promising : says which states (N, n) seem to reach the target, so that leaves without any wait.
 
     Returns
@@ -258,7 +266,7 @@ def prove_remaining(
     course = question.course(_COUNTS_BACK)
     search = Remaining(course, *question.root, seeds)
     with shared(runner, course) as bound:
-        rounds, done = _grow(search, bound, effort, report, 1.0)
+        rounds, done = _grow(search, bound, effort, report, None)
     search.tighten()
     tree = search.evidence()
     if not np.any(tree.proved):
@@ -289,7 +297,7 @@ def _grow(
     bound: Callable[[Array, Array, float, float], Images],
     effort: Effort,
     report: Callable[[float, int, int], None] | None,
-    enough: float,
+    enough: Enough | None,
 ) -> tuple[int, bool]:
     """Grow a search's tree until nothing is left to gain, which is the second answer, or it has to end; the first is
     the number of rounds."""
@@ -305,6 +313,7 @@ def _grow(
             report(search.share, search.boxes, len(search.unknown))
         done = search.is_done(near)
         large = len(search.cover.leaves) > _MOST_LEAVES or search.pairs > _MOST_PAIRS
-        if done or search.share >= enough or effort.over or large or search.gives_up:
+        satisfied = enough is not None and search.counted(enough.states) >= enough.count
+        if done or satisfied or effort.over or large or search.gives_up:
             return rounds, done
         new = search.further(near)

@@ -17,6 +17,7 @@ from certify.provers.ranks.images import Course, Images
 from certify.provers.ranks.search import Search
 from certify.provers.ranks.wanted import SearchFrom, Wanted
 
+_LARGEST = 0.7  # share of the leaves to be halved that are, the largest ones
 _FOR_CORE = 5.0  # leaves looked at for the seeds alone, relative to those of the first tree
 
 
@@ -63,9 +64,15 @@ class Remaining(SearchFrom):
             new, waiting = self._unseen(needed), np.intersect1d(needed, near)
             self.core = self.boxes < self.most and len(new) + len(waiting) > 0
             if self.core:
-                return new if len(new) else self.halve(*self.next(waiting))
+                return new if len(new) else self._halves(waiting)
         new = self._unseen(self.cover.leaves)
-        return new if len(new) else self.halve(*self.next(self._beside(near)))
+        return new if len(new) else self._halves(self._beside(near))
+
+    def _halves(self, nodes: Index) -> Index:
+        """Halves of the largest of these leaves."""
+        volumes = self.cover.widths(nodes).prod(0)
+        large = nodes[volumes >= np.quantile(volumes, 1 - _LARGEST)]
+        return self.halve(large, self.steep[:, large].argmax(0))
 
     @property
     def _live(self) -> Index:

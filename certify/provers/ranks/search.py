@@ -2,8 +2,9 @@
 
 A leaf has its rank as soon as an image lies in the target, or meets leaves of known ranks alone: the number of the
 steps to that image, and the highest of those ranks. Leaves without a rank whose images meet some leaf with one are
-halved, the largest first, and looked at again (Kalies, Mischaikow, VanderVorst 2005 do this without images of
-networks). What has a rank keeps it; so the search may end at any time.
+halved and looked at again (Kalies, Mischaikow, VanderVorst 2005 do this without images of networks), first those whose
+halves promise the most volume: large ones, of which some image lies in leaves with a rank for a large part. What has a
+rank keeps it; so the search may end at any time.
 """
 
 from __future__ import annotations
@@ -18,11 +19,14 @@ from certify.certificates.claims import UNPROVED
 from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.ranks.cover import Cover
 from certify.provers.ranks.images import Course, Images
+from certify.provers.ranks.targets import TURN
 
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 _FIRST = 2**10  # leaves of the first tree
-_ROUNDS, _GAIN = 6, 1e-4  # relative growth of what is proved, in so many rounds, below which the search ends
-_LARGEST = 0.7  # share of the leaves to be halved that are, the largest ones
+_BEFORE, _GAIN = 1 / 8, 1e-4  # relative growth of what is proved, since so few boxes, below which the search ends
+_SHARE = 0.5  # share of all promise in the leaves that are halved next
+_ANYWAY = 0.05  # share of a leaf that may gain a rank where its image, or a few of its states, say that nothing does
+_POINT = 1e-300  # width of a point
 _POINTS = 5  # of a leaf, from which it is seen if the target may be reached
 Promising = Callable[[Array], Mask]
 """True (N,) for states (N, n) that seem to reach the target."""
@@ -39,7 +43,8 @@ class Search:
         self.lo, self.hi = np.full((K, n, 1), np.nan), np.full((K, n, 1), np.nan)
         self.there, self.steep = np.zeros((K, 1), dtype=bool), np.zeros((n, 1))
         self.meets, self.loose = np.zeros(1, dtype=bool), np.zeros(1, dtype=bool)
-        self.boxes, self.pairs, self.shares = 0, 0, list[float]()
+        self.part, self.first = np.zeros(1), np.full((2, n, 1), np.nan)
+        self.boxes, self.pairs, self.stands = 0, 0, list[tuple[int, float]]()
 
     def begin(self, most: float) -> Index:
         """The leaves of a first tree, all of one size, so many at most."""
@@ -51,10 +56,12 @@ class Search:
         return new
 
     def is_done(self, near: Index) -> bool:
-        """True if no leaf is left whose halves could gain anything, or the last rounds have gained next to nothing."""
-        self.shares.append(self.share)
-        stalled = len(self.shares) > _ROUNDS and 0 < self.shares[-1] <= (1 + _GAIN) * self.shares[-1 - _ROUNDS]
-        return not len(near) or stalled
+        """True if no leaf is left whose halves could gain anything, or the last boxes have gained next to nothing."""
+        share = self.share
+        before = [earlier for boxes, earlier in self.stands if boxes <= _BEFORE * self.boxes]
+        self.stands.append((self.boxes, share))
+        stalled = before and 0 < share <= (1 + _GAIN) * before[-1]
+        return bool(not len(near) or stalled)
 
     @property
     def gives_up(self) -> bool:
@@ -62,8 +69,12 @@ class Search:
         return False
 
     def further(self, near: Index) -> Index:
-        """The leaves to look at next."""
-        return self.halve(*self.next(near))
+        """The leaves to look at next: halves of the fewest that have their share of all promise."""
+        promise = self.cover.widths(near).prod(0) * (_ANYWAY + self.part[near]) * (_ANYWAY + self._hope(near))
+        order = np.argsort(-promise, kind="stable")
+        sums = np.cumsum(promise[order])
+        first = near[order[: 1 + int(np.searchsorted(sums, _SHARE * sums[-1]))]]
+        return self.halve(first, self.steep[:, first].argmax(0))
 
     @property
     def unknown(self) -> Index:
@@ -78,6 +89,11 @@ class Search:
         leaves = self.cover.leaves
         return float(self.cover.widths(leaves[self.rank[leaves] < UNPROVED]).prod(0).sum())
 
+    def counted(self, x: Array) -> int:
+        """The number of states (n, N) in leaves with a rank."""
+        _, states, leaves = self.cover.met_by(x, x)
+        return len(np.unique(states[self.rank[leaves] < UNPROVED]))
+
     def halve(self, nodes: Index, axes: Index) -> Index:
         """Halve leaves; their halves, of which nothing is known yet."""
         halves = self.cover.halve(nodes, axes)
@@ -90,7 +106,8 @@ class Search:
         self.lo, self.hi = longer(self.lo, np.nan), longer(self.hi, np.nan)
         self.there, self.steep = longer(self.there, False), longer(self.steep, 0.0)
         self.meets, self.loose = longer(self.meets, False), longer(self.loose, False)
-        self.hope = longer(self.hope, np.nan)
+        self.hope, self.part = longer(self.hope, np.nan), longer(self.part, 0.0)
+        self.first = longer(self.first, np.nan)
         return halves
 
     def take(self, nodes: Index, found: Images) -> None:
@@ -98,6 +115,7 @@ class Search:
         self.lo[..., nodes], self.hi[..., nodes] = found.lo, found.hi
         self.there[:, nodes], self.steep[:, nodes] = found.there, found.steep
         self.meets[nodes], self.loose[nodes] = found.meets, found.loose
+        self.first[..., nodes] = found.first
         self.rank[nodes[found.inside]] = 0
         self.boxes += len(nodes)
 
@@ -126,13 +144,44 @@ class Search:
             if not len(new):
                 break
             self.rank[new], self.steps[new] = best[new], by[new]
-        some = np.logical_or.reduceat(self.rank[leaf] < UNPROVED, starts) if len(starts) else np.zeros(0, dtype=bool)
         (low, high), first = self.cover.root, k == 0
         sticks = first & ~inside & ((high > self.lo[k, :, node].T) & (low < self.hi[k, :, node].T)).all(0)
-        apart = unknown[self.meets[unknown] | self.loose[unknown]]
-        near: Index = np.unique(np.concatenate([owners[some], apart, node[sticks]]))
+        self.part[unknown] = 0.0
+        beside = self._toward(self.lo[k, :, node].T, self.hi[k, :, node].T, node, pair, leaf)
+        near: Index = np.unique(np.concatenate([beside, self._loosely(), unknown[self.meets[unknown]], node[sticks]]))
         waiting: Index = near[self.rank[near] == UNPROVED]
         return waiting
+
+    def _loosely(self) -> Index:
+        """The leaves of which a part may pass, and whose first step leads in part to leaves with a rank or anywhere."""
+        loose = self.unknown[self.loose[self.unknown]]
+        known = np.isfinite(self.first[..., loose]).all((0, 1))
+        anywhere, loose = loose[~known], loose[known]
+        (least, most), (lo, hi) = self.cover.root, self.first[..., loose]
+        turn = np.isin(np.arange(len(lo)), self.cover.angles)[:, None]
+        lo, hi = np.where(turn, lo, lo.clip(least, most)), np.where(turn, hi, hi.clip(least, most))
+        _, box, leaf = self.cover.met_by(lo, hi)
+        return np.append(anywhere, self._toward(lo, hi, loose, box, leaf))
+
+    def _toward(self, lo: Array, hi: Array, owners: Index, box: Index, leaf: Index) -> Index:
+        """The owners (B,) of boxes (n, B) of places that meet leaves with a rank, by the pairs of a box and a leaf; the
+        part of each box that lies in such leaves is noted."""
+        known = self.rank[leaf] < UNPROVED
+        box, leaf = box[known], leaf[known]
+        parts = np.bincount(box, self._overlap(lo[:, box], hi[:, box], leaf), minlength=len(owners))
+        np.maximum.at(self.part, owners, parts)
+        found: Index = owners[np.unique(box)]
+        return found
+
+    def _overlap(self, lo: Array, hi: Array, leaf: Index) -> Array:
+        """The shares of boxes (n, B) of places that lie in these leaves, one for each."""
+        low, high = self.cover.low[:, leaf], self.cover.high[:, leaf]
+        for i in self.cover.angles:
+            turns = TURN * np.rint((low[i] + high[i] - lo[i] - hi[i]) / (2 * TURN))
+            low[i], high[i] = low[i] - turns, high[i] - turns
+        both = np.maximum(np.minimum(hi, high) - np.maximum(lo, low), 0.0)
+        shares: Array = ((both + _POINT) / (hi - lo + _POINT)).prod(0)
+        return shares
 
     def _better(self, best: Index, by: Index, nodes: Index, ranks: Index, steps: Index) -> None:
         """Keep the lowest rank of each node, and its steps."""
@@ -141,24 +190,16 @@ class Search:
         lower = ranks < best[nodes]
         best[nodes[lower]], by[nodes[lower]] = ranks[lower], steps[lower]  # of several the last, the lowest, stays
 
-    def next(self, near: Index) -> tuple[Index, Index]:
-        """The leaves to halve next, and their axes."""
-        near = self._hopeful(near)
-        volumes = self.cover.widths(near).prod(0)
-        large = near[volumes >= np.quantile(volumes, 1 - _LARGEST)]
-        return large, self.steep[:, large].argmax(0)
-
-    def _hopeful(self, near: Index) -> Index:
-        """The leaves that have a promising state among a few; all of them if none has."""
+    def _hope(self, nodes: Index) -> Array:
+        """The shares of promising states among a few of each of these leaves; 1 if nothing says which are."""
         if self.promising is None:
-            return near
-        new = near[np.isnan(self.hope[near])]
+            return np.ones(len(nodes))
+        new = nodes[np.isnan(self.hope[nodes])]
         low, high = self.cover.low[:, new], self.cover.high[:, new]
         at = np.random.default_rng(0).uniform(size=(_POINTS, len(low), 1))
         states = (low + at * (high - low)).transpose(0, 2, 1)
-        self.hope[new] = self.promising(states.reshape(-1, len(low))).reshape(_POINTS, -1).any(0)
-        found: Index = near[self.hope[near] > 0]
-        return found if len(found) else near
+        self.hope[new] = self.promising(states.reshape(-1, len(low))).reshape(_POINTS, -1).mean(0)
+        return self.hope[nodes]
 
     def tighten(self) -> None:
         """Give all leaves the lowest ranks that their images show: some had a rank before others had a lower one."""
