@@ -18,6 +18,7 @@ import scipy.linalg
 import sympy
 from torch import Tensor
 
+from certify.analysis import acceptance
 from certify.analysis.candidates.trials import Trial, trial
 from certify.analysis.run import RoaOptions, certify_roa
 from certify.certificates import Certificate, checking, run_checker, sole_writer
@@ -355,8 +356,19 @@ def test_a_reference_s_answer_about_something_else_is_no_proof(
         certify_roa(*scalar_tanh(), tmp_path)
 
 
-def test_a_reference_that_needs_long_is_not_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("certify.analysis.acceptance._QUICK", 2)
+@pytest.mark.parametrize("long", ["by its leaves", "by its bytes", "as it turns out"])
+def test_a_reference_that_needs_long_is_not_waited_for(
+    long: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def alone(path: Path, **options: Any) -> dict[str, Any]:
+        if options.get("program") == "reference":
+            assert long == "as it turns out" and options["seconds"] == 5
+            raise TimeoutError
+        return run_checker(path, **options)
+
+    monkeypatch.setattr(acceptance, "run_checker", alone)
+    if long != "as it turns out":
+        monkeypatch.setattr(acceptance, "_LEAVES" if long == "by its leaves" else "_BYTES", -1)
     result = certify_roa(*scalar_tanh(), tmp_path)
     assert result.verdict is Verdict.PROVED and result.to_dict()["reference"] is None
     assert "ACCEPTED BY BOTH" not in dict(rows_of(result.to_dict(), True))["checker"]
@@ -366,7 +378,9 @@ def test_the_checker_beside_the_running_package_is_meant(tmp_path: Path, monkeyp
     folder = tmp_path / "elsewhere" / "checker"
     folder.mkdir(parents=True)
     (folder / "__init__.py").write_text("")
-    (folder / "__main__.py").write_text('def main(arguments):\n    print(\'{"error": "another"}\')\n    return 70\n')
+    (folder / "__main__.py").write_text(
+        'def bound_memory():\n    pass\n\n\ndef main(arguments):\n    print(\'{"error": "another"}\')\n    return 70\n'
+    )
     monkeypatch.setattr(checking, "__file__", str(tmp_path / "elsewhere" / "certificate" / "checking.py"))
     assert checking.ask(tmp_path) == (70, {"error": "another"})
 

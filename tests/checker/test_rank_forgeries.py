@@ -50,9 +50,7 @@ def test_many_angles_that_are_cut_in_two_do_not_take_hours(n: int) -> None:
     assert verdicts(standing(n, near=True)) == (None, None)
 
 
-@pytest.mark.parametrize(
-    ("digits", "rules"), [(0, (None, None)), (300, ("ranks", "ranks")), (2000, ("ranks", "ranks"))]
-)
+@pytest.mark.parametrize(("digits", "rule"), [(0, None), (300, "ranks"), (2000, "ranks")])
 def test_a_frame_with_many_digits_does_not_take_minutes(digits: int, rule: str | None) -> None:
     """Its inverse has as many times 64."""
     chance = np.random.default_rng(0)

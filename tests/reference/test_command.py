@@ -128,7 +128,7 @@ def test_a_file_that_is_too_large(tmp_path: Path) -> None:
 
 
 def test_an_internal_error_is_no_verdict(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: Any) -> None:
-    def broken(raw: bytes, operations: int | None, jobs: int) -> None:
+    def broken(raw: bytes, jobs: int) -> None:
         raise ZeroDivisionError("nobody expected that")
 
     monkeypatch.setattr(command, "judge", broken)
