@@ -35,6 +35,7 @@ from tests.support.marks import slow_after
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
+FORMAT = sorted((ROOT / "certify" / "checker").rglob("*.md"))
 READ = [README, *PAGES]
 FIRST = ("README.md", "index.md", "tutorial.md")  # what a newcomer reads
 _BLOCK = re.compile(r"(?:<!-- (?P<mark>[^\n]*?) -->\n)?^```(?P<language>[^\n]*)\n(?P<code>.*?)^```$", re.M | re.S)
@@ -212,6 +213,13 @@ def test_every_formula_of_a_page_becomes_mathml(page: Path, site: Path) -> None:
     assert len(shown) == len(formulas) and all(shown)
     for formula, text in zip(formulas, shown, strict=True):
         assert [formula.count(rf"\{brace}") for brace in "{}"] == [text.count(brace) for brace in "{}"], formula
+
+
+@pytest.mark.parametrize("page", [*PAGES, *FORMAT], ids=lambda page: page.name)
+def test_no_cell_of_a_table_ends_in_braces(page: Path) -> None:
+    """Markdown takes them for attributes, and the reader does not see them."""
+    cells = re.sub(r"`[^`]*`|\$\$.*?\$\$|\$[^$]*\$", "", page.read_text("utf-8"))
+    assert not re.findall(r"^\|.*\} *\|.*$", cells, re.M)
 
 
 def test_every_link_within_the_site_leads_somewhere(site: Path) -> None:
