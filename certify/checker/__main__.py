@@ -17,7 +17,7 @@ from typing import Any
 from .errors import Rejected, Unreadable
 
 _MOST_JOBS = 2**8
-_MEMORY = 2**32  # bytes that a process may have
+_MEMORY = 2**33  # bytes that a process may have
 
 
 def main(arguments: list[str]) -> int:

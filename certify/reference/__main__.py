@@ -25,7 +25,7 @@ from .rules import Verdict, judge
 
 STATUS = {"ACCEPTED": 0, "REJECTED": 1, "TRUSTED": 3}
 UNUSABLE, INTERNAL, MAX_JOBS = 2, 70, 256
-MOST_BYTES = 2**32
+MOST_BYTES = 2**33
 
 
 def read_once(path: str) -> bytes:
