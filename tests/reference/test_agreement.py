@@ -197,6 +197,8 @@ ORIGINS: dict[str, Callable[[Path], Iterator[Named]]] = {
 APART: dict[str, tuple[str, str]] = {  # all of them true
     "range, held, k = 1.0, 1 cells, within 0.1": ("local", "ACCEPTED"),
     "plant 55": ("local", "ACCEPTED"),
+    "network 9": ("local", "ACCEPTED"),  # corners of min, max and clip at rest, within a sum
+    "network 138": ("local", "ACCEPTED"),
     "atan, c = 0.5, within": ("ACCEPTED", "outer"),  # a margin of a thousandth
 }
 
