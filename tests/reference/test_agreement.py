@@ -221,7 +221,7 @@ def compared(origin: str, folder: Path, every: int = 1) -> Counter[str]:
 
 
 FEW = {"networks": 25, "rules and steps": 19, "sets and tubes": 10, "chance": 30}
-LEAST = {"networks": (480, 5), "rules and steps": (180, 400), "sets and tubes": (60, 59), "chance": (300, 90)}
+LEAST = {"networks": (480, 5), "rules and steps": (180, 400), "sets and tubes": (60, 59), "chance": (320, 60)}
 
 
 @pytest.mark.parametrize("origin", FEW)
