@@ -25,7 +25,7 @@ from .rules import Verdict, judge
 
 STATUS = {"ACCEPTED": 0, "REJECTED": 1, "TRUSTED": 3}
 UNUSABLE, INTERNAL, MAX_JOBS = 2, 70, 256
-MOST_BYTES = 2**33
+MOST_BYTES, MAX_SECONDS = 2**33, 10**9
 
 
 def read_once(path: str) -> bytes:
@@ -352,6 +352,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(given)
     if not 1 <= options.jobs <= MAX_JOBS:
         parser.error(f"argument --jobs: 1 to {MAX_JOBS} processes are allowed")
+    if options.seconds is not None and not 1 <= options.seconds <= MAX_SECONDS:
+        parser.error(f"argument --seconds: 1 to {MAX_SECONDS} seconds are allowed")
 
     if options.seconds is not None:
         from resource import RLIMIT_CPU, setrlimit

@@ -113,7 +113,7 @@ def test_files_that_cannot_be_read(tmp_path: Path, json_too: bool) -> None:
 
 
 def test_usage() -> None:
-    for arguments in ((), ("a", "b"), ("--fast", "a")):
+    for arguments in ((), ("a", "b"), ("--fast", "a"), *(("--seconds", k, "a") for k in ("-1", "0", "1" * 30))):
         assert run(*arguments).returncode == 2
         done = run(*arguments, "--json")
         assert done.returncode == 2 and list(json.loads(done.stdout)) == ["error"]
