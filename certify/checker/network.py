@@ -223,8 +223,8 @@ class Folded:
         return boxes
 
     def ends(self, x: Form) -> list[Near]:
-        """Where there is a squash and no clip: the inputs, (m, B), if tanh is taken at either end of the range that its
-        argument has on the box. As tanh is monotone, each input lies between these two."""
+        """The inputs, (m, B), at either end of the range that the squash's argument has on the box, without a clip: as
+        tanh is monotone, each input lies between these two."""
         v = self.before_squash(x).last
         both = Near(v.h.value[0], v.spread + v.error).ends
         return [tanh(Near(end)) * Near(self.scale[:, None]) + self.offset[:, None] for end in both]
