@@ -502,15 +502,34 @@ def test_solutions_stay_in_the_a_priori_box() -> None:
 
 
 def test_moves_are_less_than_the_way_to_the_ends_of_the_a_priori_box() -> None:
-    """The condition in rationals: x' = k - x^3, monotone, on boxes with ends of 0 and of both signs."""
-    lo, hi = np.array([[-3.0, 0.0, 2.0, 2.5, -0.5]]), np.array([[-2.5, 0.0, 2.25, 2.5, 0.5]])
-    for k in (Fraction(-1), Fraction(0), Fraction(20)):
-        during, _ = enclosed(lambda v, k=k: [constants(v[0])(k) + -(v[0] * v[0] * v[0])], around(lo, hi), 0.02)
-        low, high = ([Fraction(v) for v in end.tolist()] for end in during[0].range.ends)
-        for a, b, start, end in zip(low, high, lo[0].tolist(), hi[0].tolist(), strict=True):
-            least, most = (k - v**3 for v in (b, a))
-            assert a < Fraction(start) + Fraction(1, 50) * min(least, 0) or (least >= 0 and a < Fraction(start))
-            assert Fraction(end) + Fraction(1, 50) * max(most, 0) < b or (most <= 0 and Fraction(end) < b)
+    """The condition in rationals for linear fields, whose extremes are at corners: of all sizes, some rows 0, boxes
+    with ends of 0 and points."""
+    generator, found = np.random.default_rng(1), 0
+    for _ in range(30):
+        size = 2.0 ** int(generator.choice([-900, -30, 0, 0, 0, 30, 300]))
+        A = generator.standard_normal((2, 2)) * generator.choice([0.0, 1.0, 4.0], (2, 1))
+        k = generator.standard_normal((2, 1)) * generator.choice([0.0, size], (2, 1))
+        lo = generator.standard_normal((2, 6)) * generator.choice([0.0, size], (2, 6))
+        hi, h = lo + size * generator.choice([0.0, 0.0, 0.5], (2, 6)), 2.0 ** float(generator.integers(-6, 0))
+
+        def field(v: list[Any], A: np.ndarray = A, k: np.ndarray = k) -> list[Any]:
+            each = zip(A.tolist(), k[:, 0].tolist(), strict=True)
+            return [v[0].scaled(a) + v[1].scaled(b) + constants(v[0])(Fraction(c)) for (a, b), c in each]
+
+        during, _ = enclosed(field, around(lo, hi), h)
+        for box in range(6):
+            low, high = ([float(v.range.ends[end][box]) for v in during] for end in (0, 1))
+            if not np.all(np.isfinite([*low, *high])):
+                continue
+            found += 1
+            corners = [[Fraction(v) for v in corner] for corner in itertools.product(*zip(low, high, strict=True))]
+            for i in range(2):
+                rates = [
+                    sum(Fraction(a) * v for a, v in zip(A[i], x, strict=True)) + Fraction(k[i, 0]) for x in corners
+                ]
+                assert Fraction(low[i]) < Fraction(lo[i, box]) + Fraction(h) * min(*rates, 0)
+                assert Fraction(hi[i, box]) + Fraction(h) * max(*rates, 0) < Fraction(high[i])
+    assert found > 100
 
 
 def test_a_state_that_only_falls_is_not_looked_at_above() -> None:
