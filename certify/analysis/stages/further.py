@@ -30,7 +30,7 @@ _FOR_CELLS = 0.7  # the same for a search of boxes with ranks, of which only tho
 _FOR_RANKS = 0.35  # share of the whole effort, even if the search has left less
 _FOR_LEARNING = 0.6  # share of the effort that is left, the rest being for the proof and its check
 _PROBES = 30  # states at which the order of the series in time is chosen, and the frame of errors
-_LITTLE = 2e-3  # share of the root box that an error of the series may be
+_BOXES, _LITTLE = 1e4, 0.02  # share of the width of one of so many equal boxes that an error of the series may be
 _FOR_RING = 0.05  # share of the whole effort for the check of the ring, if it takes a series of a higher order
 
 
@@ -200,7 +200,8 @@ class ByRanks:
             probes = np.random.default_rng(0).uniform(lo, hi, (_PROBES, len(lo))).T
             question = Question(problem.loop, target, claim.keep, root, evidence.order)
             ring, most = evidence.tree.count(LEAF), _FOR_RING * tools.whole
-            question = with_frame(with_order(question, probes, share, _LITTLE, ring, most), probes, share)
+            little = _LITTLE * _BOXES ** (-1 / len(lo))
+            question = with_frame(with_order(question, probes, share, little, ring, most), probes, share)
             promising = partial(Simulator(problem.loop, problem.V, claim.roa).converge, effort=share)
             found = prove_ranks(question, share, tools.runner, told, enough=self.enough, promising=promising)
         if found is None:
