@@ -80,7 +80,7 @@ SATURATED = [affine([[6.0]], [-0.25])]  # its argument goes from -1/4 to 23/4
 
 def test_an_input_that_saturates_keeps_the_bounds_that_it_reaches() -> None:
     bounds = reaches(-0.25, 5.75, -0.25)
-    assert by_checker(loop(SATURATED, moved(bounds, -HAIR, HAIR))) is None
+    assert said(loop(SATURATED, moved(bounds, -HAIR, HAIR))) is None
     for lower, upper in ((HAIR, HAIR), (-HAIR, -HAIR)):
         assert said(loop(SATURATED, moved(bounds, lower, upper))) == "inputs"
 
@@ -88,7 +88,7 @@ def test_an_input_that_saturates_keeps_the_bounds_that_it_reaches() -> None:
 def test_in_the_second_step_as_in_the_first() -> None:
     """From [9/10, 1] the state comes to [27/20, 3/2]: 8.75 is where tanh is taken then."""
     bounds = reaches(0.9 * 6 - 0.25, 8.75, -0.25)
-    assert by_checker(loop(SATURATED, moved(bounds, -HAIR, HAIR), lo=0.9, steps=2)) is None
+    assert said(loop(SATURATED, moved(bounds, -HAIR, HAIR), lo=0.9, steps=2)) is None
     hair = tanh(8.75, True) - tanh(5.75, False)  # what the second step alone reaches
     assert hair > HAIR
     assert said(loop(SATURATED, moved(bounds, -HAIR, -hair / 2), lo=0.9, steps=2)) == "inputs"
@@ -101,7 +101,7 @@ def test_scales_and_slopes_of_both_signs(gain: float, scale: float) -> None:
     ends = sorted(Fraction(scale) * (tanh(y, True) - tanh(-0.25, True)) for y in (-0.25, gain - 0.25))
     bounds = ends[0] - HAIR, ends[1] + HAIR
     policy = {"scale": encode(scale), "offset": encode(0.5)}  # centring takes the offset out again
-    assert by_checker(loop(network, bounds, **policy)) is None
+    assert said(loop(network, bounds, **policy)) is None
     assert said(loop(network, moved(bounds, 2 * HAIR), **policy)) == "inputs"
     assert said(loop(network, moved(bounds, 0, -2 * HAIR), **policy)) == "inputs"
     assert said(loop(network, bounds, scale=encode(0.0))) == "format"
@@ -115,7 +115,7 @@ def test_centring_pushes_an_input_out_of_the_bounds_of_its_squash(bias: float) -
     assert said(loop(network, (-1, 1), lo=-1.0, centre="none")) is None
     least = abs(Fraction(bias)) + HAIR / 1000
     free = moved((-1, 1), -least, least)
-    assert by_checker(loop(network, free, lo=-1.0)) is None
+    assert said(loop(network, free, lo=-1.0)) is None
 
 
 @pytest.mark.parametrize("weight", [1e308, -1e308])
@@ -123,7 +123,7 @@ def test_an_argument_that_overflows_shows_nothing(weight: float) -> None:
     """Forms of 10^308 x - 10^308 x, which is 0, are not a number, or infinite."""
     network = [affine([[weight], [weight]]), affine([[weight, -weight]], of=1)]
     assert by_checker(loop(network, WIDE, lo=-1.0)) == "inputs"
-    assert by_checker(loop([affine([[weight]])], WIDE, lo=-1.0)) is None  # far, but finite
+    assert said(loop([affine([[weight]])], WIDE, lo=-1.0)) is None  # far, but finite
 
 
 def both_ways() -> list[Document]:
@@ -135,7 +135,7 @@ def both_ways() -> list[Document]:
 
 def test_one_input_by_its_form_and_the_other_by_its_squash() -> None:
     reached, narrow = moved(reaches(-0.25, 5.75, -0.25), -HAIR, HAIR), (-BAND, BAND)
-    assert by_checker(loop(both_ways(), reached, narrow)) is None
+    assert said(loop(both_ways(), reached, narrow)) is None
     assert said(loop(both_ways(), moved(reached, 0, -2 * HAIR), narrow)) == "inputs"
     assert said(loop(both_ways(), moved(reached, 2 * HAIR), narrow)) == "inputs"
     assert said(loop(both_ways(), reached, (HAIR, 1))) == "inputs"  # 0 is below it
@@ -155,11 +155,11 @@ def test_no_other_squash_and_no_clip() -> None:
 def test_two_leaves_by_two_ways() -> None:
     """Around 0 the form is nearly exact, on [0, 1] the input saturates: each leaf takes what shows it."""
     data = loop(SATURATED, moved(reaches(-0.25, 5.75, -0.25), -HAIR, HAIR), lo=-(2.0**-40), hi=2.0**-40)
-    assert by_checker(data) is None
+    assert said(data) is None
     ranks = data["evidence"]["ranks"]
     ranks |= {"lo": encode(-1.0), "hi": encode(1.0), "tree": raw(bytes([0, 255, 255]))}
     ranks |= {"ranks": raw(two_bytes([65_535, 1])), "steps": raw(bytes([0, 1]))}
-    assert by_checker(data) is None
+    assert said(data) is None
     ranks |= {"ranks": raw(two_bytes([1, 1])), "steps": raw(bytes([1, 1]))}
     assert said(data) == "inputs"  # on [-1, 0] the input goes to -1
 
