@@ -18,8 +18,11 @@ from certify.checker.document import Policy
 from certify.checker.near import Above, Form
 from certify.checker.network import enclose_on_boxes, fold, keep_bounds
 from certify.checker.networks import Affine, Map, Network
+from certify.reference.document import read
+from certify.reference.evidence import Ranked
+from certify.reference.ranks import Walk
 from tests.support.rank_forgeries import by_checker, by_reference, verdicts
-from tests.support.ranked import Document, Loop, affine, encode, hashed, mapped, raw, two_bytes
+from tests.support.ranked import Document, Loop, affine, dumped, encode, hashed, mapped, raw, two_bytes
 
 HAIR, BAND = Fraction(1, 10**9), Fraction(1, 1000)
 Bounds = tuple[Fraction | int, Fraction | int]
@@ -305,3 +308,11 @@ def test_leaves_of_all_rules(claim: str) -> None:
     assert said(along_leaves(claim, moved(bounds, -HAIR, HAIR))) is None
     for lower, upper in ((HAIR, HAIR), (-HAIR, -HAIR)):
         assert said(along_leaves(claim, moved(bounds, lower, upper))) == "inputs"
+
+
+def test_an_input_whose_form_is_no_number_has_no_ends() -> None:
+    c = read(dumped(loop(SATURATED, WIDE)))
+    assert isinstance(c.evidence, Ranked)
+    walk, nan = Walk(c, 1, c.evidence.ranking), arb("nan")
+    assert len(walk.input(0, (arb(0), [arb(1)], arb(0)), (arb(0), arb(1))).ends) == 2
+    assert not walk.input(0, (nan, [arb(1)], nan), (arb(0), arb(1))).ends
