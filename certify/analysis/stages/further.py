@@ -113,10 +113,12 @@ class Route:
 
 
 def _shapes(state: State, shapes: Mapping[str, Array]) -> Mapping[str, Array]:
-    """These shapes, or the one box that was asked for."""
+    """These shapes, or the one of the box that was asked for."""
     system, box = state.loop.system, state.options.box
-    asked = ellipsoid_in(system, box) if box is not None else ellipsoid_around(system, state.begin or ())
-    return shapes if asked is None else {"box": asked}
+    if box is not None:
+        return {"box": ellipsoid_in(system, box)}
+    around = None if state.begin is None else ellipsoid_around(system, state.begin)
+    return shapes if around is None else {"box": around}
 
 
 def _narrower(P: Array, centre: tuple[float, ...], begin: Box) -> str:
