@@ -54,9 +54,10 @@ class OuterProof:
 
 @dataclass(frozen=True, slots=True)
 class Nothing:
-    """No set beyond {V <= c2} is proved, and `why`."""
+    """No set beyond {V <= c2} is proved, and `why`; `witness` is the lowest violation found."""
 
     why: str
+    witness: Rise | None = None
 
 
 def prove_outer(
@@ -117,7 +118,7 @@ def prove_outer(
     cover = Cover(rule, -root, root, runner, top, floor, _BESIDE_RISE * span, deepen)
     stopped = cover.advance(budget, report)
     if not cover.level > floor:
-        return Nothing(f"{cover.boxes:,} boxes did not show that N falls at any level; {_ended_by(stopped)}")
+        return Nothing(f"{cover.boxes:,} boxes did not show that N falls at any level; {_ended_by(stopped)}", witness)
     if cover.level < top:
         stop = stopped
     if cover.level < top - _AGAIN * span:
