@@ -102,7 +102,7 @@ def prove_outer(
     share = replace(budget, effort=budget.effort.share(_FOR_FACES))
     found = prove_faces(system, function, top, floor, share, runner)
     if isinstance(found, Nothing):
-        return found
+        return replace(found, witness=witness)
     boxes, faces, on_faces, stopped = found
     if on_faces < top:
         top, stop = on_faces, stopped
