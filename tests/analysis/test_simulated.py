@@ -21,6 +21,8 @@ from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
 from certify.analysis.simulated import Simulator, simulated_region
 from certify.analysis.stages import simulation
+from certify.analysis.stages.candidate import Candidate
+from certify.analysis.stages.state import State
 from certify.analysis.suggested import beyond_the_ellipsoid
 from certify.certificates import Certificate
 from certify.certificates.verdict import Verdict
@@ -202,6 +204,21 @@ def test_what_a_proof_finds_wrong_is_taught_again(tmp_path: Path, monkeypatch: p
     result = proved(tmp_path)
     assert len(functions) == 2 and len(corrected) == 1 and -2.01 < corrected[0] < -0.9
     assert result.outer is not None and result.simulated is not None and (result.simulated.share or 0.0) > 0.9
+
+
+@pytest.mark.parametrize(("claim", "share"), [("practical", 0.5), ("auto", 1.0)])
+def test_candidates_whose_heats_are_whole_proofs_leave_half_of_the_effort(
+    claim: str, share: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    extend, granted = Candidate.extend, list[float]()
+
+    def told(stage: Candidate, state: State, effort: Effort) -> State:
+        granted.append(effort.left / stage.tools.whole)
+        return extend(stage, state, effort)
+
+    monkeypatch.setattr(Candidate, "extend", told)
+    proved(tmp_path, claim=claim, effort=0.04)
+    assert granted == [pytest.approx(share, abs=0.02)]
 
 
 def test_a_plant_that_is_stiff_far_out_has_a_simulated_region(tmp_path: Path) -> None:
