@@ -58,6 +58,7 @@ def plant(rate: Expression = RATE, lo: float = -4, hi: float = 2, time: str = "c
     )
 
 
+SQUARE = Polynomial(np.array([[2]]), np.array([1.0]))
 STEPS = plant(x + RATE / 10, time="discrete")
 
 
@@ -330,4 +331,17 @@ def test_more_effort_comes_before_a_wider_domain_where_little_is_proved(tmp_path
     first = step(False, 400)
     assert first is not None and first.options == (("--effort", "1.6"),) and "grows with the effort" in first.why
     for other in (step(True, 400), step(True, 850)):
+        assert other is None or "--effort" not in dict(other.options)
+
+
+def test_a_function_that_was_taught_little_is_taught_more_before_a_wider_domain(by_default: RoaResult) -> None:
+    assert by_default.outer is not None and by_default.outer.limit == "witness"
+
+    def step(covered: int, **options: object) -> Step | None:
+        changed = replace(by_default, simulated=SimulatedFacts(1000, 900, covered))
+        return beyond_the_ellipsoid(changed, RoaOptions(**options), Effort(10 * UNIT))  # type: ignore[arg-type]
+
+    first = step(400, effort=0.4)
+    assert first is not None and first.options == (("--effort", "1.6"),)
+    for other in (step(850, effort=0.4), step(400, effort=1.0), step(400, effort=0.4, lyapunov=SQUARE)):
         assert other is None or "--effort" not in dict(other.options)
