@@ -16,8 +16,8 @@ from flint import fmpq_mat
 from .case import Case, Failures
 from .exact import fraction
 from .expression import evaluate
-from .near import Above, Array, Form, Near, all_near, near, size, within
-from .network import prepare
+from .near import Above, Array, Form, Near, all_near, near, size
+from .network import keep_bounds, prepare
 from .networks import Network
 from .taylor import Taylor, affine, combination, constants, pairs, upper_bound
 
@@ -38,7 +38,7 @@ class Leaves:
     boxes: Boxes
     numbers: Array  # in the tree
     place: str  # of one, before its number
-    inputs: Near  # (m, B)
+    inputs: Array  # where each input keeps its bounds, (m, B)
     bound: Array  # an upper bound of the margin
     hold: Array  # where what is asked holds
     kept: Array  # where each constraint holds, (K, B)
@@ -116,6 +116,12 @@ class Boxes(ABC):
             affine(u.value[0, j], np.concatenate([u.value[1:, j], errors[j], zeros[self.m :]])) for j in range(self.m)
         ]
         return states, inputs
+
+    def inputs_kept(self, x: Form, u: Form) -> Array:
+        """True for each input and box (m, B) on which it keeps its bounds: by form, or as `keep_bounds` finds."""
+        if self.case.bounded:
+            return np.ones(u.value.shape[1:], dtype=bool)
+        return keep_bounds(self.net, self.c.input_bounds, x, u)
 
     def quantities(self, batch: int) -> list[Taylor]:
         """The uncertain quantities, each with its symbol."""
@@ -197,15 +203,14 @@ def middle(lo: Array, hi: Array) -> tuple[Array, Array]:
 
 
 def keeps_inputs(leaves: Leaves) -> Failures:
-    """`inputs`: by form, or the policy's enclosure lies in the bounds."""
+    """`inputs`: by form, or on each leaf."""
     c = leaves.boxes.c
     if leaves.boxes.case.bounded:
         return 0
-    for j, (name, bounds) in enumerate(zip(c.inputs, c.input_bounds, strict=True)):
-        hold = within(bounds, leaves.inputs[j])
+    for name, hold in zip(c.inputs, leaves.inputs, strict=True):
         if not np.all(hold):
             yield f"{leaves.place}{leaves.numbers[np.argmin(hold)]}", f"{name} may leave its bounds"
-    return int(leaves.inputs.value.size)
+    return int(leaves.inputs.size)
 
 
 def is_whole(tree: bytes, axes: Sequence[int], where: str = "") -> Failures:

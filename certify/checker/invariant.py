@@ -25,4 +25,4 @@ class Staying(Beyond):
         bound = self.least_bound(course.rise, [course.below.at], -np.inf)
         bound[self.function.is_below(course.x, self.level)] = -np.inf
         hold, kept = (bound < 0) & course.finite, self.kept([course.states], course.held, [course.below.at])
-        return Leaves(self, first + left, "outer leaf ", course.inputs.range, bound, hold, kept)
+        return Leaves(self, first + left, "outer leaf ", course.inputs, bound, hold, kept)

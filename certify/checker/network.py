@@ -28,6 +28,8 @@ from .near import (
     size,
     spectral_norm,
     stacked,
+    tanh,
+    within,
 )
 from .networks import Affine, Algebra, Map, Network, Step
 
@@ -206,14 +208,26 @@ class Folded:
     offset: Near
     clip: tuple[Array, Array] | None = None
 
-    def on_boxes(self, x: Form) -> OnBoxes:
-        """The network's value, shifted and squashed."""
+    def before_squash(self, x: Form) -> OnBoxes:
+        """The network's value, shifted."""
         boxes = OnBoxes(self.network, x.raised(Near(self.origin[:, None])) if np.any(self.origin) else x)
         if self.shift is not None:
             boxes.shift(self.shift)
+        return boxes
+
+    def on_boxes(self, x: Form) -> OnBoxes:
+        """The network's value, shifted and squashed."""
+        boxes = self.before_squash(x)
         if self.squash:
             boxes.then(TANH, boxes.last)
         return boxes
+
+    def ends(self, x: Form) -> list[Near]:
+        """The inputs, (m, B), at either end of the range that the squash's argument has on the box, without a clip: as
+        tanh is monotone, each input lies between these two."""
+        v = self.before_squash(x).last
+        both = Near(v.h.value[0], v.spread + v.error).ends
+        return [tanh(Near(end)) * Near(self.scale[:, None]) + self.offset[:, None] for end in both]
 
     @cached_property
     def at_origin(self) -> Near:
@@ -252,3 +266,18 @@ def enclose_on_boxes(net: Folded, x: Form) -> Form:
 
     cut, slope, gap = clip_forms(Form(u.value), u.range.error, *net.clip)
     return cut.wider(u.error * slope + gap)
+
+
+def keep_bounds(net: Folded, bounds: Sequence[tuple[Fraction, Fraction]], x: Form, u: Form) -> Array:
+    """True for each input and box (m, B) on which the input certainly lies in its bounds: as u encloses it, or as tanh
+    is monotone."""
+    hold = _all_within(bounds, u.range)
+    left = np.flatnonzero(np.logical_not(np.all(hold, axis=0)))
+    if len(left) and net.squash and net.clip is None:
+        at_a, at_b = (_all_within(bounds, end) for end in net.ends(x[:, left]))
+        hold[:, left] |= at_a & at_b
+    return hold
+
+
+def _all_within(bounds: Sequence[tuple[Fraction, Fraction]], u: Near) -> Array:
+    return np.array([within(pair, u[j]) for j, pair in enumerate(bounds)])

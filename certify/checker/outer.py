@@ -211,13 +211,13 @@ def falls(leaves: Leaves) -> Failures:
 @dataclass(frozen=True)
 class Course:
     """N on boxes whose states are x, in forms, and how it changes: N'F and n2 - N; True where they and F are finite;
-    the inputs, and the models of what equations read."""
+    where inputs keep their bounds, and the models of what equations read."""
 
     x: Form
     rise: Taylor
     below: Taylor
     finite: Array
-    inputs: Form
+    inputs: Array
     states: list[Taylor]
     held: list[Taylor]
 
@@ -251,7 +251,7 @@ class Beyond(Boxes):
         bound = self.least_bound(course.rise, gaps)
         hold = (bound < 0) & course.finite
         kept = self.kept([course.states], course.held, gaps)
-        return Leaves(self, first + left, "outer leaf ", course.inputs.range, bound, hold, kept)
+        return Leaves(self, first + left, "outer leaf ", course.inputs, bound, hold, kept)
 
     def close(self, x: Form, free: Array) -> Array:
         """The numbers of boxes that are not free, may meet the domain, and have N at its level or below somewhere."""
@@ -270,7 +270,7 @@ class Beyond(Boxes):
         N, none = both.value.widened(self.symbols), constant(Fraction(0), self.symbols, batch)
         below = constant(Fraction(self.level), self.symbols, batch) + -N
         finite = np.all([np.isfinite(v.size.top) for v in (N, *F)], axis=0)
-        return Course(x, none if both.rate is None else both.rate, below, finite, u, states, held)
+        return Course(x, none if both.rate is None else both.rate, below, finite, self.inputs_kept(x, u), states, held)
 
     def is_outside(self, x: Form) -> Array:
         """True on each box that certainly lies outside the domain, along one of the states."""

@@ -22,7 +22,7 @@ from .boxes import LEAF, Batch, batches, is_whole, middle
 from .case import Case, Failures, given
 from .exact import exactly, fraction, inverse
 from .expression import evaluate
-from .near import Above, Array, Form, Near, all_near, near, near_ball, within
+from .near import Above, Array, Form, Near, all_near, near, near_ball
 from .network import enclose_on_boxes
 from .periodic import is_periodic
 from .ring import Moving
@@ -194,8 +194,7 @@ class Steps(Moving):
         c = self.c
         u = enclose_on_boxes(self.net, x)
         if not self.case.bounded:
-            hold = [within(bounds, u.range[j]) for j, bounds in enumerate(c.input_bounds)]
-            course.note("inputs", np.all(hold, axis=0), numbers, "an input may leave its bounds")
+            course.note("inputs", np.all(self.inputs_kept(x, u), axis=0), numbers, "an input may leave its bounds")
         states, inputs = self.models(x, u)
         motion = self.motion(states, inputs)
         if c.sample:

@@ -103,7 +103,7 @@ class Ring(Moving):
         gaps = [lambda left: self.gap(centre[:, left], radius[:, left], self.c.c2, 1.0)]
         kept = self.kept(motion.courses, motion.held, gaps)
         hold = self.hold(bound, meet, motion.G)
-        return RingLeaves(self, first + met, "leaf ", u.range, bound, hold, kept, meet, motion)
+        return RingLeaves(self, first + met, "leaf ", self.inputs_kept(x, u), bound, hold, kept, meet, motion)
 
     def hold(self, bound: Array, meet: Array, G: list[Taylor]) -> Array:
         """True where the bound is negative or, on leaves that cannot meet the ring, all of G has a finite model: a

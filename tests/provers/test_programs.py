@@ -65,6 +65,25 @@ def test_policies_on_boxes(name: str, where: Any, size: float) -> None:
         assert np.all(theirs.error.top <= wide * (1 + 1e-6) + 1e-11)
 
 
+@np.errstate(all="ignore")
+@pytest.mark.parametrize("size", [1e-3, 0.3, 1.0])
+@pytest.mark.parametrize("centre", ["output", "none"])
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_inputs_lie_between_the_ends_of_their_squash(name: str, centre: str, size: float) -> None:
+    """Samples do, within what the checker finds; so an input keeps its bounds for both programs."""
+    closed, (x, error) = loop(name, centre=centre, squash="tanh"), boxes(100, size)
+    least, most = policy_enclosure(closed).between(x, error)
+    generator = np.random.default_rng(4)
+    for _ in range(60):
+        d = np.sign(generator.normal(size=(2, 100))) * generator.random((2, 100)) ** 0.1
+        u = closed.policy((x[:, 0] + (x[:, 1:] * d).sum(1)).T).T
+        assert np.all((least <= u + 1e-13) & (u - 1e-13 <= most))
+    theirs = [end.ends for end in folded(closed).ends(Form(x.transpose(1, 0, 2), Above(error)))]
+    room = 1e-11 * np.abs(closed.network.scale).max()
+    assert np.all(np.min([lo for lo, _ in theirs], axis=0) >= least - room)
+    assert np.all(np.max([hi for _, hi in theirs], axis=0) <= most + room)
+
+
 @pytest.mark.parametrize("size", [1e-3, 0.3])
 def test_a_part_of_a_batch_has_the_same_bounds(size: float) -> None:
     x, error = boxes(300, size)

@@ -9,11 +9,12 @@ from __future__ import annotations
 from certify.provers.bounds.flow import Flow
 from certify.provers.bounds.loop import LoopModels, loop_models
 from certify.provers.bounds.neural import NeuralEnclosure, NeuralModels
-from certify.provers.bounds.policy import operations_of_policy, policy_enclosure
+from certify.provers.bounds.policy import Enclosure, operations_of_policy, policy_enclosure
 from certify.provers.bounds.symbolic import SymbolicEnclosure, SymbolicModels
 from certify.provers.bounds.taylor import Models, Taylor, upper_bound
 
 __all__ = [
+    "Enclosure",
     "Flow",
     "LoopModels",
     "Models",

@@ -107,9 +107,10 @@ class FusedLayers:
         self._weights = [weights[i % 2] for i in range(len(layers) + 1)]
         self._result = numbers(m)
 
-    def __call__(self, loops: Loops, x: Array, x_error: Array) -> tuple[Array, Array, Array]:
-        """The affine form (m, n + 1, B) behind the last layer, the scaled error (m, B), and what each axis adds to the
-        bends of the first layer, (n, B); x is (reads, n + 1, B), its error (reads, B)."""
+    def __call__(self, loops: Loops, x: Array, x_error: Array) -> tuple[Array, Array, Array, Array]:
+        """The affine form (m, n + 1, B) behind the last layer, the scaled error (m, B), what each axis adds to the
+        bends of the first layer, (n, B), and the ends between which the last layer lies, squashed, (2, m, B); x is
+        (reads, n + 1, B), its error (reads, B)."""
         self._x[:] = x
         self._x_errors[:, 0], self._x_errors[:, 1] = x_error, 0.0
         np.square(np.abs(x).sum(1)).sum(0, out=self._size)
@@ -131,7 +132,8 @@ class FusedLayers:
             else:
                 each.slope[:], each.t[:], each.p[:] = self.around(*each.ends)
             loops.bend(*each.bend)
-        return self._form.copy(), self._error_backwards(loops, x_error), self._share.copy()
+        ends = (each.values if self.squash else each.ends).copy()
+        return self._form.copy(), self._error_backwards(loops, x_error), self._share.copy(), ends
 
     def _error_backwards(self, loops: Loops, x_error: Array) -> Array:
         """The sum of all errors on the way in the outputs (m, B), by the magnitudes of their weights."""

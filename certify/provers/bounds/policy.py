@@ -29,9 +29,10 @@ from certify.provers.bounds.taylor import EPS, TINY
 _ENTRY, _NEURON, _OBSERVATION = 0.05, 25.0, 4.0  # operations of an entry of a product, of a relaxation, a model
 _NUMBERS = 2**15  # units of a layer times boxes at a time, which stay in a core's cache, with a symbol for each axis
 _MOST = 512  # boxes at a time
+_TANH = 2.0**-46  # error of tanh and of what is made of it, relative to 1
 
 
-Parts = tuple[Array, Array, Array]
+Parts = tuple[Array, Array, Array, Array]
 
 
 class Enclosure(ABC):
@@ -64,7 +65,7 @@ class Enclosure(ABC):
         mid (m, B), slopes (m, k, B), error (m, B), share (k, B) : share says how much each axis spreads the
             first layer, which is where a split reduces the error.
         """
-        h, error, share = self._in_pieces(x, x_error)
+        h, error, share, _ = self._in_pieces(x, x_error)
         through = self.scale[:, None] * h[:, 0]
         mid, slopes = through + self.offset[:, None], self.scale[:, None, None] * h[:, 1:]
         rounding = 4 * EPS * (np.abs(through) + np.abs(self.offset)[:, None] + np.abs(slopes).sum(1)) + TINY
@@ -74,19 +75,27 @@ class Enclosure(ABC):
             mid, slopes, error = clipped(mid, slopes, error, *self.clip)
         return mid, slopes, error, share / share.sum(0)
 
+    @np.errstate(all="ignore")
+    def between(self, x: Array, x_error: Array) -> tuple[Array, Array]:
+        """The inputs' lower and upper ends (m, B) for such states, by the range of what the squash is taken of: tanh is
+        monotone. They know nothing of a clip."""
+        first, second = self.scale[:, None] * self._in_pieces(x, x_error)[3] + self.offset[:, None]
+        doubt = (_TANH * np.abs(self.scale) + 4 * EPS * np.abs(self.offset) + self.offset_error)[:, None]
+        return np.minimum(first, second) - doubt, np.maximum(first, second) + doubt
+
     def _in_pieces(self, x: Array, x_error: Array) -> Parts:
         """As many boxes at a time as stay in a core's cache, with the last repeated to make them up."""
         batch, parts = x.shape[2], []
         for first in range(0, batch, self.piece):
             index = np.arange(first, first + self.piece).clip(max=batch - 1)
             parts.append(self._inside(x.take(index, -1), x_error.take(index, -1), batch))
-        h, error, share = (joined(column)[..., :batch] for column in zip(*parts, strict=True))
-        return h, error, share + TINY
+        h, error, share, ends = (joined(column)[..., :batch] for column in zip(*parts, strict=True))
+        return h, error, share + TINY, ends
 
     @abstractmethod
     def _inside(self, x: Array, x_error: Array, batch: int) -> Parts:
-        """The affine form (m, n + 1, B) of what is scaled, its scaled error (m, B), and what each axis adds to the
-        bends, (n, B); `batch` is the number of boxes in all pieces."""
+        """The affine form (m, n + 1, B) of what is scaled, its scaled error (m, B), what each axis adds to the bends,
+        (n, B), and the ends between which it lies, (2, m, B); `batch` is the number of boxes in all pieces."""
 
 
 class LayersEnclosure(Enclosure):
@@ -131,11 +140,11 @@ class LayersEnclosure(Enclosure):
             layers = self._spare.pop()
         except IndexError:
             layers = FusedLayers(self.layers, self.symbols, self.squash, self.scale, self.piece, self.activation)
-        form, error, share = layers(loops(self.units * batch), x, x_error)
+        form, error, share, ends = layers(loops(self.units * batch), x, x_error)
         self._spare.append(layers)
         if bent is not None:
             share = share + (self.layers[0].magnitude.sum(0)[:, None, None] * bent).sum(0)
-        return form, error, share
+        return form, error, share, ends
 
 
 class StepsEnclosure(Enclosure):
@@ -153,9 +162,10 @@ class StepsEnclosure(Enclosure):
         value = boxes.value(self.network, x, x_error)
         if np.any(self.shift):
             value = boxes.shifted(value, self.shift, self.shift_error)
+        ends = np.stack([value.h[:, 0] - value.radius, value.h[:, 0] + value.radius])
         if self.squash:
-            value = boxes.squashed(value)
-        return value.h, boxes.backwards(np.diag(self.scale)), boxes.share
+            value, ends = boxes.squashed(value), np.tanh(ends)
+        return value.h, boxes.backwards(np.diag(self.scale)), boxes.share, ends
 
 
 def norm_of(weight: Array) -> float:

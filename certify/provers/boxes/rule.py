@@ -26,6 +26,7 @@ from certify.loop.expressions import Expression, evaluate, nodes
 from certify.loop.plants import System, kept_constraints
 from certify.loop.policies import bounded_by_form
 from certify.provers.bounds import (
+    Enclosure,
     Flow,
     Models,
     Taylor,
@@ -173,7 +174,8 @@ class VdotBound:
             score = np.where(kept, score, np.abs(slopes_x).sum(0))
             proved, bound = proved & kept, np.where(kept, bound, np.inf)
         if self.check_inputs:
-            for j, (inside, outside) in enumerate(input_bounds_kept(self.system, mid, slopes, wide)):
+            found = input_bounds_kept(self.system, self.policy, x, error, mid, slopes, wide)
+            for j, (inside, outside) in enumerate(found):
                 proved, violated, smooth = proved & inside, violated | outside, smooth & inside
                 score = np.where(inside, score, np.abs(slopes[j]) + share * wide[j])
         if self.constraints is not None:
@@ -273,13 +275,20 @@ class VdotBound:
         return bound
 
 
-def input_bounds_kept(system: System, mid: Array, slopes: Array, wide: Array) -> list[tuple[Mask, Mask]]:
-    """Two masks (B,) for each input, enclosed by `mid + slopes.d` within `wide`: it lies in its bounds on the box, and
-    it certainly leaves them at the centre."""
-    reach, kept = np.abs(slopes).sum(1) + wide + 1e-11 * np.abs(mid), []
-    for j, (low, high) in enumerate(system.input_bounds):
-        slack = 1e-11 * (abs(float(low)) + abs(float(high)))
-        inside = (mid[j] - reach[j] > float(low) + slack) & (mid[j] + reach[j] < float(high) - slack)
-        outside = (mid[j] - wide[j] > float(high) + slack) | (mid[j] + wide[j] < float(low) - slack)
-        kept.append((inside, outside))
-    return kept
+def input_bounds_kept(
+    system: System, policy: Enclosure, x: Array, error: Array, mid: Array, slopes: Array, wide: Array
+) -> list[tuple[Mask, Mask]]:
+    """Two masks (B,) for each input, on boxes of states `x[:, 0] + x[:, 1:] d` within `error`: it lies in its bounds on
+    the box, as `mid + slopes.d` within `wide` or as the squash is monotone; and it certainly leaves them at the centre.
+    """
+    low, high = np.array([[float(end) for end in pair] for pair in system.input_bounds]).T[:, :, None]
+    slack = 1e-11 * (np.abs(low) + np.abs(high))
+    low, high = low + slack, high - slack
+    reach = np.abs(slopes).sum(1) + wide + 1e-11 * np.abs(mid)
+    inside = (mid - reach > low) & (mid + reach < high)
+    left = chosen(~inside.all(0))
+    if len(left) and policy.squash and policy.clip is None:
+        least, most = policy.between(x.take(left, -1), error.take(left, -1))
+        inside[:, left] |= (least > low) & (most < high)
+    outside = (mid - wide > high + 2 * slack) | (mid + wide < low - 2 * slack)
+    return list(zip(inside, outside, strict=True))

@@ -215,7 +215,8 @@ class LoopOnN(ABC):
         proved, bound, score, rises = self.judged(on, level)
         score = np.where(np.isfinite(score) & smooth, score, np.abs(x[:, 1:]).sum(0))
         if self.check_inputs:
-            for j, (inside, outside) in enumerate(input_bounds_kept(self.system, mid, slopes, wide)):
+            found = input_bounds_kept(self.system, self.policy, x, error, mid, slopes, wide)
+            for j, (inside, outside) in enumerate(found):
                 proved, rises = proved & inside, rises | outside
                 score = np.where(inside, score, np.abs(slopes[j]) + share * wide[j])
         asked = (N.c <= level) & self.asks(centre) & self._inside(x[:, 0])

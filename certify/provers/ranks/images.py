@@ -188,7 +188,7 @@ class Course:
         below, above = form.box
         kept = self.in_domain(below, above)
         if self.check_inputs:
-            for inside, _ in input_bounds_kept(system, mid, slopes, wide):
+            for inside, _ in input_bounds_kept(system, self.policy, x, error, mid, slopes, wide):
                 kept = kept & inside
         states, inputs, quantities = loop_models(
             system, x, error, mid, slopes, wide, 0 if self.flow is None else self.flow.symbols
