@@ -18,6 +18,7 @@ from certify.analysis.simulated import Simulator
 from certify.analysis.stages.state import State, Tools
 from certify.certificates.claims import Problem
 from certify.certificates.tree import LEAF
+from certify.certificates.verdict import Stop
 from certify.effort import Effort
 from certify.errors import OptionError
 from certify.lyapunov import Neural, Polynomial, are_inside, of_polynomial, volume
@@ -195,10 +196,11 @@ class Beyond:
             covered = 0.0 if isinstance(found, Nothing) else learner.cover(learned.function, found.outer.level)
             if best is None or covered > best[0]:
                 best = covered, found
-            again = covered < _MOST * learned.cover and found.witness is not None
-            if not again or found.witness is None or effort.left < _LEAST * self.tools.whole:
+            wrong = found.witness if isinstance(found, Nothing) or found.stop is Stop.WITNESS else None
+            enough = covered >= _MOST * learned.cover or effort.left < _LEAST * self.tools.whole
+            if wrong is None or enough:
                 return best[1]
-            learner.correct(found.witness.x, covered)
+            learner.correct(wrong.x, covered)
             share = effort.share(_FOR_LEARNING)
 
 
