@@ -163,7 +163,7 @@ def _stages_after(state: State, tools: Tools) -> list[Stage]:
     options, stages = state.options, list[Stage]()
     if isinstance(state.evidence, PartitionTree):  # nothing can be added to a solver's word
         if options.enlarges:
-            stages.append(Tube(tools) if state.centre is None else Route(tools))
+            stages.append(Tube(tools) if state.begin is None else Route(tools))
         if state.converging:
             stages.append(Equilibrium(tools))
         if options.goes_beyond:

@@ -3,25 +3,25 @@ boxes with ranks."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.analysis.asked import ellipsoid_in
+from certify.analysis.asked import ellipsoid_around, ellipsoid_in
 from certify.analysis.facts import TubeFacts
 from certify.analysis.simulated import Simulator
 from certify.analysis.stages.state import State, Tools
 from certify.certificates.claims import Problem
+from certify.certificates.ellipsoids import Box, sublevel_set, tube_start
 from certify.certificates.tree import LEAF
 from certify.certificates.verdict import Stop
 from certify.effort import Effort
 from certify.errors import OptionError
-from certify.lyapunov import Neural, Polynomial, are_inside, of_polynomial, volume
+from certify.lyapunov import Neural, Polynomial, of_polynomial, volume
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.symbolic import Symbolic
 from certify.provers.base import Budget, Progress
@@ -99,20 +99,21 @@ class Route:
         """Add the widest tube that the effort finds; `missed` says why there is none."""
         from certify.provers.tube.enlarge import surround
 
-        (claim, evidence), centre, trial = state.proved, state.centre or (), state.contest.best.trial
-        if holds(trial.task.problem, claim.roa, centre):
-            return replace(state, missed="the checker accepted only a lower level, and the state lies above it")
+        (claim, evidence), begin, trial = state.proved, state.begin or (), state.contest.best.trial
+        what = named(begin)
+        if holds(trial.task.problem, claim.roa, begin):
+            return replace(state, missed=f"the checker accepted only a lower level, and {what} lies above it")
         with self.tools.timing("tube"):
             self.tools.tell("tube")
-            middle, goal = np.array([float(q) for q in centre]), trial.P / claim.roa
+            middle, goal = np.array([float(lo + hi) / 2 for lo, hi in begin]), trial.P / claim.roa
             shapes = _shapes(state, {trial.name: trial.P, "domain": ellipsoid_in(state.loop.system)})
             found, missed = surround(trial.task.problem.loop, middle, goal, shapes, effort.share(_FOR_SEARCH))
         if found is None:
             return replace(state, missed=missed)
         tube, at = found.tube, tuple(middle.tolist())
         facts = TubeFacts(tube.start, found.shape, len(tube.slabs), tube.duration, at)
-        if not facts.contains([centre]):
-            return replace(state, missed="the tube is narrower than the rounding of that state")
+        if not tube_start(tube.start, at).covers(begin):
+            return replace(state, missed=_narrower(tube.start, at, begin))
         state = state.with_result(tube=facts)
         return replace(
             state, claim=claim.with_tube(Quadratic(tube.start), at), evidence=replace(evidence, tube=tube.slabs)
@@ -121,13 +122,28 @@ class Route:
 
 def _shapes(state: State, shapes: Mapping[str, Array]) -> Mapping[str, Array]:
     """These shapes, or the one box that was asked for."""
-    box = state.options.box
-    return shapes if box is None else {"box": ellipsoid_in(state.loop.system, box)}
+    system, box = state.loop.system, state.options.box
+    asked = ellipsoid_in(system, box) if box is not None else ellipsoid_around(system, state.begin or ())
+    return shapes if asked is None else {"box": asked}
 
 
-def holds(problem: Problem, level: float, state: Sequence[Fraction]) -> bool:
-    """True if {V <= level} holds a state, decided in rationals."""
-    return are_inside(problem.V.P, level, [state])[0]
+def _narrower(P: Array, centre: tuple[float, ...], begin: Box) -> str:
+    """The reason why a box, or a state, does not lie in the start of a tube."""
+    if all(lo == hi for lo, hi in begin):
+        return "the tube is narrower than the rounding of that state"
+    reach = np.array([float(hi - lo) / 2 for lo, hi in begin])
+    share = min(1.0, float(reach @ np.abs(P) @ reach) ** -0.5)
+    return f"the widest tube holds {share:.2g} of the box in each direction; ask for smaller boxes, one by one"
+
+
+def named(begin: Box) -> str:
+    """Names what a tube has to start around."""
+    return "the state" if all(lo == hi for lo, hi in begin) else "the box"
+
+
+def holds(problem: Problem, level: float, box: Box) -> bool:
+    """True if {V <= level} is shown in rationals to hold a box, or a state."""
+    return sublevel_set(problem.V.P, level).covers(box)
 
 
 @dataclass(frozen=True)
