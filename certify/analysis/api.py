@@ -57,7 +57,7 @@ class Keywords(TypedDict, total=False):
     rate: float | None
     enlarge: bool | None
     box: Mapping[str, float] | None
-    reach_from: Mapping[str, Exact] | None
+    reach_from: Mapping[str, Exact | tuple[Exact, Exact]] | None
     ranks: bool | None
     lyapunov: str | os.PathLike[str] | Neural | Polynomial | Symbolic | None
     lyapunov_level: float | None

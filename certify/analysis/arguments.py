@@ -193,17 +193,27 @@ def widths(text: str, name: str) -> dict[str, float]:
 
 def state(text: str, name: str) -> dict[str, Fraction]:
     """Exact numbers by name, separated by commas or spaces."""
-    found = dict[str, Fraction]()
-    for key, value in _assignments(text, f"`{name}`"):
-        if key in found:
-            raise OptionError(f"`{name}` must name each number once; found {key} twice.")
-        found[key] = _exact(value, key)
-    return found
+    return _by_name(text, name, _exact)
+
+
+def box(text: str, name: str) -> dict[str, Fraction | tuple[Fraction, Fraction]]:
+    """Exact numbers or ranges by name, separated by commas or spaces."""
+    return _by_name(text, name, value_or_range)
 
 
 def bound_or_bounds(text: str, name: str) -> Fraction | dict[str, Fraction]:
     """An exact number, or several by name."""
     return state(text, name) if "=" in text else _exact(text, name)
+
+
+def _by_name(text: str, name: str, read: Callable[[str, str], Any]) -> dict[str, Any]:
+    """Values by name, each of which comes once."""
+    found = dict[str, Any]()
+    for key, value in _assignments(text, f"`{name}`"):
+        if key in found:
+            raise OptionError(f"`{name}` must name each number once; found {key} twice.")
+        found[key] = read(value, key)
+    return found
 
 
 def _number(text: str, name: str) -> float:
@@ -243,7 +253,7 @@ _READERS: Mapping[str, Callable[[Any, str], Any]] = {
     "row": numbers,
     "layers": layers,
     "widths": widths,
-    "state": state,
+    "box": box,
     "file": lambda text, _: Path(text),
     "ranges": _ranges,
     "bounds": bound_or_bounds,

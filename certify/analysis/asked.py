@@ -5,14 +5,16 @@ A run asks here before it begins; nothing here is part of a proof.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Mapping
 from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.analysis.options import RoaOptions
+from certify.analysis.options import Place, RoaOptions, interval
+from certify.certificates.ellipsoids import Box
 from certify.errors import InputError, OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.constraints import not_kept_at_origin
@@ -119,8 +121,9 @@ def ellipsoid_in(system: System, box: Mapping[str, float] | None = None) -> Arra
     return np.diag([float(box.get(name, least * sides[name])) ** -2 for name in names])
 
 
-def state_in(system: System, values: Mapping[str, Fraction | float]) -> tuple[Fraction, ...]:
-    """A state by the states' values, as a deviation from the operating point, at which states without a value are.
+def box_in(system: System, values: Mapping[str, Place]) -> Box:
+    """A state or a box by the states' values, as deviations from the operating point, at which states without a value
+    are.
 
     Raises
     ------
@@ -131,16 +134,27 @@ def state_in(system: System, values: Mapping[str, Fraction | float]) -> tuple[Fr
         raise OptionError(
             f"`reach_from` must name states of {system.name}, {', '.join(names)}; found {', '.join(values) or 'none'}."
         )
-    state = tuple(Fraction(values.get(name, q)) - q for name, q in zip(names, at, strict=True))
-    for name, q, v, (lo, hi) in zip(names, at, state, system.domain, strict=True):
-        if not lo < v < hi:
-            raise OptionError(
-                f"`reach_from` must lie in the interior of the domain, {name} between {float(lo + q):g} and "
-                f"{float(hi + q):g}; found {float(v + q):g}."
-            )
-    return state
+    box = tuple(
+        (Fraction(lo) - q, Fraction(hi) - q)
+        for (lo, hi), q in ((interval(values.get(name, q)), q) for name, q in zip(names, at, strict=True))
+    )
+    for name, q, ends, (lo, hi) in zip(names, at, box, system.domain, strict=True):
+        for v in ends:
+            if not lo < v < hi:
+                raise OptionError(
+                    f"`reach_from` must lie in the interior of the domain, {name} between {float(lo + q):g} and "
+                    f"{float(hi + q):g}; found {float(v + q):g}."
+                )
+    return box
 
 
-def values_of(system: System, deviations: Sequence[Fraction]) -> tuple[Fraction, ...]:
-    """A state's values from its deviations from the operating point."""
-    return tuple(q + v for q, v in zip(system.exact_x_eq(), deviations, strict=True))
+def values_of(system: System, box: Box) -> Box:
+    """A box of the states' values from one of deviations from the operating point."""
+    return tuple((q + lo, q + hi) for q, (lo, hi) in zip(system.exact_x_eq(), box, strict=True))
+
+
+def ellipsoid_around(system: System, box: Box) -> Array | None:
+    """P (n, n) of the least ellipsoid {x'Px <= 1} with axes along the states, of which those not named in a `box` are
+    smallest, that holds a box around its middle; None for a state."""
+    wide = {s.name: float(hi - lo) / 2 for s, (lo, hi) in zip(system.states, box, strict=True) if lo < hi}
+    return ellipsoid_in(system, {name: math.sqrt(len(wide)) * r for name, r in wide.items()}) if wide else None

@@ -20,7 +20,7 @@ Kind = Literal[
     "row",
     "layers",
     "widths",
-    "state",
+    "box",
     "matrix",
     "file",
     "ranges",
@@ -98,5 +98,6 @@ def declared(of: type) -> Mapping[str, Option]:
 
 def _shown(value: Any) -> str:
     if isinstance(value, Mapping):
-        return ", ".join(f"{name}={float(each):g}" for name, each in value.items())
+        ends = {name: each if isinstance(each, tuple) else (each,) for name, each in value.items()}
+        return ", ".join(f"{name}={'..'.join(f'{float(end):g}' for end in each)}" for name, each in ends.items())
     return f"{value:g}" if isinstance(value, float) else repr(value)

@@ -45,7 +45,10 @@ def to_dict(result: RoaResult) -> dict[str, Any]:
         "reach_time": result.reach_time,
         "reach_from": None
         if result.reach_from is None
-        else {s.name: str(q) for s, q in zip(system.states, result.reach_from, strict=True)},
+        else {
+            s.name: str(lo) if lo == hi else [str(lo), str(hi)]
+            for s, (lo, hi) in zip(system.states, result.reach_from, strict=True)
+        },
         "tube": None if result.tube is None else result.tube.to_dict(),
         "outer": None if result.outer is None else result.outer.to_dict(),
         "ranks": None if result.ranks is None else result.ranks.to_dict(),

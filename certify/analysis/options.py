@@ -22,14 +22,24 @@ if TYPE_CHECKING:
 EngineName = Literal["bounds", "dreal", "both"]
 Asked = Literal["auto", "asymptotic", "practical", "nearby", "invariant"]
 Around = Literal["auto", "origin", "rest"]
+Place = Fraction | float | tuple[Fraction | float, Fraction | float]
+"""A number, or the ends (lo, hi) of an interval."""
 _MOST_JOBS = 256  # processes of the checker
+
+
+def interval(place: Place) -> tuple[Fraction | float, Fraction | float]:
+    """The ends of an interval, which are equal for a number."""
+    return place if isinstance(place, tuple) else (place, place)
 
 
 _POSITIVE = ("be a positive number", lambda value: math.isfinite(value) and value > 0)
 _FROM_0 = ("be a number of at least 0", lambda value: 0 <= value < math.inf)
 _ABOVE_0 = ("be positive", lambda value: value > 0)
 _HALF_WIDTHS = ("have positive half-widths", lambda value: all(map(_POSITIVE[1], value.values())))
-_NUMBERS = ("be a state of finite numbers", lambda value: all(map(math.isfinite, value.values())))
+_PLACES = (
+    "be a state of finite numbers, or a box with pairs (lo, hi), lo <= hi",
+    lambda value: all(lo <= hi and math.isfinite(hi - lo) for lo, hi in map(interval, value.values())),
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,11 +68,11 @@ class RoaOptions:
         "Let the tube start from the largest multiple of the ellipsoid with these half-axes; a state that is not named "
         "gets the smallest fraction of its domain among those that are."),
         written="As in x=0.4,phi=0.2.", python="Half-axes by state.")
-    reach_from: Mapping[str, Fraction | float] | None = option(
-        None, "claim", "state", _NUMBERS, typed="--from", metavar="STATE", varies=False, first=True, help=(
-        "Prove that this state converges too, with what lies around it: a tube around its trajectory leads into the "
-        "proved set. A state that is not named is at the operating point."),
-        written="As in x=0.5,y=-0.2.", python="Values by state.")
+    reach_from: Mapping[str, Place] | None = option(
+        None, "claim", "box", _PLACES, typed="--from", metavar="STATE|BOX", varies=False, first=True, help=(
+        "Prove that this state converges too, with what lies around it, or all of this box: a tube around a trajectory "
+        "leads into the proved set. A state that is not named is at the operating point."),
+        written="As in x=0.5,y=-0.2 or x=0.4..0.6,y=-0.2.", python="Values by state, or pairs (lo, hi).")
     ranks: bool = option(False, "claim", "flag", help=(
         "In discrete time and with held inputs: prove from which boxes of the domain every trajectory reaches the "
         "proved set, in how many steps at most; angles of the plant count modulo 2 pi."))

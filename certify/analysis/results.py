@@ -23,7 +23,7 @@ from certify.analysis.json_object import to_dict
 from certify.analysis.stated import in_one_line, stated
 from certify.certificates import parse_certificate, write_atomically
 from certify.certificates.claims import Problem
-from certify.certificates.ellipsoids import Ellipsoid, sublevel_set, tube_start
+from certify.certificates.ellipsoids import Box, Ellipsoid, sublevel_set, tube_start
 from certify.certificates.membership import Region
 from certify.certificates.ranked import Ranked
 from certify.certificates.timing import Timing, reach_time
@@ -78,7 +78,7 @@ class RoaResult:
     simulated: SimulatedFacts | None = None
     nonlinearity: Nonlinearity | None = None
     constraints: Mapping[str, str] = field(default_factory=dict)
-    reach_from: tuple[Fraction, ...] | None = None
+    reach_from: Box | None = None
     witness: Witness | None = None
     eigenvalues: tuple[str, ...] = ()
     boxes: int = 0

@@ -185,7 +185,7 @@ def bounds_in(value: Any, name: str) -> Fraction | dict[str, Fraction]:
     ------
     InputError : it is something else.
     """
-    return _state(value, name) if isinstance(value, Mapping) else _exact(value, name)
+    return _named(value, name, "values", _exact) if isinstance(value, Mapping) else _exact(value, name)
 
 
 def period_in(value: Any, where: str) -> Fraction | tuple[Fraction, Fraction]:
@@ -198,8 +198,8 @@ def period_in(value: Any, where: str) -> Fraction | tuple[Fraction, Fraction]:
     return _exact(value, where) if isinstance(value, _NUMBERS) else _pair(value, where)
 
 
-def _state(value: Any, name: str) -> dict[str, Fraction]:
-    return _named(value, name, "values", _exact)
+def _box(value: Any, name: str) -> dict[str, Fraction | tuple[Fraction, Fraction]]:
+    return _named(value, name, "values or pairs", period_in)
 
 
 def _ranges(value: Any, name: str) -> dict[str, Any]:
@@ -227,7 +227,7 @@ _READERS: Mapping[str, Callable[[Any, str], Any]] = {
     "row": lambda value, name: tuple(number(v, name) for v in _entries(value, name)),
     "layers": lambda value, name: tuple(_whole(v, name) for v in _entries(value, name)),
     "widths": lambda value, name: _named(value, name, "half-widths", number),
-    "state": _state,
+    "box": _box,
     "matrix": _matrix,
     "file": lambda value, _: value,
     "ranges": _ranges,

@@ -84,7 +84,7 @@ class Stop(Enum):
     LOCAL = "local"
     FLOOR = "floor"
     SMOOTH = "smooth"
-    PATH = "no tube from that state"
+    PATH = "no tube from there"
     BEYOND = "the level of the function"
     SOLVER = "solver"
     SPECTRUM = "spectrum"

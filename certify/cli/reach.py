@@ -46,7 +46,7 @@ def reach(
             help="Prove that this region is reached, in discrete time or with a held input, from which boxes of the "
             "domain, and in how many steps at most: a comparison of the states' values, such as 'position >= 0.45'; "
             "repeatable, for a region where all of them hold. Or FILE.json, a certificate about the same loop: its set "
-            "{V <= c2} is then to be reached, after which its claim holds. In steps, --from may be a box.",
+            "{V <= c2} is then to be reached, after which its claim holds.",
             rich_help_panel=FIRST,
         ),
     ] = None,
@@ -63,8 +63,8 @@ def reach(
     quiet: Quiet = False,
     importing: ImportOptions,
 ) -> None:
-    """Prove that a state converges, by a tube around its trajectory, or with --target that a region is reached, or the
-    set of a certificate."""
+    """Prove that a state or a box converges, by a tube around a trajectory, or with --target that a region is reached,
+    or the set of a certificate."""
     start, note, path = time.perf_counter(), noting(quiet), the_policy(context, file, policy)
     from certify.analysis.reaching import ReachOptions, certify_reach, into_set_of
     from certify.analysis.reaching.options import is_file, steps_within
@@ -98,9 +98,11 @@ def _require_one(target: list[str] | None, within: str | None, typed: dict[str, 
     OptionError : there is neither a target nor a state, or an option belongs to the other question.
     """
     if target is None and "reach_from" not in typed:
-        raise OptionError("`target` or `reach_from` must be given: a region that is to be reached, or a state.")
+        raise OptionError("`target` or `reach_from` must be given: a region that is to be reached, or a state or box.")
     if by_tube and "reach_from" not in typed:
-        raise OptionError("`reach_from` must be given, a state: in continuous time a tube leads from it into the set.")
+        raise OptionError(
+            "`reach_from` must be given: in continuous time a tube leads from a state or box into the set."
+        )
     if by_tube and within is not None:
         raise OptionError("`within` needs a `target` that is reached in steps: how many it may take.")
     if not by_tube and (odd := [name for name in ("box", "resume") if name in typed]):

@@ -111,14 +111,12 @@ class OnBoxes:
     def relaxed(self, v: Forms, kinds: Sequence[str | tuple[arb, arb]]) -> Forms:
         """Each entry's function between two lines on the range of the entry; a clip has its two ends for a name."""
         rows, slopes, gaps, stride = Rows(), Rows(), Rows(), self.stride(v)
-        errors = v.error or [[ZERO] * self.count] * len(v.rows)
-        for row, kind, error in zip(v.rows, kinds, errors, strict=True):
+        for row, kind, taken in zip(v.rows, kinds, self.ranges(v), strict=True):
             entries, steep, apart = list[arb](), list[arb](), list[arb]()
-            for b, e in enumerate(error):
-                middle, *coefficients = row[b * stride : (b + 1) * stride]
-                slope, shift, gap = self.line(kind, middle, sum(map(abs, coefficients), e), b)
+            for b, (middle, reach) in enumerate(taken):
+                slope, shift, gap = self.line(kind, middle, reach, b)
                 entries.append(slope * middle + shift)
-                entries += [slope * x for x in coefficients]
+                entries += [slope * x for x in row[b * stride + 1 : (b + 1) * stride]]
                 steep.append(slope)
                 apart.append(gap)
             rows.append(entries)
@@ -209,6 +207,14 @@ class OnBoxes:
         return self.vector(result, (v, lambda ways: ways))
 
     # ------------------------------------------------------------------------------------------------- the results
+
+    def ranges(self, v: Forms) -> list[list[tuple[arb, arb]]]:
+        """For each entry its middle and its reach on each leaf."""
+        stride, result = self.stride(v), list[list[tuple[arb, arb]]]()
+        for row, errors in zip(v.rows, v.error or [[ZERO] * self.count] * len(v.rows), strict=True):
+            each = [(row[b * stride : (b + 1) * stride], error) for b, error in enumerate(errors)]
+            result.append([(middle, sum(map(abs, slopes), error)) for (middle, *slopes), error in each])
+        return result
 
     def forms(self, v: Forms, wanted: Sequence[int]) -> list[list[Form]]:
         """Some entries of a vector, each on each leaf."""

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from functools import cache
 from typing import TYPE_CHECKING
 
-from flint import arb, arb_mat
+from flint import arb, arb_mat, fmpq
 
 from .fields import exact
 
@@ -96,10 +96,15 @@ def beta(c: Certificate) -> list[arb]:
     return [arb((q - exact(b)) / exact(s)).atanh() for q, s, b in each]
 
 
+def lies_within(values: Iterable[arb], lo: fmpq, hi: fmpq) -> bool:
+    """True if all of these numbers certainly lie between the ends."""
+    return all(v >= arb(lo) and v <= arb(hi) for v in values)
+
+
 def within_bounds(c: Certificate, ranges: Sequence[tuple[arb, arb]]) -> bool:
     """True if every input, given by centre and radius, certainly lies in its bounds."""
     return all(
-        centre - radius >= arb(lo) and centre + radius <= arb(hi)
+        lies_within((centre - radius, centre + radius), lo, hi)
         for (centre, radius), (lo, hi) in zip(ranges, c.plant.input_bounds, strict=True)
     )
 

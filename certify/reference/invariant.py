@@ -68,7 +68,7 @@ class Staying(OverDomain):
         beside = arb_mat([[entry for x in rows for entry in x[i]] for i in range(self.c.n)])
         u = self.motion.policy(beside, len(some))
         return [
-            Part(f"outer leaf {box.number}", x, [forms[b] for forms in u], own)
+            Part(f"outer leaf {box.number}", x, [row[b] for row in u], own)
             for b, (box, x, own) in enumerate(zip(some, rows, each, strict=True))
         ]
 

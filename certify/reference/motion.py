@@ -13,7 +13,7 @@ from itertools import pairwise
 from flint import arb, arb_mat, fmpq
 
 from .affine import Form, OnBoxes, called, clip
-from .balls import ZERO, beta, bounded_by_form, total, within_bounds
+from .balls import ZERO, beta, bounded_by_form, lies_within, total
 from .document import Certificate
 from .expressions import Call
 from .flow import Moving, mean_on, reached_from
@@ -24,16 +24,35 @@ from .taylor import Taylor, constant
 
 
 @dataclass(frozen=True)
+class Input:
+    """An input on a box. It lies between `ends` as well, two numbers in any order, unless there are none."""
+
+    form: Form
+    ends: tuple[arb, ...]
+
+    @property
+    def range(self) -> tuple[arb, arb]:
+        """The centre and the radius of its form within the error."""
+        mid, slopes, error = self.form
+        return mid, total(map(abs, slopes)) + error
+
+    def keeps(self, lo: fmpq, hi: fmpq) -> bool:
+        """True if it certainly lies in these bounds."""
+        centre, radius = self.range
+        return any(lies_within(pair, lo, hi) for pair in ((centre - radius, centre + radius), self.ends) if pair)
+
+
+@dataclass(frozen=True)
 class Stage:
-    """A box that `place` names: `x` are lists [constant, coefficients of d], `u` the inputs' forms within errors."""
+    """A box that `place` names: `x` are lists [constant, coefficients of d], `u` the inputs."""
 
     place: str
     x: list[list[arb]]
-    u: list[Form]
+    u: list[Input]
 
     def ranges(self) -> list[tuple[arb, arb]]:
         """The centre and the radius of each input's enclosure."""
-        return [(mid, total(abs(v) for v in slopes) + error) for mid, slopes, error in self.u]
+        return [u.range for u in self.u]
 
 
 class Motion:
@@ -61,35 +80,44 @@ class Motion:
 
     def keep_bounds(self, at: Stage) -> None:
         """Rule `inputs`."""
-        good = self.bounded or within_bounds(self.c, at.ranges())
+        each = zip(at.u, self.c.plant.input_bounds, strict=True)
+        good = self.bounded or all(u.keeps(*bounds) for u, bounds in each)
         require(good, "inputs", at.place, "an input is not certain to stay in its bounds")
 
-    def policy(self, x: arb_mat, count: int) -> list[list[Form]]:
+    def policy(self, x: arb_mat, count: int) -> list[list[Input]]:
         """For each input and each leaf, given x on the leaves; the network reads x from its origin."""
         policy, algebra, rows = self.c.policy, OnBoxes(count), x.tolist()
         first = algebra.shifted(algebra.given(rows), map(arb, policy.origin))
         net = algebra.shifted(policy.network.run(algebra, first), self.shifts)
+        taken = algebra.ranges(net)
         if policy.squash == "tanh":
             net = algebra.map(Map((), self.c.m, "tanh"), net)
-        inputs = range(self.c.m)
-        return [[self.output(j, form) for form in forms] for j, forms in enumerate(algebra.forms(net, inputs))]
+        each = enumerate(zip(algebra.forms(net, range(self.c.m)), taken, strict=True))
+        return [[self.input(j, *of_leaf) for of_leaf in zip(*rows, strict=True)] for j, rows in each]
 
-    def output(self, j: int, squashed: Form) -> Form:
-        """Input j from the squash of the network's output."""
-        policy, (mid, slopes, error) = self.c.policy, squashed
-        scale, limits = arb(policy.scale[j]), policy.limits(j)
-        u = scale * mid + self.offset[j], [scale * v for v in slopes], abs(scale) * error
-        return u if limits is None else clip(u, arb(limits[0]), arb(limits[1]))
+    def input(self, j: int, squashed: Form, taken: tuple[arb, arb]) -> Input:
+        """Input j from the squash of the network's output, and from the middle and the reach of that output.
+
+        tanh rises: without a clip the input is between what it would be at both ends, where there is one at all.
+        """
+        policy, (mid, slopes, error), (middle, reach) = self.c.policy, squashed, taken
+        scale, limits, offset = arb(policy.scale[j]), policy.limits(j), self.offset[j]
+        u = scale * mid + offset, [scale * v for v in slopes], abs(scale) * error
+        if limits is not None:
+            return Input(clip(u, arb(limits[0]), arb(limits[1])), ())
+        rises = policy.squash == "tanh" and mid.is_finite()
+        ends = (middle - reach, middle + reach) if rises else ()
+        return Input(u, tuple(scale * y.tanh() + offset for y in ends))
 
     # --------------------------------------------------------------------------------------------------- the models
 
     def numbers(self, at: Stage) -> Moving:
         """Models by their names; an input's error and what is uncertain have a symbol each."""
-        plant = self.c.plant
+        plant, forms = self.c.plant, [u.form for u in at.u]
         states = {name: self.affine(row) for name, row in zip(plant.states, at.x, strict=True)}
         inputs = {
             name: self.moving(mid, slopes, self.d + j, error)
-            for j, (name, (mid, slopes, error)) in enumerate(zip(plant.inputs, at.u, strict=True))
+            for j, (name, (mid, slopes, error)) in enumerate(zip(plant.inputs, forms, strict=True))
         }
         uncertain, anything = dict[str, Taylor](), dict[str, Taylor]()
         for j, (name, (lo, hi)) in enumerate(zip(plant.uncertain, plant.ranges, strict=True)):

@@ -14,14 +14,13 @@ from itertools import product
 
 from flint import arb, arb_mat, fmpq_mat
 
-from .affine import Form
 from .balls import ZERO, total
 from .batches import in_batches
 from .document import Certificate, Ranks
 from .evidence import REMAINS, Ranked, Ranking, Tree
 from .keep import kept
 from .leaves import LEAF, Box, cut, structure
-from .motion import Motion, Stage
+from .motion import Input, Motion, Stage
 from .rational import bits
 from .refusal import Refused, require, under
 from .taylor import Taylor, constant
@@ -171,13 +170,13 @@ class Walk(Motion):
             rows.append([(arb(a) + arb(b)) / 2, *(radius if k == i else ZERO for k in range(self.d))])
         return rows
 
-    def inputs(self, each: Sequence[Rows]) -> list[list[Form]]:
+    def inputs(self, each: Sequence[Rows]) -> list[list[Input]]:
         """The inputs on each of some boxes."""
         x = arb_mat([[v for rows in each for v in rows[i]] for i in range(self.n)])
         u = self.policy(x, len(each))
-        return [[forms[b] for forms in u] for b in range(len(each))]
+        return [[row[b] for row in u] for b in range(len(each))]
 
-    def step(self, rows: Rows, at: str, u: list[Form]) -> Rows:
+    def step(self, rows: Rows, at: str, u: list[Input]) -> Rows:
         """The states after one step more, in which these are the inputs, or a refusal."""
         c = self.c
         here = Stage(at, rows, u)

@@ -27,12 +27,14 @@ from certify.report.words import (
     network_name,
     nonlinearity_in_words,
     number,
+    place,
     point,
     pretty_unit,
     quantity,
     seconds,
     share_of_runs,
     shortest,
+    state_or_box,
     symbol,
     volume_name,
     volume_unit,
@@ -123,7 +125,8 @@ def _set_rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     rows, units = [], state_units(result)
     if result.get("reach_from"):
         asked = _asked(result)
-        rows.append(("state", f"{asked}, which lies in {{V <= c2}}" if shown and not result.get("tube") else asked))
+        shape = state_or_box(result["reach_from"])
+        rows.append((shape, f"{asked}, which lies in {{V <= c2}}" if shown and not result.get("tube") else asked))
     if result.get("tube"):
         rows.append(("tube", _tube(result)))
     if result.get("outer"):
@@ -201,7 +204,8 @@ def _work_rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     about = ""
     if is_missed(result):
         beyond = result.get("stop") == "beyond"
-        about = ", about a smaller set" if beyond else ", about {V <= c2} alone, in which the state does not lie"
+        shape = state_or_box(result.get("reach_from") or {})
+        about = ", about a smaller set" if beyond else f", about {{V <= c2}} alone, in which the {shape} does not lie"
     both = " BY BOTH" if result["checked"] == result.get("reference") == "ACCEPTED" else ""
     rows.append(("checker", f"{result['checked'] or 'not reached'}{both}{about}"))
     return rows
@@ -232,9 +236,8 @@ def _rate(result: Mapping[str, Any], timing: TimingInWords) -> str:
 
 
 def _asked(result: Mapping[str, Any]) -> str:
-    """The requested state, by the states' values."""
-    names = state_names(result)
-    return point(names, [Fraction(result["reach_from"][name]) for name in names], state_units(result))
+    """The requested state or box, by the states' values."""
+    return place({name: result["reach_from"][name] for name in state_names(result)}, state_units(result))
 
 
 def _tube(result: Mapping[str, Any]) -> str:

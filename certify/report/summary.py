@@ -30,6 +30,7 @@ from certify.report.words import (
     inner_level,
     listed,
     pretty_unit,
+    state_or_box,
     varying,
 )
 
@@ -45,10 +46,10 @@ def summary(result: Mapping[str, Any]) -> RenderableType:
     Parameters
     ----------
     result : the object that `certify roa --json` prints. Of its keys `states` and `inputs` (lists of `{name, unit}`),
-        `operating_point` (values by state), `reach_from` (values by state, of the state that was asked about), `claim`
-        (`{kind}`, with `rate` and `sample` where there are), `time` and `uncertain` may be absent: then there are no
-        units, the operating point is 0, no state was asked about, the claim is the asymptotic one, time is continuous,
-        and all of the plant is exact.
+        `operating_point` (values by state), `reach_from` (by state the value, or both ends, that was asked about),
+        `claim` (`{kind}`, with `rate` and `sample` where there are), `time` and `uncertain` may be absent: then there
+        are no units, the operating point is 0, no state was asked about, the claim is the asymptotic one, time is
+        continuous, and all of the plant is exact.
 
     Returns
     -------
@@ -96,7 +97,8 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
         smaller = f" with the states of the domain where N(x) <= {below(outer['level'])}" if outer else ""
         return f"{name}: the level of N is NOT proved; what is proved is {{V <= {below(level)}}}{smaller}"
     if is_missed(result):
-        return f"{name}: the state is NOT shown to converge; what is proved is {{V <= {below(level)}}}, without it"
+        shape = state_or_box(result.get("reach_from") or {})
+        return f"{name}: the {shape} is NOT shown to converge; what is proved is {{V <= {below(level)}}}, without it"
     return f"{name}: nothing was proved"
 
 

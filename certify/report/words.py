@@ -184,8 +184,27 @@ def point(names: Sequence[str], values: Sequence[float | Fraction], units: Seque
     >>> point(["p", "theta"], [1.5, -0.1], ["m", ""])
     'p = 1.5 m, θ = −0.1'
     """
+    return _values(names, [shortest(float(v)) for v in values], units)
+
+
+def place(asked: Mapping[str, str | Sequence[str]], units: Sequence[str]) -> str:
+    """A state or a box in words, from exact numbers as text, or two of them.
+
+    >>> place({"p": ["7/5", "8/5"], "theta": "-1/10"}, ["m", ""])
+    'p = 1.4..1.6 m, θ = −0.1'
+    """
+    ends = [[v] if isinstance(v, str) else v for v in asked.values()]
+    return _values(list(asked), ["..".join(shortest(float(Fraction(v))) for v in each) for each in ends], units)
+
+
+def state_or_box(asked: Mapping[str, str | Sequence[str]]) -> str:
+    """Names what was asked about: a box if it has an interval."""
+    return "state" if all(isinstance(v, str) for v in asked.values()) else "box"
+
+
+def _values(names: Sequence[str], values: Sequence[str], units: Sequence[str]) -> str:
     each = zip(names, values, units, strict=True)
-    return ", ".join(f"{symbol(name)} = {shortest(float(v))} {pretty_unit(unit)}".rstrip() for name, v, unit in each)
+    return ", ".join(f"{symbol(name)} = {v} {pretty_unit(unit)}".rstrip() for name, v, unit in each)
 
 
 def pretty_unit(unit: str) -> str:

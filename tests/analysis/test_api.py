@@ -104,7 +104,8 @@ def test_a_tube_by_name(tmp_path: Path) -> None:
 
 def test_a_state_by_name(tmp_path: Path) -> None:
     result = certify_roa(*scalar_tanh(), tmp_path, level=0.25, reach_from={"x": "1.3"}, box={"x": 0.1}, effort=0.2)
-    assert (result.verdict, result.claim, result.reach_from) == (Verdict.PROVED, "reached", (Fraction(13, 10),))
+    x = Fraction(13, 10)
+    assert (result.verdict, result.claim, result.reach_from) == (Verdict.PROVED, "reached", ((x, x),))
     assert result.contains([Fraction(13, 10)]) is True and result.contains([-1.3]) is False
 
 

@@ -18,8 +18,11 @@ from certify.checker.document import Policy
 from certify.checker.near import Above, Form
 from certify.checker.network import enclose_on_boxes, fold, keep_bounds
 from certify.checker.networks import Affine, Map, Network
-from tests.support.rank_forgeries import by_checker, verdicts
-from tests.support.ranked import Document, Loop, affine, encode, hashed, mapped, raw, two_bytes
+from certify.reference.document import read
+from certify.reference.evidence import Ranked
+from certify.reference.ranks import Walk
+from tests.support.rank_forgeries import by_checker, by_reference, verdicts
+from tests.support.ranked import Document, Loop, affine, dumped, encode, hashed, mapped, raw, two_bytes
 
 HAIR, BAND = Fraction(1, 10**9), Fraction(1, 1000)
 Bounds = tuple[Fraction | int, Fraction | int]
@@ -80,7 +83,7 @@ SATURATED = [affine([[6.0]], [-0.25])]  # its argument goes from -1/4 to 23/4
 
 def test_an_input_that_saturates_keeps_the_bounds_that_it_reaches() -> None:
     bounds = reaches(-0.25, 5.75, -0.25)
-    assert by_checker(loop(SATURATED, moved(bounds, -HAIR, HAIR))) is None
+    assert said(loop(SATURATED, moved(bounds, -HAIR, HAIR))) is None
     for lower, upper in ((HAIR, HAIR), (-HAIR, -HAIR)):
         assert said(loop(SATURATED, moved(bounds, lower, upper))) == "inputs"
 
@@ -88,7 +91,7 @@ def test_an_input_that_saturates_keeps_the_bounds_that_it_reaches() -> None:
 def test_in_the_second_step_as_in_the_first() -> None:
     """From [9/10, 1] the state comes to [27/20, 3/2]: 8.75 is where tanh is taken then."""
     bounds = reaches(0.9 * 6 - 0.25, 8.75, -0.25)
-    assert by_checker(loop(SATURATED, moved(bounds, -HAIR, HAIR), lo=0.9, steps=2)) is None
+    assert said(loop(SATURATED, moved(bounds, -HAIR, HAIR), lo=0.9, steps=2)) is None
     hair = tanh(8.75, True) - tanh(5.75, False)  # what the second step alone reaches
     assert hair > HAIR
     assert said(loop(SATURATED, moved(bounds, -HAIR, -hair / 2), lo=0.9, steps=2)) == "inputs"
@@ -101,7 +104,7 @@ def test_scales_and_slopes_of_both_signs(gain: float, scale: float) -> None:
     ends = sorted(Fraction(scale) * (tanh(y, True) - tanh(-0.25, True)) for y in (-0.25, gain - 0.25))
     bounds = ends[0] - HAIR, ends[1] + HAIR
     policy = {"scale": encode(scale), "offset": encode(0.5)}  # centring takes the offset out again
-    assert by_checker(loop(network, bounds, **policy)) is None
+    assert said(loop(network, bounds, **policy)) is None
     assert said(loop(network, moved(bounds, 2 * HAIR), **policy)) == "inputs"
     assert said(loop(network, moved(bounds, 0, -2 * HAIR), **policy)) == "inputs"
     assert said(loop(network, bounds, scale=encode(0.0))) == "format"
@@ -115,7 +118,7 @@ def test_centring_pushes_an_input_out_of_the_bounds_of_its_squash(bias: float) -
     assert said(loop(network, (-1, 1), lo=-1.0, centre="none")) is None
     least = abs(Fraction(bias)) + HAIR / 1000
     free = moved((-1, 1), -least, least)
-    assert by_checker(loop(network, free, lo=-1.0)) is None
+    assert said(loop(network, free, lo=-1.0)) is None
 
 
 @pytest.mark.parametrize("weight", [1e308, -1e308])
@@ -123,7 +126,7 @@ def test_an_argument_that_overflows_shows_nothing(weight: float) -> None:
     """Forms of 10^308 x - 10^308 x, which is 0, are not a number, or infinite."""
     network = [affine([[weight], [weight]]), affine([[weight, -weight]], of=1)]
     assert by_checker(loop(network, WIDE, lo=-1.0)) == "inputs"
-    assert by_checker(loop([affine([[weight]])], WIDE, lo=-1.0)) is None  # far, but finite
+    assert said(loop([affine([[weight]])], WIDE, lo=-1.0)) is None  # far, but finite
 
 
 def both_ways() -> list[Document]:
@@ -135,7 +138,7 @@ def both_ways() -> list[Document]:
 
 def test_one_input_by_its_form_and_the_other_by_its_squash() -> None:
     reached, narrow = moved(reaches(-0.25, 5.75, -0.25), -HAIR, HAIR), (-BAND, BAND)
-    assert by_checker(loop(both_ways(), reached, narrow)) is None
+    assert said(loop(both_ways(), reached, narrow)) is None
     assert said(loop(both_ways(), moved(reached, 0, -2 * HAIR), narrow)) == "inputs"
     assert said(loop(both_ways(), moved(reached, 2 * HAIR), narrow)) == "inputs"
     assert said(loop(both_ways(), reached, (HAIR, 1))) == "inputs"  # 0 is below it
@@ -155,11 +158,11 @@ def test_no_other_squash_and_no_clip() -> None:
 def test_two_leaves_by_two_ways() -> None:
     """Around 0 the form is nearly exact, on [0, 1] the input saturates: each leaf takes what shows it."""
     data = loop(SATURATED, moved(reaches(-0.25, 5.75, -0.25), -HAIR, HAIR), lo=-(2.0**-40), hi=2.0**-40)
-    assert by_checker(data) is None
+    assert said(data) is None
     ranks = data["evidence"]["ranks"]
     ranks |= {"lo": encode(-1.0), "hi": encode(1.0), "tree": raw(bytes([0, 255, 255]))}
     ranks |= {"ranks": raw(two_bytes([65_535, 1])), "steps": raw(bytes([0, 1]))}
-    assert by_checker(data) is None
+    assert said(data) is None
     ranks |= {"ranks": raw(two_bytes([1, 1])), "steps": raw(bytes([1, 1]))}
     assert said(data) == "inputs"  # on [-1, 0] the input goes to -1
 
@@ -208,3 +211,108 @@ def test_what_samples_reach_is_never_outside_of_what_is_kept(seed: int) -> None:
     alone = [keep_bounds(net, far, x[:, [k]], found[:, [k]])[:, 0] for k in range(batch)]
     assert np.array_equal(keep_bounds(net, far, x, found), np.transpose(alone))  # a batch is its boxes
     assert 0 < np.sum(alone) < np.size(alone)
+
+
+@pytest.mark.parametrize("seed", range(16))
+def test_bounds_that_are_a_hair_of_a_hair_too_narrow(seed: int) -> None:
+    """Neither the ball of an end nor the middle of one lies in bounds that the input leaves by 2^-70."""
+    chance = np.random.default_rng(seed)
+    lo, hi = sorted(chance.uniform(-1, 1, 2).tolist())
+    gain, bias, scale = chance.normal(0, 2), chance.normal(), chance.choice([-1, 1]) * chance.uniform(0.3, 3)
+    network, policy = [affine([[gain]], [bias])], {"centre": "none", "scale": encode(scale)}
+    values = sorted(Fraction(scale) * tanh(Fraction(gain) * Fraction(x) + Fraction(bias), True) for x in (lo, hi))
+    bounds, bit = (values[0], values[1]), Fraction(1, 2**70)
+    assert said(loop(network, moved(bounds, -Fraction(1, 2**40), Fraction(1, 2**40)), lo=lo, hi=hi, **policy)) is None
+    assert said(loop(network, moved(bounds, bit, 1), lo=lo, hi=hi, **policy)) == "inputs"
+    assert said(loop(network, moved(bounds, -1, -bit), lo=lo, hi=hi, **policy)) == "inputs"
+
+
+def test_a_bound_that_is_reached_exactly() -> None:
+    assert by_reference(loop([affine([[6.0]])], (0, 1))) is None  # tanh(0) is 0 in balls too
+    assert by_reference(loop([affine([[6.0]])], (HAIR, 1))) == "inputs"
+
+
+@pytest.mark.parametrize("u_eq", ["0", "-9/10", "4/5"])
+def test_centring_before_tanh_moves_what_tanh_is_taken_of(u_eq: str) -> None:
+    beta = np.arctanh(float(Fraction(u_eq)))
+    bounds = tanh(beta, True), tanh(6 + beta, False)
+    data = loop(SATURATED, moved(bounds, -HAIR, HAIR), centre="preactivation")
+    for plant, expected in ((moved(bounds, -HAIR, HAIR), None), (moved(bounds, HAIR, 1), "inputs")):
+        ends = [str(v) for v in plant]
+        assert said(data | {"plant": data["plant"] | {"u_eq": [u_eq], "input_bounds": [ends]}}) == expected
+
+
+def test_one_end_by_the_form_and_the_other_by_the_squash() -> None:
+    """y_1 + (h - h), h = tanh(y_1): lines around tanh lie far above it, its range reaches far below what cancels.
+
+    The form of the input goes from -0.35 to 2.15, what it is at the ends of the range from -0.53 to 1.24.
+    """
+    h = affine([[1.0], [1.0]], of=2)
+    network = [affine([[6.0]], [-0.25]), mapped("tanh", 1), h, affine([[1.0, -1.0]], of=3)]
+    network.append({"kind": "sum", "of": [1, 4]})
+    low, high = (Fraction(-11, 25), Fraction(-27, 50)), (Fraction(13, 10), Fraction(11, 5))
+    assert said(loop(network, (low[0], high[1]))) is None
+    assert said(loop(network, (low[1], high[0]))) is None
+    assert said(loop(network, (low[0], high[0]))) == "inputs"  # though it is true
+
+
+@pytest.mark.parametrize("gain", [6.0, -6.0])
+def test_each_leaf_of_a_batch_has_a_range_of_its_own(gain: float) -> None:
+    """One half has its inputs within loose bounds by their forms, the other one leaves them: in both orders."""
+    data = loop([affine([[gain]])], (Fraction(-1, 2), 2), lo=-1.0)
+    ranks = data["evidence"]["ranks"]
+    ranks |= {"tree": raw(bytes([0, 255, 255])), "ranks": raw(two_bytes([65_535, 1])), "steps": raw(bytes([0, 1]))}
+    one = {"ranks": raw(two_bytes([1, 65_535])), "steps": raw(bytes([1, 0]))}
+    alone = [said(data), said(data | {"evidence": data["evidence"] | {"ranks": ranks | one}})]
+    assert sorted(alone, key=str) == [None, "inputs"]
+    ranks |= {"ranks": raw(two_bytes([1, 1])), "steps": raw(bytes([1, 1]))}
+    assert said(data) == "inputs"
+
+
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_where_the_policy_may_not_exist_its_squash_shows_nothing(weight: float) -> None:
+    """The root of x - 1/2 has no value on half of the leaf, whatever it is multiplied by."""
+    root, bounds = [affine([[1.0]], [-0.5]), mapped("sqrt", 1), affine([[weight]], of=2)], (-BAND, 1 - BAND)
+    assert said(loop(root, bounds, centre="none")) == "inputs"
+    assert said(loop(root, bounds, centre="none", lo=0.75)) is None
+
+
+def along_leaves(claim: str, bounds: Bounds) -> Document:
+    """xdot = -x on the halves of [-1, 1], with one input that does not act, under rules `ring`, `outer`, `invariant`.
+
+    With `outer` {V <= c2} is small, and its ring has leaves of its own.
+    """
+    data, zero, halves = loop(SATURATED, bounds), (0.0).hex(), raw(bytes([0, 255, 255]))
+    dynamics = [["+", ["-", "x"], ["*", "0", "u0"]]]
+    data["plant"] |= {"time": "continuous", "dynamics": dynamics, "domain": [["-1", "1"]]}
+    N = {"expression": ["*", "x", "x"], "level": (0.5).hex()}
+    covering = {"T": encode(1.0), "root": encode(1.0), "tree": halves, "faces": [raw(b"\xff")] * 2}
+    if claim == "invariant":
+        evidence = {"kind": "outer", "outer": covering}
+        return data | {"claim": {"kind": claim, "outer": N}, "evidence": evidence}
+    far = claim == "outer"
+    return data | {
+        "claim": {"kind": "practical", "rate": zero, "sample": None, "outer": N if far else None},
+        "lyapunov": {"kind": "quadratic", "P": encode(64.0 if far else 1.0)},
+        "levels": {"local": (0.25).hex(), "floor": (0.25).hex(), "roa": (0.9).hex()},
+        "evidence": {
+            "kind": "partition-tree", "T": encode(1.0), "root": encode(0.125 if far else 1.0), "tree": halves,
+            "order": 1, "cells": [], "local": None, "contraction": None, "tube": [], "outer": covering if far else None,
+        },
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("claim", ["ring", "outer", "invariant"])
+def test_leaves_of_all_rules(claim: str) -> None:
+    bounds = reaches(-6.25, 5.75, -0.25)
+    assert said(along_leaves(claim, moved(bounds, -HAIR, HAIR))) is None
+    for lower, upper in ((HAIR, HAIR), (-HAIR, -HAIR)):
+        assert said(along_leaves(claim, moved(bounds, lower, upper))) == "inputs"
+
+
+def test_an_input_whose_form_is_no_number_has_no_ends() -> None:
+    c = read(dumped(loop(SATURATED, WIDE)))
+    assert isinstance(c.evidence, Ranked)
+    walk, nan = Walk(c, 1, c.evidence.ranking), arb("nan")
+    assert len(walk.input(0, (arb(0), [arb(1)], arb(0)), (arb(0), arb(1))).ends) == 2
+    assert not walk.input(0, (nan, [arb(1)], nan), (arb(0), arb(1))).ends

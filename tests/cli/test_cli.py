@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -637,6 +638,50 @@ def test_reach_proves_that_a_state_converges(
     assert status == 0 and out.splitlines()[-1].startswith("ACCEPTED ") and "c = 1.5 1.4" in out
 
 
+def test_reach_proves_that_a_box_converges(
+    tmp_path: Path, spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    box = "p=1.49..1.51", "v=1.38..1.42"
+    status, out, _ = run(capsys, "reach", *spring, "--from", ",".join(box), "--effort", "0.3", "--json")
+    data = json.loads(out)
+    assert status == 0 and data["verdict"] == "PROVED" and data["checked"] == "ACCEPTED"
+    assert data["reach_from"] == {"p": ["149/100", "151/100"], "v": ["69/50", "71/50"]}
+    assert data["tube"]["shape"] == "box" and data["tube"]["centre"] == [1.5, 1.4]
+    file = tmp_path / "o" / "certificate.json"
+    assert run(capsys, "contains", file, *box)[0] == 0
+    wider = [round(1.5 + 2 * (-1) ** k * data["tube"]["semi_axes"][0], 6) for k in (1, 0)]
+    assert run(capsys, "contains", file, f"p={wider[0]}..{wider[1]}", box[1])[0] != 0
+    status, out, _ = run(capsys, "reach", *spring, "--from", ",".join(box), "--effort", "0.3")
+    assert status == 0 and re.search(r"box +p = 1.49..1.51 m, v = 1.38..1.42 m/s", out)
+
+
+def test_a_box_that_is_wider_than_every_tube_is_not_shown_to_converge(
+    tmp_path: Path, spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ("reach", *spring, "--from", "p=1.3..1.7,v=1.4", "--effort", "0.1")
+    status, out, _ = run(capsys, *given)
+    said = " ".join(out.split())
+    assert status == 3 and "the box is NOT shown to converge" in said and "PROVED" not in said
+    share = re.search(r"the widest tube holds (0\.\d+) of the box in each direction", said)
+    assert share is not None and 0 < float(share[1]) < 1
+    assert "The box p = 1.3..1.7 m, v = 1.4 m/s was asked about" in (tmp_path / "o" / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("begin", "more", "why"),
+    [
+        ("p=1.5..1.4", (), "lo <= hi; found p=1.5..1.4"),
+        ("p=1.4..2", (), "must lie in the interior of the domain, p between -2 and 2; found 2"),
+        ("p=1.4..1.5", ("--box", "p=0.1"), "leave it out where --from is a box"),
+    ],
+)
+def test_a_box_that_cannot_be_asked_about_is_refused(
+    begin: str, more: tuple[str, ...], why: str, spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, _, err = run(capsys, "reach", *spring, "--from", begin, *more)
+    assert status == 2 and why in " ".join(err.split())
+
+
 def test_a_state_that_is_not_shown_to_converge_exits_3(
     tmp_path: Path, spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -645,7 +690,7 @@ def test_a_state_that_is_not_shown_to_converge_exits_3(
     assert status == 3
     said = " ".join(out.split())
     assert said.startswith("UNKNOWN soft_spring: the state is NOT shown to converge; what is proved is {V <= ")
-    assert "no tube from that state" in said and "PROVED" not in said
+    assert "no tube from there" in said and "PROVED" not in said
     assert "It is not shown to converge" in (tmp_path / "o" / "report.html").read_text()
     status, out, _ = run(capsys, *given, "--json")
     data = json.loads(out)
@@ -843,6 +888,25 @@ def test_a_plant_in_discrete_time_is_listed_by_its_steps(
     monkeypatch.setattr("certify.loop.plants.get_system", lambda _: steps)
     listed = run(capsys, "systems")[1]
     assert "  theta+ = theta\n" in listed and "theta' =" not in listed
+
+
+@pytest.mark.parametrize(
+    ("u_eq", "said"),
+    [
+        ('"1/3"', "f(x_eq, u_eq) = 0 "),
+        ("0.3333333333333", "f(x_eq, u_eq) = 0 but for 3.3e-14 "),
+        ("0.33", "no equilibrium: x' = -0.00333333 at (x_eq, u_eq)"),
+    ],
+)
+def test_plant_says_how_far_it_is_from_rest(
+    u_eq: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plant = tmp_path / "s.toml"
+    plant.write_text(
+        f'name = "s"\nstates = ["x"]\ninputs = ["u"]\n[dynamics]\nx = "u - 1/3"\n[u_eq]\nu = {u_eq}\n'
+        "[domain]\nx = [-1, 1]\n[input_bounds]\nu = [-2, 2]\n"
+    )
+    assert said in run(capsys, "plant", plant)[1]
 
 
 def test_plants_list_disturbances_and_ranges(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -781,7 +781,8 @@ def test_leaves_of_a_batch_enclose_a_deep_policy(name: str) -> None:
                 z = [0.5 * lo + 0.5 * hi + 0.5 * (hi - lo) * t for lo, hi, t in ends]
                 x = [balls.total(arb(t) * v for t, v in zip(row, z, strict=True)) for row in T]
                 d = [(arb(v) - m) / r for v, m, r in zip(z, leaf.centre, leaf.radius, strict=True)]
-                for value, (mid, slopes, error) in zip(policy_in_arb(c.policy, c.u_eq, x), leaf.u, strict=True):
+                for value, u in zip(policy_in_arb(c.policy, c.u_eq, x), leaf.u, strict=True):
+                    mid, slopes, error = u.form
                     off = abs(value - mid - balls.total(s * t for s, t in zip(slopes, d, strict=True)))
                     assert off <= error * (1 + arb(2) ** -60)
                     worst = max(worst, float(off / error))
@@ -794,6 +795,7 @@ def test_a_leaf_is_enclosed_alike_alone_and_among_others() -> None:
     with ctx.workprec(128):
         for leaf in each:
             (alone,) = shared.enclose([leaf.box])
-            for (mid, slopes, error), (other, others, same) in zip(leaf.u, alone.u, strict=True):
+            for u, other_u in zip(leaf.u, alone.u, strict=True):
+                (mid, slopes, error), (other, others, same) = u.form, other_u.form
                 for v, w in zip((mid, *slopes, error), (other, *others, same), strict=True):
                     assert abs(v - w) <= arb(2) ** -80

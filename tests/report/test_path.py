@@ -180,13 +180,11 @@ def test_a_state_that_is_missed_is_said_to_be_first(missed: RoaResult) -> None:
     page = page_of(missed)
     text = page.text
     assert missed.certificate is not None and certificate_of(missed).kind == "asymptotic"
-    said = "The state p = 1.95 m, v = 1.95 m/s was asked about. It is not shown to converge: no tube from that state"
+    said = "The state p = 1.95 m, v = 1.95 m/s was asked about. It is not shown to converge: no tube from there"
     assert said in text and "The certificate is about {V ≤ c₂} alone, in which this state does not lie." in text
     assert text.index("UNKNOWN") < text.index("PROVED · ACCEPTED")
     assert "c₀" not in text and "tube in p" not in text
-    assert (
-        text.count("no tube from that state") == 1 and "The limit of the set" not in text
-    )  # it is no limit of the set
+    assert text.count("no tube from there") == 1 and "The limit of the set" not in text  # it is no limit of the set
     assert missed.diagnosis is not None and dict(missed.diagnosis.next.options) == {"--effort": "0.32"}
     alone = page_of(missed, dict(missed.checker or {}))  # the certificate by itself knows of no state
     assert "UNKNOWN" not in alone.text and "PROVED · ACCEPTED" in alone.text

@@ -93,7 +93,7 @@ def _with_facts(state: State, accepted: Accepted) -> State:
 
 def _concluded(state: State, accepted: Accepted) -> State:
     """State the verdict: UNKNOWN if the accepted claim is less than was asked for."""
-    from certify.analysis.stages.further import holds
+    from certify.analysis.stages.further import holds, named
 
     trial, options, result = state.contest.best.trial, state.options, state.result
     task, claim, proof, witness = trial.task, accepted.certificate.claim, state.proof, result.witness
@@ -102,13 +102,13 @@ def _concluded(state: State, accepted: Accepted) -> State:
     if options.lyapunov_level is not None and (claim.outer is None or claim.outer.level < options.lyapunov_level):
         why = short_of(task.problem, claim, options, state.beyond)
         return state.finished(replace(found, stop=Stop.BEYOND, detail=why))
-    if state.centre is not None and claim.start is None:
-        if not holds(task.problem, claim.roa, state.centre):
+    if state.begin is not None and claim.start is None:
+        if not holds(task.problem, claim.roa, state.begin):
             tube = state.claim is not None and state.claim.start is not None
             why = (accepted.mended or "the checker refused the tube") if tube else state.missed
             return state.finished(replace(found, stop=Stop.PATH, detail=why))
         if state.claim is None or state.claim.start is None:
-            state = state.noting("the state lies in the proved set, and no tube is needed")
+            state = state.noting(f"{named(state.begin)} lies in the proved set, and no tube is needed")
     if task.exactly and claim.roa < task.target:
         refused = replace(result, stop=Stop.REFUSED, detail=accepted.mended or "")
         return state.finished(short_of_target(refused, task, claim))

@@ -3,32 +3,40 @@ boxes with ranks."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.analysis.asked import ellipsoid_in
+from certify.analysis.asked import ellipsoid_around, ellipsoid_in
 from certify.analysis.facts import TubeFacts
 from certify.analysis.simulated import Simulator
 from certify.analysis.stages.state import State, Tools
-from certify.certificates.claims import Claim, Problem
+from certify.certificates.claims import Problem
+from certify.certificates.ellipsoids import Box, sublevel_set, tube_start
 from certify.certificates.tree import LEAF
+from certify.certificates.verdict import Stop
 from certify.effort import Effort
 from certify.errors import OptionError
-from certify.lyapunov import Neural, Polynomial, are_inside, of_polynomial, volume
+from certify.lyapunov import Neural, Polynomial, of_polynomial, volume
 from certify.lyapunov.function import Quadratic
+from certify.lyapunov.symbolic import Symbolic
 from certify.provers.base import Budget, Progress
 from certify.provers.ranks import Enough, Question, Sublevel, prove_ranks, root_box, with_frame, with_order
+
+if TYPE_CHECKING:
+    from certify.provers.outer import Nothing, OuterProof
 
 Array = NDArray[np.float64]
 _FOR_SEARCH = 0.5  # share of the effort that is left, the rest being for the check
 _FOR_CELLS = 0.7  # the same for a search of boxes with ranks, of which only those with one are checked
 _FOR_RANKS = 0.35  # share of the whole effort, even if the search has left less
 _FOR_LEARNING = 0.6  # share of the effort that is left, the rest being for the proof and its check
+_MOST = 0.8  # share of what a learned function promised: with less proved it is taught again
+_LEAST = 0.1  # share of the whole effort, with less of which it is not
 _PROBES = 30  # states at which the order of the series in time is chosen, and the frame of errors
 _BOXES, _LITTLE = 1e4, 0.02  # share of the width of one of so many equal boxes that an error of the series may be
 _FOR_RING = 0.05  # share of the whole effort for the check of the ring, if it takes a series of a higher order
@@ -91,20 +99,21 @@ class Route:
         """Add the widest tube that the effort finds; `missed` says why there is none."""
         from certify.provers.tube.enlarge import surround
 
-        (claim, evidence), centre, trial = state.proved, state.centre or (), state.contest.best.trial
-        if holds(trial.task.problem, claim.roa, centre):
-            return replace(state, missed="the checker accepted only a lower level, and the state lies above it")
+        (claim, evidence), begin, trial = state.proved, state.begin or (), state.contest.best.trial
+        what = named(begin)
+        if holds(trial.task.problem, claim.roa, begin):
+            return replace(state, missed=f"the checker accepted only a lower level, and {what} lies above it")
         with self.tools.timing("tube"):
             self.tools.tell("tube")
-            middle, goal = np.array([float(q) for q in centre]), trial.P / claim.roa
+            middle, goal = np.array([float(lo + hi) / 2 for lo, hi in begin]), trial.P / claim.roa
             shapes = _shapes(state, {trial.name: trial.P, "domain": ellipsoid_in(state.loop.system)})
             found, missed = surround(trial.task.problem.loop, middle, goal, shapes, effort.share(_FOR_SEARCH))
         if found is None:
             return replace(state, missed=missed)
         tube, at = found.tube, tuple(middle.tolist())
         facts = TubeFacts(tube.start, found.shape, len(tube.slabs), tube.duration, at)
-        if not facts.contains([centre]):
-            return replace(state, missed="the tube is narrower than the rounding of that state")
+        if not tube_start(tube.start, at).covers(begin):
+            return replace(state, missed=_narrower(tube.start, at, begin))
         state = state.with_result(tube=facts)
         return replace(
             state, claim=claim.with_tube(Quadratic(tube.start), at), evidence=replace(evidence, tube=tube.slabs)
@@ -112,14 +121,31 @@ class Route:
 
 
 def _shapes(state: State, shapes: Mapping[str, Array]) -> Mapping[str, Array]:
-    """These shapes, or the one box that was asked for."""
-    box = state.options.box
-    return shapes if box is None else {"box": ellipsoid_in(state.loop.system, box)}
+    """These shapes, or the one of the box that was asked for."""
+    system, box = state.loop.system, state.options.box
+    if box is not None:
+        return {"box": ellipsoid_in(system, box)}
+    around = None if state.begin is None else ellipsoid_around(system, state.begin)
+    return shapes if around is None else {"box": around}
 
 
-def holds(problem: Problem, level: float, state: Sequence[Fraction]) -> bool:
-    """True if {V <= level} holds a state, decided in rationals."""
-    return are_inside(problem.V.P, level, [state])[0]
+def _narrower(P: Array, centre: tuple[float, ...], begin: Box) -> str:
+    """The reason why a box, or a state, does not lie in the start of a tube."""
+    if all(lo == hi for lo, hi in begin):
+        return "the tube is narrower than the rounding of that state"
+    reach = np.array([float(hi - lo) / 2 for lo, hi in begin])
+    share = min(1.0, float(reach @ np.abs(P) @ reach) ** -0.5)
+    return f"the widest tube holds {share:.2g} of the box in each direction; ask for smaller boxes, one by one"
+
+
+def named(begin: Box) -> str:
+    """Names what a tube has to start around."""
+    return "the state" if all(lo == hi for lo, hi in begin) else "the box"
+
+
+def holds(problem: Problem, level: float, box: Box) -> bool:
+    """True if {V <= level} is shown in rationals to hold a box, or a state."""
+    return sublevel_set(problem.V.P, level).covers(box)
 
 
 @dataclass(frozen=True)
@@ -135,24 +161,16 @@ class Beyond:
         ------
         OptionError : the function is one of another number of states.
         """
-        from certify.provers.outer import Nothing, prove_outer
+        from certify.provers.outer import Nothing
 
-        tools, (claim, evidence), trial = self.tools, state.proved, state.contest.best.trial
-        system, options = state.loop.system, state.options
-        function = options.lyapunov or self._learned(state, claim, effort)
-        if function.n != system.n:
-            raise OptionError(f"`lyapunov` must be a function of {system.n} states; found one of {function.n}.")
-        N = of_polynomial(function, system.states) if isinstance(function, Polynomial) else function
-        report = None if tools.progress is None else partial(tools.report, stage="outer")
-        with tools.timing("outer"):
-            tools.tell("outer")
-            budget = Budget(effort.share(_FOR_SEARCH), options.max_boxes)
-            found = prove_outer(
-                trial.task.problem, claim.roa, trial.T, N, options.lyapunov_level, budget, tools.runner, report
-            )
+        given, system = state.options.lyapunov, state.loop.system
+        if given is not None and given.n != system.n:
+            raise OptionError(f"`lyapunov` must be a function of {system.n} states; found one of {given.n}.")
+        found = self._learned(state, effort) if given is None else self._proved(state, given, effort)
         if isinstance(found, Nothing):
-            which = "the function `lyapunov`" if options.learned is None else "the learned function"
+            which = "the function `lyapunov`" if given is not None else "the learned function"
             return state.noting(f"no set of {which} is proved to lead into the ellipsoid: {found.why}")
+        (claim, evidence) = state.proved
         return replace(
             state,
             beyond=found,
@@ -160,17 +178,48 @@ class Beyond:
             evidence=replace(evidence, outer=found.evidence),
         )
 
-    def _learned(self, state: State, claim: Claim, effort: Effort) -> Neural | Polynomial:
-        """A function whose set may reach beyond the ellipsoid, learned with a share of the effort that is left."""
-        from certify.lyapunov.learning import fit_polynomial, learn
+    def _proved(self, state: State, function: Neural | Polynomial | Symbolic, effort: Effort) -> OuterProof | Nothing:
+        """The largest set of the function that a share of the effort proves."""
+        from certify.provers.outer import prove_outer
 
-        options, problem = state.options, state.contest.best.trial.task.problem
-        with self.tools.timing("learn"):
-            self.tools.tell("learn")
+        tools, (claim, _), trial, options = self.tools, state.proved, state.contest.best.trial, state.options
+        N = of_polynomial(function, state.loop.system.states) if isinstance(function, Polynomial) else function
+        report = None if tools.progress is None else partial(tools.report, stage="outer")
+        with tools.timing("outer"):
+            tools.tell("outer")
+            budget = Budget(effort.share(_FOR_SEARCH), options.max_boxes)
+            return prove_outer(
+                trial.task.problem, claim.roa, trial.T, N, options.lyapunov_level, budget, tools.runner, report
+            )
+
+    def _learned(self, state: State, effort: Effort) -> OuterProof | Nothing:
+        """The largest set of functions learned with shares of the effort, until most of what samples say is proved.
+
+        Samples may miss where a function rises, and a proof may not: what it finds is then part of the next lesson.
+        """
+        from certify.lyapunov.learning import Network, Terms, learner_of
+        from certify.provers.outer import Nothing
+
+        options, problem, best = state.options, state.contest.best.trial.task.problem, None
+        n, neural = problem.loop.system.n, options.learned == "neural"
+        model = Network(n, tuple(options.hidden)) if neural else Terms(n, options.degree)
+        share, learner = effort.share(_FOR_LEARNING), None
+        while True:
+            with self.tools.timing("learn"):
+                self.tools.tell("learn")
+                if learner is None:
+                    learner = learner_of(problem.loop, problem.V, state.proved[0].roa, model, options.seed, share)
+                learned = learner.learn(share)
+            found = self._proved(state, learned.function, effort)
+            covered = 0.0 if isinstance(found, Nothing) else learner.cover(learned.function, found.outer.level)
+            if best is None or covered > best[0]:
+                best = covered, found
+            wrong = found.witness if isinstance(found, Nothing) or found.stop is Stop.WITNESS else None
+            enough = covered >= _MOST * learned.cover or effort.left < _LEAST * self.tools.whole
+            if wrong is None or enough:
+                return best[1]
+            learner.correct(wrong.x, covered)
             share = effort.share(_FOR_LEARNING)
-            if options.learned == "neural":
-                return learn(problem.loop, problem.V, claim.roa, options.hidden, options.seed, share).function
-            return fit_polynomial(problem.loop, problem.V, claim.roa, options.degree, options.seed, share).function
 
 
 @dataclass(frozen=True)

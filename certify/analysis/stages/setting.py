@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from certify.analysis.asked import (
+    box_in,
     constraints_in_words,
+    ellipsoid_around,
     ellipsoid_in,
     require_kept_at_origin,
     require_one_that_knows,
-    state_in,
     values_of,
 )
 from certify.analysis.options import RoaOptions
@@ -49,8 +50,10 @@ class Setting:
             raise OptionError(
                 "`ranks` needs a loop whose time goes in steps: discrete time, or a held input (`sample_time`)."
             )
-        centre = None if options.reach_from is None else state_in(system, options.reach_from)
-        state = replace(state, centre=centre)
+        begin = None if options.reach_from is None else box_in(system, options.reach_from)
+        if begin is not None and options.box is not None and ellipsoid_around(system, begin) is not None:
+            raise OptionError("`box` is about the tube around a state; leave it out where `reach_from` is a box.")
+        state = replace(state, begin=begin)
         if system.measurements is not None and not system.measurements.runs:
             state = _without_data(state)
         elif system.measurements is not None:
@@ -71,7 +74,7 @@ class Setting:
                 network=loop.network,
                 claim=state.kind,
                 constraints=constraints_in_words(loop.system),
-                reach_from=None if centre is None else values_of(loop.system, centre),
+                reach_from=None if begin is None else values_of(loop.system, begin),
             )
             return _by_spectrum(state, rest)
 

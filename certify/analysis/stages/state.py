@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
-from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
@@ -20,6 +19,7 @@ from certify.certificates import PartitionTree, TrustedSolver
 from certify.certificates.claims import Claim
 from certify.certificates.claims.claim import Kind
 from certify.certificates.data import DataBounds
+from certify.certificates.ellipsoids import Box
 from certify.certificates.samples import SampleBounds
 from certify.effort import WHOLE, Effort
 from certify.loop.closed_loop import ClosedLoop
@@ -45,7 +45,7 @@ class State:
     result : as far as it is known.
     converging : convergence to one nearby equilibrium is to be shown as well.
     insists : the same, and a smaller set of which it is shown is better than a larger one.
-    centre : the state that a tube has to start around, in deviations; None if none was named.
+    begin : the state or box that a tube has to start around, in deviations; None if none was named.
     notes : remarks for a person, in order; none is ever taken away.
     race, proof : the candidates, and what the prover says of the best.
     claim, evidence : what is to be certified.
@@ -54,7 +54,7 @@ class State:
     beyond : the set of another function around the ellipsoid.
     ranked : boxes with ranks, as the search found them.
     simulated : the region of attraction by runs.
-    missed : why no tube holds `centre`.
+    missed : why no tube holds `begin`.
     accepted : the certificate that the checker accepts.
     done : the result is final.
     """
@@ -64,7 +64,7 @@ class State:
     result: RoaResult
     converging: bool = False
     insists: bool = False
-    centre: tuple[Fraction, ...] | None = None
+    begin: Box | None = None
     notes: tuple[str, ...] = ()
     race: Race | None = None
     proof: Proof | None = None

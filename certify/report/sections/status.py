@@ -6,15 +6,14 @@ if it accepts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from typing import Any
 
 from certify.certificates import AnyCertificate, OuterTree, PartitionTree, RanksAlone, ReachCertificate, TrustedSolver
 from certify.errors import SoundnessError
 from certify.report.claims import CHECKED_ALWAYS, words_for
-from certify.report.words import point
+from certify.report.words import place, state_or_box
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,8 +120,9 @@ def missed_of(result: Mapping[str, Any] | None, status: Status) -> str:
     if result.get("stop") == "beyond":
         smaller = " The certificate is about a smaller set." if status.accepted else ""
         return f"An outer set was asked for that is not proved: {result['reason'].rstrip('.')}.{smaller}"
-    asked: Mapping[str, str] = result.get("reach_from") or {}
+    asked: Mapping[str, str | Sequence[str]] = result.get("reach_from") or {}
     units = {s["name"]: s.get("unit") or "" for s in result.get("states") or ()}
-    where = point(list(asked), [Fraction(v) for v in asked.values()], [units.get(name, "") for name in asked])
-    proved = "The certificate is about {V ≤ c₂} alone, in which this state does not lie." if status.accepted else ""
-    return f"The state {where} was asked about. It is not shown to converge: {result['reason']}. {proved}".rstrip()
+    where = place(asked, [units.get(name, "") for name in asked])
+    what = state_or_box(asked)
+    proved = f"The certificate is about {{V ≤ c₂}} alone, in which this {what} does not lie." if status.accepted else ""
+    return f"The {what} {where} was asked about. It is not shown to converge: {result['reason']}. {proved}".rstrip()
