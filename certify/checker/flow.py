@@ -35,7 +35,7 @@ Constant = Callable[[Fraction], Any]
 Way = tuple[Array, Array]  # the largest move of each state in a period: a number, and one times ||d||
 Enclosed = tuple[Way, list[Jet]]  # and f on the way
 _QUARTERS = 4  # of a period, for constraints
-_ATTEMPTS = 4  # at the a-priori enclosure
+_ATTEMPTS = 8  # at the a-priori enclosure
 
 
 @dataclass(frozen=True)
@@ -117,19 +117,25 @@ def enclosed(
     f: Callable[[list[Taylor]], list[Taylor]], states: list[Taylor], longest: float
 ) -> tuple[list[Taylor], list[Taylor]]:
     """Models of the states during a period of at most that length, and f of them; NaN where none of a few attempts is
-    an enclosure (Moore 1966)."""
-    way = np.zeros((len(states), len(states[0].c)))
+    an enclosure: in it states fall and rise by less than to its ends, so that they cannot come there (Moore 1966)."""
+    down, up = np.zeros((2, len(states), len(states[0].c)))
     for attempt in range(2 + _ATTEMPTS):
-        during = [replace(x, r=x.r + own) for x, own in zip(states, way, strict=True)]
+        during = [reached(x, *ends) for x, *ends in zip(states, down, up, strict=True)]
         F = f(during)
         if attempt == 1 + _ATTEMPTS:
             break
-        most = np.array([(v.size * longest).top for v in F])
-        good = np.all(most < way, axis=0)
+        most = (Above(np.maximum(outwards(F), 0.0)) * longest).top  # and above 0
+        good = np.all(most < (down, up), axis=(0, 1))
         if np.all(good):
             break
-        way = np.where(good, way, 1.25 * most if attempt < _ATTEMPTS else np.nan)
+        down, up = np.where(good, (down, up), 1.25 * most if attempt < _ATTEMPTS else np.nan)
     return during, F
+
+
+def reached(x: Taylor, down: Array, up: Array) -> Taylor:
+    """A number from x - down to x + up."""
+    middle = (up - down) / 2
+    return x + affine(middle, np.zeros_like(x.g), (Above(down) + up) * 0.5 + size(middle).ulps(1))
 
 
 class Held(Stepping):

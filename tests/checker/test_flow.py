@@ -19,11 +19,12 @@ from certify.checker.case import Case
 from certify.checker.decrease import Level
 from certify.checker.document import Multipliers
 from certify.checker.exact import exactly
-from certify.checker.flow import Series
+from certify.checker.flow import Series, enclosed
 from certify.checker.jets import Units
 from certify.checker.local import Local
 from certify.checker.ring import Ring
 from certify.checker.stepping import size_beyond
+from certify.checker.taylor import affine, constants
 from tests.checker.test_ball import points
 from tests.checker.test_cubic import FUNCTIONS, JUST, Member, closeness, derivatives, random_jet, shares, value
 from tests.checker.test_uncertain import holds
@@ -449,3 +450,94 @@ def q(value_: float) -> fmpq:
 
 def numbers(A: fmpq_mat) -> np.ndarray:
     return np.array([[float(Fraction(int(v.p), int(v.q))) for v in row] for row in A.tolist()])
+
+
+# ----------------------------------------------------------------------------------------- the a-priori box of a leaf
+
+
+def around(lo: np.ndarray, hi: np.ndarray) -> list[Any]:
+    """Models of all states of boxes (n, B)."""
+    slopes = np.eye(len(lo))[:, :, None] * (0.5 * (hi - lo))[:, None]
+    return [affine(c, g) for c, g in zip(0.5 * (lo + hi), slopes, strict=True)]
+
+
+def cubic(terms: np.ndarray) -> Callable[[list[Any]], list[Any]]:
+    """The fields k_i0 + k_i1 x + k_i2 y + k_i3 x y + k_i4 x^3 + k_i5 y^3 of models, or numbers."""
+
+    def field(states: list[Any]) -> list[Any]:
+        x, y = states
+        number: Any = float if isinstance(x, np.ndarray) else constants(x)
+        parts = [number(Fraction(1)), x, y, x * y, x * x * x, y * y * y]
+        found = []
+        for row in terms.tolist():
+            each = [number(Fraction(k)) * part for k, part in zip(row, parts, strict=True)]
+            found.append(sum(each[1:], each[0]))
+        return found
+
+    return field
+
+
+def test_solutions_stay_in_the_a_priori_box() -> None:
+    """Random cubic fields, solutions from corners and within, by short steps; boxes that are far from square too."""
+    generator, seen, one_sided = np.random.default_rng(0), 0, 0
+    for _ in range(20):
+        terms = generator.standard_normal((2, 6)) * 2.0 ** generator.integers(-3, 3, (2, 6))
+        lo = generator.uniform(-2, 2, (2, 8))
+        hi, h = lo + 2.0 ** generator.integers(-8, 0, (2, 8)), 2.0 ** float(generator.integers(-6, -1))
+        with np.errstate(all="ignore"):  # boxes of states that escape
+            during, F = enclosed(cubic(terms), around(lo, hi), h)
+        ends, rates = (np.array([v.range.ends for v in some]) for some in (during, F))  # (n, 2, B)
+        held = np.isfinite(ends).all((0, 1))
+        seen += int(held.sum())
+        falls, rises = lo - ends[:, 0], ends[:, 1] - hi
+        one_sided += int((held & ((rises > 4 * falls) | (falls > 4 * rises))).sum())
+        for at in (lo, hi, np.stack([lo[0], hi[1]]), np.stack([hi[0], lo[1]]), generator.uniform(lo, hi)):
+            x = at[:, held]
+            for _ in range(40):
+                f = np.array(cubic(terms)(list(x)))
+                assert np.all((rates[:, 0, held] <= f) & (f <= rates[:, 1, held]))
+                x = x + h / 40 * np.array(cubic(terms)(list(x + h / 80 * f)))
+                assert np.all((ends[:, 0, held] < x) & (x < ends[:, 1, held]))
+    assert seen > 60 and one_sided > 20
+
+
+def test_moves_are_less_than_the_way_to_the_ends_of_the_a_priori_box() -> None:
+    """The condition in rationals for linear fields, whose extremes are at corners: of all sizes, some rows 0, boxes
+    with ends of 0 and points."""
+    generator, found = np.random.default_rng(1), 0
+    for _ in range(30):
+        size = 2.0 ** int(generator.choice([-900, -30, 0, 0, 0, 30, 300]))
+        A = generator.standard_normal((2, 2)) * generator.choice([0.0, 1.0, 4.0], (2, 1))
+        k = generator.standard_normal((2, 1)) * generator.choice([0.0, size], (2, 1))
+        lo = generator.standard_normal((2, 6)) * generator.choice([0.0, size], (2, 6))
+        hi, h = lo + size * generator.choice([0.0, 0.0, 0.5], (2, 6)), 2.0 ** float(generator.integers(-6, 0))
+
+        def field(v: list[Any], A: np.ndarray = A, k: np.ndarray = k) -> list[Any]:
+            each = zip(A.tolist(), k[:, 0].tolist(), strict=True)
+            return [v[0].scaled(a) + v[1].scaled(b) + constants(v[0])(Fraction(c)) for (a, b), c in each]
+
+        during, _ = enclosed(field, around(lo, hi), h)
+        for box in range(6):
+            low, high = ([float(v.range.ends[end][box]) for v in during] for end in (0, 1))
+            if not np.all(np.isfinite([*low, *high])):
+                continue
+            found += 1
+            corners = [[Fraction(v) for v in corner] for corner in itertools.product(*zip(low, high, strict=True))]
+            for i in range(2):
+                rates = [
+                    sum(Fraction(a) * v for a, v in zip(A[i], x, strict=True)) + Fraction(k[i, 0]) for x in corners
+                ]
+                assert Fraction(low[i]) < Fraction(lo[i, box]) + Fraction(h) * min(*rates, 0)
+                assert Fraction(hi[i, box]) + Fraction(h) * max(*rates, 0) < Fraction(high[i])
+    assert found > 100
+
+
+def test_a_state_that_only_falls_is_not_looked_at_above() -> None:
+    """x' = -x^3 from 5/2: it falls by 5/8 at most in 1/25, but from 5/8 more by 1.2, and so on, so that no box has ends
+    that are equally far. A state that escapes has no box: x' = x^2 from 10, which is infinite after 1/10."""
+    at = np.array([[2.5]])
+    (x,), _ = enclosed(lambda v: [-(v[0] * v[0] * v[0])], around(at, at), 1 / 25)
+    low, high = x.range.ends
+    assert 2.5 - 1.25 * 0.625 - 1e-9 <= low[0] < 2.5 / np.sqrt(1.5) and high[0] <= 2.5 + 1e-9
+    with np.errstate(all="ignore"):
+        assert np.isnan(enclosed(lambda v: [v[0] * v[0]], around(4 * at, 4 * at), 1 / 10)[0][0].r.v).all()

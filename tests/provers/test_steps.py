@@ -211,6 +211,16 @@ def test_the_flow_of_a_plant_that_escapes() -> None:
         assert not bool(Flow((x**2,), held(h), 4)(states, {}, {}, 1).exists)
 
 
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_the_flow_of_a_plant_that_only_falls(order: int) -> None:
+    """x' = -x^3 from 5/2: farther up it is steeper by so much that no box has both ends equally far."""
+    x = Symbol("x")
+    mean = Flow((-(x**3),), held("1/25"), order)({x: one_model(2.5, 0.0)[x]}, {}, {}, 1)
+    fall, model = 2.5 - 2.5 / np.sqrt(1.5), mean.G[0]
+    assert bool(mean.exists) and mean.up[0, 0] <= 1e-9 and fall <= mean.down[0, 0] <= 0.625 * (1 + 1e-9)
+    assert abs(float(model.c[0]) + 25 * fall) <= float(model.r[0])
+
+
 @pytest.mark.parametrize(
     "equations", [("q**2", "-y"), ("p*y", "q"), ("q**2*y", "q"), ("q*x/(2 + q) + q**2*y", "q**3 - x*q*p")]
 )

@@ -23,7 +23,7 @@ from certify.provers.bounds.arrays import Array, Mask, chosen
 from certify.provers.bounds.taylor import EPS, TINY, Models, Taylor
 
 _QUARTERS = 4  # of a period, for constraints
-_ATTEMPTS, _WIDER = 4, 1.25  # at the enclosure of the solution
+_ATTEMPTS, _WIDER = 8, 1.25  # at the enclosure of the solution
 Values = Mapping[Symbol, Taylor]
 
 
@@ -57,6 +57,7 @@ class Flow:
         self.symbols = int(self.shortest < self.longest)  # the period's own, the last of all
         self.most = math.nextafter(float(self.longest), math.inf)
 
+    @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
     def __call__(self, states: Values, inputs: Values, quantities: Values, first: int) -> Mean:
         """G from states, held inputs and uncertain quantities; those have symbols of their own from `first` on."""
         like = next(iter(states.values()))
@@ -110,22 +111,27 @@ class Flow:
 
     def _enclose(self, states: Values, held: Values, now: Sequence[Taylor]) -> tuple[dict[Symbol, Taylor], Mask]:
         """Models of all states up to the end of the period, and where (B,) they are that."""
-        size = _sizes(now)
-        kappa = _WIDER * self.most * size
-        left = np.arange(size.shape[1])
+        move = self._most(now)
+        way = _WIDER * move
+        left = np.arange(move.shape[2])
         for attempt in range(_ATTEMPTS):
             if attempt:
-                kappa[:, left] = _WIDER * self.most * size.take(left, -1)
-            around = {s: _widened(v.at(left), kappa[i].take(left)) for i, (s, v) in enumerate(states.items())}
+                way[..., left] = _WIDER * move.take(left, -1)
+            around = {s: _between(v.at(left), *way[:, i].take(left, -1)) for i, (s, v) in enumerate(states.items())}
             values = {**around, **{symbol: model.at(left) for symbol, model in held.items()}}
-            size[:, left] = _sizes(self._rate(values, Models(next(iter(around.values())))))
-            wrong = ~(self.most * size.take(left, -1) * (1 + EPS) < kappa.take(left, -1))
-            left = left[chosen(np.asarray(wrong.any(0)))]
+            move[..., left] = self._most(self._rate(values, Models(next(iter(around.values())))))
+            wrong = ~(move.take(left, -1) < way.take(left, -1))
+            left = left[chosen(np.asarray(wrong.any((0, 1))))]
             if not len(left):
                 break
-        exists = np.ones(size.shape[1], dtype=np.bool_)
+        exists = np.ones(move.shape[2], dtype=np.bool_)
         exists[left] = False
-        return {s: _widened(v, kappa[i]) for i, (s, v) in enumerate(states.items())}, exists
+        return {s: _between(v, *way[:, i]) for i, (s, v) in enumerate(states.items())}, exists
+
+    def _most(self, rate: Sequence[Taylor]) -> Array:
+        """Bounds (2, n, B), above 0, of the moves down and up at this rate."""
+        moves: Array = self.most * np.maximum(_ends(rate), 0.0) * (1 + EPS) + TINY
+        return moves
 
     def times_period(self, model: Taylor) -> Taylor:
         """h v."""
@@ -149,11 +155,6 @@ def _with_a_symbol(model: Taylor) -> Taylor:
     return Taylor(model.c, np.pad(model.g, ((0, 1), (0, 0))), np.pad(model.Q, ((0, 1), (0, 1), (0, 0))), model.r)
 
 
-def _sizes(models: Sequence[Taylor]) -> Array:
-    """Bounds of |v| (n, B)."""
-    return np.stack([np.abs(model.c) + model.radius() for model in models]) * (1 + EPS)
-
-
 def _ends(models: Sequence[Taylor]) -> tuple[Array, Array]:
     """Bounds of -v and of v, (n, B) each."""
     c, reach = np.stack([model.c for model in models]), np.stack([model.radius() for model in models])
@@ -168,8 +169,11 @@ def _highest(a: Array, b: Array, h: float) -> Array:
     return np.where(np.isnan(peak), np.inf, np.maximum(peak, 0.0)) * (1 + 8 * EPS)
 
 
-def _widened(model: Taylor, by: Array) -> Taylor:
-    return Taylor(model.c, model.g, model.Q, (model.r + by) * (1 + EPS))
+def _between(model: Taylor, down: Array, up: Array) -> Taylor:
+    """Numbers from `model - down` to `model + up`."""
+    middle, reach = 0.5 * (up - down), 0.5 * (up + down)
+    rounding = EPS * (np.abs(model.c) + np.abs(middle))
+    return Taylor(model.c + middle, model.g, model.Q, (model.r + reach) * (1 + EPS) + rounding)
 
 
 def _without_symbols(model: Taylor) -> Taylor:
