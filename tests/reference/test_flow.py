@@ -290,7 +290,7 @@ def test_discrete_time(name: str, practical: bool) -> None:
                     assert holds(g, value, d, y) if models == "ball" else value_at(t, symbols).overlaps(value)
 
 
-# ---------------------------------------------------------------------------------------- the a-priori box, and the series
+# ------------------------------------------------------------------------------------- the a-priori box, and the series
 
 
 @pytest.mark.parametrize(
