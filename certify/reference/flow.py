@@ -238,18 +238,23 @@ def highest(first: Taylor, second: Taylor, h: arb) -> arb:
 def moved_within(c: Certificate, leaf: Moving, hi: arb, at: str) -> tuple[dict[str, Taylor], list[Move]]:
     """The states until hi, and by how much each falls and rises at most, or a refusal.
 
-    Where less than what was tried is found for all of them, that much is what they move by.
+    Where less than what was tried is found for all of them, that much is what they move by. Models of boxes that are
+    not even bound the lesser move less well, so that it may grow without end where even boxes serve: they come second.
     """
-    names, tried = c.plant.states, [(ZERO, ZERO)] * c.n
-    for _ in range(ATTEMPTS):
-        moved = dict(zip(names, map(between, leaf.states.values(), tried), strict=True))
-        with under("flow", at):
-            F = c.plant.dynamics.evaluate({**moved, **leaf.inputs, **leaf.anything}, constant, leaf.called)
-        require(all(f.is_finite() for f in F), "flow", at, "F has no finite model within a period")
-        found = swept(hi, [arb((-(-f).bound()).lower()).union(arb(f.bound().upper())) for f in F])
-        if all(fall < a and rise < b for (fall, rise), (a, b) in zip(found, tried, strict=True)):
-            return dict(zip(names, map(between, leaf.states.values(), found), strict=True)), found
-        tried = [(MORE * fall + LEAST, MORE * rise + LEAST) for fall, rise in found]
+    names = c.plant.states
+    for even in (False, True):
+        tried = [(ZERO, ZERO)] * c.n
+        for _ in range(ATTEMPTS):
+            moved = dict(zip(names, map(between, leaf.states.values(), tried), strict=True))
+            with under("flow", at):
+                F = c.plant.dynamics.evaluate({**moved, **leaf.inputs, **leaf.anything}, constant, leaf.called)
+            if not all(f.is_finite() for f in F):
+                break
+            found = swept(hi, [arb((-(-f).bound()).lower()).union(arb(f.bound().upper())) for f in F])
+            if all(fall < a and rise < b for (fall, rise), (a, b) in zip(found, tried, strict=True)):
+                return dict(zip(names, map(between, leaf.states.values(), found), strict=True)), found
+            each = [(fall.max(rise),) * 2 for fall, rise in found] if even else found
+            tried = [(MORE * fall + LEAST, MORE * rise + LEAST) for fall, rise in each]
     raise Refused("flow", at, "no bound of how far the state goes within a period was found")
 
 
