@@ -1,8 +1,9 @@
 """Rule `flow`: the mean of f over a period in which the inputs are held, for every period of the sample.
 
 phi(h) = x + h G, where x_1 is the mean over the period of f(x, u, q(t)), and what f changes by on the way is written as
-a series in time whose last coefficient is taken at every state that phi may reach. That is found first: where hi |f|
-stays below kappa as long as the state stays within kappa of where it was, no component can be the first to leave.
+a series in time whose last coefficient is taken at every state that phi may reach. That is found first: where hi f
+stays between -a and b as long as the state is between x - a and x + b, no component can be the first to leave. On a
+ball a and b are one number, kappa + kappa' ||d||.
 
 What is uncertain may be another number at each instant. In x_1 alone a quantity stands at one instant at a time, so
 that a symbol can be its mean. All else takes it as any number of its whole range, and not of a cell of it: within a
@@ -33,8 +34,8 @@ from .series import Constant, added, coefficients
 from .taylor import Taylor, constant
 
 Move = tuple[arb, arb]  # by how much a state falls, and rises, at most
-ATTEMPTS, MORE = 12, arb(1.25)  # more than the last hi |f| is tried, as long as that grows by more than this
-LEAST = arb(2) ** -200  # of what is tried: hi |f| < kappa is asked, also where f is 0
+ATTEMPTS, MORE = 24, arb(1.25)  # more than the last move is tried, as long as that grows by more than this
+LEAST = arb(2) ** -200  # of what is tried: it is positive, also for a state that moves one way only, or not at all
 
 
 def later(
@@ -144,7 +145,7 @@ def reached_on(loop: Loop, known: Known, at: str, rule: str) -> dict[str, Model]
                 ranges = [f.v + f.reach * SPREAD for f in F]
                 largest = (arb(exact(c.inner) * s).sqrt() for s in inverse_diagonal(c.P, "lyapunov"))
                 sizes = [x.slope.min(size) for x, size in zip(states, largest, strict=True)]
-                in_domain(c, [v * SPREAD for v in sizes], swept(c, ranges), at)
+                in_domain(c, [v * SPREAD for v in sizes], swept(hi, ranges), at)
             return {name: beyond(x, k, t) for name, x, k, t in zip(c.plant.states, states, *most, strict=True)}
         far = [ZERO if rest else MORE * v + LEAST for rest, v in zip(rests, most[0], strict=True)]
         turned = [MORE * v + LEAST for v in most[1]]
@@ -157,12 +158,11 @@ def beyond(x: Model, far: arb, turned: arb) -> Model:
     return replace(x, off=x.off + far, slack=x.slack + turned, lip=lip)
 
 
-def swept(c: Certificate, F: Sequence[arb]) -> list[Move]:
-    """By how much the states fall and rise at most within a period, t times a mean of f_i.
+def swept(period: arb, F: Sequence[arb]) -> list[Move]:
+    """By how much the states fall and rise at most within a period, t times a mean of f_i: neither is less than 0.
 
     By their ends: the product of two balls also holds what would be the least t f_i if t could be negative.
     """
-    period = arb(c.step)
     return [((-period * arb(f.lower())).max(ZERO), (period * arb(f.upper())).max(ZERO)) for f in F]
 
 
@@ -198,15 +198,14 @@ class Moving:
 
 
 def reached_from(c: Certificate, leaf: Moving, order: int, at: str) -> dict[str, Taylor]:
-    """The states of a whole period, each within kappa of where it was and in the domain, or a refusal.
+    """The states of a whole period, all of them in the domain, or a refusal.
 
     Of the two bounds of a move the one by x_1 and x_2 is asked for only where f alone does not do.
     """
-    within, F = moved_within(c, leaf, arb(c.step), at)
+    within, moves = moved_within(c, leaf, arb(c.step), at)
     states = [x.c + (x.first + x.r) * SPREAD for x in leaf.states.values()]
     if leaf.bounds is not None:
         states = [within_both(x, w) for x, w in zip(states, leaf.bounds, strict=True)]
-    moves = swept(c, F)
     try:
         in_domain(c, states, moves, at, leaf.free)
     except Refused:
@@ -236,19 +235,26 @@ def highest(first: Taylor, second: Taylor, h: arb) -> arb:
     return (h * (a + h * b)).max(ZERO)
 
 
-def moved_within(c: Certificate, leaf: Moving, hi: arb, at: str) -> tuple[dict[str, Taylor], list[arb]]:
-    """The states until hi, each within kappa of where it was, and enclosures of f at these, or a refusal."""
-    names, far = c.plant.states, [ZERO] * c.n
-    for _ in range(ATTEMPTS):
-        moved = dict(zip(names, map(widened, leaf.states.values(), far), strict=True))
-        with under("flow", at):
-            F = c.plant.dynamics.evaluate({**moved, **leaf.inputs, **leaf.anything}, constant, leaf.called)
-        require(all(f.is_finite() for f in F), "flow", at, "F has no finite model within a period")
-        ranges = [arb((-(-f).bound()).lower()).union(arb(f.bound().upper())) for f in F]
-        most = [arb((hi * abs(v)).upper()) for v in ranges]
-        if all(v < k for v, k in zip(most, far, strict=True)):
-            return dict(zip(names, map(widened, leaf.states.values(), most), strict=True)), ranges
-        far = [MORE * v + LEAST for v in most]
+def moved_within(c: Certificate, leaf: Moving, hi: arb, at: str) -> tuple[dict[str, Taylor], list[Move]]:
+    """The states until hi, and by how much each falls and rises at most, or a refusal.
+
+    Where less than what was tried is found for all of them, that much is what they move by. Models of boxes that are
+    not even bound the lesser move less well, so that it may grow without end where even boxes serve: they come second.
+    """
+    names = c.plant.states
+    for even in (False, True):
+        tried = [(ZERO, ZERO)] * c.n
+        for _ in range(ATTEMPTS):
+            moved = dict(zip(names, map(between, leaf.states.values(), tried), strict=True))
+            with under("flow", at):
+                F = c.plant.dynamics.evaluate({**moved, **leaf.inputs, **leaf.anything}, constant, leaf.called)
+            if not all(f.is_finite() for f in F):
+                break
+            found = swept(hi, [arb((-(-f).bound()).lower()).union(arb(f.bound().upper())) for f in F])
+            if all(fall < a and rise < b for (fall, rise), (a, b) in zip(found, tried, strict=True)):
+                return dict(zip(names, map(between, leaf.states.values(), found), strict=True)), found
+            each = [(fall.max(rise),) * 2 for fall, rise in found] if even else found
+            tried = [(MORE * fall + LEAST, MORE * rise + LEAST) for fall, rise in each]
     raise Refused("flow", at, "no bound of how far the state goes within a period was found")
 
 
@@ -258,8 +264,10 @@ def within_both(x: arb, w: arb) -> arb:
     return lo.union(hi) if lo <= hi else x
 
 
-def widened(x: Taylor, far: arb) -> Taylor:
-    return x.widened(far)
+def between(x: Taylor, move: Move) -> Taylor:
+    """x, or up to so much less, or more."""
+    fall, rise = move
+    return (x + Taylor((rise - fall) / 2)).widened((rise + fall) / 2)
 
 
 def mean_on(

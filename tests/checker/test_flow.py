@@ -5,14 +5,16 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from fractions import Fraction
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from flint import arb, ctx, fmpq, fmpq_mat
+from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 from numpy.random import Generator
 
 from certify.checker.case import Case
@@ -25,6 +27,11 @@ from certify.checker.local import Local
 from certify.checker.ring import Ring
 from certify.checker.stepping import size_beyond
 from certify.checker.taylor import affine, constants
+from certify.reference.balls import ON_LEAVES
+from certify.reference.flow import Moving, moved_within
+from certify.reference.refusal import Refused
+from certify.reference.taylor import Taylor as BallModel
+from certify.reference.taylor import constant
 from tests.checker.test_ball import points
 from tests.checker.test_cubic import FUNCTIONS, JUST, Member, closeness, derivatives, random_jet, shares, value
 from tests.checker.test_uncertain import holds
@@ -454,6 +461,8 @@ def numbers(A: fmpq_mat) -> np.ndarray:
 
 # ----------------------------------------------------------------------------------------- the a-priori box of a leaf
 
+Field = Callable[[list[Any]], list[Any]]
+
 
 def around(lo: np.ndarray, hi: np.ndarray) -> list[Any]:
     """Models of all states of boxes (n, B)."""
@@ -461,12 +470,59 @@ def around(lo: np.ndarray, hi: np.ndarray) -> list[Any]:
     return [affine(c, g) for c, g in zip(0.5 * (lo + hi), slopes, strict=True)]
 
 
-def cubic(terms: np.ndarray) -> Callable[[list[Any]], list[Any]]:
+def by_the_checker(field: Field, lo: np.ndarray, hi: np.ndarray, h: float) -> np.ndarray:
+    """The ends (n, 2, B) of the states of a period from boxes (n, B), rationals, None where there are none."""
+    with np.errstate(all="ignore"):  # boxes of states that escape
+        during, _ = enclosed(field, around(lo, hi), h)
+    ends = np.array([v.range.ends for v in during])
+    found = np.full(ends.shape, None)
+    for at in np.argwhere(np.isfinite(ends).all((0, 1)))[:, 0]:
+        found[:, :, at] = [[Fraction(v) for v in pair] for pair in ends[:, :, at]]
+    return found
+
+
+def by_the_reference(field: Field, lo: np.ndarray, hi: np.ndarray, h: float) -> np.ndarray:
+    n, names = len(lo), [f"x{i}" for i in range(len(lo))]
+
+    def evaluate(known: Mapping[str, Any], *rest: object) -> list[Any]:
+        return field([known[name] for name in names])
+
+    c: Any = SimpleNamespace(n=n, plant=SimpleNamespace(states=names, dynamics=SimpleNamespace(evaluate=evaluate)))
+    found = np.full((n, 2, lo.shape[1]), None)
+    with ctx.workprec(ON_LEAVES):
+        for at in range(lo.shape[1]):
+            ends = [(arb(a), arb(b)) for a, b in zip(lo[:, at].tolist(), hi[:, at].tolist(), strict=True)]
+            rows = [arb_mat(1, n, [(b - a) / 2 * (i == j) for j in range(n)]) for i, (a, b) in enumerate(ends)]
+            states = {k: BallModel((a + b) / 2, g) for k, (a, b), g in zip(names, ends, rows, strict=True)}
+            leaf = Moving(states, {}, {}, {}, None, (), (), None)
+            with suppress(Refused):
+                within, _ = moved_within(c, leaf, arb(h), "leaf")
+                sides = [(v.c - v.first - v.r, v.c + v.first + v.r) for v in within.values()]
+                found[:, :, at] = [[rational(a.lower()), rational(b.upper())] for a, b in sides]
+    return found
+
+
+def rational(v: arb) -> Fraction:
+    digits, exponent = v.man_exp()
+    return Fraction(int(digits)) * Fraction(2) ** int(exponent)
+
+
+BOTH = pytest.mark.parametrize("program", [by_the_checker, by_the_reference])
+
+
+def constant_beside(x: Any) -> Callable[[Fraction], Any]:
+    """Constants in the numbers of x: those of either program, or floats."""
+    if isinstance(x, BallModel):
+        return lambda q: constant(fmpq(q.numerator, q.denominator))
+    return float if isinstance(x, np.ndarray) else constants(x)
+
+
+def cubic(terms: np.ndarray) -> Field:
     """The fields k_i0 + k_i1 x + k_i2 y + k_i3 x y + k_i4 x^3 + k_i5 y^3 of models, or numbers."""
 
     def field(states: list[Any]) -> list[Any]:
         x, y = states
-        number: Any = float if isinstance(x, np.ndarray) else constants(x)
+        number = constant_beside(x)
         parts = [number(Fraction(1)), x, y, x * y, x * x * x, y * y * y]
         found = []
         for row in terms.tolist():
@@ -477,16 +533,15 @@ def cubic(terms: np.ndarray) -> Callable[[list[Any]], list[Any]]:
     return field
 
 
-def test_solutions_stay_in_the_a_priori_box() -> None:
+@BOTH
+def test_solutions_stay_in_the_a_priori_box(program: Any) -> None:
     """Random cubic fields, solutions from corners and within, by short steps; boxes that are far from square too."""
     generator, seen, one_sided = np.random.default_rng(0), 0, 0
     for _ in range(20):
         terms = generator.standard_normal((2, 6)) * 2.0 ** generator.integers(-3, 3, (2, 6))
         lo = generator.uniform(-2, 2, (2, 8))
         hi, h = lo + 2.0 ** generator.integers(-8, 0, (2, 8)), 2.0 ** float(generator.integers(-6, -1))
-        with np.errstate(all="ignore"):  # boxes of states that escape
-            during, F = enclosed(cubic(terms), around(lo, hi), h)
-        ends, rates = (np.array([v.range.ends for v in some]) for some in (during, F))  # (n, 2, B)
+        ends = program(cubic(terms), lo, hi, h).astype(float)
         held = np.isfinite(ends).all((0, 1))
         seen += int(held.sum())
         falls, rises = lo - ends[:, 0], ends[:, 1] - hi
@@ -494,17 +549,32 @@ def test_solutions_stay_in_the_a_priori_box() -> None:
         for at in (lo, hi, np.stack([lo[0], hi[1]]), np.stack([hi[0], lo[1]]), generator.uniform(lo, hi)):
             x = at[:, held]
             for _ in range(40):
-                f = np.array(cubic(terms)(list(x)))
-                assert np.all((rates[:, 0, held] <= f) & (f <= rates[:, 1, held]))
-                x = x + h / 40 * np.array(cubic(terms)(list(x + h / 80 * f)))
-                assert np.all((ends[:, 0, held] < x) & (x < ends[:, 1, held]))
+                x = x + h / 40 * np.array(cubic(terms)(list(x + h / 80 * np.array(cubic(terms)(list(x))))))
+                assert np.all((ends[:, 0, held] < x + 1e-12) & (x - 1e-12 < ends[:, 1, held]))
     assert seen > 60 and one_sided > 20
 
 
-def test_moves_are_less_than_the_way_to_the_ends_of_the_a_priori_box() -> None:
+def test_rates_of_the_a_priori_box_hold_along_it() -> None:
+    """The checker's f there at random points of the box."""
+    generator = np.random.default_rng(2)
+    for _ in range(10):
+        terms = generator.standard_normal((2, 6)) * 2.0 ** generator.integers(-3, 3, (2, 6))
+        lo = generator.uniform(-2, 2, (2, 8))
+        with np.errstate(all="ignore"):
+            during, F = enclosed(cubic(terms), around(lo, lo + 2.0 ** generator.integers(-8, 0, (2, 8))), 1 / 32)
+        ends, rates = (np.array([v.range.ends for v in some]) for some in (during, F))  # (n, 2, B)
+        held = np.isfinite(ends).all((0, 1))
+        for at in np.array(list(itertools.product([0.0, 0.5, 1.0], repeat=2))):
+            x = ends[:, 0, held] + at[:, None] * (ends[:, 1, held] - ends[:, 0, held])
+            f = np.array(cubic(terms)(list(x)))
+            assert held.any() and np.all((rates[:, 0, held] <= f + 1e-12) & (f - 1e-12 <= rates[:, 1, held]))
+
+
+@BOTH
+def test_moves_are_less_than_the_way_to_the_ends_of_the_a_priori_box(program: Any) -> None:
     """The condition in rationals for linear fields, whose extremes are at corners: of all sizes, some rows 0, boxes
-    with ends of 0 and points."""
-    generator, found = np.random.default_rng(1), 0
+    with ends of 0 and points. The reference's box is what is found to be below a and b: no more than to these ends."""
+    generator, found, strict = np.random.default_rng(1), 0, program is by_the_checker
     for _ in range(30):
         size = 2.0 ** int(generator.choice([-900, -30, 0, 0, 0, 30, 300]))
         A = generator.standard_normal((2, 2)) * generator.choice([0.0, 1.0, 4.0], (2, 1))
@@ -513,31 +583,34 @@ def test_moves_are_less_than_the_way_to_the_ends_of_the_a_priori_box() -> None:
         hi, h = lo + size * generator.choice([0.0, 0.0, 0.5], (2, 6)), 2.0 ** float(generator.integers(-6, 0))
 
         def field(v: list[Any], A: np.ndarray = A, k: np.ndarray = k) -> list[Any]:
-            each = zip(A.tolist(), k[:, 0].tolist(), strict=True)
-            return [v[0].scaled(a) + v[1].scaled(b) + constants(v[0])(Fraction(c)) for (a, b), c in each]
+            number, each = constant_beside(v[0]), zip(A.tolist(), k[:, 0].tolist(), strict=True)
+            return [number(Fraction(a)) * v[0] + number(Fraction(b)) * v[1] + number(Fraction(c)) for (a, b), c in each]
 
-        during, _ = enclosed(field, around(lo, hi), h)
+        ends = program(field, lo, hi, h)
         for box in range(6):
-            low, high = ([float(v.range.ends[end][box]) for v in during] for end in (0, 1))
-            if not np.all(np.isfinite([*low, *high])):
+            low, high = ends[:, :, box].T.tolist()
+            if None in low:
                 continue
             found += 1
-            corners = [[Fraction(v) for v in corner] for corner in itertools.product(*zip(low, high, strict=True))]
+            corners = list(itertools.product(*zip(low, high, strict=True)))
             for i in range(2):
                 rates = [
                     sum(Fraction(a) * v for a, v in zip(A[i], x, strict=True)) + Fraction(k[i, 0]) for x in corners
                 ]
-                assert Fraction(low[i]) < Fraction(lo[i, box]) + Fraction(h) * min(*rates, 0)
-                assert Fraction(hi[i, box]) + Fraction(h) * max(*rates, 0) < Fraction(high[i])
+                fall = Fraction(lo[i, box]) + Fraction(h) * min(*rates, 0) - low[i]
+                rise = high[i] - Fraction(hi[i, box]) - Fraction(h) * max(*rates, 0)
+                assert (fall > 0 and rise > 0) if strict else (fall >= 0 and rise >= 0)
     assert found > 100
 
 
-def test_a_state_that_only_falls_is_not_looked_at_above() -> None:
+@BOTH
+def test_a_state_that_only_falls_is_not_looked_at_above(program: Any) -> None:
     """x' = -x^3 from 5/2: it falls by 5/8 at most in 1/25, but from 5/8 more by 1.2, and so on, so that no box has ends
     that are equally far. A state that escapes has no box: x' = x^2 from 10, which is infinite after 1/10."""
     at = np.array([[2.5]])
-    (x,), _ = enclosed(lambda v: [-(v[0] * v[0] * v[0])], around(at, at), 1 / 25)
-    low, high = x.range.ends
-    assert 2.5 - 1.25 * 0.625 - 1e-9 <= low[0] < 2.5 / np.sqrt(1.5) and high[0] <= 2.5 + 1e-9
-    with np.errstate(all="ignore"):
-        assert np.isnan(enclosed(lambda v: [v[0] * v[0]], around(4 * at, 4 * at), 1 / 10)[0][0].r.v).all()
+    for sign in (1, -1):
+        ((low, high),) = sign * program(lambda v: [-(v[0] * v[0] * v[0])], sign * at, sign * at, 1 / 25)[:, ::sign, 0]
+        assert 2.5 - 1.25 * 0.625 - 1e-9 <= low < 2.5 / np.sqrt(1.5) and 2.5 <= high <= 2.5 + 1e-9
+    for h, held in ((1 / 80, True), (1 / 10, False)):
+        found = program(lambda v: [v[0] * v[0]], 4 * at, 4 * at, h)
+        assert (None not in found) == held
