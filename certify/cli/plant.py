@@ -129,7 +129,7 @@ def _facts(s: System, eigenvalues: Sequence[complex], reach: Controllability) ->
 
 
 def _rest(s: System) -> str:
-    """How far the operating point is from an equilibrium."""
+    """The value of f at the operating point, or its distance from an equilibrium, in words."""
     from certify.loop.plants import residuals, rests_where
 
     moves = {name: r for name, r in residuals(s).items() if r != 0}
