@@ -301,6 +301,11 @@ def _without_equilibrium(refused: _Refused) -> Certificate | None:
     return refused.with_claim(refused.claim.without_equilibrium(), contraction=None)
 
 
+def _without_contraction(refused: _Refused) -> Certificate | None:
+    """The claim without its one equilibrium, if just that is refused: the set beyond the ellipsoid and a tube stay."""
+    return _without_equilibrium(refused) if refused.rule == "contraction" else None
+
+
 def _local_only(refused: _Refused) -> Certificate | None:
     """At the inner level, and then at one that is lower itself."""
     claim = refused.claim
@@ -316,6 +321,7 @@ def _without_ranks(refused: _Refused) -> Certificate | None:
 
 _CONCESSIONS = (
     _without_ranks,
+    _without_contraction,
     _without_outer,
     _with_higher_floor,
     _without_tube,

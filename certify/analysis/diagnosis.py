@@ -189,7 +189,8 @@ def _next(
     if (amiss := commands_too_much(*asked)) is not None:
         return Step((), amiss)
     ended = result.stop in (Stop.INPUTS, Stop.BOXES, Stop.STALLED) or result.stop.ran_out
-    if ended and (outside := clipped_outside(*asked)) is not None:
+    little = result.simulated is not None and (result.simulated.share or 0.0) < NEARLY_ALL
+    if (ended or little) and (outside := clipped_outside(*asked)) is not None:
         return Step((), outside)
     weaker = result.claim in ("practical", "nearby")
     if weaker and (centred := by_centring(result, options, asked, effort)) is not None:

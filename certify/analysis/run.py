@@ -35,6 +35,7 @@ from certify.provers.execution import runner_at
 __all__ = ["Report", "RoaOptions", "RoaResult", "certify_roa"]
 # Shares of the effort for candidates and ring, where more is to come:
 _BEFORE_TUBE, _BEFORE_OUTER = 0.5, 0.25
+_BEFORE_MORE = 0.5  # the same of candidates alone, where each heat is a whole proof
 
 
 def certify_roa(
@@ -140,7 +141,10 @@ def _through(state: State, tools: Tools) -> State:
     state = Setting(tools).extend(state, tools.effort)
     options = state.options
     if goes_on(state):
-        return _extended(state, [Candidate(tools), Onwards(tools), Acceptance(tools), Simulation(tools)], tools.effort)
+        whole_proofs = not (state.interruptible or state.loop.system.in_steps)
+        search = tools.effort.share(_BEFORE_MORE) if whole_proofs else tools.effort
+        state = _extended(state, [Candidate(tools)], search)
+        return _extended(state, [Onwards(tools), Acceptance(tools), Simulation(tools)], tools.effort)
     share = _BEFORE_TUBE if options.enlarges else _BEFORE_OUTER if options.goes_beyond else 1.0
     search = tools.effort.share(share)
     state = _extended(state, [Candidate(tools), Ring(tools)], search)

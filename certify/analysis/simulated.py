@@ -7,6 +7,7 @@ The same loop and effort draw the same states, whatever machine simulates them.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -77,6 +78,8 @@ class Simulator:
         else:
             flow = replace(flow, angles=())
         step, self.horizon = time_scales(flow)
+        whole = math.inf if flow.discrete or flow.period else time_scales(flow, most=math.inf)[1]
+        self.farther = whole if self.horizon < whole < math.inf else 0.0
         self.flow, self.step, self.V, self.level = flow, flow.fitting(step), V, level
 
     @property
@@ -88,7 +91,7 @@ class Simulator:
         """True (N,) for states (N, n) whose runs converge before the effort, an operation of which is worth several
         multiplications here, is over."""
         left = Effort(_QUICK * effort.left)
-        found, _, _ = run_until_near(self.flow, x, self.V.P, self.level, self.step, self.horizon, left)
+        found, _, _ = run_until_near(self.flow, x, self.V.P, self.level, self.step, self.horizon, left, self.farther)
         effort.charge(left.spent / _QUICK)
         return found
 

@@ -30,6 +30,7 @@ _WORTH = 1.1  # growth of the simulated region that is worth a word
 _NEAR = 1e-3  # of the largest level in the domain: a run that comes so low has converged
 _ROUNDING = Fraction(2) ** -23  # of a number: where single precision rounds it
 _ENDED = ("effort", "boxes")  # limits of an outer set that more effort lifts
+_TAUGHT = 1.0  # an effort below it ends the lessons of a function before they are over
 _LOOK = 3 * UNIT  # operations for one look
 
 
@@ -156,7 +157,8 @@ def beyond_the_ellipsoid(result: RoaResult, options: RoaOptions, effort: Effort)
     said, outer = _share_in_words(result), result.outer
     grows = not result.ranks.done if result.ranks is not None else outer is not None and outer.limit in _ENDED
     more = Step((("--effort", f"{4 * options.effort:g}"),), f"{said}, and the set grows with the effort")
-    if grows and simulated.share < MOST:
+    young = outer is not None and options.lyapunov is None and options.effort < _TAUGHT
+    if (grows or young) and simulated.share < MOST:
         return more
     wider = _in_a_wider_domain(result, effort)
     if wider is not None:

@@ -91,7 +91,7 @@ def _page(s: System, A: Matrix, B: Matrix, eigenvalues: Sequence[complex], reach
 
 
 def _facts(s: System, eigenvalues: Sequence[complex], reach: Controllability) -> list[tuple[str, str]]:
-    from certify.loop.plants import constraints_of_values, residuals, rests_where
+    from certify.loop.plants import constraints_of_values
 
     steps = s.time == "discrete"
     largest = max(abs(e) - 1 if steps else e.real for e in eigenvalues)
@@ -108,10 +108,7 @@ def _facts(s: System, eigenvalues: Sequence[complex], reach: Controllability) ->
         ("open loop", f"{word}; eigenvalues {shown}"),
         ("inputs reach", f"{reach.rank} of {s.n} directions: {word_reach} ({how})"),
     ]
-    found = {name: float(r) for name, r in residuals(s).items() if not (abs(float(r)) <= 1e-12)}
-    off = [f"{name} moves by {r:.6g}" if steps else f"{name}' = {r:.6g}" for name, r in found.items()]
-    rest = f"f(x_eq, u_eq) = {rests_where(s)}" if not off else f"no equilibrium: {', '.join(off)} at (x_eq, u_eq)"
-    rows.insert(0, ("at rest", rest))
+    rows.insert(0, ("at rest", _rest(s)))
     rows += [(f"asked: {name}", f"{e} < 0") for name, e in constraints_of_values(s).items()]
     if s.angles:
         rows.append(("angles", f"{', '.join(s.angles)}: the same place after a full turn, 2 pi"))
@@ -129,6 +126,23 @@ def _facts(s: System, eigenvalues: Sequence[complex], reach: Controllability) ->
         reads = ", ".join(f"{x} - {_number(q)}" if q else x.name for x, q in zip(s.states, s.exact_x_eq(), strict=True))
         rows.append(("policy reads", f"{reads}: deviations from x_eq, and so do A, B, V and the certificate"))
     return rows
+
+
+def _rest(s: System) -> str:
+    """The value of f at the operating point, or its distance from an equilibrium, in words."""
+    from certify.loop.plants import residuals, rests_where
+
+    moves = {name: r for name, r in residuals(s).items() if r != 0}
+    where = f"f(x_eq, u_eq) = {rests_where(s)}"
+    if not moves:
+        return where
+    if all(abs(float(r)) <= 1e-12 for r in moves.values()):
+        exactly = any(isinstance(r, Fraction) for r in moves.values())
+        rounding = "" if exactly else ", within rounding"
+        return f"{where} but for {max(abs(float(r)) for r in moves.values()):.2g}{rounding}"
+    verb = " moves by" if s.time == "discrete" else "' ="
+    off = (f"{name}{verb} {float(r):.6g}" for name, r in moves.items())
+    return f"no equilibrium: {', '.join(off)} at (x_eq, u_eq)"
 
 
 def _measured(s: System, data: Measurements) -> list[tuple[str, str]]:

@@ -20,7 +20,7 @@ from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.constraints import keeping
 from certify.loop.plants import System
-from certify.loop.plants.ode import eigenvalues_of, rk4_step
+from certify.loop.plants.ode import eigenvalues_of, fastest_at, rk4_step
 from certify.loop.policies import PolicyNetwork, bounded_by_form
 
 Array = NDArray[np.float64]
@@ -122,7 +122,12 @@ class Flow:
         """Multiplications' worth of a step of so many states."""
         return (1 if self.discrete else _STAGES) * self.cost * states + _AROUND
 
-    def advance(self, x: Array, u: Array | None, step: float) -> Array:
+    def steps_at(self, x: Array, least: float, most: float) -> Array:
+        """A step in seconds for each state (N, n), (N, 1): the fastest time constant there, between two bounds."""
+        fastest = np.clip(fastest_at(self.field, x, self.hi - self.lo), _STEP / most, _STEP / least)
+        return np.asarray(_STEP / fastest[:, None])
+
+    def advance(self, x: Array, u: Array | None, step: float | Array) -> Array:
         """States one step later, (..., n), with the input held at u if there is one."""
         if self.discrete:
             after = self.field(x)
@@ -149,14 +154,16 @@ def cost_of(network: PolicyNetwork) -> float:
     return _EQUATIONS + network.network.entries + _TANH * network.network.units
 
 
-def time_scales(flow: Flow, samples: int = _RATE_SAMPLES, reach: Array | None = None) -> tuple[float, float]:
+def time_scales(
+    flow: Flow, samples: int = _RATE_SAMPLES, reach: Array | None = None, most: float = _MAX_STEPS
+) -> tuple[float, float]:
     """(step, horizon) in seconds: the fastest time constant, and 15 times the slowest at the origin.
 
     Of `samples` states in the domain, or in the part of it where `|x_i| <= reach_i`.
 
     The fastest is taken over Jacobians at the origin and at sampled states of the domain, because a plant can be
-    stiffer away from the origin; Runge-Kutta of order four is stable up to 2.8 of it. The horizon is cut at 3,000
-    steps. In discrete time the two are numbers of steps, the first 1.
+    stiffer away from the origin; Runge-Kutta of order four is stable up to 2.8 of it. The horizon is cut at `most`
+    steps, 3,000. In discrete time the two are numbers of steps, the first 1.
     """
     lo, hi = (flow.lo, flow.hi) if reach is None else (np.maximum(flow.lo, -reach), np.minimum(flow.hi, reach))
     x = np.random.default_rng(0).uniform(lo, hi, (samples, len(lo)))
@@ -168,7 +175,7 @@ def time_scales(flow: Flow, samples: int = _RATE_SAMPLES, reach: Array | None = 
     fastest = float(np.max(np.abs(rates), initial=0.0))
     slowest = float(np.min(np.abs(rates[:1].real), initial=math.inf))
     step = _STEP / fastest if fastest > 0 else 1.0
-    return step, min(_HORIZON / slowest if slowest > 0 else math.inf, _MAX_STEPS * flow.fitting(step))
+    return step, min(_HORIZON / slowest if slowest > 0 else math.inf, most * flow.fitting(step))
 
 
 def simulate(flow: Flow, starts: Array, step: float, steps: int, effort: Effort = UNLIMITED) -> Array:

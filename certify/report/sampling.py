@@ -30,6 +30,7 @@ SETTLED = 1e-3
 _GRID = {1: 401, 2: 35}
 _FINER = 8  # of the step, in runs that are asked again because they contradict what is claimed
 _HALVINGS = 2  # of the grid's cells along the boundary of the region
+_FEWEST_STEPS = 100  # of a run with steps of its own
 _WIDTH = 4  # fine cells to either side that a smoothed value knows of
 _OUTSIDE = 1.01  # times the level: a run that starts below it and comes so high has left the set
 
@@ -217,15 +218,26 @@ def simulated_roa_fraction(
 
 
 def run_until_near(
-    flow: Flow, x: Array, P: Array, target: float, step: float, horizon: float, effort: Effort = UNLIMITED
+    flow: Flow,
+    x: Array,
+    P: Array,
+    target: float,
+    step: float,
+    horizon: float,
+    effort: Effort = UNLIMITED,
+    farther: float = 0.0,
 ) -> tuple[Mask, Mask, float]:
     """Simulate; return the runs that reached `V <= target`, those that left the domain, what is kept or the bounds of
-    inputs, and the simulated seconds."""
+    inputs, and the simulated seconds.
+
+    With `farther`, a horizon beyond `horizon`, each state has a step of its own, at least `step`, by which most runs
+    come so far in as many steps.
+    """
     attracted, left = np.zeros((2, len(x)), dtype=np.bool_)
     keeps = flow.keeps(x)
     alive, x, apart = np.flatnonzero(keeps), x[keeps], flow.steps_between(step)
     left[~keeps] = True
-    reached, u = horizon, None
+    reached, u, time = horizon, None, np.zeros(len(left))
     with np.errstate(all="ignore"):
         for k in range(math.ceil(horizon / step / apart) * apart):
             if k % apart == 0:
@@ -243,10 +255,17 @@ def run_until_near(
                 break
             effort.charge(flow.operations(len(x)))
             u = flow.input(x, u, k, step)
-            x = flow.advance(x, u, step)
+            if farther:
+                effort.charge(flow.operations(len(x)))
+                own = flow.steps_at(x, step, farther / _FEWEST_STEPS)
+                time[alive] += own[:, 0]
+                x = flow.advance(x, u, own)
+            else:
+                x = flow.advance(x, u, step)
             inside = np.all((x >= flow.lo) & (x <= flow.hi), axis=-1)  # False for NaN
             inside &= flow.keeps(x)
             left[alive[~inside]] = True
+            inside &= time[alive] <= farther
             x, alive, u = x[inside], alive[inside], None if u is None else u[inside]
         near = quadratic(P, x) <= target
     attracted[alive[near]] = True

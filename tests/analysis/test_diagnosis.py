@@ -12,7 +12,7 @@ import pytest
 
 from certify.analysis.candidates.trials import Trial, trial
 from certify.analysis.diagnosis import diagnose
-from certify.analysis.facts import Step
+from certify.analysis.facts import SimulatedFacts, Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
 from certify.analysis.run import certify_roa
@@ -133,6 +133,8 @@ def test_a_clip_that_a_rounding_puts_out_of_bounds_is_named(tmp_path: Path, prec
     most = np.array([float(precision(0.4))])
     result = certify_roa(bounded, replace(network, clip=(-most, most)), tmp_path, quick)
     assert result.diagnosis is not None and result.diagnosis.next.why.startswith("u is clipped at -0.4")
+    little = replace(result, stop=Stop.WITNESS, simulated=SimulatedFacts(1000, 500, 50))  # V ends before the clip does
+    assert diagnose(little, quick, None).next.why.startswith("u is clipped at -0.4")
     inside = np.nextafter([0.4], 0)
     assert certify_roa(bounded, replace(network, clip=(-inside, inside)), tmp_path, quick).stop is Stop.DOMAIN
 

@@ -21,6 +21,8 @@ from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
 from certify.analysis.simulated import Simulator, simulated_region
 from certify.analysis.stages import simulation
+from certify.analysis.stages.candidate import Candidate
+from certify.analysis.stages.state import State
 from certify.analysis.suggested import beyond_the_ellipsoid
 from certify.certificates import Certificate
 from certify.certificates.verdict import Verdict
@@ -31,6 +33,7 @@ from certify.loop.expressions import Expression, Number, Symbol
 from certify.loop.policies import load_policy
 from certify.lyapunov import Polynomial
 from certify.lyapunov.function import Quadratic
+from certify.lyapunov.learning import Learned, Learner
 from certify.report.rows import rows_of
 from certify.report.sections.simulated import drawn_of
 from tests.support.marks import slow_after
@@ -55,6 +58,7 @@ def plant(rate: Expression = RATE, lo: float = -4, hi: float = 2, time: str = "c
     )
 
 
+SQUARE = Polynomial(np.array([[2]]), np.array([1.0]))
 STEPS = plant(x + RATE / 10, time="discrete")
 
 
@@ -167,7 +171,7 @@ def test_the_ellipsoid_stays_where_nothing_is_learned(
     def failing(*_: object) -> None:
         raise InputError("too little converges.")
 
-    monkeypatch.setattr("certify.lyapunov.learning.learn", failing)
+    monkeypatch.setattr("certify.lyapunov.learning.learner_of", failing)
     result = proved(tmp_path)
     assert result.outer is None and result.levels == by_default.levels
     assert result.notice is not None and "no function is learned" in result.notice
@@ -176,12 +180,56 @@ def test_the_ellipsoid_stays_where_nothing_is_learned(
 def test_the_ellipsoid_stays_where_no_level_is_proved(
     by_default: RoaResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    falls_nowhere = Polynomial(np.array([[2]]), np.array([-1.0]))
-    monkeypatch.setattr("certify.analysis.stages.further.Beyond._learned", lambda *_: falls_nowhere)
+    falls_nowhere = Learned(Polynomial(np.array([[2]]), np.array([-1.0])), 1.0, 0.9, ())
+    monkeypatch.setattr("certify.lyapunov.learning.Learner.learn", lambda *_: falls_nowhere)
     result = proved(tmp_path)
     assert result.outer is None and result.levels == by_default.levels
     assert result.notice is not None and "no set of the learned function" in result.notice
     assert result.diagnosis is not None and dict(result.diagnosis.next.options) == {"--candidate": "polynomial"}
+
+
+def test_what_a_proof_finds_wrong_is_taught_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A first function of which nothing is proved, as if samples had missed where it rises; the next one counts."""
+    learn, functions, corrected = Learner.learn, list[Learned](), list[float]()
+
+    def wrong_at_first(learner: Learner, effort: Effort) -> Learned:
+        functions.append(learn(learner, effort))
+        rises = Polynomial(np.array([[1], [2]]), np.array([2.0, 0.5]))  # least at -2, where the state goes on to 0
+        return functions[-1] if len(functions) > 1 else replace(functions[-1], function=rises)
+
+    correct = Learner.correct
+    monkeypatch.setattr(Learner, "learn", wrong_at_first)
+    monkeypatch.setattr(
+        Learner, "correct", lambda learner, x, cover: (corrected.append(float(x[0])), correct(learner, x, cover))[1]
+    )
+    result = proved(tmp_path)
+    assert len(functions) == 2 and len(corrected) == 1 and -2.01 < corrected[0] < -0.9
+    assert result.outer is not None and result.simulated is not None and (result.simulated.share or 0.0) > 0.9
+
+
+@pytest.mark.parametrize(("claim", "share"), [("practical", 0.5), ("auto", 1.0)])
+def test_candidates_whose_heats_are_whole_proofs_leave_half_of_the_effort(
+    claim: str, share: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    extend, granted = Candidate.extend, list[float]()
+
+    def told(stage: Candidate, state: State, effort: Effort) -> State:
+        granted.append(effort.left / stage.tools.whole)
+        return extend(stage, state, effort)
+
+    monkeypatch.setattr(Candidate, "extend", told)
+    proved(tmp_path, claim=claim, effort=0.04)
+    assert granted == [pytest.approx(share, abs=0.02)]
+
+
+def test_a_plant_that_is_stiff_far_out_has_a_simulated_region(tmp_path: Path) -> None:
+    """The slowest time constant is 100 s; at the domain's ends the fastest is 1 ms, and steps of that come to 3 s."""
+    slow = plant(-x / 100 - 100 * x**9 + u, -1, 1)
+    runs = Simulator(ClosedLoop(slow, REST), Quadratic(np.eye(1)), 1e-4)
+    assert runs.horizon < 5 and runs.farther == pytest.approx(1500)
+    found = simulated_region(runs, Effort(3 * UNIT))
+    assert found is not None and len(found.converging) == found.runs
+    assert Simulator(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 1e-4).farther == 0
 
 
 @pytest.mark.parametrize("system", [plant(), STEPS], ids=["outer", "ranks"])
@@ -283,4 +331,17 @@ def test_more_effort_comes_before_a_wider_domain_where_little_is_proved(tmp_path
     first = step(False, 400)
     assert first is not None and first.options == (("--effort", "1.6"),) and "grows with the effort" in first.why
     for other in (step(True, 400), step(True, 850)):
+        assert other is None or "--effort" not in dict(other.options)
+
+
+def test_a_function_that_was_taught_little_is_taught_more_before_a_wider_domain(by_default: RoaResult) -> None:
+    assert by_default.outer is not None and by_default.outer.limit == "witness"
+
+    def step(covered: int, **options: object) -> Step | None:
+        changed = replace(by_default, simulated=SimulatedFacts(1000, 900, covered))
+        return beyond_the_ellipsoid(changed, RoaOptions(**options), Effort(10 * UNIT))  # type: ignore[arg-type]
+
+    first = step(400, effort=0.4)
+    assert first is not None and first.options == (("--effort", "1.6"),)
+    for other in (step(850, effort=0.4), step(400, effort=1.0), step(400, effort=0.4, lyapunov=SQUARE)):
         assert other is None or "--effort" not in dict(other.options)

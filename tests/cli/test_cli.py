@@ -890,6 +890,25 @@ def test_a_plant_in_discrete_time_is_listed_by_its_steps(
     assert "  theta+ = theta\n" in listed and "theta' =" not in listed
 
 
+@pytest.mark.parametrize(
+    ("u_eq", "said"),
+    [
+        ('"1/3"', "f(x_eq, u_eq) = 0 "),
+        ("0.3333333333333", "f(x_eq, u_eq) = 0 but for 3.3e-14 "),
+        ("0.33", "no equilibrium: x' = -0.00333333 at (x_eq, u_eq)"),
+    ],
+)
+def test_plant_says_how_far_it_is_from_rest(
+    u_eq: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plant = tmp_path / "s.toml"
+    plant.write_text(
+        f'name = "s"\nstates = ["x"]\ninputs = ["u"]\n[dynamics]\nx = "u - 1/3"\n[u_eq]\nu = {u_eq}\n'
+        "[domain]\nx = [-1, 1]\n[input_bounds]\nu = [-2, 2]\n"
+    )
+    assert said in run(capsys, "plant", plant)[1]
+
+
 def test_plants_list_disturbances_and_ranges(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "s.toml").write_text(RANGED.format(wind="[-0.1, 0.2]"))
     status, out, _ = run(capsys, "plant", tmp_path / "s.toml", "--param", "k=0.5..1.5")

@@ -173,6 +173,21 @@ def test_whoever_asks_for_an_input_out_of_bounds_is_lost() -> None:
     assert found.fate.tolist() == [Fate.CONVERGED, Fate.LOST]  # |u| <= 1 means |y| <= 1/4
 
 
+def test_a_plant_that_is_stiff_far_out_has_steps_by_state() -> None:
+    """Steps for the fastest time constant, 1 ms, would come to 2 s; the slowest is 100 s."""
+    loop = disc(1.0)
+    dynamics = tuple(-s / 100 - 100 * s**9 for s in loop.system.states)
+    flow = LearningFlow(ClosedLoop(dataclasses.replace(loop.system, dynamics=dynamics), loop.network), UNIT, 0.01)
+    assert flow.by_state and flow.steps * flow.step < 5 and not LearningFlow(disc(), UNIT, 0.01).by_state
+    assert flow.run(np.array([[0.9, 0.0], [0.3, -0.8]]), np.ones(2)).converged.all()
+
+
+def test_runs_are_as_many_as_the_effort_is_worth() -> None:
+    few = draw(LearningFlow(disc(), UNIT, 0.04, Effort(2e8)), np.random.default_rng(0))
+    many = draw(LearningFlow(disc(), UNIT, 0.04, Effort(1e12)), np.random.default_rng(0))
+    assert 900 < len(few.x) < len(many.x) / 2
+
+
 def test_directions_are_those_of_every_corner() -> None:
     system, network = scalar_tanh()
     flow = LearningFlow(ClosedLoop(pushed(system), network), Quadratic(np.eye(1)), 0.25)
@@ -234,6 +249,17 @@ def test_a_function_that_falls_has_no_counterexample_and_others_have() -> None:
     z, _, slope = search.rising(shifted, 0.5, 0.0, none, generator)
     np.testing.assert_allclose(along(shifted, z, search.worst(shifted, z)[0]), slope)
     assert len(z) and np.all(flow.V(z) > flow.c) and np.all(shifted(z) < 0.5) and np.all(slope > 0)
+
+
+def test_around_a_violation_there_are_others() -> None:
+    flow, search = searched()
+    shifted = Polynomial(np.array([[2, 0], [1, 0], [0, 2]]), np.array([1.0, -1.0, 1.0]))  # least at (1/2, 0)
+    at = np.array([0.3, 0.0])
+    z, v = search.near(shifted, at, np.random.default_rng(1))
+    assert len(z) > 100 and np.all(along(shifted, z, v) >= 0) and np.all(flow.V(z) > flow.c)
+    assert np.array_equal(z[0], at) and np.linalg.norm(z - at, axis=1).max() < 0.4
+    falls = Polynomial(np.array([[2, 0], [0, 2]]), np.ones(2))
+    assert not len(search.near(falls, at, np.random.default_rng(1))[0])
 
 
 def test_the_worst_corner_is_the_one_that_counts() -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,23 +15,30 @@ from certify.analysis.asked import ellipsoid_around, ellipsoid_in
 from certify.analysis.facts import TubeFacts
 from certify.analysis.simulated import Simulator
 from certify.analysis.stages.state import State, Tools
-from certify.certificates.claims import Claim, Problem
+from certify.certificates.claims import Problem
 from certify.certificates.ellipsoids import Box, sublevel_set, tube_start
 from certify.certificates.tree import LEAF
+from certify.certificates.verdict import Stop
 from certify.effort import Effort
 from certify.errors import OptionError
 from certify.lyapunov import Neural, Polynomial, of_polynomial, volume
 from certify.lyapunov.function import Quadratic
+from certify.lyapunov.symbolic import Symbolic
 from certify.provers.base import Budget, Progress
 from certify.provers.ranks import Enough, Question, Sublevel, prove_ranks, root_box, with_frame, with_order
+
+if TYPE_CHECKING:
+    from certify.provers.outer import Nothing, OuterProof
 
 Array = NDArray[np.float64]
 _FOR_SEARCH = 0.5  # share of the effort that is left, the rest being for the check
 _FOR_CELLS = 0.7  # the same for a search of boxes with ranks, of which only those with one are checked
 _FOR_RANKS = 0.35  # share of the whole effort, even if the search has left less
 _FOR_LEARNING = 0.6  # share of the effort that is left, the rest being for the proof and its check
+_MOST = 0.8  # share of what a learned function promised: with less proved it is taught again
+_LEAST = 0.1  # share of the whole effort, with less of which it is not
 _PROBES = 30  # states at which the order of the series in time is chosen, and the frame of errors
-_LITTLE = 2e-3  # share of the root box that an error of the series may be
+_BOXES, _LITTLE = 1e4, 0.02  # share of the width of one of so many equal boxes that an error of the series may be
 _FOR_RING = 0.05  # share of the whole effort for the check of the ring, if it takes a series of a higher order
 
 
@@ -113,10 +121,12 @@ class Route:
 
 
 def _shapes(state: State, shapes: Mapping[str, Array]) -> Mapping[str, Array]:
-    """These shapes, or the one box that was asked for."""
+    """These shapes, or the one of the box that was asked for."""
     system, box = state.loop.system, state.options.box
-    asked = ellipsoid_in(system, box) if box is not None else ellipsoid_around(system, state.begin or ())
-    return shapes if asked is None else {"box": asked}
+    if box is not None:
+        return {"box": ellipsoid_in(system, box)}
+    around = None if state.begin is None else ellipsoid_around(system, state.begin)
+    return shapes if around is None else {"box": around}
 
 
 def _narrower(P: Array, centre: tuple[float, ...], begin: Box) -> str:
@@ -151,24 +161,16 @@ class Beyond:
         ------
         OptionError : the function is one of another number of states.
         """
-        from certify.provers.outer import Nothing, prove_outer
+        from certify.provers.outer import Nothing
 
-        tools, (claim, evidence), trial = self.tools, state.proved, state.contest.best.trial
-        system, options = state.loop.system, state.options
-        function = options.lyapunov or self._learned(state, claim, effort)
-        if function.n != system.n:
-            raise OptionError(f"`lyapunov` must be a function of {system.n} states; found one of {function.n}.")
-        N = of_polynomial(function, system.states) if isinstance(function, Polynomial) else function
-        report = None if tools.progress is None else partial(tools.report, stage="outer")
-        with tools.timing("outer"):
-            tools.tell("outer")
-            budget = Budget(effort.share(_FOR_SEARCH), options.max_boxes)
-            found = prove_outer(
-                trial.task.problem, claim.roa, trial.T, N, options.lyapunov_level, budget, tools.runner, report
-            )
+        given, system = state.options.lyapunov, state.loop.system
+        if given is not None and given.n != system.n:
+            raise OptionError(f"`lyapunov` must be a function of {system.n} states; found one of {given.n}.")
+        found = self._learned(state, effort) if given is None else self._proved(state, given, effort)
         if isinstance(found, Nothing):
-            which = "the function `lyapunov`" if options.learned is None else "the learned function"
+            which = "the function `lyapunov`" if given is not None else "the learned function"
             return state.noting(f"no set of {which} is proved to lead into the ellipsoid: {found.why}")
+        (claim, evidence) = state.proved
         return replace(
             state,
             beyond=found,
@@ -176,17 +178,48 @@ class Beyond:
             evidence=replace(evidence, outer=found.evidence),
         )
 
-    def _learned(self, state: State, claim: Claim, effort: Effort) -> Neural | Polynomial:
-        """A function whose set may reach beyond the ellipsoid, learned with a share of the effort that is left."""
-        from certify.lyapunov.learning import fit_polynomial, learn
+    def _proved(self, state: State, function: Neural | Polynomial | Symbolic, effort: Effort) -> OuterProof | Nothing:
+        """The largest set of the function that a share of the effort proves."""
+        from certify.provers.outer import prove_outer
 
-        options, problem = state.options, state.contest.best.trial.task.problem
-        with self.tools.timing("learn"):
-            self.tools.tell("learn")
+        tools, (claim, _), trial, options = self.tools, state.proved, state.contest.best.trial, state.options
+        N = of_polynomial(function, state.loop.system.states) if isinstance(function, Polynomial) else function
+        report = None if tools.progress is None else partial(tools.report, stage="outer")
+        with tools.timing("outer"):
+            tools.tell("outer")
+            budget = Budget(effort.share(_FOR_SEARCH), options.max_boxes)
+            return prove_outer(
+                trial.task.problem, claim.roa, trial.T, N, options.lyapunov_level, budget, tools.runner, report
+            )
+
+    def _learned(self, state: State, effort: Effort) -> OuterProof | Nothing:
+        """The largest set of functions learned with shares of the effort, until most of what samples say is proved.
+
+        Samples may miss where a function rises, and a proof may not: what it finds is then part of the next lesson.
+        """
+        from certify.lyapunov.learning import Network, Terms, learner_of
+        from certify.provers.outer import Nothing
+
+        options, problem, best = state.options, state.contest.best.trial.task.problem, None
+        n, neural = problem.loop.system.n, options.learned == "neural"
+        model = Network(n, tuple(options.hidden)) if neural else Terms(n, options.degree)
+        share, learner = effort.share(_FOR_LEARNING), None
+        while True:
+            with self.tools.timing("learn"):
+                self.tools.tell("learn")
+                if learner is None:
+                    learner = learner_of(problem.loop, problem.V, state.proved[0].roa, model, options.seed, share)
+                learned = learner.learn(share)
+            found = self._proved(state, learned.function, effort)
+            covered = 0.0 if isinstance(found, Nothing) else learner.cover(learned.function, found.outer.level)
+            if best is None or covered > best[0]:
+                best = covered, found
+            wrong = found.witness if isinstance(found, Nothing) or found.stop is Stop.WITNESS else None
+            enough = covered >= _MOST * learned.cover or effort.left < _LEAST * self.tools.whole
+            if wrong is None or enough:
+                return best[1]
+            learner.correct(wrong.x, covered)
             share = effort.share(_FOR_LEARNING)
-            if options.learned == "neural":
-                return learn(problem.loop, problem.V, claim.roa, options.hidden, options.seed, share).function
-            return fit_polynomial(problem.loop, problem.V, claim.roa, options.degree, options.seed, share).function
 
 
 @dataclass(frozen=True)
@@ -216,7 +249,8 @@ class ByRanks:
             probes = np.random.default_rng(0).uniform(lo, hi, (_PROBES, len(lo))).T
             question = Question(problem.loop, target, claim.keep, root, evidence.order)
             ring, most = evidence.tree.count(LEAF), _FOR_RING * tools.whole
-            question = with_frame(with_order(question, probes, share, _LITTLE, ring, most), probes, share)
+            little = _LITTLE * _BOXES ** (-1 / len(lo))
+            question = with_frame(with_order(question, probes, share, little, ring, most), probes, share)
             promising = partial(Simulator(problem.loop, problem.V, claim.roa).converge, effort=share)
             found = prove_ranks(question, share, tools.runner, told, enough=self.enough, promising=promising)
         if found is None:

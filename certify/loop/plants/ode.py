@@ -56,9 +56,28 @@ def eigenvalues_of(field: Callable[[Array], Array], x: Array, widths: Array) -> 
     >>> eigenvalues_of(lambda x: -2 * x, np.zeros((1, 1)), np.ones(1)).real.round(6).tolist()
     [[-2.0]]
     """
+    J = _jacobians(field, x, widths)
+    return np.asarray(np.linalg.eigvals(J[np.all(np.isfinite(J), axis=(1, 2))]), dtype=np.complex128)
+
+
+def fastest_at(field: Callable[[Array], Array], x: Array, widths: Array) -> Array:
+    """The largest modulus (N,) of an eigenvalue of the Jacobian at each state (N, n), as `eigenvalues_of` has them;
+    infinite where there is none.
+
+    >>> fastest_at(lambda x: -(x**3), np.array([[1.0], [2.0]]), np.ones(1)).round(6).tolist()
+    [3.0, 12.0]
+    """
+    J = _jacobians(field, x, widths)
+    finite = np.all(np.isfinite(J), axis=(1, 2))
+    found = np.full(len(x), np.inf)
+    found[finite] = np.abs(np.linalg.eigvals(J[finite])).max(-1)
+    return found
+
+
+def _jacobians(field: Callable[[Array], Array], x: Array, widths: Array) -> Array:
+    """Jacobians (N, n, n), transposed, by central differences."""
     delta = _APART * widths
     shifted = x[:, None, None, :] + np.array([1.0, -1.0])[:, None, None] * np.diag(delta)
     with np.errstate(all="ignore"):
         F = field(shifted)
-        J = (F[:, 0] - F[:, 1]) / (2 * delta)[:, None]  # transposed; the eigenvalues are the same
-    return np.asarray(np.linalg.eigvals(J[np.all(np.isfinite(J), axis=(1, 2))]), dtype=np.complex128)
+        return np.asarray((F[:, 0] - F[:, 1]) / (2 * delta)[:, None])

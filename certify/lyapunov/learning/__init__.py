@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from certify.lyapunov.learning.learned import Learned, Round, fit_polynomial, learn, learn_staying
+from certify.lyapunov.learning.learned import (
+    Learned,
+    Learner,
+    Round,
+    fit_polynomial,
+    learn,
+    learn_staying,
+    learner_of,
+)
 from certify.lyapunov.learning.models import Network, Terms
 
-__all__ = ["Learned", "Network", "Round", "Terms", "fit_polynomial", "learn", "learn_staying"]
+__all__ = ["Learned", "Learner", "Network", "Round", "Terms", "fit_polynomial", "learn", "learn_staying", "learner_of"]

@@ -14,6 +14,7 @@ from certify.lyapunov.learning.samples import Samples
 
 Array = NDArray[np.float64]
 _SAMPLES, _CLIMBERS, _SINKING, _ON_FACES = 30_000, 400, 4000, 2000
+_AROUND = 3000
 _CLIMB, _SINK, _STRIDE = 6, 12, 0.03  # steps, and their length in scaled states
 _NEARBY, _BESIDE = 0.15, 0.05  # of the region's standard deviation: around its states, around violations
 
@@ -64,6 +65,14 @@ class Search:
         v, slope = self.worst(function, z)
         some = slope > above
         return z[some], v[some], slope[some]
+
+    def near(self, function: LyapunovFunction, z: Array, generator: np.random.Generator) -> tuple[Array, Array]:
+        """States (B, n) around one at which N does not fall, z (n,), at all distances up to a tenth of the region, at
+        which N does not fall either; and the flow there as of `rising`."""
+        apart = 10.0 ** generator.uniform(-4, -1, (_AROUND, 1)) * self.spread / self.scale
+        around = self._asked(np.concatenate([z[None], z + apart * generator.normal(size=(_AROUND, len(z)))]))
+        v, slope = self.worst(function, around)
+        return around[slope >= 0], v[slope >= 0]
 
     def worst(self, function: LyapunovFunction, z: Array) -> tuple[Array, Array]:
         """The flow's direction at the corner where N falls least, (B, n), and N's derivative along it, (B,)."""

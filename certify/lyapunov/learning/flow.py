@@ -19,7 +19,7 @@ from certify.effort import UNLIMITED, Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.constraints import keeping
 from certify.loop.plants import corners
-from certify.loop.plants.ode import eigenvalues_of, rk4_step
+from certify.loop.plants.ode import eigenvalues_of, fastest_at, rk4_step
 from certify.loop.policies import bounded_by_form
 from certify.lyapunov.function import Quadratic
 
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 _STEP = 0.5  # of the time constant of the fastest eigenvalue
 _HORIZON = 12.0  # time constants of the slowest
-_MAX_STEPS = 3000
+_MAX_STEPS, _FEWEST_STEPS = 3000, 100
 _RATE_SAMPLES = 300
 _SHELL = 0.75  # of c, inside of which nothing is asked
 _NEAR = 0.93  # of a domain's half-width: from here on its faces are near
@@ -91,7 +91,10 @@ class LearningFlow:
         generator = np.random.default_rng(0)
         rates = eigenvalues_of(self.rate, self.uniform(_RATE_SAMPLES, generator), self.high - self.low)
         self.step = _STEP / float(np.max(np.abs(rates), initial=1e-9))
-        self.steps = min(_MAX_STEPS, math.ceil(_HORIZON / max(self._slowest(), 1e-9) / self.step))
+        slowest = self._slowest()
+        self.horizon = _HORIZON / max(slowest, 1e-9)
+        self.steps = min(_MAX_STEPS, math.ceil(self.horizon / self.step))
+        self.by_state = slowest > 0 and self.steps * self.step < self.horizon  # one step for all does not come so far
 
     def _slowest(self) -> float:
         """The rate at which the slowest motion about the origin decays; not positive if one does not."""
@@ -147,13 +150,13 @@ class LearningFlow:
         """Simulate from states (B, n)."""
         middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
         fate = np.full(len(starts), Fate.UNDECIDED, dtype=np.int64)
-        length, nearness = np.zeros(len(starts)), np.zeros(len(starts))
+        length, nearness, time = np.zeros((3, len(starts)))
         x, alive = starts, np.arange(len(starts))
         with np.errstate(all="ignore"):
             for _ in range(self.steps):
                 home, kept = self.is_home(x), self.inside(x)
                 fate[alive[home & kept]], fate[alive[~kept]] = Fate.CONVERGED, Fate.LOST
-                on = kept & ~home
+                on = kept & ~home & (time[alive] < self.horizon)
                 x, alive = x[on], alive[on]
                 if not alive.size:
                     break
@@ -161,7 +164,15 @@ class LearningFlow:
                 close = np.clip((relative - _NEAR) / (1 - _NEAR), 0.0, 1.0) ** 2
                 nearness[alive] = np.maximum(nearness[alive], close)
                 self.effort.charge(_CALL + 5 * len(x) * self.loop.operations)
-                after = rk4_step(self.rate, x, self.step)
+                step = self._steps_at(x) if self.by_state else np.full(len(x), self.step)
+                after = rk4_step(self.rate, x, step[:, None])
+                time[alive] += step
                 length[alive] += np.linalg.norm((after - x) / scale, axis=-1)
                 x = after
         return Runs(fate, length, nearness)
+
+    def _steps_at(self, x: Array) -> Array:
+        """A step for each state (B,), by the fastest eigenvalue there."""
+        self.effort.charge(_CALL + 2 * self.n * len(x) * self.loop.operations)
+        fastest = np.minimum(fastest_at(self.rate, x, self.high - self.low), _STEP / self.step)
+        return np.asarray(np.minimum(_STEP / np.maximum(fastest, 1e-9), self.horizon / _FEWEST_STEPS))

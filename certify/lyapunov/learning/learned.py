@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,7 +105,7 @@ def learn(
     ------
     InputError : the loop goes in steps, the ellipsoid is none of its states, or too little converges to learn from.
     """
-    return _learned(loop, inner, c2, Network(loop.system.n, tuple(hidden)), seed, effort, progress)
+    return learner_of(loop, inner, c2, Network(loop.system.n, tuple(hidden)), seed, effort).learn(effort, progress)
 
 
 def fit_polynomial(
@@ -123,7 +123,7 @@ def fit_polynomial(
     ------
     InputError : as `learn`, or the degree is odd or out of range.
     """
-    return _learned(loop, inner, c2, Terms(loop.system.n, degree), seed, effort, progress)
+    return learner_of(loop, inner, c2, Terms(loop.system.n, degree), seed, effort).learn(effort, progress)
 
 
 def learn_staying(
@@ -145,12 +145,18 @@ def learn_staying(
 
     _require_continuous(loop)
     generator = np.random.default_rng(seed)
-    return _taught(StayingFlow(loop, generator, effort), model, generator, effort, progress)
+    return Learner(StayingFlow(loop, generator, effort), model, generator).learn(effort, progress)
 
 
-def _learned(
-    loop: ClosedLoop, inner: Quadratic, c2: float, model: Model, seed: int, effort: Effort, progress: Report | None
-) -> Learned:
+def learner_of(
+    loop: ClosedLoop, inner: Quadratic, c2: float, model: Model, seed: int = 0, effort: Effort = UNLIMITED
+) -> Learner:
+    """The learner of a function for a set beyond {V <= c2}; the arguments are those of `learn`.
+
+    Raises
+    ------
+    InputError : as `learn`.
+    """
     system = loop.system
     _require_continuous(loop)
     if inner.n != system.n or not (math.isfinite(c2) and c2 > 0):
@@ -159,7 +165,7 @@ def _learned(
             f"found {inner.n} states and the level {c2}."
         )
     generator = np.random.default_rng(seed)
-    return _taught(LearningFlow(loop, inner, _WITHIN * c2, effort), model, generator, effort, progress)
+    return Learner(LearningFlow(loop, inner, _WITHIN * c2, effort), model, generator)
 
 
 def _require_continuous(loop: ClosedLoop) -> None:
@@ -170,22 +176,57 @@ def _require_continuous(loop: ClosedLoop) -> None:
         )
 
 
-def _taught(
-    flow: LearningFlow, model: Model, generator: np.random.Generator, effort: Effort, progress: Report | None
-) -> Learned:
-    start = time.monotonic()
-    samples = draw(flow, generator)
-    lesson = _Lesson(flow, samples, generator)
-    search = Search(flow, samples)
-    p, damping = model.initial(generator), 1.0
-    best, history = p, list[Round]()
-    while len(history) < _ROUNDS and (not history or not effort.over):
-        done = len(history)
+class Learner:
+    """A function being learned, which a prover may send back with a state where it is wrong.
+
+    Parameters
+    ----------
+    flow : the loop with the set outside of which the function is to fall.
+    model : of the function.
+    """
+
+    def __init__(self, flow: LearningFlow, model: Model, generator: np.random.Generator) -> None:
+        self._start, self._model, self._generator = time.monotonic(), model, generator
+        self._samples = draw(flow, generator)
+        self._lesson, self._search = _Lesson(flow, self._samples, generator), Search(flow, self._samples)
+        self._p, self._damping = model.initial(generator), 1.0
+        self._best, self._reached = self._p, Round(math.inf, -math.inf, -math.inf, 0, 0.0)
+        self._history = list[Round]()
+
+    def learn(self, effort: Effort = UNLIMITED, progress: Report | None = None) -> Learned:
+        """Up to 20 rounds, one at least: the best function of all so far."""
+        done = len(self._history)
+        while len(self._history) < done + _ROUNDS and (len(self._history) == done or not effort.over):
+            self._round(effort)
+            if progress is not None:
+                progress(self._history[-1])
+        function = self._model.function(self._best, self._samples.scale)
+        return Learned(function, self._reached.level, self._reached.cover, tuple(self._history))
+
+    def cover(self, function: Neural | Polynomial, level: float) -> float:
+        """The sampled share of the region of attraction in {N <= level}, N a function of the plant's states."""
+        return self._cover(function(self._search.region), level)
+
+    def correct(self, x: Array, cover: float) -> None:
+        """Take it that only this share can be proved of the best function, which does not fall near the state x (n,);
+        what is found there is asked of later ones."""
+        self._reached = replace(self._reached, cover=cover)
+        at = x / self._samples.scale
+        self._lesson.add(
+            *self._search.near(self._model.function(self._best), at, self._generator), np.zeros((0, len(x))), True
+        )
+
+    def _cover(self, values: Array, level: float) -> float:
+        return self._samples.inner + (1 - self._samples.inner) * float(np.mean(values <= level))
+
+    def _round(self, effort: Effort) -> None:
+        done, model, lesson, search = len(self._history), self._model, self._lesson, self._search
         steps = _STEPS if done else _FIRST
-        fitted = fit(model, p, lesson.values(), lesson.slopes(model.function(p)), steps, damping, effort)
-        p, damping = fitted.p, max(fitted.damping, 1e-4) if done else 1.0
-        function = model.function(p)
-        effort.charge(_SEARCHED * _EACH * len(p))
+        slopes = lesson.slopes(model.function(self._p))
+        fitted = fit(model, self._p, lesson.values(), slopes, steps, self._damping, effort)
+        self._p, self._damping = fitted.p, max(fitted.damping, 1e-4) if done else 1.0
+        function, generator = model.function(self._p), self._generator
+        effort.charge(_SEARCHED * _EACH * len(self._p))
         z, v, slope = search.rising(function, lesson.sought, -_NATURAL * _MARGIN, lesson.risen, generator, lesson.least)
         low = search.low(function, lesson.sought, generator)
         level = min(
@@ -194,15 +235,11 @@ def _taught(
             lesson.sought,
         )
         level -= _BESIDE * abs(level)
-        cover = samples.inner + (1 - samples.inner) * float(np.mean(function(search.region / samples.scale) <= level))
-        if not history or cover > max(each.cover for each in history):
-            best = p
-        history.append(Round(fitted.cost, level, cover, len(z) + len(low), time.monotonic() - start))
-        if progress is not None:
-            progress(history[-1])
+        cover, seconds = self._cover(function(search.region / search.scale), level), time.monotonic() - self._start
+        self._history.append(Round(fitted.cost, level, cover, len(z) + len(low), seconds))
+        if cover > self._reached.cover:
+            self._best, self._reached = self._p, self._history[-1]
         lesson.add(z, v, low, relax=done + 1 >= _RELAXED * _ROUNDS)
-    reached = max(history, key=lambda each: each.cover)
-    return Learned(model.function(best, samples.scale), reached.level, reached.cover, tuple(history))
 
 
 class _Lesson:

@@ -22,7 +22,8 @@ from certify.lyapunov.learning.flow import LearningFlow
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 _STATES = 12_000
-_LOOKED_AT = 4000
+_LOOKED_AT, _FIRST, _FEW = 4000, 500, 1000  # states, by the first of which runs are judged; runs in any case
+_FOR_RUNS = 0.4  # share of the effort that is left
 _SHARE = 0.15  # of the domain that converges, from which on states are drawn from the domain
 _CHAINS, _MOVES = 600, 24  # of the walk through a smaller region
 _STRIDES = (0.3, 0.8, 1.5)  # in standard deviations of the chains' states
@@ -66,11 +67,14 @@ def draw(flow: LearningFlow, generator: np.random.Generator) -> Samples:
     ------
     InputError : almost nothing converges from outside of the inner ellipsoid.
     """
-    looked = flow.uniform(_LOOKED_AT, generator)
-    found = flow.run(looked, flow.high - flow.low)
-    if found.converged.mean() >= _SHARE:
-        scale = np.abs(looked[found.converged]).max(0)
-        x = flow.uniform(_STATES, generator)
+    looked, widths, before = flow.uniform(_LOOKED_AT, generator), flow.high - flow.low, flow.effort.spent
+    converged = flow.run(looked[:_FIRST], widths).converged
+    each = (flow.effort.spent - before) / _FIRST
+    looked = looked[: _FIRST + _affordable(flow, each, _LOOKED_AT - _FIRST)]
+    converged = np.concatenate([converged, flow.run(looked[_FIRST:], widths).converged])
+    if converged.mean() >= _SHARE:
+        scale = np.abs(looked[converged]).max(0)
+        x = flow.uniform(_affordable(flow, each, _STATES), generator)
     else:
         region, beyond = _walk(flow, generator)
         scale = np.abs(region).max(0)
@@ -90,6 +94,11 @@ def draw(flow: LearningFlow, generator: np.random.Generator) -> Samples:
     share = float(home.sum() / (home.sum() + way.sum()))
     value, slope = _ranked(key, share, flow.n)
     return Samples(x[~home], value[~home], (rate * slope)[~home], scale, share)
+
+
+def _affordable(flow: LearningFlow, each: float, wanted: int) -> int:
+    """As many of the wanted runs as a share of the effort is worth, at so many operations for each."""
+    return int(min(wanted, max(_FEW, _FOR_RUNS * flow.effort.left / each))) if each else wanted
 
 
 def _ranked(key: Array, inner: float, n: int) -> tuple[Array, Array]:

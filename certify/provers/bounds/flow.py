@@ -126,7 +126,7 @@ class Flow:
                 break
         exists = np.ones(move.shape[2], dtype=np.bool_)
         exists[left] = False
-        return {s: _between(v, *way[:, i]) for i, (s, v) in enumerate(states.items())}, exists
+        return {s: _between(v, *move[:, i]) for i, (s, v) in enumerate(states.items())}, exists
 
     def _most(self, rate: Sequence[Taylor]) -> Array:
         """Bounds (2, n, B), above 0, of the moves down and up at this rate."""

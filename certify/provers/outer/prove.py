@@ -54,9 +54,10 @@ class OuterProof:
 
 @dataclass(frozen=True, slots=True)
 class Nothing:
-    """No set beyond {V <= c2} is proved, and `why`."""
+    """No set beyond {V <= c2} is proved, and `why`; if for a violation, `witness` is the lowest one found."""
 
     why: str
+    witness: Rise | None = None
 
 
 def prove_outer(
@@ -101,7 +102,7 @@ def prove_outer(
     share = replace(budget, effort=budget.effort.share(_FOR_FACES))
     found = prove_faces(system, function, top, floor, share, runner)
     if isinstance(found, Nothing):
-        return found
+        return found if top > floor else replace(found, witness=witness)
     boxes, faces, on_faces, stopped = found
     if on_faces < top:
         top, stop = on_faces, stopped
@@ -117,7 +118,8 @@ def prove_outer(
     cover = Cover(rule, -root, root, runner, top, floor, _BESIDE_RISE * span, deepen)
     stopped = cover.advance(budget, report)
     if not cover.level > floor:
-        return Nothing(f"{cover.boxes:,} boxes did not show that N falls at any level; {_ended_by(stopped)}")
+        why = f"{cover.boxes:,} boxes did not show that N falls at any level; {_ended_by(stopped)}"
+        return Nothing(why, witness if stopped is Stop.WITNESS else None)
     if cover.level < top:
         stop = stopped
     if cover.level < top - _AGAIN * span:
