@@ -241,18 +241,25 @@ def moved_within(c: Certificate, leaf: Moving, hi: arb, at: str) -> tuple[dict[s
     Where less than what was tried is found for all of them, that much is what they move by. Models of boxes that are
     not even bound the lesser move less well, so that it may grow without end where even boxes serve: they come second.
     """
-    names = c.plant.states
+
+    def within(moves: Sequence[Move]) -> dict[str, Taylor]:
+        return dict(zip(c.plant.states, map(between, leaf.states.values(), moves), strict=True))
+
+    def moves_on(states: Mapping[str, Taylor]) -> list[Move] | None:
+        with under("flow", at):
+            F = c.plant.dynamics.evaluate({**states, **leaf.inputs, **leaf.anything}, constant, leaf.called)
+        if not all(f.is_finite() for f in F):
+            return None
+        return swept(hi, [arb((-(-f).bound()).lower()).union(arb(f.bound().upper())) for f in F])
+
     for even in (False, True):
         tried = [(ZERO, ZERO)] * c.n
         for _ in range(ATTEMPTS):
-            moved = dict(zip(names, map(between, leaf.states.values(), tried), strict=True))
-            with under("flow", at):
-                F = c.plant.dynamics.evaluate({**moved, **leaf.inputs, **leaf.anything}, constant, leaf.called)
-            if not all(f.is_finite() for f in F):
+            found = moves_on(within(tried))
+            if found is None:
                 break
-            found = swept(hi, [arb((-(-f).bound()).lower()).union(arb(f.bound().upper())) for f in F])
             if all(fall < a and rise < b for (fall, rise), (a, b) in zip(found, tried, strict=True)):
-                return dict(zip(names, map(between, leaf.states.values(), found), strict=True)), found
+                return within(found), moves_on(within(found)) or found
             each = [(fall.max(rise),) * 2 for fall, rise in found] if even else found
             tried = [(MORE * fall + LEAST, MORE * rise + LEAST) for fall, rise in each]
     raise Refused("flow", at, "no bound of how far the state goes within a period was found")

@@ -614,3 +614,30 @@ def test_a_state_that_only_falls_is_not_looked_at_above(program: Any) -> None:
     for h, held in ((1 / 80, True), (1 / 10, False)):
         found = program(lambda v: [v[0] * v[0]], 4 * at, 4 * at, h)
         assert (None not in found) == held
+
+
+def test_an_even_box_serves_where_one_with_other_ends_does_not() -> None:
+    """x' = 2 + x^3 from [-1, 1]: models of the cube bound the lesser move less well if the ends are not equally far."""
+    one = np.array([[1.0]])
+
+    def field(v: list[Any]) -> list[Any]:
+        return [constant_beside(v[0])(Fraction(2)) + v[0] * v[0] * v[0]]
+
+    for h, held in ((0.08, True), (0.1, True), (0.15, False)):
+        assert (None not in by_the_reference(field, -one, one, h)) == held
+
+
+def test_the_reference_has_an_a_priori_box_where_the_checker_has_one() -> None:
+    """Random cubic fields, about the longest period for which the checker has one."""
+    generator, asked = np.random.default_rng(3), 0
+    for _ in range(12):
+        terms = generator.standard_normal((2, 6)) * 2.0 ** generator.integers(-3, 3, (2, 6))
+        lo = generator.uniform(-2, 2, (2, 1))
+        hi, good, bad = lo + 2.0 ** generator.integers(-8, 0, (2, 1)), 0.0, 1.0
+        while bad - good > bad / 128 and bad > 2.0**-10:
+            h = (good + bad) / 2
+            good, bad = (good, h) if None in by_the_checker(cubic(terms), lo, hi, h) else (h, bad)
+        if good:
+            asked += bad < 1
+            assert None not in by_the_reference(cubic(terms), lo, hi, good)
+    assert asked > 6
