@@ -118,15 +118,18 @@ def enclosed(
 ) -> tuple[list[Taylor], list[Taylor]]:
     """Models of the states during a period of at most that length, and f of them; NaN where none of a few attempts is
     an enclosure: in it states fall and rise by less than to its ends, so that they cannot come there (Moore 1966), and
-    by no more than that."""
+    by no more than that. Boxes with both ends equally far come second: their models may be narrower."""
     down, up = np.zeros((2, len(states), len(states[0].c)))
-    for _ in range(1 + _ATTEMPTS):
+    for attempt in range(2 * (1 + _ATTEMPTS)):
         F = f([reached(x, *ends) for x, *ends in zip(states, down, up, strict=True)])
         most = (Above(np.maximum(outwards(F), 0.0)) * longest).top  # and above 0
         good = np.all(most < (down, up), axis=(0, 1))
         if np.all(good):
             break
-        down, up = np.where(good, (down, up), 1.25 * most)
+        further = np.zeros_like(most) if attempt == _ATTEMPTS else 1.25 * most
+        if attempt > _ATTEMPTS:
+            further[:] = further.max(axis=0)
+        down, up = np.where(good, (down, up), further)
     during = [reached(x, *ends) for x, *ends in zip(states, *np.where(good, most, np.nan), strict=True)]
     return during, f(during)
 

@@ -616,7 +616,8 @@ def test_a_state_that_only_falls_is_not_looked_at_above(program: Any) -> None:
         assert (None not in found) == held
 
 
-def test_an_even_box_serves_where_one_with_other_ends_does_not() -> None:
+@BOTH
+def test_an_even_box_serves_where_one_with_other_ends_does_not(program: Any) -> None:
     """x' = 2 + x^3 from [-1, 1]: models of the cube bound the lesser move less well if the ends are not equally far."""
     one = np.array([[1.0]])
 
@@ -624,7 +625,7 @@ def test_an_even_box_serves_where_one_with_other_ends_does_not() -> None:
         return [constant_beside(v[0])(Fraction(2)) + v[0] * v[0] * v[0]]
 
     for h, held in ((0.08, True), (0.1, True), (0.15, False)):
-        assert (None not in by_the_reference(field, -one, one, h)) == held
+        assert (None not in program(field, -one, one, h)) == held
 
 
 def test_the_reference_has_an_a_priori_box_where_the_checker_has_one() -> None:
