@@ -24,7 +24,7 @@ from certify.analysis.stages.simulation import Onwards, Simulation, goes_on
 from certify.analysis.stages.state import Report, Stage, State, Tools, effort_of
 from certify.certificates import PartitionTree, earlier_aside, sole_writer
 from certify.certificates.verdict import Stop, Verdict
-from certify.effort import Effort
+from certify.effort import UNIT, Effort
 from certify.errors import InputError, SoundnessError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.composition import composed
@@ -35,7 +35,8 @@ from certify.provers.execution import runner_at
 __all__ = ["Report", "RoaOptions", "RoaResult", "certify_roa"]
 # Shares of the effort for candidates and ring, where more is to come:
 _BEFORE_TUBE, _BEFORE_OUTER = 0.5, 0.25
-_BEFORE_MORE = 0.5  # the same of candidates alone, where each heat is a whole proof
+_BEFORE_MORE = 0.5  # the same of candidates alone, where each heat is a whole proof,
+_A_PROOF = 5 * UNIT  # but so many operations, if there are as many: a proof at all comes first
 
 
 def certify_roa(
@@ -142,7 +143,8 @@ def _through(state: State, tools: Tools) -> State:
     options = state.options
     if goes_on(state):
         whole_proofs = not (state.interruptible or state.loop.system.in_steps)
-        search = tools.effort.share(_BEFORE_MORE) if whole_proofs else tools.effort
+        half = max(_BEFORE_MORE * tools.effort.left, _A_PROOF)
+        search = tools.effort.part(half) if whole_proofs else tools.effort
         state = _extended(state, [Candidate(tools)], search)
         return _extended(state, [Onwards(tools), Acceptance(tools), Simulation(tools)], tools.effort)
     share = _BEFORE_TUBE if options.enlarges else _BEFORE_OUTER if options.goes_beyond else 1.0

@@ -528,7 +528,7 @@ def test_a_prior_that_is_left_as_it_is_has_an_advice(
 
 
 def test_inputs_in_another_unit_under_which_states_diverge_are_asked_about(tmp_path: Path) -> None:
-    """Of a car whose force is a thousand times too large the flow has no enclosure, and more rows help little."""
+    """Of a car whose force is 100,000 times too large the flow has no enclosure, and more rows help little."""
     car = """name = "car"
 states = ["v"]
 inputs = ["u"]
@@ -545,7 +545,7 @@ v = [-35, 35]
 u = [-4000, 4000]
 """
     rows = np.array([[20.0, u, 20.0 + u / 2400] for u in (-3000.0, -1000.0, 1500.0, 4000.0)])
-    rows[:, 1] *= 1000
+    rows[:, 1] *= 100_000
     (tmp_path / "car.toml").write_text(car)
     data = write(tmp_path / "data.csv", rows, "v,u,v_next")
     with pytest.raises(certify.InputError, match="look at the units of the measurements and at the period"):

@@ -207,9 +207,11 @@ def test_what_a_proof_finds_wrong_is_taught_again(tmp_path: Path, monkeypatch: p
     assert result.outer is not None and result.simulated is not None and (result.simulated.share or 0.0) > 0.9
 
 
-@pytest.mark.parametrize(("claim", "share"), [("practical", 0.5), ("auto", 1.0)])
-def test_candidates_whose_heats_are_whole_proofs_leave_half_of_the_effort(
-    claim: str, share: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("claim", "effort", "share"), [("practical", 0.4, 0.5), ("practical", 0.04, 1.0), ("auto", 0.04, 1.0)]
+)
+def test_candidates_whose_heats_are_whole_proofs_leave_half_of_more_effort_than_a_proof_takes(
+    claim: str, effort: float, share: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     extend, granted = Candidate.extend, list[float]()
 
@@ -218,7 +220,7 @@ def test_candidates_whose_heats_are_whole_proofs_leave_half_of_the_effort(
         return extend(stage, state, effort)
 
     monkeypatch.setattr(Candidate, "extend", told)
-    proved(tmp_path, claim=claim, effort=0.04)
+    proved(tmp_path, claim=claim, effort=effort)
     assert granted == [pytest.approx(share, abs=0.02)]
 
 

@@ -116,7 +116,7 @@ def refused() -> dict[str, Document]:
         "beyond the region": grow(scalar_claim(c2=3.7)),
         "inputs": narrow,
         "inputs and ring": with_tree(narrow, uniform(range(2), 4)),
-        "flow": flow,
+        "flow": with_tree(flow, b"\xff"),
     } | trees | others  # fmt: skip
 
 

@@ -110,7 +110,7 @@ class Flow:
         return [evaluate(expression, values, models, known) for expression in self.dynamics]
 
     def _enclose(self, states: Values, held: Values, now: Sequence[Taylor]) -> tuple[dict[Symbol, Taylor], Mask]:
-        """Models of all states up to the end of the period, and where (B,) they are that."""
+        """Models of all states up to the end of the period, NaN where there are none, and where (B,) there are."""
         move = self._most(now)
         way = _WIDER * move
         left = np.arange(move.shape[2])
@@ -125,7 +125,7 @@ class Flow:
             if not len(left):
                 break
         exists = np.ones(move.shape[2], dtype=np.bool_)
-        exists[left] = False
+        exists[left], move[..., left] = False, np.nan
         return {s: _between(v, *move[:, i]) for i, (s, v) in enumerate(states.items())}, exists
 
     def _most(self, rate: Sequence[Taylor]) -> Array:

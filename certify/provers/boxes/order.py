@@ -21,7 +21,7 @@ from certify.provers.boxes.rule import VdotBound
 Array = NDArray[np.float64]
 _COSTS = {2: 1.0, 3: 1.5, 4: 2.1}  # cost of a box relative to order 2, by the order
 _POINTS, _WORST, _ROUNDS = 64, 8, 4  # points of a round, and how many of them the next one starts from
-_MANY = 2000  # points that are looked at for corners, which few points may miss
+_MANY = 10_000  # points that are looked at for corners, which few points may miss
 _LEAST = 1e-2  # share of the decay by the longest series: below it a point cannot be had at any price
 
 
