@@ -154,7 +154,9 @@ def values_of(system: System, box: Box) -> Box:
 
 
 def ellipsoid_around(system: System, box: Box) -> Array | None:
-    """P (n, n) of the least ellipsoid {x'Px <= 1} with axes along the states, of which those not named in a `box` are
-    smallest, that holds a box around its middle; None for a state."""
+    """P (n, n) of an ellipsoid {x'Px <= 1} that holds a box moved to 0, with axes along the states; None for a state.
+
+    Along states that have an interval it is the smallest, along others as wide as `ellipsoid_in` makes it.
+    """
     wide = {s.name: float(hi - lo) / 2 for s, (lo, hi) in zip(system.states, box, strict=True) if lo < hi}
     return ellipsoid_in(system, {name: math.sqrt(len(wide)) * r for name, r in wide.items()}) if wide else None

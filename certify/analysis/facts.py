@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates import RankTree
-from certify.certificates.ellipsoids import tube_start
 from certify.lyapunov import extents, semi_axes, volume
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.symbolic import Symbolic
@@ -84,10 +81,6 @@ class TubeFacts:
     slabs: int
     duration: float
     centre: tuple[float, ...] | None = None
-
-    def contains(self, states: Sequence[Sequence[Fraction | float]]) -> list[bool]:
-        """Decide in rationals whether states, as deviations from the operating point, lie in the start."""
-        return tube_start(self.start, self.centre).holds(states)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON, with the size of the start along the states."""
