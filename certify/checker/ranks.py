@@ -179,6 +179,8 @@ class Steps(Moving):
         x = x[:, moving]
         for k in range(1, int(np.max(count[moving], initial=0)) + 1):
             left = np.flatnonzero(count[moving] >= k)
+            if not len(left):
+                break
             x, of = self.step(x[:, left], numbers[moving[left]], course)
             moving = moving[left[of]]
             if self.c.dynamics.jumps:

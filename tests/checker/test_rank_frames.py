@@ -131,7 +131,7 @@ def by_checker(data: Document, lo: Sequence[float], hi: Sequence[float], count: 
         steps = Steps(Case(document.certificate(json.loads(dumped(data)), "0" * 64)))
         x = steps.start(np.array(lo)[:, None], np.array(hi)[:, None])
         for _ in range(count):
-            x = steps.step(x, np.arange(1), Course())
+            x, _ = steps.step(x, np.arange(1), Course())
             each = np.array(x.range.ends)[:, :, 0].T
             if not np.all(np.isfinite(each)):
                 break

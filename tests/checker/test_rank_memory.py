@@ -199,7 +199,7 @@ def checkers_images(data: Document, lo: list[float], hi: list[float], count: int
         steps = Steps(Case(document.certificate(json.loads(dumped(data)), "0" * 64)))
         x = steps.start(np.array(lo)[:, None], np.array(hi)[:, None])
         for _ in range(count):
-            x = steps.step(x, np.arange(1), Course())
+            x, _ = steps.step(x, np.arange(1), Course())
             c, *of_symbols = x.value[:, :, 0]
             if not np.all(np.isfinite(x.size.top)):
                 break

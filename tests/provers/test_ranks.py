@@ -166,7 +166,7 @@ def test_images_hold_trajectories(loop: tuple[System, PolicyNetwork], framed: bo
     d = np.sign(generator.normal(size=(n, 200))) * generator.random((n, 200)) ** 0.2
     x, f = (centre + radius * d).T, system.function()
     for _ in range(12):
-        form, kept, _ = course.step(form)
+        form, _, kept, _ = course.step(form)
         if system.sample is None:
             x = f(x, ClosedLoop(*loop).policy(x))
         else:
@@ -433,8 +433,8 @@ def test_the_first_image_counts_however_wide_it_is() -> None:
     course = asked.course((1, 2))
     found = course(np.full((2, 1), 0.1), np.full((2, 1), 0.9), 0.0, 0.0)
     lo, hi = asked.root
-    assert np.any(found.hi[0, :, 0] - found.lo[0, :, 0] > 0.15 * (hi - lo))
-    assert np.all(np.isnan(found.lo[1])) and not found.loose[0] and found.taken[0] == 2
+    assert np.any(found.widths[0, :, 0] > 0.15 * (hi - lo))
+    assert np.all(np.isnan(found.widths[1])) and not found.loose[0] and found.taken[0] == 2
 
 
 def test_a_search_ends_where_enough_states_have_a_rank() -> None:

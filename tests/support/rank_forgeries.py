@@ -229,7 +229,7 @@ def _images(
         there, course = steps.is_in_target(x), _Each(len(every))
         found: list[list[list[Interval] | None]] = [[] for _ in every]
         for _ in range(longest):
-            x = steps.step(x, np.arange(len(every)), course)
+            x, _ = steps.step(x, np.arange(len(every)), course)
             ends, come = np.array(x.range.ends).transpose(2, 1, 0).tolist(), steps.is_in_target(x)
             for row, good, here, box in zip(found, course.good, come, ends, strict=True):
                 row.append(None if not good else [] if here else [(a, b) for a, b in box])

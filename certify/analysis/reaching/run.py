@@ -186,7 +186,8 @@ def _proved(
     angles = system.angles if goal.given is None else tuple(system.states[i].name for i in goal.turned)
     require_periodic(system, angles, question.root, partial(goal.certificate, question, provenance={}), clerk)
     with tools.timing("ranks"), runner_at(options.cluster) as runner:
-        found = _searched(question, options, longest, search, runner, tools)
+        arrivals = () if result.runs is None else result.runs.arrivals
+        found = _searched(question, options, arrivals, search, runner, tools)
     evidence = None if found is None else _within(found.evidence, options.within)
     if found is None or evidence is None:
         return replace(result, reason="no box of the domain is proved to lead into the target")
@@ -207,10 +208,10 @@ def _proved(
 
 
 def _searched(
-    question: Question, options: ReachOptions, longest: int, effort: Effort, runner: Runner, tools: Tools
+    question: Question, options: ReachOptions, arrivals: tuple[int, ...], effort: Effort, runner: Runner, tools: Tools
 ) -> RankProof | None:
     """Leaves from which the region is reached: those that the box needs, or else all that the effort finds. Where
-    simulated runs take few steps, `longest` at most, there is hope that images of parts of the box lie in it."""
+    simulated runs arrive after few steps, there is hope that images of parts of the box lie in it."""
 
     def report(share: float, boxes: int, waiting: int) -> None:
         tools.tell("ranks", Progress(0.0, 0.0, boxes, waiting, share, effort.left))
@@ -219,8 +220,8 @@ def _searched(
     if options.begin is not None:
         lo, hi = (np.array([float(pair[k]) for pair in options.begin]) for k in (0, 1))
         most = UNPROVED - 1 if options.within is None else options.within
-        direct = _DIRECT if 0 < longest <= MOST_STEPS else 0
-        wanted = Wanted(np.nextafter(lo, -np.inf), np.nextafter(hi, np.inf), most, direct, longest)
+        direct = _DIRECT if 0 < max(arrivals, default=0) <= MOST_STEPS else 0
+        wanted = Wanted(np.nextafter(lo, -np.inf), np.nextafter(hi, np.inf), most, direct, arrivals)
     found = prove_ranks(question, effort, runner, report, wanted)
     if runner.remark is not None:
         tools.remarks.append(runner.remark)

@@ -48,11 +48,16 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Runs:
-    """Simulated runs from a box: how many, the most steps of one that gets there, and one that does not."""
+    """Simulated runs from a box: how many, the numbers of steps after which some get there, and one that does not."""
 
     count: int
-    longest: int | None
+    arrivals: tuple[int, ...]
     failing: Run | None
+
+    @property
+    def longest(self) -> int | None:
+        """The most steps of a run that gets there."""
+        return self.arrivals[-1] if self.arrivals else None
 
 
 class Simulation:
@@ -74,10 +79,10 @@ class Simulation:
         """Runs from states of the box, or from some of these, of which the first is its middle; `within` is the number
         of steps after which the target is to be reached."""
         x, most = begins(self.begin)[some], LONG if within is None else within
-        start, alive, longest, failing = x, np.arange(len(x)), None, list[Run]()
+        start, alive, arrivals, failing = x, np.arange(len(x)), list[int](), list[Run]()
         for k in range(most + 1):
             there = self.beyond(self._place(x), self.flow.policy(x), ()).max(-1) <= _CLOSE
-            longest = k if np.any(there) else longest
+            arrivals += [k] if np.any(there) else []
             x, alive = x[~there], alive[~there]
             ended = self.ended(x, k)
             failing += [Run(self._exact(start[alive[i]]), *end) for i, end in ended.items()]
@@ -90,8 +95,8 @@ class Simulation:
         if not effort.over:
             failing += [Run(self._exact(start[i]), "late", most) for i in alive]
         worst = ("violates", "late", "left")
-        longest = None if effort.over else longest
-        return Runs(len(start), longest, min(failing, key=lambda run: worst.index(run.end), default=None))
+        arrivals = [] if effort.over else arrivals
+        return Runs(len(start), tuple(arrivals), min(failing, key=lambda run: worst.index(run.end), default=None))
 
     def ended(self, x: Array, k: int) -> dict[int, tuple[End, int, str]]:
         """The runs that end at states x (N, n) after k steps, by their numbers, and how."""

@@ -77,6 +77,8 @@ def _of_function(node: Operation, at: Expression) -> Expression:
             return one / (one + at**2)
         case "abs":
             return Operation("sign", at)
+        case "heaviside":  # where the sign is certain
+            return Operation("*", Number(0), Operation("sign", at))
     return one / (2 * node)  # sqrt
 
 

@@ -17,7 +17,7 @@ from certify.errors import InputError
 from certify.loop.expressions.gathering import gathered
 from certify.loop.expressions.tree import FUNCTIONS, GRAMMAR, Expression, Number, Operation, Symbol, nodes
 
-OF_ONE = (*FUNCTIONS, "abs", "sign")
+OF_ONE = (*FUNCTIONS, "abs", "heaviside", "sign")
 
 V = TypeVar("V")
 

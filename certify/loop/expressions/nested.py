@@ -7,7 +7,7 @@ from fractions import Fraction
 from typing import Any
 
 from certify.errors import CertificateFormatError, InputError
-from certify.loop.expressions.tree import CORNERS, FUNCTIONS, Expression, Number, Operation, Symbol
+from certify.loop.expressions.tree import CORNERS, FUNCTIONS, JUMP, Expression, Number, Operation, Symbol
 
 Tree = Any  # nested lists: a name, an exact fraction as text, or an operator with its operands
 
@@ -27,7 +27,7 @@ def to_tree(expression: Expression) -> Tree:
 
 _OPERANDS = {
     **{"+": (1, None), "*": (1, None), "-": (1, 2), "/": (2, 2), "**": (2, 2)},
-    **dict.fromkeys(FUNCTIONS, (1, 1)),
+    **dict.fromkeys((*FUNCTIONS, JUMP), (1, 1)),
     **CORNERS,
 }
 

@@ -72,6 +72,8 @@ def _code(node: Expression, operands: Sequence[str], module: Module) -> str:
             return f"minimum(maximum({v}, {lo}), {hi})"
         if node.operator == "sign":
             return f"{module}.where({operands[0]} < 0, -1.0, 1.0)"
+        if node.operator == "heaviside":
+            return f"{module}.where({operands[0]} < 0, 0.0, 1.0)"
         if node.operator in (*FUNCTIONS, "abs"):
             return f"{module}.{_NAMES[module].get(node.operator, node.operator)}({operands[0]})"
     raise InputError(f"{node!r} is no expression.")
@@ -101,6 +103,7 @@ _PLAIN: Mapping[str, Callable[..., float]] = {
     **{"abs": abs, "min": min, "max": max},
     "clip": lambda v, lo, hi: min(max(v, lo), hi),
     "sign": lambda v: -1.0 if v < 0 else 1.0,
+    "heaviside": lambda v: 0.0 if v < 0 else 1.0,
 }
 
 

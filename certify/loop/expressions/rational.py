@@ -64,6 +64,8 @@ class _Rational(Algebra[_Number]):
             return value
         if name == "abs":
             return abs(value)
+        if name == "heaviside":
+            return Fraction(value > 0) if value != 0 else _Unnamed("a jump at 0")
         if name == "sign":
             return Fraction(1 if value > 0 else -1) if value != 0 else _Unnamed(AT_CORNER)
         if name == "sqrt":

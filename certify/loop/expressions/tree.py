@@ -22,7 +22,9 @@ FUNCTIONS = ("sin", "cos", "tan", "tanh", "exp", "atan", "sqrt")
 """The smooth functions, of one operand."""
 CORNERS: Mapping[str, tuple[int, int | None]] = {"abs": (1, 1), "min": (2, None), "max": (2, None), "clip": (3, 3)}
 """The functions with corners, and the least and largest number of their operands."""
-NAMED = (*FUNCTIONS, *CORNERS)
+JUMP = "heaviside"
+"""The function that jumps: 0 of negative numbers, 1 of positive ones, and either of 0; for discrete time."""
+NAMED = (*FUNCTIONS, *CORNERS, JUMP)
 GRAMMAR = f"+ - * /, integer powers, {', '.join(NAMED)}"
 MOST_EXPONENT = 64
 MOST_DEPTH = 800  # of a tree; a certificate holds less
@@ -267,6 +269,11 @@ def clip(value: object, lo: object, hi: object) -> Expression:
     return function("clip", value, lo, hi)
 
 
+def heaviside(x: object) -> Expression:
+    """1 of positive numbers, 0 of negative ones; at 0 it may be either, at each step anew."""
+    return function(JUMP, x)
+
+
 def in_absolute_values(expression: Expression) -> Expression:
     """The tree with each min, max and clip written with abs, as FORMAT.md says; it has the same values.
 
@@ -323,6 +330,11 @@ def cornered(*expressions: Expression) -> Iterator[Operation]:
     return (node for node in nodes(*expressions) if isinstance(node, Operation) and node.operator in CORNERS)
 
 
+def jumping(*expressions: Expression) -> list[Operation]:
+    """The different parts that are heavisides of others."""
+    return [node for node in nodes(*expressions) if isinstance(node, Operation) and node.operator == JUMP]
+
+
 def substitute(expression: Expression, values: Mapping[Any, Expression]) -> Expression:
     """The tree with some of its nodes replaced, all at once, and nothing simplified: a replacement stays whole."""
     found: dict[Expression, Expression] = {}
@@ -349,7 +361,7 @@ def _require_exponent(base: Expression, exponent: Expression) -> None:
 
 
 def _require_operands(name: str, found: int) -> None:
-    least, most = CORNERS.get(name, (1, 1 if name in FUNCTIONS else None))
+    least, most = CORNERS.get(name, (1, 1 if name in (*FUNCTIONS, JUMP) else None))
     if found < least or (most is not None and found > most):
         wanted = str(most) if least == most else f"at least {least}"
         raise InputError(f"{name} must have {wanted} operand{'s' if wanted[-1] != '1' else ''}; found {found}.")

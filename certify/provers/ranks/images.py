@@ -5,6 +5,7 @@ answer to them cancels them there, as it does in truth; what is not of first ord
 so are the oldest ones (Kuehn 1998, Girard 2005). Errors are those of N x for a matrix N, the frame: where its rows are
 left eigenvectors of the step's map, errors shrink as fast as states do, while those of single states may grow by a
 factor with each step (the wrapping effect; Moore 1966, Lohner 1987).
+Where equations jump, a box has an image for each choice of heavisides that may occur, as many as `ways` says.
 FORMAT.md has the same in its chapter on ranks; boxes here are wider by more than rounding makes of them.
 """
 
@@ -12,12 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
+from itertools import product as choices
 from typing import NamedTuple
 
 import numpy as np
 
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import Expression, Symbol, evaluate
+from certify.loop.expressions import Expression, Symbol, evaluate, jumping
 from certify.loop.policies import bounded_by_form
 from certify.provers.bounds import Flow, Models, Taylor, loop_models, policy_enclosure, upper_bound
 from certify.provers.bounds.arrays import Array, Index, Mask, joined, pieces, product
@@ -31,16 +34,18 @@ _ENDS = 1e-9  # relative distance kept from ends of the domain
 _WIDEST = 0.15  # share of the root box beyond which an image is of no use
 _MORE_THAN_ROUNDING = 1e-13  # relative, of sums whose terms may cancel
 _NUMBERS = 2**16  # half a mebibyte of a model of second order at a time, of which a step of a loop has hundreds
+_WAYS = 4  # images of a box at once that are of use
 _MORE = 1.5  # operations of a step of a box, relative to those of a box's bound, whose symbols are fewer
 
 
 class Images(NamedTuple):
-    """Images of boxes (n, B) after so many steps each, K of them.
+    """Images of boxes (n, B) after so many steps each, K of them, up to R for each.
 
     Parameters
     ----------
-    lo, hi : (K, n, B); NaN where there is none that is of use.
-    there : (K, B), the image lies in the target.
+    lo, hi : (K, R, n, B); NaN where there are no more images, as of those that were in the target before.
+    there : (K, R, B), the image lies in the target.
+    known : (K, B), all images of the box are of use.
     inside, meets : (B,), the box itself does; it may have states there.
     loose : (B,), all that is asked for in the first step may hold in a part of the box, though not in all of it.
     fails : (B,), the first step violates a constraint from everywhere in the box, or leaves the domain.
@@ -52,6 +57,7 @@ class Images(NamedTuple):
     lo: Array
     hi: Array
     there: Mask
+    known: Mask
     inside: Mask
     meets: Mask
     loose: Mask
@@ -59,6 +65,18 @@ class Images(NamedTuple):
     first: Array
     taken: Array
     steep: Array
+
+    @property
+    def widths(self) -> Array:
+        """The largest width of a box's images, (K, n, B); NaN where they are of no use."""
+        widths: Array = np.fmax.reduce(self.hi - self.lo, axis=1)
+        return widths
+
+    @property
+    def arrived(self) -> Mask:
+        """True where all of a box's images are, or were before, in the target, (K, B)."""
+        arrived: Mask = self.known & (self.there | np.isnan(self.lo[:, :, 0])).all(1)
+        return arrived
 
 
 @dataclass(frozen=True)
@@ -123,6 +141,8 @@ class Course:
         sample = self.system.sample
         self.flow = None if sample is None else Flow(self.dynamics, sample, order, bool(keep))
         self.ends = np.array([[float(end) for end in pair] for pair in self.system.domain]).T[:, :, None]
+        self.jumps = len(jumping(*self.dynamics))
+        self.ways = _WAYS if self.jumps else 1
         self.operations = _MORE * operations_of_box(loop, order, (memory - 1) * self.system.n)  # of a step
 
     @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
@@ -140,8 +160,9 @@ class Course:
         slopes, errors = np.eye(n)[:, :, None] * radius, np.zeros((n, self.symbols - n, batch))
         form = Form(np.concatenate([centre[:, None], slopes, errors], 1))
         found = Images(
-            np.full((K, n, batch), np.nan),
-            np.full((K, n, batch), np.nan),
+            np.full((K, self.ways, n, batch), np.nan),
+            np.full((K, self.ways, n, batch), np.nan),
+            np.zeros((K, self.ways, batch), dtype=bool),
             np.zeros((K, batch), dtype=bool),
             self.is_there(form),
             ~self.target.misses(form.x, self.angles),
@@ -151,37 +172,59 @@ class Course:
             np.zeros(batch),
             np.abs(slopes).sum(0) / self.root[:, None],
         )
-        left = np.flatnonzero(~found.inside)
-        form, widest = form.at(left), np.zeros(batch)
+        of = np.flatnonzero(~found.inside)  # the box of each image
+        form, widest = form.at(of), np.zeros(batch)
         for count in range(1, self.counts[-1] + 1):
-            if not len(left):
+            if not len(of):
                 break
-            form, kept, lost = self.step(form)
-            found.taken[left] += 1
-            below, above = form.box
+            np.add.at(found.taken, of, 1)
+            form, before, kept, lost = self.step(form)
+            of = of[before]
+            starts = np.flatnonzero(np.diff(of, prepend=-1))
             if count == 1:
-                found.first[..., left] = below, above
-                (least, most), seen = self.ends[:, self.straight], (below[self.straight], above[self.straight])
-                found.fails[left] = fails = lost | ((seen[1] < least) | (seen[0] > most)).any(0)
-                found.loose[left] = ~(kept | fails)
-            width = ((above - below) / self.root[:, None]).max(0)
-            good = kept & ((width < _WIDEST) | (count == 1))
-            if count in self.counts:
-                k = self.counts.index(count)
-                there = good & self.is_there(form)
-                found.lo[k, :, left[good]], found.hi[k, :, left[good]] = below[:, good].T, above[:, good].T
-                found.there[k, left] = there
-                further = good & (width > widest[left])
-                steep = np.abs(form.x[:, 1 : n + 1]) / self.root[:, None, None]
-                found.steep[:, left[further]] = steep.sum(0)[:, further]
-                widest[left] = np.maximum(widest[left], np.where(good, width, 0.0))
-                good &= ~there
-            left, form = left[good], form.at(good)
+                self._first(found, of, starts, form, kept, lost)
+            good = kept & ((self._width(form) < _WIDEST) | (count == 1))
+            often = np.diff(starts, append=len(of))
+            whole = np.logical_and.reduceat(good, starts) & (often <= self.ways)
+            left = np.repeat(whole, often)
+            of, form = of[left], form.at(left)
+            if count in self.counts and len(of):
+                left = self._note(found, self.counts.index(count), of, form, widest)
+                of, form = of[left], form.at(left)
         return found
 
-    def step(self, form: Form) -> tuple[Form, Mask, Mask]:
-        """The states after a step, where (B,) all that is asked for on the way holds, and where a constraint certainly
-        does not."""
+    def _width(self, form: Form) -> Array:
+        """Widths of images, as shares of the root's."""
+        below, above = form.box
+        widths: Array = ((above - below) / self.root[:, None]).max(0)
+        return widths
+
+    def _first(self, found: Images, of: Index, starts: Index, form: Form, kept: Mask, lost: Mask) -> None:
+        """Take in the first step of boxes `of`, each with its images from `starts` on."""
+        (below, above), box = form.box, of[starts]
+        (least, most), seen = self.ends[:, self.straight], (below[self.straight], above[self.straight])
+        fails = np.logical_and.reduceat(lost | ((seen[1] < least) | (seen[0] > most)).any(0), starts)
+        found.first[0, :, box] = np.minimum.reduceat(below, starts, 1).T
+        found.first[1, :, box] = np.maximum.reduceat(above, starts, 1).T
+        found.fails[box], found.loose[box] = fails, ~(np.logical_and.reduceat(kept, starts) | fails)
+
+    def _note(self, found: Images, k: int, of: Index, form: Form, widest: Array) -> Mask:
+        """Take in the images of boxes `of` after the k-th number of steps; the images that do not lie in the target."""
+        n, starts = self.system.n, np.flatnonzero(np.diff(of, prepend=-1))
+        there, (below, above), box = self.is_there(form), form.box, of[starts]
+        number = np.arange(len(of)) - np.repeat(starts, np.diff(starts, append=len(of)))
+        found.known[k, box], found.there[k, number, of] = True, there
+        found.lo[k, number, :, of], found.hi[k, number, :, of] = below.T, above.T
+        width = np.maximum.reduceat(self._width(form), starts)
+        steep = np.abs(form.x[:, 1 : n + 1]) / self.root[:, None, None]
+        further = width > widest[box]
+        found.steep[:, box[further]] = np.maximum.reduceat(steep.sum(0), starts, 1)[:, further]
+        widest[box] = np.maximum(widest[box], width)
+        return ~there
+
+    def step(self, form: Form) -> tuple[Form, Index, Mask, Mask]:
+        """The images after a step, and of which states each is; where (B,) all that is asked for on the way holds, and
+        where a constraint certainly does not."""
         system, x = self.system, form.x
         error = 4 * EPS * np.abs(x).sum(1) + TINY
         mid, slopes, wide, _ = self.policy(x, error)
@@ -197,17 +240,33 @@ class Course:
         here = list(states.values())
         during: Sequence[Mapping[Symbol, Taylor]] = [values]
         if self.flow is None:
-            known: dict[Expression, Taylor] = {}
-            after = [evaluate(expression, values, Models(here[0]), known) for expression in self.dynamics]
+            after, of = self._stepped(values, here[0])
         else:
             mean = self.flow(states, inputs, quantities, self.symbols + system.m)
             after = [v + self.flow.times_period(rate) for v, rate in zip(here, mean.G, strict=True)]
+            of = np.arange(len(kept))
             kept = kept & mean.exists & self.in_domain(below - mean.down, above + mean.up)
             during = mean.during
         lost = np.zeros_like(kept)
         for g in self.constraints.during(during):
             kept, lost = kept & (upper_bound(g)[0] < 0), lost | (upper_bound(g.scaled(-1.0))[0] < 0)
-        return self.form(after), kept & np.all([np.isfinite(v.c + v.radius()) for v in after], axis=0), lost
+        finite = np.all([np.isfinite(v.c + v.radius()) for v in after], axis=0)
+        return self.form(after), of, kept[of] & finite, lost[of]
+
+    def _stepped(self, values: Mapping[Symbol, Taylor], like: Taylor) -> tuple[list[Taylor], Index]:
+        """The next states in discrete time, for each choice of heavisides those that may have it, one after the other
+        of the same state; and of which states they are."""
+        each, some = list[list[Taylor]](), list[Index]()
+        for choice in choices((0, 1), repeat=self.jumps):
+            models, known = _Chosen(like, choice), dict[Expression, Taylor]()
+            after = [evaluate(expression, values, models, known) for expression in self.dynamics]
+            if not self.jumps:
+                return after, np.arange(len(like.c))
+            some.append(np.flatnonzero(models.possible))
+            each.append([v.at(some[-1]) for v in after])
+        of = np.concatenate(some)
+        order = np.argsort(of, kind="stable")
+        return [_joined(of_state).at(order) for of_state in zip(*each, strict=True)], of[order]
 
     def in_domain(self, below: Array, above: Array) -> Mask:
         """True on boxes (n, B) inside the domain, but for angles."""
@@ -230,3 +289,24 @@ class Course:
         e = np.abs(product(self.into, rest)).sum(1) + product(np.abs(self.into), np.stack([v.r for v in models]))
         e = e * (1 + self.doubt) + _MORE_THAN_ROUNDING * product(np.abs(self.into), np.abs(rest).sum(1))
         return Form(np.concatenate([first[:, : n + 1], self.back[:, :, None] * e, first[:, n + 1 :]], 1))
+
+
+class _Chosen(Models):
+    """Models with chosen values of heavisides, in the order of evaluation, and the boxes where each may be."""
+
+    def __init__(self, like: Taylor, choice: Sequence[int]) -> None:
+        super().__init__(like)
+        self.left, self.possible = iter(choice), np.ones(len(like.c), dtype=bool)
+
+    def function(self, name: str, value: Taylor) -> Taylor:
+        if name != "heaviside":
+            return super().function(name, value)
+        chosen = next(self.left)
+        self.possible &= ~(upper_bound(value.scaled(1.0 if chosen else -1.0))[0] < 0)
+        return self.constant(Fraction(chosen))
+
+
+def _joined(models: Sequence[Taylor]) -> Taylor:
+    """Models on several batches as those on one."""
+    parts = zip(*((v.c, v.g, v.Q, v.r) for v in models), strict=True)
+    return Taylor(*(np.concatenate(part, -1) for part in parts))

@@ -21,7 +21,7 @@ from certify.provers.ranks.images import Course, Images
 from certify.provers.ranks.remaining import Remaining
 from certify.provers.ranks.search import COUNTS, Promising, Search
 from certify.provers.ranks.targets import TURN, Target
-from certify.provers.ranks.wanted import Direct, SearchFrom, Wanted
+from certify.provers.ranks.wanted import COUNTS_FROM, Direct, SearchFrom, Wanted
 
 _HALF_TURN = 3.1416  # and a little more
 _SLIVER, _SAMPLES = 1e-6, 64
@@ -82,7 +82,7 @@ def with_order(
         if leaves * course.operations > most:
             break
         found = _images(course, x, x, effort)
-        widths = ((found.hi - found.lo)[0] / (question.root[1] - question.root[0])[:, None]).max(0)
+        widths = (found.widths[0] / (question.root[1] - question.root[0])[:, None]).max(0)
         width = float(np.nanmedian(widths)) if np.any(np.isfinite(widths)) else math.inf
         if width < _GAIN * least or least == math.inf:
             best, least = asked, width
@@ -101,8 +101,8 @@ def with_frame(question: Question, x: Array, effort: Effort) -> Question:
 
     def widths(asked: Question) -> float:
         found = _images(asked.course(COUNTS), x - reach, x + reach, effort)
-        relative = (found.hi - found.lo) / reach[None]
-        return float(np.where(found.there, 0.0, np.log(np.nan_to_num(relative.max(1), nan=_LOST))).sum())
+        relative = found.widths / reach[None]
+        return float(np.where(found.arrived, 0.0, np.log(np.nan_to_num(relative.max(1), nan=_LOST))).sum())
 
     other = replace(question, frame=frame)
     return other if widths(other) < widths(question) else question
@@ -119,11 +119,11 @@ def with_memory(question: Question, lo: Array, hi: Array, steps: int, effort: Ef
         asked = replace(question, memory=memory)
         course = asked.course((steps,))
         found = _images(course, lo, hi, effort)
-        widths = np.nan_to_num(((found.hi - found.lo) / root).max(1), nan=1.0)
-        boxes = np.log(np.where(found.there, _THERE, widths)).mean() * len(lo) / 2
+        widths = np.nan_to_num((found.widths / root).max(1), nan=1.0)
+        boxes = np.log(np.where(found.arrived, _THERE, widths)).mean() * len(lo) / 2
         if boxes + math.log(course.operations) < least:
             best, least = asked, boxes + math.log(course.operations)
-        if np.all(found.there) or effort.over:  # more memory has more operations, and no fewer boxes
+        if np.all(found.arrived) or effort.over:  # more memory has more operations, and no fewer boxes
             break
     return best
 
@@ -224,19 +224,19 @@ def prove_ranks(
     -------
     RankProof | None : None if no leaf beyond the target has a rank, and no leaf of a box that was wanted.
     """
-    course = question.course(COUNTS if wanted is None else wanted.counts)
-    searches = [
-        Search(course, *question.root, promising) if wanted is None else SearchFrom(course, *question.root, wanted)
-    ]
-    if wanted is not None and wanted.direct:
-        searches.insert(0, Direct(course, *question.root, wanted))
+    if wanted is None:
+        searches = [Search(question.course(COUNTS), *question.root, promising)]
+    else:
+        searches = [SearchFrom(question.course(COUNTS_FROM), *question.root, wanted)]
+        if wanted.direct:
+            searches.insert(0, Direct(question.course(wanted.straight), *question.root, wanted))
     boxes = rounds = 0
-    with shared(runner, course) as bound:
-        for search in searches:
+    for search in searches:
+        with shared(runner, search.course) as bound:
             more, done = _grow(search, bound, effort, report, enough)
-            boxes, rounds = boxes + search.boxes, rounds + more
-            if done or effort.over:
-                break
+        boxes, rounds = boxes + search.boxes, rounds + more
+        if done or effort.over or not search.hopeless:
+            break
     search.tighten()
     tree = search.evidence()
     if not np.any(tree.steps if wanted is None else tree.proved):

@@ -14,7 +14,7 @@ import numpy as np
 from certify.certificates.claims import UNPROVED
 from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.ranks.images import Course, Images
-from certify.provers.ranks.search import Search
+from certify.provers.ranks.search import Search, together
 from certify.provers.ranks.wanted import SearchFrom, Wanted
 
 _LARGEST = 0.7  # share of the leaves to be halved that are, the largest ones
@@ -87,10 +87,10 @@ class Remaining(SearchFrom):
 
     def _beside(self, near: Index) -> Index:
         """The leaves among some that have no image, or one that meets a leaf that remains; all if there are none."""
-        imaged = np.isfinite(self.lo[:, 0, near])
-        k, at = np.nonzero(imaged)
-        _, image, leaf = self.cover.met_by(self.lo[k, :, near[at]].T, self.hi[k, :, near[at]].T)
-        beside: Index = np.union1d(near[~imaged.any(0)], near[at[image[self.rank[leaf] < UNPROVED]]])
+        _, node, image, lo, hi = self.images(near)
+        _, pair, leaf = self.cover.met_by(lo, hi)
+        none = near[~self.known[:, self.place[near]].any(0)]
+        beside: Index = np.union1d(none, node[image[pair[self.rank[leaf] < UNPROVED]]])
         return beside if len(beside) else near
 
     def tighten(self) -> None:
@@ -118,13 +118,10 @@ class Remaining(SearchFrom):
     def _settle(self, live: Index) -> None:
         """Find which of these leaves remain, together with those that do so already; and which are lost."""
         counts = np.array(self.course.counts)
-        k, at = np.nonzero(np.isfinite(self.lo[:, 0, live]))
-        node, lo, hi = live[at], self.lo[k, :, live[at]].T, self.hi[k, :, live[at]].T
-        _, image, leaf = self.cover.met_by(lo, hi)
-        order = np.argsort(image, kind="stable")
-        image, leaf, self.pairs = image[order], leaf[order], len(image)
-        starts = np.flatnonzero(np.diff(image, prepend=-1))
-        owner, steps = node[image[starts]], counts[k[image[starts]]]
+        k, node, image, lo, hi = self.images(live)
+        inside, pair, leaf = self.cover.met_by(lo, hi)
+        starts, at, leaf = together(image, inside, pair, leaf)
+        owner, steps, self.pairs = node[at], counts[k[at]], len(leaf)
 
         def within(some: Mask) -> Mask:
             """True for images all of whose leaves are among some."""
@@ -146,6 +143,6 @@ class Remaining(SearchFrom):
         self.rank[some], self.steps[some] = best[some], by[some]
         straight, (least, most) = self.course.straight, self.cover.root
         away = ((lo[straight] > most[straight]) | (hi[straight] < least[straight])).any(0)
-        self.lost[node[away]] = True
+        self.lost[node[np.bincount(image[~away], minlength=len(k)) == 0]] = True
         while np.any(new := within(self.lost) & ~self.lost[owner]):
             self.lost[owner[new]] = True

@@ -33,15 +33,20 @@ Promising = Callable[[Array], Mask]
 
 
 class Search:
-    """Ranks of the leaves of a tree that grows; leaves with no `promising` state are halved last."""
+    """Ranks of the leaves of a tree that grows; leaves with no `promising` state are halved last. Of the images of a
+    leaf after each number of steps so many are `kept`, or else all."""
+
+    kept: int | None = None
 
     def __init__(self, course: Course, lo: Array, hi: Array, promising: Promising | None = None) -> None:
         self.promising, self.hope = promising, np.full(1, np.nan)
         self.course, self.cover = course, Cover(lo, hi, course.angles)
         K, n = len(course.counts), len(lo)
         self.rank, self.steps = np.full(1, UNPROVED), np.zeros(1, dtype=np.int64)
-        self.lo, self.hi = np.full((K, n, 1), np.nan), np.full((K, n, 1), np.nan)
-        self.there, self.steep = np.zeros((K, 1), dtype=bool), np.zeros((n, 1))
+        self.place = np.zeros(1, dtype=np.int64)  # of a leaf's images among all; the first ones are none
+        self.lo, self.hi = np.full((2, K, course.ways, n, 1), np.nan)[:, :, : self.kept]
+        self.known, self.there = np.zeros((2, K, 1), dtype=bool)
+        self.steep = np.zeros((n, 1))
         self.meets, self.loose = np.zeros(1, dtype=bool), np.zeros(1, dtype=bool)
         self.part, self.first = np.zeros(1), np.full((2, n, 1), np.nan)
         self.boxes, self.pairs, self.stands = 0, 0, list[tuple[int, float]]()
@@ -65,7 +70,12 @@ class Search:
 
     @property
     def gives_up(self) -> bool:
-        """True if another search has more hope now."""
+        """True if it is not worth going on."""
+        return False
+
+    @property
+    def hopeless(self) -> bool:
+        """True if another search has more hope."""
         return False
 
     def further(self, near: Index) -> Index:
@@ -103,8 +113,7 @@ class Search:
             return np.concatenate([v, np.full((*v.shape[:-1], new), fill, dtype=v.dtype)], -1)
 
         self.rank, self.steps = longer(self.rank, UNPROVED), longer(self.steps, 0)
-        self.lo, self.hi = longer(self.lo, np.nan), longer(self.hi, np.nan)
-        self.there, self.steep = longer(self.there, False), longer(self.steep, 0.0)
+        self.place, self.steep = longer(self.place, 0), longer(self.steep, 0.0)
         self.meets, self.loose = longer(self.meets, False), longer(self.loose, False)
         self.hope, self.part = longer(self.hope, np.nan), longer(self.part, 0.0)
         self.first = longer(self.first, np.nan)
@@ -112,8 +121,13 @@ class Search:
 
     def take(self, nodes: Index, found: Images) -> None:
         """Take in the images of leaves."""
-        self.lo[..., nodes], self.hi[..., nodes] = found.lo, found.hi
-        self.there[:, nodes], self.steep[:, nodes] = found.there, found.steep
+        further, lo, hi = np.where(found.there[:, :, None], np.nan, 0.0), found.lo, found.hi
+        self.place[nodes] = len(self.known[0]) + np.arange(len(nodes))
+        self.lo = np.concatenate([self.lo, (lo + further)[:, : self.kept]], -1)
+        self.hi = np.concatenate([self.hi, (hi + further)[:, : self.kept]], -1)
+        self.known = np.concatenate([self.known, found.known], -1)
+        self.there = np.concatenate([self.there, found.arrived], -1)
+        self.steep[:, nodes] = found.steep
         self.meets[nodes], self.loose[nodes] = found.meets, found.loose
         self.first[..., nodes] = found.first
         self.rank[nodes[found.inside]] = 0
@@ -123,34 +137,39 @@ class Search:
         """Give ranks to all leaves that have one by now; those without that may meet the target, or whose images meet
         some leaf with a rank, or lie in the root box with a part only."""
         unknown, counts = self.unknown, np.array(self.course.counts)
-        k, at = np.nonzero(np.isfinite(self.lo[:, 0, unknown]))
-        node, there = unknown[at], self.there[k, unknown[at]]
         best, by = np.full(self.cover.size, UNPROVED), np.zeros(self.cover.size, dtype=np.int64)
-        self._better(best, by, node[there], counts[k[there]], counts[k[there]])
-        node, k = node[~there], k[~there]
-        inside, pair, leaf = self.cover.met_by(self.lo[k, :, node].T, self.hi[k, :, node].T)
-        kept = inside[pair]
-        order = np.argsort(pair[kept], kind="stable")
-        pair, leaf = pair[kept][order], leaf[kept][order]
-        self.pairs = len(pair)
-        starts = np.flatnonzero(np.diff(pair, prepend=-1))
-        owners = node[pair[starts]]
-        steps = counts[k[pair[starts]]]
+        k, at = np.nonzero(self.there[:, self.place[unknown]])
+        self._better(best, by, unknown[at], counts[k], counts[k])
+        k, node, image, lo, hi = self.images(unknown)
+        inside, pair, leaf = self.cover.met_by(lo, hi)
+        starts, at, met = together(image, inside, pair, leaf)
+        owners, steps, self.pairs = node[at], counts[k[at]], len(met)
         while True:
-            highest = np.maximum.reduceat(self.rank[leaf], starts) if len(starts) else np.zeros(0, dtype=np.int64)
+            highest = np.maximum.reduceat(self.rank[met], starts) if len(starts) else np.zeros(0, dtype=np.int64)
             known = (highest < UNPROVED) & (highest + steps < UNPROVED)
             self._better(best, by, owners[known], highest[known] + steps[known], steps[known])
             new = unknown[(best[unknown] < self.rank[unknown])]
             if not len(new):
                 break
             self.rank[new], self.steps[new] = best[new], by[new]
-        (low, high), first = self.cover.root, k == 0
-        sticks = first & ~inside & ((high > self.lo[k, :, node].T) & (low < self.hi[k, :, node].T)).all(0)
+        (low, high), first = self.cover.root, k[image] == 0
+        sticks = first & ~inside & ((high > lo) & (low < hi)).all(0)
         self.part[unknown] = 0.0
-        beside = self._toward(self.lo[k, :, node].T, self.hi[k, :, node].T, node, pair, leaf)
-        near: Index = np.unique(np.concatenate([beside, self._loosely(), unknown[self.meets[unknown]], node[sticks]]))
+        beside = self._toward(lo, hi, node[image], pair, leaf)
+        others = self._loosely(), unknown[self.meets[unknown]], node[image[sticks]]
+        near: Index = np.unique(np.concatenate([beside, *others]))
         waiting: Index = near[self.rank[near] == UNPROVED]
         return waiting
+
+    def images(self, nodes: Index) -> tuple[Index, Index, Index, Array, Array]:
+        """The images of leaves that do not lie in the target: for each number of steps of a leaf that number's index
+        and the leaf, and for each image the index of these, and its corners (n, I)."""
+        places = self.place[nodes]
+        k, at = np.nonzero(self.known[:, places] & ~self.there[:, places])
+        node = nodes[at]
+        lo, hi = self.lo[k, :, :, places[at]], self.hi[k, :, :, places[at]]
+        image, way = np.nonzero(np.isfinite(lo[:, :, 0]))
+        return k, node, image, lo[image, way].T, hi[image, way].T
 
     def _loosely(self) -> Index:
         """The leaves of which a part may pass, and whose first step leads in part to leaves with a rank or anywhere."""
@@ -218,3 +237,14 @@ class Search:
         return RankTree(
             lo, hi, tree, rank.astype(np.uint16), steps.astype(np.uint8), self.course.frame, self.course.memory
         )
+
+
+def together(of: Index, inside: Mask, pair: Index, leaf: Index) -> tuple[Index, Index, Index]:
+    """The leaves that images of the same (`of`) meet, from pairs of an image and a leaf: where those of each begin, of
+    which they are, and the leaves. Left out is all of which an image does not lie inside the root box."""
+    kept = np.bincount(of[~inside], minlength=int(of.max(initial=-1)) + 1) == 0
+    pair, leaf = pair[kept[of[pair]]], leaf[kept[of[pair]]]
+    order = np.argsort(of[pair], kind="stable")
+    owner = of[pair][order]
+    starts: Index = np.flatnonzero(np.diff(owner, prepend=-1))
+    return starts, owner[starts], leaf[order]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from certify.certificates.claims import UNPROVED
-from certify.provers.bounds.arrays import Array, Index, Mask
+from certify.provers.bounds.arrays import Array, Index
 from certify.provers.ranks.images import Course, Images
 from certify.provers.ranks.search import Search
 
@@ -22,8 +22,10 @@ MOST_STEPS = 255  # of a leaf
 _GROWTH = 1.5  # of an image, relative to its leaf, that counts as none
 _NARROW = 1e-11  # share of the root box below which leaves are not halved
 _FALLS = 0.95  # of the volume without a rank from one round to the next, at most
+_ROUNDS = 5  # after which it does not fall either
 _SHARE = 0.7  # of the leaves that may be halved, the largest ones
 _MOST_LEFT = 0.5  # share of the box without which a search of its own parts is worth all effort
+_AROUND = 2  # steps beside those that simulated runs take
 _OF_A_TURN = 0.01  # width of an angle below which it is not halved at first
 
 
@@ -31,18 +33,19 @@ _OF_A_TURN = 0.01  # width of an angle below which it is not halved at first
 class Wanted:
     """A box lo <= x <= hi (n,) of places, each of whose leaves is to have a rank of `most` at most; `direct` says how
     many boxes are looked at in the hope that images of parts of the box lie in the target, as where few steps suffice:
-    so many, and more as long as they prove more and more of it. `longest`: the steps that simulated runs take."""
+    so many, and more as long as they prove more and more of it. `arrivals`: the steps that simulated runs take."""
 
     lo: Array
     hi: Array
     most: int = UNPROVED - 1
     direct: int = 0
-    longest: int = 0
+    arrivals: tuple[int, ...] = ()
 
     @property
-    def counts(self) -> tuple[int, ...]:
-        """The steps after which images are looked at; a target may hold at one instant alone."""
-        return tuple(sorted({*COUNTS_FROM, *(k for k in (self.longest, self.longest + 1) if 0 < k <= MOST_STEPS)}))
+    def straight(self) -> tuple[int, ...]:
+        """The steps after which an image may lie in the target: all around those that runs take."""
+        least, most = min(self.arrivals, default=0), max(self.arrivals, default=0)
+        return tuple(range(max(1, least - _AROUND), min(MOST_STEPS, most + most // 2 + _AROUND) + 1))
 
 
 class SearchFrom(Search):
@@ -90,7 +93,7 @@ class SearchFrom(Search):
         if not len(waiting):  # the box has ranks that are too high
             waiting = self._own[self.rank[self._own] > self.wanted.most]
             self.rank[waiting], self.steps[waiting] = UNPROVED, 0
-        stuck = waiting[~np.isfinite(self.lo[:, 0, waiting]).any(0)]
+        stuck = waiting[~self.known[:, self.place[waiting]].any(0)]
         chosen = np.union1d(stuck, np.intersect1d(waiting, near))
         chosen = chosen if len(chosen) else waiting
         volumes = self.cover.widths(chosen).prod(0)
@@ -113,25 +116,22 @@ class SearchFrom(Search):
         while len(new):
             known[new] = True
             open_ = new[self.seen[new] & (self.rank[new] == UNPROVED)]
-            k, at = self._course_of(open_)
-            leaves = self._met(self.lo[k, :, at].T, self.hi[k, :, at].T)
+            leaves = self._met(*self._course_of(open_))
             new = leaves[~known[leaves]]
         found: Index = np.flatnonzero(known)
         return found
 
-    def _course_of(self, nodes: Index) -> tuple[Index, Index]:
-        """For each leaf that has an image the number of the one that counts, and the leaf."""
-        if not len(nodes):
-            return nodes, nodes
-        own = self.cover.high[:, nodes] - self.cover.low[:, nodes]
-        with np.errstate(invalid="ignore"):
-            growth = ((self.hi[:, :, nodes] - self.lo[:, :, nodes]) / own).max(1)
-        there: Mask = self.there[:, nodes]
-        growth = np.where(np.isfinite(growth), growth, np.inf)
+    def _course_of(self, nodes: Index) -> tuple[Array, Array]:
+        """The images (n, I) that count, of the leaves that have some."""
+        own, at = self.cover.high[:, nodes] - self.cover.low[:, nodes], self.place[nodes]
+        known, widths = self.known[:, at], np.nan_to_num((self.hi[..., at] - self.lo[..., at]) / own)
+        growth = np.where(known, widths.max((1, 2)), np.inf)
         far = np.where(growth <= _GROWTH, np.arange(len(growth))[:, None], -1).max(0)
         k = np.where(far >= 0, far, growth.argmin(0))
-        use = np.isfinite(growth.min(0)) & ~there.any(0)
-        return k[use], nodes[use]
+        use = known.any(0) & ~self.there[:, at].any(0)
+        lo, hi = self.lo[k[use], :, :, at[use]], self.hi[k[use], :, :, at[use]]
+        some = np.isfinite(lo[:, :, 0])
+        return lo[some].T, hi[some].T
 
     def _met(self, lo: Array, hi: Array) -> Index:
         """The leaves that boxes meet."""
@@ -142,12 +142,14 @@ class SearchFrom(Search):
 
 class Direct(SearchFrom):
     """Ranks of parts of a box whose own images lie in the target: its tree is one of the box itself, but for angles,
-    of which a tree has a turn."""
+    of which a tree has a turn. No other image is of use, or kept."""
+
+    kept = 0
 
     def __init__(self, course: Course, lo: Array, hi: Array, wanted: Wanted) -> None:
         turning = np.isin(np.arange(len(lo)), course.angles)
         super().__init__(course, np.where(turning, lo, wanted.lo), np.where(turning, hi, wanted.hi), wanted)
-        self.left, self.before = math.inf, math.inf
+        self.left, self.stalls = math.inf, 0
 
     def begin(self, most: float) -> Index:
         """The whole box; of angles the parts of a turn, as narrow as the box, that meet it."""
@@ -161,9 +163,15 @@ class Direct(SearchFrom):
 
     @property
     def gives_up(self) -> bool:
-        """True once enough boxes were looked at, little of the box is proved, and halves prove hardly more."""
-        stalled = self.left > _MOST_LEFT and self.left >= _FALLS * self.before
-        return self.boxes >= self.wanted.direct and stalled
+        """True once enough boxes were looked at, and halves prove hardly more: at once where little of the box is
+        proved, else after some rounds."""
+        rounds = 1 if self.hopeless else _ROUNDS
+        return self.boxes >= self.wanted.direct and self.stalls >= rounds
+
+    @property
+    def hopeless(self) -> bool:
+        """True where so little of the box is proved that another search may prove more."""
+        return self.left > _MOST_LEFT
 
     def further(self, near: Index) -> Index:
         """Halves of all parts without a rank."""
@@ -174,7 +182,8 @@ class Direct(SearchFrom):
     def spread(self) -> Index:
         """Give ranks, and see how much of the box is left without."""
         near = super().spread()
-        self.before, self.left = self.left, float(self.cover.widths(self._open).prod(0).sum())
+        before, self.left = self.left, float(self.cover.widths(self._open).prod(0).sum())
+        self.stalls = self.stalls + 1 if self.left >= _FALLS * before else 0
         return near
 
     @property
