@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import Algebra, Expression, Symbol, differentiate, evaluate, solution_series
+from certify.loop.expressions import JUMP, Algebra, Expression, Symbol, differentiate, evaluate, solution_series
 from certify.loop.networks import (
     Affine,
     Clip,
@@ -52,6 +52,8 @@ class BallAlgebra(Algebra[flint.arb]):
     def function(self, name: str, value: flint.arb) -> flint.arb:
         if name == "sign":
             return flint.arb(1) if value > 0 else flint.arb(-1) if value < 0 else self.at_corner
+        if name == JUMP:
+            return flint.arb(1) if value > 0 else flint.arb(0) if value < 0 else flint.arb.nan()
         return abs(value) if name == "abs" else super().function(name, value)
 
     def extreme(self, name: str, a: flint.arb | Fraction, b: flint.arb | Fraction) -> flint.arb | Fraction:

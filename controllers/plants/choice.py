@@ -27,7 +27,13 @@ def chosen_plant(name: str) -> tuple[System, Plant]:
     InputError : no such plant; its own file bears the name of one that ships; it has no operating
         point inside its domain; or its options cannot be used.
     """
-    from certify.loop.plants import available_systems, chosen_system, get_system, require_origin_inside
+    from certify.loop.plants import (
+        available_systems,
+        chosen_system,
+        get_system,
+        require_no_jumps,
+        require_origin_inside,
+    )
 
     if name in available_plants():
         return get_system(name), get_plant(name)
@@ -42,6 +48,7 @@ def chosen_plant(name: str) -> tuple[System, Plant]:
             "the name of its plant. Give it another `name`."
         )
     require_origin_inside(system)
+    require_no_jumps(system)
     plant = default_plant(system)
     if name.endswith(".toml"):
         from certify.loop.plants.source import read_plant_file

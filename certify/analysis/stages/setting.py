@@ -24,7 +24,7 @@ from certify.effort import Effort
 from certify.errors import InputError, OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.equilibrium import Rest, find_rest, seen_from
-from certify.loop.plants import Measurements, Samples, require_origin_inside
+from certify.loop.plants import Measurements, Samples, require_no_jumps, require_origin_inside
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ class Setting:
         options, system, network = state.options, state.loop.system, state.loop.network
         require_within_limits(system, network)
         require_origin_inside(system)
+        require_no_jumps(system)
         require_one_that_knows(system, options)
         if options.box is not None:
             ellipsoid_in(system, options.box)

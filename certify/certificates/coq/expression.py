@@ -62,7 +62,7 @@ def from_tree(tree: Any, states: Mapping[str, int], inputs: Mapping[str, int]) -
     Raises
     ------
     CertificateFormatError : the tree is none of FORMAT.md's, or too large.
-    InputError : it has abs, min, max or clip.
+    InputError : it has abs, min, max, clip or heaviside.
     """
     names = {name: Expression("input", index=j) for name, j in inputs.items()}
     names |= {name: Expression("state", index=i) for name, i in states.items()}
@@ -147,7 +147,7 @@ class _Reader:
                 return Expression("mul", (Expression("sin", (values[0],)), inverse))
             case (name, 1) if name in FUNCTIONS:
                 return Expression(name, (values[0],))
-            case (("abs" | "min" | "max" | "clip"), _):
+            case (("abs" | "min" | "max" | "clip" | "heaviside"), _):
                 raise InputError(
                     f"Coq's statement is about smooth equations; found {operator}. The checker reads such certificates."
                 )

@@ -15,9 +15,9 @@ from typing import Generic, TypeVar
 
 from certify.errors import InputError
 from certify.loop.expressions.gathering import gathered
-from certify.loop.expressions.tree import FUNCTIONS, GRAMMAR, Expression, Number, Operation, Symbol, nodes
+from certify.loop.expressions.tree import FUNCTIONS, GRAMMAR, JUMP, Expression, Number, Operation, Symbol, nodes
 
-OF_ONE = (*FUNCTIONS, "abs", "heaviside", "sign")
+OF_ONE = (*FUNCTIONS, "abs", JUMP, "sign")
 
 V = TypeVar("V")
 
@@ -48,7 +48,10 @@ class Algebra(ABC, Generic[V]):
         return value.inverse()  # type: ignore[attr-defined, no-any-return]
 
     def function(self, name: str, value: V) -> V:
-        """One of `FUNCTIONS`, abs or sign, by its name; a sign that is not certain is no number."""
+        """One of `FUNCTIONS`, abs or sign, by its name; a sign that is not certain is no number. An arithmetic that
+        takes equations that jump says so itself."""
+        if name == JUMP:
+            raise InputError("equations that jump, with heaviside, are no part of this proof.")
         if name == "tan":
             return self.product(None, [self.function("sin", value), self.inverse(self.function("cos", value))])
         return getattr(value, name)()  # type: ignore[no-any-return]

@@ -14,6 +14,7 @@ from certify.errors import InputError
 from certify.loop.expressions.tree import (
     FUNCTIONS,
     GRAMMAR,
+    JUMP,
     Expression,
     Number,
     Operation,
@@ -25,6 +26,7 @@ from certify.loop.expressions.tree import (
 )
 
 _CORNERS = {"Abs": "abs", "Min": "min", "Max": "max"}
+_JUMP = "Heaviside"  # its second argument is its value at 0, and here it may be any of two
 
 
 def from_sympy(expression: Any) -> Expression:
@@ -59,6 +61,8 @@ def from_sympy(expression: Any) -> Expression:
     name = type(e).__name__
     if name in _CORNERS:
         return function(_CORNERS[name], *map(from_sympy, e.args))
+    if name == _JUMP:
+        return function(JUMP, from_sympy(e.args[0]))
     if e.is_Function and name in FUNCTIONS:
         return Operation(name, from_sympy(e.args[0]))
     if e.is_Float:

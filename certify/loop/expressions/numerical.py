@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from certify.errors import InputError
 from certify.loop.expressions.gathering import gathered
-from certify.loop.expressions.tree import FUNCTIONS, Expression, Number, Operation, Symbol, nodes
+from certify.loop.expressions.tree import FUNCTIONS, JUMP, Expression, Number, Operation, Symbol, nodes
 
 Module = Literal["numpy", "torch"]
 _NAMES = {"numpy": {"atan": "arctan"}, "torch": {}}
@@ -72,7 +72,7 @@ def _code(node: Expression, operands: Sequence[str], module: Module) -> str:
             return f"minimum(maximum({v}, {lo}), {hi})"
         if node.operator == "sign":
             return f"{module}.where({operands[0]} < 0, -1.0, 1.0)"
-        if node.operator == "heaviside":
+        if node.operator == JUMP:
             return f"{module}.where({operands[0]} < 0, 0.0, 1.0)"
         if node.operator in (*FUNCTIONS, "abs"):
             return f"{module}.{_NAMES[module].get(node.operator, node.operator)}({operands[0]})"
@@ -103,7 +103,7 @@ _PLAIN: Mapping[str, Callable[..., float]] = {
     **{"abs": abs, "min": min, "max": max},
     "clip": lambda v, lo, hi: min(max(v, lo), hi),
     "sign": lambda v: -1.0 if v < 0 else 1.0,
-    "heaviside": lambda v: 0.0 if v < 0 else 1.0,
+    JUMP: lambda v: 0.0 if v < 0 else 1.0,
 }
 
 

@@ -10,7 +10,7 @@ from fractions import Fraction
 from certify.errors import InputError
 from certify.loop.expressions.evaluate import Algebra, evaluate
 from certify.loop.expressions.gathering import MOST_BITS
-from certify.loop.expressions.tree import Expression, Symbol
+from certify.loop.expressions.tree import JUMP, Expression, Symbol
 
 AT_CORNER = "the slope of abs at 0"
 _AT_ZERO: Mapping[str, int] = {"sin": 0, "cos": 1, "tan": 0, "tanh": 0, "exp": 1, "atan": 0}
@@ -64,8 +64,8 @@ class _Rational(Algebra[_Number]):
             return value
         if name == "abs":
             return abs(value)
-        if name == "heaviside":
-            return Fraction(value > 0) if value != 0 else _Unnamed("a jump at 0")
+        if name == JUMP:
+            return Fraction(value > 0) if value != 0 else _Unnamed("heaviside of 0, either 0 or 1")
         if name == "sign":
             return Fraction(1 if value > 0 else -1) if value != 0 else _Unnamed(AT_CORNER)
         if name == "sqrt":

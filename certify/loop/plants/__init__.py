@@ -19,7 +19,7 @@ from certify.loop.plants.samples import Sampled, Samples, Unknown
 from certify.loop.plants.system import System, exact
 from certify.loop.plants.toml import load_system
 from certify.loop.plants.uncertainty import at_values, corners, input_errors, kind_of, with_input_errors
-from certify.loop.plants.validation import require_origin_inside
+from certify.loop.plants.validation import require_no_jumps, require_origin_inside
 
 __all__ = [
     "Axis",
@@ -52,6 +52,7 @@ __all__ = [
     "load_system",
     "mean_rate",
     "require_equilibrium",
+    "require_no_jumps",
     "require_origin_inside",
     "residuals",
     "rests_where",

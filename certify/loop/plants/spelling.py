@@ -9,8 +9,8 @@ import ast
 from collections.abc import Collection, Sequence
 
 _MODULES = ("np", "numpy", "math", "cmath", "sympy", "sp", "torch", "jnp", "jax", "scipy", "casadi", "ca", "tf")
-_NO_JUMPS = "equations must have no jumps"
-_STEP = f"{_NO_JUMPS}; a step from 0 to 1 where y changes its sign is (1 + tanh(50*y))/2, as steep as its factor says"
+_NO_JUMPS = "equations must have no jumps but heaviside, in discrete time"
+_STEP = f"{_NO_JUMPS}; in other time a step from 0 to 1 where y changes its sign is (1 + tanh(50*y))/2"
 _ANGLE = "an angle needs no wrapping, since sin and cos repeat"
 _TABLE = "a table with lines between its points is a sum such as y0 + k0*(x - x0) + (k1 - k0)*max(x - x1, 0) + ..."
 # {x} and {y} are the arguments, {X} and {Y} the same in brackets where they need some.
@@ -42,10 +42,10 @@ _FORMULAS = {
 _SAME = {
     **dict.fromkeys(("fabs", "absolute", "Abs"), "abs"),
     **{"sgn": "sign", "fmin": "min", "fmax": "max", "Min": "min", "Max": "max"},
-    **{"minimum": "min", "maximum": "max", "clamp": "clip"},
+    **{"minimum": "min", "maximum": "max", "clamp": "clip", "Heaviside": "heaviside"},
 }
 _NOT_ALLOWED = {
-    **dict.fromkeys(("heaviside", "Heaviside", "step", "where", "Piecewise", "piecewise"), _STEP),
+    **dict.fromkeys(("step", "where", "Piecewise", "piecewise"), _STEP),
     **dict.fromkeys(("floor", "ceil", "ceiling", "round", "trunc", "fix", "int"), _STEP),
     **dict.fromkeys(("mod", "fmod", "remainder", "Mod", "wrap", "angle_normalize"), f"{_NO_JUMPS}; {_ANGLE}"),
     **dict.fromkeys(("interp", "interp1d", "interpolate", "lookup", "table"), f"there are no tables; {_TABLE}"),

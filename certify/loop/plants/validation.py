@@ -7,11 +7,13 @@ from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from certify.errors import InputError
-from certify.loop.expressions import Expression, Symbol, constant_of, nodes, symbols_of
+from certify.loop.expressions import Expression, Symbol, constant_of, jumping, nodes, symbols_of
 from certify.loop.expressions.gathering import MOST_BITS
 
 if TYPE_CHECKING:
     from certify.loop.plants.system import System
+
+MOST_JUMPS = 6  # heavisides that a checker takes
 
 
 def validate(system: System) -> None:
@@ -47,6 +49,21 @@ def require_origin_inside(system: System) -> None:
                 f"the domain of {symbol} must contain 0 in its interior, as a deviation from x_eq; "
                 f"found [{float(lo)}, {float(hi)}]."
             )
+
+
+def require_no_jumps(system: System) -> None:
+    """Reject a plant whose equations jump: sets around an equilibrium are not proved of it.
+
+    Raises
+    ------
+    InputError : they do.
+    """
+    for jump in jumping(*system.dynamics):
+        raise InputError(
+            f"the equations of {system.name} jump, at {jump}, and sets around an equilibrium are not proved of such "
+            "plants; certify reach proves that regions are reached, certify roa --claim invariant that boxes are never "
+            "left."
+        )
 
 
 def _check_counts(system: System) -> None:
@@ -128,6 +145,23 @@ def _check_equations(system: System) -> None:
                 raise InputError(
                     f"an equation of {system.name} uses {node}, which is no state, input, parameter or disturbance."
                 )
+    _check_jumps(system)
+
+
+def _check_jumps(system: System) -> None:
+    """Reject a heaviside that stands elsewhere than in equations of discrete time, or one too many."""
+    jumps, arguments = jumping(*system.dynamics), [a for call in system.calls for a in call.arguments]
+    if jumps and system.time != "discrete":
+        y = jumps[0].operands[0]
+        raise InputError(
+            f"equations may jump in discrete time alone, and {system.name} has {jumps[0]}. Smooth it in other time, as "
+            f"in (1 + tanh(50*({y})))/2."
+        )
+    if len(jumps) > MOST_JUMPS:
+        raise InputError(f"{system.name} must have at most {MOST_JUMPS} different heavisides; it has {len(jumps)}.")
+    others = (*system.u_eq, *system.x_eq, *system.observations, *system.constraints.values(), *arguments)
+    if elsewhere := jumping(*others):
+        raise InputError(f"only the equations of {system.name} may jump; {elsewhere[0]} stands elsewhere.")
 
 
 def _check_angles(system: System) -> None:

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import Expression, Symbol, evaluate, jumping
+from certify.loop.expressions import JUMP, Expression, Symbol, evaluate, jumping
 from certify.loop.policies import bounded_by_form
 from certify.provers.bounds import Flow, Models, Taylor, loop_models, policy_enclosure, upper_bound
 from certify.provers.bounds.arrays import Array, Index, Mask, joined, pieces, product
@@ -299,7 +299,7 @@ class _Chosen(Models):
         self.left, self.possible = iter(choice), np.ones(len(like.c), dtype=bool)
 
     def function(self, name: str, value: Taylor) -> Taylor:
-        if name != "heaviside":
+        if name != JUMP:
             return super().function(name, value)
         chosen = next(self.left)
         self.possible &= ~(upper_bound(value.scaled(1.0 if chosen else -1.0))[0] < 0)
