@@ -127,14 +127,15 @@ class Boxes(ABC):
         """The uncertain quantities, each with its symbol."""
         return [self.number(pair, self.errors + self.m + j, batch) for j, pair in enumerate(self.c.ranges)]
 
-    def f(self, states: list[Taylor], held: list[Taylor]) -> list[Taylor]:
-        """f of states, and of inputs and uncertain quantities."""
+    def f(self, states: list[Taylor], held: list[Taylor], choose: Any = None) -> list[Taylor]:
+        """f of states, and of inputs and uncertain quantities; `choose` gives the value of a heaviside."""
         constant, variables = constants(held[0]), [*states, *held]
         if not self.c.dynamics.calls:
-            return evaluate(self.c.dynamics, constant, variables)
+            return evaluate(self.c.dynamics, constant, variables, None, choose)
         from .calls import entries
 
-        return evaluate(self.c.dynamics, constant, variables, lambda call, given: entries(call, given, self.calls))
+        calling = lambda call, given: entries(call, given, self.calls)  # noqa: E731
+        return evaluate(self.c.dynamics, constant, variables, calling, choose)
 
     def kept(self, courses: list[list[Taylor]], held: list[Taylor], gaps: Sequence[Callable[[Array], Taylor]]) -> Array:
         """True for each constraint and box on which it is negative at all of these states where no gap is, (K, B)."""

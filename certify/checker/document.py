@@ -27,6 +27,7 @@ MAX_ORDER = 8  # of a series in time
 MAX_CELLS, MAX_CUTS = 4096, 64  # of the box of uncertain quantities in all, and of one range
 PLAIN, WITH_TUBE = ("asymptotic", "practical"), ("enlarged", "reached")
 PRACTICAL, WITHOUT_V = ("practical", "nearby"), ("reaches", "remains", "invariant")
+JUMPING = ("reaches", "remains")  # claims of which equations may jump, in discrete time
 CLAIMS = {  # the keys of each claim, and those that may be missing
     **dict.fromkeys((*PLAIN, "nearby"), ("rate sample outer", "ranks keep data samples")),
     "enlarged": ("rate sample outer start", "keep data"),
@@ -204,7 +205,7 @@ def certificate(data: Any, sha256: str, at: str = "", kinds: Sequence[str] = tup
     whole["schema"].choice("certify-certificate/9")
     whole["provenance"].must(isinstance(whole["provenance"].raw, dict), "an object")
     kind, networks = whole["claim"].kind(kinds), read_networks(whole["networks"])
-    plant = _plant(whole["plant"], networks)
+    plant = _plant(whole["plant"], networks, kind in JUMPING)
     n, m = len(plant["states"]), len(plant["inputs"])
     policy = _policy(whole["policy"], networks, n, m, kind in PRACTICAL)
     c = Certificate(kind, **plant, networks=tuple(networks.values()), policy=policy, sha256=sha256)
@@ -254,7 +255,7 @@ def _partition(shown: Mapping[str, Value], c: Certificate, most: int) -> Partiti
     return Partition(*of_tree, cuts, ball)
 
 
-def _plant(plant: Value, networks: Mapping[str, Network]) -> dict[str, Any]:
+def _plant(plant: Value, networks: Mapping[str, Network], jumping: bool) -> dict[str, Any]:
     keys = "name time states inputs uncertain dynamics u_eq domain input_bounds"
     name, time, *names, uncertain, dynamics, u_eq, domain, bounds = plant.keys(keys)
     states, inputs = (value.listed(Value.name, 1, MAX_STATES) for value in names)
@@ -262,14 +263,15 @@ def _plant(plant: Value, networks: Mapping[str, Network]) -> dict[str, Any]:
     n, m, others = len(states), len(inputs), tuple(other for other, _ in quantities)
     everything = states + inputs + others
     plant.must(len(set(everything)) == len(everything), "a plant in which no name stands for two things")
+    discrete, trees = time.choice("continuous", "discrete") == "discrete", dynamics.listed(lambda tree: tree.raw, n)
     return {
         "name": name.name(),
-        "discrete": time.choice("continuous", "discrete") == "discrete",
+        "discrete": discrete,
         "states": states,
         "inputs": inputs,
         "uncertain": others,
         "ranges": tuple(interval for _, interval in quantities),
-        "dynamics": parse(dynamics.listed(lambda tree: tree.raw, n), everything, dynamics.at, networks),
+        "dynamics": parse(trees, everything, dynamics.at, networks, discrete and jumping),
         "u_eq": u_eq.listed(Value.rational, m),
         "domain": domain.listed(Value.interval, n),
         "input_bounds": bounds.listed(Value.interval, m),

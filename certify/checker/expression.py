@@ -5,7 +5,7 @@ A leaf is a name or an exact fraction; a node is `["+", a, b, ...]`, `["*", a, b
 `["network", name, i, a, ...]`. Powers and tan are expanded here, so that an arithmetic needs only +, *, unary -,
 `function` for inv and the others, and a function that calls networks. The result of +, *, - and inv on rationals alone
 is a rational, computed here. abs is a function; `["min", a, b, ...]`, `["max", a, b, ...]` and `["clip", v, lo, hi]`
-are written with it.
+are written with it. Where equations may jump, `["heaviside", a]` is an operation whose value is chosen: 0 or 1.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from .networks import Network
 
 MAX_OPERATIONS, MAX_DEPTH, MAX_EXPONENT = 20_000, 200, 64
+MAX_JUMPS = 6  # heavisides of equations
 MAX_BITS = 2**14  # of a numerator or a denominator
 _OPERATORS: dict[str, Callable[..., Any]] = {"+": operator.add, "*": operator.mul, "neg": operator.neg}
 Part = int | Fraction  # of an operation: an index on the tape, or a number that stands on it only if it has to
@@ -80,16 +81,22 @@ class Tape:
         return sum(len(call.entries) for call in self.calls.values())
 
     @property
+    def jumps(self) -> int:
+        """The number of heavisides."""
+        return sum(operation.name == "heaviside" for operation in self.operations)
+
+    @property
     def size(self) -> int:
         """The number of operations, with those in networks, for each call."""
         return len(self.operations) + sum(network.operations for network in self.called)
 
 
 def evaluate(
-    tape: Tape, constant: Callable[[Fraction], Any], variables: Sequence[Any], calling: Any = None
+    tape: Tape, constant: Callable[[Fraction], Any], variables: Sequence[Any], calling: Any = None, choose: Any = None
 ) -> list[Any]:
     """The outputs of `tape` at `variables` (states, inputs, uncertain quantities), in their arithmetic;
-    `calling` gives the entries that a call uses, of it and its arguments."""
+    `calling` gives the entries that a call uses, of it and its arguments; `choose` the value of a heaviside, of its
+    argument."""
     values: list[Any] = []
     for k, operation in enumerate(tape.operations):
         given, detail = [values[i] for i in operation.operands], operation.detail
@@ -102,6 +109,8 @@ def evaluate(
                 value = dict(zip(tape.calls[k].entries, calling(tape.calls[k], given), strict=True))
             case "entry":
                 value = given[0][detail]
+            case "heaviside" if choose is not None:
+                value = choose(*given)
             case "+" | "*" | "neg":
                 value = _OPERATORS[operation.name](*given)
             case name:
@@ -110,12 +119,21 @@ def evaluate(
     return [values[i] for i in tape.outputs]
 
 
-def parse(trees: Sequence[Any], names: Sequence[str], at: str, networks: Mapping[str, Network] | None = None) -> Tape:
-    """Compile trees over `names`, which stand at this place and may call networks; raises `Rejected` under rule
-    `format`."""
-    builder = _Builder({name: i for i, name in enumerate(names)}, at, networks or {})
+def parse(
+    trees: Sequence[Any],
+    names: Sequence[str],
+    at: str,
+    networks: Mapping[str, Network] | None = None,
+    jumping: bool = False,
+) -> Tape:
+    """Compile trees over `names`, which stand at this place, may call networks, and may have heavisides if they are
+    `jumping`; raises `Rejected` under rule `format`."""
+    builder = _Builder({name: i for i, name in enumerate(names)}, at, networks or {}, jumping)
     outputs = tuple(builder.index(builder.build(tree, f"{at}[{i}]", 0)) for i, tree in enumerate(trees))
-    return Tape(tuple(operation for _, operation in builder.tape.values()), outputs, tuple(trees))
+    tape = Tape(tuple(operation for _, operation in builder.tape.values()), outputs, tuple(trees))
+    if tape.jumps > MAX_JUMPS:
+        strict.fail(at, f"more than {MAX_JUMPS} different heavisides")
+    return tape
 
 
 def load(function: str) -> None:
@@ -133,8 +151,8 @@ def load(function: str) -> None:
 class _Builder:
     """Appends operations; an operation that already stands on the tape is shared."""
 
-    def __init__(self, names: dict[str, int], at: str, networks: Mapping[str, Network]) -> None:
-        self.names, self.at, self.networks, self.visited = names, at, networks, 0
+    def __init__(self, names: dict[str, int], at: str, networks: Mapping[str, Network], jumping: bool) -> None:
+        self.names, self.at, self.networks, self.jumping, self.visited = names, at, networks, jumping, 0
         self.tape: dict[str, tuple[int, Operation]] = {}  # by strings, whose hashes nobody can predict
 
     def apply(self, name: str, *parts: Part) -> Part:
@@ -188,6 +206,8 @@ class _Builder:
                 return self.apply("*", a, self.apply("inv", b))
             case (("sin" | "cos" | "tanh" | "exp" | "atan" | "sqrt" | "abs"), [a]):
                 return self.apply(name, a)
+            case "heaviside", [a] if self.jumping:
+                return self.push(name, (self.index(a),))
             case "tan", [a]:
                 return self.apply("*", self.apply("sin", a), self.apply("inv", self.apply("cos", a)))
             case (("min" | "max"), [first, *others]) if others:

@@ -2,16 +2,18 @@
 where there is no target, to leaves of any finite rank.
 
 A leaf is followed step by step: its image is affine in the symbols of the leaf and of the errors of the last steps, n
-of each. New errors are bounded in coordinates N x, and so are the oldest ones, which have no symbols any more. `Cover`
-decides which leaves the last image meets.
+of each. New errors are bounded in coordinates N x, and so are the oldest ones, which have no symbols any more. Where
+equations jump, a leaf has an image for each choice of heavisides that may occur. `Cover` decides which leaves the last
+images meet.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property, reduce
+from itertools import product
 from operator import add
 from typing import TYPE_CHECKING
 
@@ -25,7 +27,7 @@ from .expression import evaluate
 from .near import Above, Array, Form, Near, all_near, near, near_ball
 from .network import enclose_on_boxes
 from .periodic import is_periodic
-from .ring import Moving
+from .ring import Motion, Moving
 from .sections import MAX_RANK
 from .taylor import Taylor, affine, combination, constants, upper_bound
 
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
 
 TURN = near_ball(2 * arb.pi())
 _MOST_NODES = 2**14  # of the tree that an image may meet
+_MOST_IMAGES = 64  # of a leaf, at once
 Failing = tuple[str, str]  # a place, and what fails there
 
 
@@ -156,6 +159,10 @@ class Steps(Moving):
     def cover(self) -> Cover:
         return Cover(self.case)
 
+    @property
+    def batch(self) -> int:
+        return max(1, super().batch >> self.c.dynamics.jumps)
+
     def leaves(self) -> Iterator[Batch]:
         """The tree's leaves in batches; the cover is made before there are several processes."""
         self.cover  # noqa: B018
@@ -172,13 +179,25 @@ class Steps(Moving):
         x = x[:, moving]
         for k in range(1, int(np.max(count[moving], initial=0)) + 1):
             left = np.flatnonzero(count[moving] >= k)
-            moving, x = moving[left], self.step(x[:, left], numbers[moving[left]], course)
+            x, of = self.step(x[:, left], numbers[moving[left]], course)
+            moving = moving[left[of]]
+            if self.c.dynamics.jumps:
+                left = self.going_on(x, moving, numbers, course)
+                moving, x = moving[left], x[:, left]
             done = np.flatnonzero(count[moving] == k)
             arrived = moving[done]
             bound = np.full(len(arrived), MAX_RANK - 1) if self.c.claim == "remains" else rank[arrived] - k
             hold = self.arrives(x[:, done], bound)
             course.note("ranks", hold, numbers[arrived], "the steps may lead neither to the target nor to such ranks")
         return course
+
+    def going_on(self, x: Form, of: Array, numbers: Array, course: Course) -> Array:
+        """The images, of leaves `of`, that are followed further: those outside the target, of leaves that have not too
+        many."""
+        left = np.flatnonzero(np.logical_not(self.is_in_target(x)))
+        few = np.bincount(of[left], minlength=len(numbers)) <= _MOST_IMAGES
+        course.note("ranks", few, numbers, f"a leaf may have no more than {_MOST_IMAGES} images at once")
+        return left[few[of[left]]]
 
     def start(self, lo: Array, hi: Array) -> Form:
         """The boxes with these corners, in their symbols."""
@@ -187,16 +206,18 @@ class Steps(Moving):
         errors = np.zeros((self.ranks.memory * self.n, *centre.shape))
         return Form(np.concatenate([centre[None], slopes, errors]), Above(np.zeros_like(centre)))
 
-    def step(self, x: Form, numbers: Array, course: Course) -> Form:
-        """The images of forms after a step, and what the rules say of it. Of a form (1 + n + p n, n, B) the first n
-        coefficients are those of the leaf's symbols, then come those of errors, n for each step, the last step first.
+    def step(self, x: Form, numbers: Array, course: Course) -> tuple[Form, Array]:
+        """The images of forms after a step, and which form each is of; and what the rules say of it. Of a form
+        (1 + n + p n, n, B) the first n coefficients are those of the leaf's symbols, then come those of errors, n for
+        each step, the last step first.
         """
         c = self.c
         u = enclose_on_boxes(self.net, x)
         if not self.case.bounded:
             course.note("inputs", np.all(self.inputs_kept(x, u), axis=0), numbers, "an input may leave its bounds")
         states, inputs = self.models(x, u)
-        motion = self.motion(states, inputs)
+        motions = list(self.motions(states, inputs))
+        motion, _ = motions[0]
         if c.sample:
             hold = self.in_domain(*motion.ends)
             course.note("flow", hold, numbers, "the state may leave the domain during a period")
@@ -205,9 +226,37 @@ class Steps(Moving):
             course.note("keep", np.all(hold, axis=0), numbers, "a constraint may be violated")
         hold = self.in_domain(*x.range.ends)
         course.note("ranks", hold, numbers, "the state may leave the domain")
-        later = self.form(self.after(states, motion.G))
-        course.note("ranks", np.all(np.isfinite(later.size.top), axis=0), numbers, "F may be undefined")
-        return later
+        each = [([x.at(some) for x in states], [g.at(some) for g in motion.G]) for motion, some in motions]
+        of = np.concatenate([some for _, some in motions])
+        later = self.form(
+            [joined(of_state) for of_state in zip(*(self.after(*moving) for moving in each), strict=True)]
+        )
+        course.note("ranks", np.all(np.isfinite(later.size.top), axis=0), numbers[of], "F may be undefined")
+        return later, of
+
+    def motions(self, states: list[Taylor], inputs: list[Taylor]) -> Iterator[tuple[Motion, Array]]:
+        """The motion on forms, and the forms on which it may be so: all, or where equations jump, for each choice of
+        heavisides those where none of them certainly is the other number."""
+        batch, jumps = len(states[0].c), self.c.dynamics.jumps
+        if not jumps:
+            yield self.motion(states, inputs), np.arange(batch)
+            return
+        held = [*inputs, *self.quantities(batch)]
+        for choice in product((0, 1), repeat=jumps):
+            F, possible = self.chosen(states, held, choice)
+            G = [f + -x for f, x in zip(F, states, strict=True)]
+            yield Motion(G, [states], held), np.flatnonzero(possible)
+
+    def chosen(self, states: list[Taylor], held: list[Taylor], choice: Sequence[int]) -> tuple[list[Taylor], Array]:
+        """F with these values of heavisides, and the forms (B,) where each may have its value."""
+        values, possible = iter(choice), np.ones(len(states[0].c), dtype=bool)
+
+        def choose(a: Taylor) -> Taylor:
+            value = next(values)
+            possible[upper_bound(a if value else -a) < 0] = False
+            return constants(a)(Fraction(value))
+
+        return self.f(states, held, choose), possible
 
     def form(self, models: list[Taylor]) -> Form:
         """Models in the symbols that they keep, and in new ones of errors that have all else."""
@@ -263,6 +312,12 @@ class Steps(Moving):
         rows = [combination(*zip(row, states, strict=True)) for row in self.c.P.tolist()]
         V = [x * row for x, row in zip(states, rows, strict=True)]
         return [reduce(add, [*V, number(Fraction(-self.c.c2))])]
+
+
+def joined(models: Sequence[Taylor]) -> Taylor:
+    """Models on several batches as those on one."""
+    r = np.concatenate([v.r.top + 0 * v.c for v in models])
+    return Taylor(np.concatenate([v.c for v in models]), np.concatenate([v.p for v in models], -1), Above(r))
 
 
 def moved(x: Array, turns: Array) -> tuple[Array, Array]:
