@@ -25,7 +25,7 @@ from .keep import kept
 from .leaves import LEAF, Box, cut, structure
 from .motion import Input, Motion, Stage
 from .rational import bits
-from .refusal import Refused, require, under
+from .refusal import Refused, require
 from .taylor import Taylor, constant
 
 RULE, UNRANKED = "ranks", 65_535
@@ -67,7 +67,7 @@ def follow(some: Sequence[Box], cover: Cover, walk: Walk, target: Target | None)
         moved = {b: list[Rows]() for b, _ in left}
         for (b, rows), u in zip(left, walk.inputs([rows for _, rows in left]), strict=True):
             for image in walk.step(rows, places[b], u):
-                there = walk.jumps > 0 and target is not None and target.holds(image, places[b])
+                there = walk.jumps > 0 and target is not None and target.holds(image)
                 moved[b] += [] if there else [image]
             few = len(moved[b]) <= MAX_IMAGES
             require(few, RULE, places[b], f"more than {MAX_IMAGES} images outside of the target at once")
@@ -76,7 +76,7 @@ def follow(some: Sequence[Box], cover: Cover, walk: Walk, target: Target | None)
     for box, images, count, at in zip(some, each, steps, places, strict=True):
         rank = cover.ranks[box.number]
         for rows in images:
-            if target is None or not target.holds(rows, at):
+            if target is None or not target.holds(rows):
                 require(rank > 0, RULE, at, "its rank is 0, and it is not certain to lie in a target")
                 cover.leads_to(rows, UNRANKED - 1 if target is None else rank - count, at)
 
@@ -273,21 +273,22 @@ class Target:
         self.c, self.stated, self.turn = c, stated, 2 * arb.pi()
         self.P = None if c.target is not None else arb_mat(c.P)
 
-    def holds(self, rows: Rows, at: str) -> bool:
-        """True if all of the box is certainly in the target; a refusal where an expression has no finite model."""
-        return all(bool(v.by_squares() <= 0) or bool(v.from_corner() <= 0) for v in self.values(rows, at))
+    def holds(self, rows: Rows) -> bool:
+        """True if all of the box is certainly in the target, where numbers have finite models."""
+        try:
+            values = self.values(rows)
+        except Refused:
+            return False
+        return all(v.is_finite() and (bool(v.by_squares() <= 0) or bool(v.from_corner() <= 0)) for v in values)
 
-    def values(self, rows: Rows, at: str) -> list[Taylor]:
+    def values(self, rows: Rows) -> list[Taylor]:
         """Models of numbers that are at most 0 in the target."""
         if self.c.target is None:
-            return [self.V_beyond(rows, at)]
+            return [self.V_beyond(rows)]
         names = {name: Taylor(x, arb_mat([g])) for name, (x, *g) in zip(self.c.plant.states, rows, strict=True)}
-        with under(RULE, at):
-            values: list[Taylor] = self.c.target.evaluate(names, constant)
-        require(all(v.is_finite() for v in values), RULE, at, "an expression of the target has no finite model")
-        return values
+        return self.c.target.evaluate(names, constant)
 
-    def V_beyond(self, rows: Rows, at: str) -> Taylor:
+    def V_beyond(self, rows: Rows) -> Taylor:
         """V - c2, at the place near 0."""
         if self.P is None:
             raise TypeError("a claim with a target has no V")
@@ -298,9 +299,7 @@ class Target:
         x, A = arb_mat(n, 1, centre), arb_mat([row[1:] for row in rows])
         PA = self.P * A
         V = (x.transpose() * (self.P * x))[0, 0]
-        model = Taylor(V - arb(self.c.outer), 2 * (x.transpose() * PA), A.transpose() * PA)
-        require(model.is_finite(), RULE, at, "V has no finite model")
-        return model
+        return Taylor(V - arb(self.c.outer), 2 * (x.transpose() * PA), A.transpose() * PA)
 
 
 def ends(row: Sequence[arb]) -> tuple[arb, arb]:

@@ -181,7 +181,7 @@ def far(**more: Any) -> Document:
     beyond 13; the target is x >= 1, the tree's box is [0, 1]."""
     f = plus("x", "1/2", times(6, H(["-", "x", "1/4"])))
     known: dict[str, Any] = {"target": [["-", "1", "x"]], "ranks": [2, NO], "steps": [2, 0]}
-    return document([f], [0.0], [1.0], 1, **{**known, **more})
+    return document([more.pop("dynamics", f)], [0.0], [1.0], 1, **{**known, **more})
 
 
 def test_what_is_in_the_target_goes_no_further() -> None:
@@ -203,6 +203,21 @@ def test_what_is_not_in_the_target_goes_on() -> None:
     assert found(far(**late, network=[affine([[1.0]])], bound="6")) == ("inputs", "ranks leaf 0")
     assert found(far(keep=[["-", "x", "1"]])) == ("keep", "ranks leaf 0")  # [1/2, 1]
     assert found(far(domain=("-1", "1"))) == FIRST and found(far(domain=("-1", "10001/10000"))) is None
+
+
+def test_without_jumps_all_steps_are_taken() -> None:
+    """x + 7 is in the target after the first of two steps."""
+    for f, rule in ((plus("x", "7"), FIRST), (plus("x", times(7, H(plus("x", "1")))), None)):
+        assert found(far(domain=("-1", "2"), dynamics=f)) == rule
+
+
+def test_a_target_that_may_not_exist_on_an_image_does_not_hold_it() -> None:
+    """On [1/2, 1], which goes on, but not beyond 13/2."""
+    for nothing in (["/", "1", ["-", "x", "3/4"]], ["sqrt", ["-", "x", "3/4"]], ["exp", ["/", "1", ["-", "x", "1"]]]):
+        aim = plus(["-", "1", "x"], ["*", "0", nothing])
+        assert found(far(target=[aim])) is None
+        assert found(far(target=[aim], ranks=[1, NO], steps=[1, 0])) == FIRST
+    assert found(far(target=[["-", "1", "x"], ["*", "0", ["sqrt", ["-", "7", "x"]]]])) == FIRST
 
 
 def test_each_image_is_asked_for_the_same() -> None:
@@ -257,6 +272,7 @@ def test_images_in_the_target_do_not_count() -> None:
     target = [["*", ["-", "x", "3/64"], ["-", "7/16", "x"]]]
     assert found(on_unit(f, -0.125, 0.125, ranks=[2], steps=[2], target=target)) is None
     assert found(on_unit(f, -0.125, 8.0)) is None
+    assert found(document([f], [-8.0], [8.0], 1, [1, 1])) is None  # 64 of each leaf
     verdict = rules.judge(dumped(on_unit(f, -0.125, 8.0, ranks=[2], steps=[2])))
     assert verdict.rule == "ranks" and "64 images" in str(verdict.detail)
 
