@@ -231,7 +231,7 @@ def read_sections(value: Any, claims: tuple[str, ...]) -> Certificate:
     require(claim in claims, "format", "claim.kind", f"one of {', '.join(claims)} was expected with `then`")
     rate, sample = read_rate(said["rate"], claim), read_sample(said["sample"])
     networks = read_networks(data["networks"], "networks")
-    plant = read_plant(data["plant"], networks)
+    plant = read_plant(data["plant"], networks, claim)
     n = len(plant.states)
     fixed = claim != "reached" or not plant.uncertain
     require(fixed, "format", "plant.uncertain", f"nothing may be uncertain with claim '{claim}'")
@@ -478,7 +478,8 @@ def integer(text: str) -> int:
     return int(text)
 
 
-def read_plant(value: Any, networks: Mapping[str, Network]) -> Plant:
+def read_plant(value: Any, networks: Mapping[str, Network], claim: str) -> Plant:
+    """Equations may have jumps in discrete time, with claims that follow each of their values."""
     sections = ("name", "time", "states", "inputs", "uncertain", "dynamics", "u_eq", "domain", "input_bounds")
     plant = keys(value, "plant", *sections)
     timed = plant["time"] in ("continuous", "discrete")
@@ -497,12 +498,14 @@ def read_plant(value: Any, networks: Mapping[str, Network]) -> Plant:
     names = {*states, *inputs, *uncertain}
     require(len(names) == n + m + len(uncertain), "format", "plant", "a name stands for two things")
     u_eq = entries(plant["u_eq"], "plant.u_eq", m)
+    discrete, nodes = plant["time"] == "discrete", entries(plant["dynamics"], "plant.dynamics", n)
+    jumps = discrete and claim in (REACHES, REMAINS)
     return Plant(
         name=plant["name"],
-        discrete=plant["time"] == "discrete",
+        discrete=discrete,
         states=tuple(states),
         inputs=tuple(inputs),
-        dynamics=equations(entries(plant["dynamics"], "plant.dynamics", n), names, "plant.dynamics", networks),
+        dynamics=equations(nodes, names, "plant.dynamics", networks, jumps),
         u_eq=tuple(rational(q, f"plant.u_eq.{j}") for j, q in enumerate(u_eq)),
         domain=intervals(plant["domain"], "plant.domain", n),
         input_bounds=intervals(plant["input_bounds"], "plant.input_bounds", m),

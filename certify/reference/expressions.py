@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .networks import Network
 
 MAX_NESTING, MAX_NODES = 200, 20_000  # of lists; of lists, names and numbers in all equations, and of operations
+HEAVISIDE, MAX_JUMPS = "heaviside", 6
 RATIONAL = re.compile(r"-?(0|[1-9][0-9]{0,1200})(/[1-9][0-9]{0,1200})?")
 OPERANDS = {
     "+": (1, MAX_NODES),
@@ -36,6 +37,7 @@ OPERANDS = {
     "atan": (1, 1),
     "sqrt": (1, 1),
     "abs": (1, 1),
+    HEAVISIDE: (1, 1),
     "min": (2, MAX_NODES),
     "max": (2, MAX_NODES),
     "clip": (3, 3),
@@ -54,6 +56,7 @@ HALF = fmpq(1, 2)
 # i), or the name of an operation and the numbers of earlier steps
 Step = tuple[Any, ...]
 Called = Callable[["Call", Sequence[Any]], Sequence[Any]]
+Jump = Callable[[Any], Any]
 
 
 def rational(text: Any, at: str) -> fmpq:
@@ -87,6 +90,11 @@ class Equations:
         """The number of entries of calls that are used."""
         return sum(len(call.entries) for call in self.calls.values())
 
+    @property
+    def jumps(self) -> int:
+        """The number of operations whose value is 0 or 1, either where their argument is 0."""
+        return sum(step[0] == HEAVISIDE for step in self.steps)
+
     @cached_property
     def used_up(self) -> list[list[int]]:
         """For each step the earlier ones that no later step asks for, nor a result."""
@@ -98,12 +106,16 @@ class Equations:
         return found
 
     def evaluate(
-        self, names: Mapping[str, Any], constant: Callable[[fmpq], Any], called: Called | None = None
+        self,
+        names: Mapping[str, Any],
+        constant: Callable[[fmpq], Any],
+        called: Called | None = None,
+        jump: Jump | None = None,
     ) -> list[Any]:
         """Over anything that has `+`, `*`, unary `-` and `function(name)`; `1/` is a function.
 
-        `called` gives the entries of a call that are used. A value is dropped after its last use: a model of many
-        variables is large.
+        `called` gives the entries of a call that are used, `jump` the value of a jump at its argument, one jump after
+        the other in the order of the steps. A value is dropped after its last use: a model of many variables is large.
         """
         values: dict[int, Any] = {}
         for k, (step, used_up) in enumerate(zip(self.steps, self.used_up, strict=True)):
@@ -113,6 +125,8 @@ class Equations:
                 call = self.calls[k]
                 given = called(call, [values[operand] for operand in step[2:]])
                 values[k] = dict(zip(call.entries, given, strict=True))
+            elif step[0] == HEAVISIDE and jump is not None:
+                values[k] = jump(values[step[1]])
             else:
                 values[k] = evaluated(step, values, names, constant)
             for operand in used_up:
@@ -154,8 +168,8 @@ def evaluated(step: Step, values: Mapping[int, Any], names: Mapping[str, Any], c
 class _Compiler:
     """Checks the grammar and writes the steps down, each once."""
 
-    def __init__(self, names: set[str], at: str, networks: Mapping[str, Network]) -> None:
-        self.names, self.at, self.networks, self.nodes = names, at, networks, 0
+    def __init__(self, names: set[str], at: str, networks: Mapping[str, Network], jumps: bool) -> None:
+        self.names, self.at, self.networks, self.jumps, self.nodes = names, at, networks, jumps, 0
         self.steps, self.rationals = dict[Step, int](), dict[int, fmpq]()
 
     def step(self, *step: Any) -> int:
@@ -191,13 +205,14 @@ class _Compiler:
             require(good, "format", at, "the exponent must be an integer, not 0 and at most 64 in magnitude")
             result = self.power(self.compile(rest[0], at, depth + 1), abs(rest[1]))
             return result if rest[1] > 0 else self.step("1/", result)
+        require(self.jumps or name != HEAVISIDE, "format", at, "a jump was not expected here")
         least, most = OPERANDS.get(name, (1, 0))
         require(least <= len(rest) <= most, "format", at, "an operator with its number of operands was expected")
         return self.operation(name, [self.compile(operand, at, depth + 1) for operand in rest])
 
     def operation(self, name: str, operands: list[int]) -> int:
         first, *others = operands
-        if name in (*PLAIN, "abs"):
+        if name in (*PLAIN, "abs", HEAVISIDE):
             return self.step(name, first)
         if name == "tan":
             return self.step("*", self.step("sin", first), self.step("1/", self.step("cos", first)))
@@ -239,10 +254,14 @@ class _Compiler:
 
 
 def equations(
-    nodes: Sequence[Any], names: set[str], at: str, networks: Mapping[str, Network] = MappingProxyType({})
+    nodes: Sequence[Any],
+    names: set[str],
+    at: str,
+    networks: Mapping[str, Network] = MappingProxyType({}),
+    jumps: bool = False,
 ) -> Equations:
-    """Rule `format` for expressions in some names, which may call these networks."""
-    compiler = _Compiler(names, at, networks)
+    """Rule `format` for expressions in some names, which may call these networks, and may have jumps or not."""
+    compiler = _Compiler(names, at, networks, jumps)
     results = [compiler.compile(node, f"{at}.{i}") for i, node in enumerate(nodes)]
     steps, wanted = list(compiler.steps), set(results)
     for k in reversed(range(len(steps))):
@@ -258,4 +277,6 @@ def equations(
     for k in sorted(used):
         calls[k] = Call(networks[kept[k][1]], tuple(used[k]), count)
         count += len(used[k])
-    return Equations(kept, tuple(place[k] for k in results), calls)
+    found = Equations(kept, tuple(place[k] for k in results), calls)
+    require(found.jumps <= MAX_JUMPS, "format", at, f"more than {MAX_JUMPS} different jumps in the equations")
+    return found

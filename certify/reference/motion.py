@@ -15,7 +15,7 @@ from flint import arb, arb_mat, fmpq
 from .affine import Form, OnBoxes, called, clip
 from .balls import ZERO, beta, bounded_by_form, lies_within, total
 from .document import Certificate
-from .expressions import Call
+from .expressions import Call, Jump
 from .flow import Moving, mean_on, reached_from
 from .function import net_at_0
 from .networks import Map
@@ -134,12 +134,12 @@ class Motion:
         """A list [constant, coefficients of d]."""
         return Taylor(row[0], arb_mat(1, self.symbols, row[1:] + [ZERO] * (self.symbols - self.d)))
 
-    def F(self, at: Stage) -> list[Taylor]:
-        """Models of f(x, pi(x), q), all of them finite."""
+    def F(self, at: Stage, jump: Jump | None = None) -> list[Taylor]:
+        """Models of f(x, pi(x), q), all of them finite; `jump` says which values jumps have."""
         known = self.numbers(at)
         names = {**known.states, **known.inputs, **known.uncertain}
         with under(self.rule, at.place):
-            result = self.c.plant.dynamics.evaluate(names, constant, self.called)
+            result = self.c.plant.dynamics.evaluate(names, constant, self.called, jump)
         require(all(f.is_finite() for f in result), self.rule, at.place, "F has no finite model")
         return result
 

@@ -4,15 +4,18 @@ without a target to any that have a rank.
 A leaf of rank r with k steps is followed for these steps as a box that is affine in the leaf's symbols and in those of
 the errors of its last steps. Where it ends all of it is in the target, or every leaf that it meets has a rank of at
 most r - k.
+
+Equations that jump have an image for each value that their jumps may have, by the bounds of what these are jumps of. So
+a box may become many, which are followed one by one until they lie in the target.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import product
 
-from flint import arb, arb_mat, fmpq_mat
+from flint import arb, arb_mat, fmpq, fmpq_mat
 
 from .balls import ZERO, total
 from .batches import in_batches
@@ -22,12 +25,13 @@ from .keep import kept
 from .leaves import LEAF, Box, cut, structure
 from .motion import Input, Motion, Stage
 from .rational import bits
-from .refusal import Refused, require, under
+from .refusal import Refused, require
 from .taylor import Taylor, constant
 
 RULE, UNRANKED = "ranks", 65_535
 MAX_MET = 2**14  # nodes of the tree that one image meets
 MAX_FRAME_BITS = 2**14  # of its longest number, times its rows
+MAX_IMAGES = 64  # of a leaf after each step
 Rows = list[list[arb]]  # for each state the constant, the coefficients of the leaf's symbols, and those of errors
 Range = tuple[float, float]
 
@@ -57,16 +61,24 @@ def follow(some: Sequence[Box], cover: Cover, walk: Walk, target: Target | None)
     """The rules for some leaves, whose policies are enclosed together, or a refusal."""
     places = [f"ranks leaf {box.number}" for box in some]
     steps = [cover.steps[box.number] for box in some]
-    each = [walk.start(box) for box in some]
+    each = [[walk.start(box)] for box in some]
     for done in range(max(steps)):
-        left = [b for b, count in enumerate(steps) if count > done]
-        for b, u in zip(left, walk.inputs([each[b] for b in left]), strict=True):
-            each[b] = walk.step(each[b], places[b], u)
-    for box, rows, count, at in zip(some, each, steps, places, strict=True):
+        left = [(b, rows) for b, count in enumerate(steps) if count > done for rows in each[b]]
+        moved = {b: list[Rows]() for b, _ in left}
+        for (b, rows), u in zip(left, walk.inputs([rows for _, rows in left]), strict=True):
+            for image in walk.step(rows, places[b], u):
+                there = walk.jumps > 0 and target is not None and target.holds(image)
+                moved[b] += [] if there else [image]
+            few = len(moved[b]) <= MAX_IMAGES
+            require(few, RULE, places[b], f"more than {MAX_IMAGES} images outside of the target at once")
+        for b, images in moved.items():
+            each[b] = images
+    for box, images, count, at in zip(some, each, steps, places, strict=True):
         rank = cover.ranks[box.number]
-        if target is None or not target.holds(rows, at):
-            require(rank > 0, RULE, at, "its rank is 0, and it is not certain to lie in a target")
-            cover.leads_to(rows, UNRANKED - 1 if target is None else rank - count, at)
+        for rows in images:
+            if target is None or not target.holds(rows):
+                require(rank > 0, RULE, at, "its rank is 0, and it is not certain to lie in a target")
+                cover.leads_to(rows, UNRANKED - 1 if target is None else rank - count, at)
 
 
 class Cover:
@@ -153,7 +165,7 @@ class Walk(Motion):
 
     def __init__(self, c: Certificate, order: int, ranking: Ranking) -> None:
         angles = c.ranks.angles if c.ranks is not None else ()
-        self.stay = c.n * ranking.memory
+        self.stay, self.jumps = c.n * ranking.memory, c.plant.dynamics.jumps
         super().__init__(c, c.n + self.stay, order, None, angles)
         self.domain = [(arb(lo), arb(hi)) for lo, hi in c.plant.domain]
         one = fmpq_mat([[int(i == k) for k in range(c.n)] for i in range(c.n)])
@@ -172,12 +184,14 @@ class Walk(Motion):
 
     def inputs(self, each: Sequence[Rows]) -> list[list[Input]]:
         """The inputs on each of some boxes."""
+        if not each:
+            return []
         x = arb_mat([[v for rows in each for v in rows[i]] for i in range(self.n)])
         u = self.policy(x, len(each))
         return [[row[b] for row in u] for b in range(len(each))]
 
-    def step(self, rows: Rows, at: str, u: list[Input]) -> Rows:
-        """The states after one step more, in which these are the inputs, or a refusal."""
+    def step(self, rows: Rows, at: str, u: list[Input]) -> Iterator[Rows]:
+        """The states after one step more, in which these are the inputs, for all that jumps may be, or a refusal."""
         c = self.c
         here = Stage(at, rows, u)
         self.keep_bounds(here)
@@ -190,16 +204,21 @@ class Walk(Motion):
             a, b = ends(row)
             inside = name in self.free or bool(a > lo and b < hi)
             require(inside, RULE, at, f"{name} is not certain to be inside of the domain before a step")
-        return self.settled(self.after(here, within), at)
+        return (self.settled(models, at) for models in self.after(here, within))
 
-    def after(self, here: Stage, within: dict[str, Taylor] | None) -> list[Taylor]:
-        """Models of the next state: F in discrete time, else x + h G."""
+    def after(self, here: Stage, within: dict[str, Taylor] | None) -> Iterator[list[Taylor]]:
+        """Models of the next state: F in discrete time, for all that jumps may be, else x + h G."""
         if within is None:
-            return self.F(here)
+            waiting = [list[int]()]
+            while waiting:
+                choice = Choice(waiting.pop())
+                yield self.F(here, choice)
+                waiting += choice.others
+            return
         h = self.period()
         G = self.mean(here, within, h)
         moved = [h * g if self.c.varies else g.scaled(h.c) for g in G]
-        return [self.affine(row) + g for row, g in zip(here.x, moved, strict=True)]
+        yield [self.affine(row) + g for row, g in zip(here.x, moved, strict=True)]
 
     def settled(self, models: list[Taylor], at: str) -> Rows:
         """The states as rows of numbers: what is not affine in the symbols that stay, all but those of the oldest
@@ -222,6 +241,31 @@ class Walk(Motion):
         return rows
 
 
+class Choice:
+    """A value for each jump, in the order in which they are evaluated: first those that are given, then the lesser of
+    those that each may have. `others` are given the greater one instead, so that each choice comes once.
+
+    An argument's model is that with the values that jumps before it have.
+    """
+
+    def __init__(self, given: list[int]) -> None:
+        self.given, self.values, self.others = given, list[int](), list[list[int]]()
+
+    def __call__(self, a: Taylor) -> Taylor:
+        number = len(self.values)
+        if number < len(self.given):
+            value = self.given[number]
+        else:
+            require(a.is_finite(), RULE, "jump", "its argument has no finite model")  # or maybe it does not exist
+            excluded = (-a).is_negative(), a.is_negative()  # a value of 0, of 1
+            possible = [v for v in (0, 1) if not excluded[v]]
+            require(len(possible) > 0, RULE, "jump", "its argument is positive and negative")
+            value, *greater = possible
+            self.others += [[*self.values, v] for v in greater]
+        self.values.append(value)
+        return constant(fmpq(value))
+
+
 class Target:
     """The set that is reached: {V <= c2} as places, or that where no expression of the target is positive."""
 
@@ -229,21 +273,22 @@ class Target:
         self.c, self.stated, self.turn = c, stated, 2 * arb.pi()
         self.P = None if c.target is not None else arb_mat(c.P)
 
-    def holds(self, rows: Rows, at: str) -> bool:
-        """True if all of the box is certainly in the target; a refusal where an expression has no finite model."""
-        return all(bool(v.by_squares() <= 0) or bool(v.from_corner() <= 0) for v in self.values(rows, at))
+    def holds(self, rows: Rows) -> bool:
+        """True if all of the box is certainly in the target, where numbers have finite models."""
+        try:
+            values = self.values(rows)
+        except Refused:
+            return False
+        return all(v.is_finite() and (bool(v.by_squares() <= 0) or bool(v.from_corner() <= 0)) for v in values)
 
-    def values(self, rows: Rows, at: str) -> list[Taylor]:
+    def values(self, rows: Rows) -> list[Taylor]:
         """Models of numbers that are at most 0 in the target."""
         if self.c.target is None:
-            return [self.V_beyond(rows, at)]
+            return [self.V_beyond(rows)]
         names = {name: Taylor(x, arb_mat([g])) for name, (x, *g) in zip(self.c.plant.states, rows, strict=True)}
-        with under(RULE, at):
-            values: list[Taylor] = self.c.target.evaluate(names, constant)
-        require(all(v.is_finite() for v in values), RULE, at, "an expression of the target has no finite model")
-        return values
+        return self.c.target.evaluate(names, constant)
 
-    def V_beyond(self, rows: Rows, at: str) -> Taylor:
+    def V_beyond(self, rows: Rows) -> Taylor:
         """V - c2, at the place near 0."""
         if self.P is None:
             raise TypeError("a claim with a target has no V")
@@ -254,9 +299,7 @@ class Target:
         x, A = arb_mat(n, 1, centre), arb_mat([row[1:] for row in rows])
         PA = self.P * A
         V = (x.transpose() * (self.P * x))[0, 0]
-        model = Taylor(V - arb(self.c.outer), 2 * (x.transpose() * PA), A.transpose() * PA)
-        require(model.is_finite(), RULE, at, "V has no finite model")
-        return model
+        return Taylor(V - arb(self.c.outer), 2 * (x.transpose() * PA), A.transpose() * PA)
 
 
 def ends(row: Sequence[arb]) -> tuple[arb, arb]:

@@ -150,7 +150,7 @@ def by_reference(data: Document, lo: list[float], hi: list[float], count: int) -
         walk = Walk(c, c.evidence.order, c.evidence.ranking)
         rows = walk.start(Box(0, lo, hi))
         for _ in range(count):
-            rows = walk.step(rows, "here", *walk.inputs([rows]))
+            (rows,) = walk.step(rows, "here", *walk.inputs([rows]))
             found.append([(exactly(a), exactly(b)) for a, b in map(ends, rows)])
     return found
 

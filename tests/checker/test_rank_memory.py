@@ -219,7 +219,7 @@ def references_images(data: Document, lo: list[float], hi: list[float], count: i
         rows = walk.start(Box(0, lo, hi))
         for _ in range(count):
             try:
-                rows = walk.step(rows, "here", *walk.inputs([rows]))
+                (rows,) = walk.step(rows, "here", *walk.inputs([rows]))
             except Refused:
                 break
             each = np.array([list(map(nearly, row)) for row in rows])

@@ -885,7 +885,7 @@ def test_boxes_hold_all_trajectories(order: int, calls: int, frame: list[list[fl
     N = frame or [[1.0, 0.0], [0.0, 1.0]]
     rows = [walk.start(Box(0, [0.5, -0.5], [0.6, -0.4]))]
     for _ in range(3):
-        rows.append(walk.step(rows[-1], "here", *walk.inputs([rows[-1]])))
+        rows += walk.step(rows[-1], "here", *walk.inputs([rows[-1]]))
     nearest = 0.0
     for _ in range(150):
         d = [chance.choice([-1.0, 1.0, chance.uniform(-1, 1)]) for _ in range(2)]
