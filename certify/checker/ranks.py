@@ -256,7 +256,8 @@ class Steps(Moving):
         def choose(a: Taylor) -> Taylor:
             value = next(values)
             possible[upper_bound(a if value else -a) < 0] = False
-            return constants(a)(Fraction(value))
+            chosen, exists = constants(a)(Fraction(value)), 0 * a.size.top
+            return Taylor(chosen.c, chosen.p, Above(exists))
 
         return self.f(states, held, choose), possible
 

@@ -17,6 +17,7 @@ import pytest
 from certify.reference import rules
 from certify.reference.document import read
 from tests.support.certificates import edited
+from tests.support.rank_forgeries import by_checker
 from tests.support.ranked import UNRANKED, Document, Loop, affine, around_level, dumped, mapped, two_bytes, uniform
 
 NO, HAIR = UNRANKED, Fraction(1, 10**9)
@@ -57,9 +58,12 @@ def document(
 
 
 def found(data: Document) -> tuple[str, str] | None:
-    """The rule that refuses it, and where."""
+    """The rule by which the reference refuses it, and where; then the checker refuses it as well."""
     verdict = rules.judge(dumped(data))
-    return None if verdict.result == "ACCEPTED" else (str(verdict.rule), str(verdict.at))
+    if verdict.result == "ACCEPTED":
+        return None
+    assert by_checker(data) is not None
+    return str(verdict.rule), str(verdict.at)
 
 
 def on_unit(f: Any, lo: float = 0.0, hi: float = 1.0, **more: Any) -> Document:
@@ -482,3 +486,39 @@ def test_affine_pieces_as_rationals_have_them() -> None:
         assert (found(data) is None) == good
         count[good] += 1
     assert min(count.values()) > 20
+
+
+# --------------------------------------------------------------------------------------------------------- the checker
+
+
+def within(lift: Fraction) -> Iterator[tuple[str, Document]]:
+    """Certificates that hold by so much, or do not where it is negative, by the rule that refuses them then."""
+    half, edge = ["/", "x", "2"], str(Fraction(1, 2) - lift)
+    yield "ranks", on_unit(plus(half, ["*", edge, H(["-", "x", "1/3"])], str(lift / 2)))
+    yield "ranks", on_unit(plus(half, times(5, H(["-", "x", str(1 + lift)])), "1/8"))
+    yield "ranks", on_unit(plus(half, times(5, ["-", "1", H(plus("x", str(lift)))]), "1/8"))
+    yield "ranks", on_unit(plus(["/", "x", "4"], times(5, H(plus(["-", APART, APART], str(-lift)))), "1/8"))
+    yield "ranks", on_unit(plus("1/2", times(5, H(["-", plus("x", H(["-", "x", str(1 + lift)])), "3/2"]))))
+    late: dict[str, Any] = {"target": [["-", str(Fraction(13, 2) + HAIR), "x"]]}
+    yield "ranks", far(domain=("-1", str(1 + lift)))
+    yield "keep", far(keep=[["-", "x", str(1 + lift)]])
+    yield "ranks", far(**late, domain=("-1", str(7 + lift)))
+    yield "keep", far(**late, keep=[["-", "x", str(7 + lift)]])
+    yield "inputs", edited(far(network=[affine([[1.0]])], bound="1"), "plant.input_bounds.0", ["-1", str(1 + lift)])
+
+
+@pytest.mark.parametrize("k", range(10))
+def test_the_checker_sees_small_margins(k: int) -> None:
+    for lift in (Fraction(1, 10**6), Fraction(-1, 10**6), Fraction(1, 10**10), Fraction(-1, 10**10)):
+        rule, data = list(within(lift))[k]
+        assert by_checker(data) == (None if lift > 0 else rule)
+
+
+def test_the_checker_has_the_same_limits() -> None:
+    for count, rule in ((40, None), (64, "ranks")):
+        assert by_checker(on_unit(GROWS, -0.125, 2.5, ranks=[count], steps=[count])) == rule
+    for count, rule in ((6, None), (7, "format")):
+        assert by_checker(on_unit(plus("1/2", *different(count)))) == rule
+    assert by_checker(document([GROWS], [-4.0], [4.0], 4, [3] * 16, [1, 2, 3, 1] * 4)) is None
+    assert by_checker(on_unit(plus("1/2", H(APART), ["-", H(plus("x", "-1/2"))]))) is None
+    assert by_checker(on_unit(plus("x", H(["-", ["sin", "x"], "1/2"])), -3.25, 3.25, angles=("x",))) is None
