@@ -265,7 +265,8 @@ def count(tree: RankTree, angles: Sequence[int] = ()) -> Count:
 def proved_volume(tree: RankTree, angles: Sequence[int] = ()) -> tuple[float, float]:
     """The volume of the leaves of finite rank, and their share of the root box, both rounded down.
 
-    In an angle only one turn of the root box counts, from its lower end.
+    In an angle only one turn of the root box counts, from its lower end. In a state in which nothing is cut a leaf has
+    all of the root box, however narrow that is.
 
     Raises
     ------
@@ -275,13 +276,15 @@ def proved_volume(tree: RankTree, angles: Sequence[int] = ()) -> tuple[float, fl
     most, proved = tree.hi.copy(), tree.proved
     for i in angles:
         most[i] = min(most[i], math.nextafter(tree.lo[i] + 2 * math.pi, -math.inf))  # 2 math.pi is below 2 pi
-    size, whole = np.ones(len(lower)), 1.0
+    size, share = np.ones(len(lower)), np.ones(len(lower))
     for i in range(len(most)):
-        width = np.minimum(upper[:, i], most[i]) - lower[:, i]
-        size = np.nextafter(size * np.maximum(np.nextafter(width, 0.0), 0.0), 0.0)
-        whole = math.nextafter(whole * math.nextafter(float(most[i] - tree.lo[i]), math.inf), math.inf)
-    volume = math.nextafter(math.fsum(size[proved]), 0.0)
-    return volume, 1.0 if np.all(proved) else max(0.0, math.nextafter(volume / whole, 0.0))
+        width = np.maximum(np.nextafter(np.minimum(upper[:, i], most[i]) - lower[:, i], 0.0), 0.0)
+        size = np.nextafter(size * width, 0.0)
+        part = np.nextafter(width / math.nextafter(float(most[i] - tree.lo[i]), math.inf), 0.0)
+        uncut = (lower[:, i] == tree.lo[i]) & (upper[:, i] >= most[i])
+        share = np.where(uncut, share, np.maximum(np.nextafter(share * part, 0.0), 0.0))
+    volume, known = (math.nextafter(math.fsum(each[proved]), 0.0) for each in (size, share))
+    return volume, 1.0 if np.all(proved) else max(0.0, known)
 
 
 def _half(lo: list[float], hi: list[float], axis: int, at: float, side: int) -> tuple[list[float], list[float]]:

@@ -118,8 +118,11 @@ def test_a_cluster_finds_the_same_certificate(tmp_path: Path, monkeypatch: pytes
 
 def test_a_cluster_that_lies_proves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each box is said to lie in the target: the checker refuses it, and the error names the cluster."""
-    vector, many = (2,), (len(COUNTS),)
-    images = [("lo", "f8", many + vector), ("hi", "f8", many + vector), ("there", "u1", many)]
+    vector, many, each = (2,), (len(COUNTS),), (len(COUNTS), 1)
+    images = [
+        *(("lo", "f8", each + vector), ("hi", "f8", each + vector)),
+        *(("there", "u1", each), ("known", "u1", many)),
+    ]
     row = np.dtype(
         [
             *images,

@@ -519,6 +519,7 @@ def test_the_checker_has_the_same_limits() -> None:
         assert by_checker(on_unit(GROWS, -0.125, 2.5, ranks=[count], steps=[count])) == rule
     for count, rule in ((6, None), (7, "format")):
         assert by_checker(on_unit(plus("1/2", *different(count)))) == rule
+    assert by_checker(document([GROWS], [-1.0], [1.0], 1, [3, 3], [3, 3], target=[["-", "x", "2"]])) is None
     assert by_checker(document([GROWS], [-4.0], [4.0], 4, [3] * 16, [1, 2, 3, 1] * 4)) is None
     assert by_checker(on_unit(plus("1/2", H(APART), ["-", H(plus("x", "-1/2"))]))) is None
     assert by_checker(on_unit(plus("x", H(["-", ["sin", "x"], "1/2"])), -3.25, 3.25, angles=("x",))) is None

@@ -5,6 +5,7 @@ Nothing is PROVED before the checker, run as a process of its own, has accepted 
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Callable, Mapping
@@ -33,6 +34,7 @@ from certify.certificates import (
 from certify.certificates.claims import UNPROVED, Ranks
 from certify.certificates.ellipsoids import Box
 from certify.certificates.ranked import Ranked, steps_from
+from certify.certificates.tree import leaves_within
 from certify.certificates.verdict import Verdict
 from certify.effort import Effort
 from certify.errors import OptionError
@@ -58,6 +60,7 @@ _PROBES = 30  # states at which the order of the series in time is chosen, and t
 _RUNS = 1e10  # operations for simulated runs, a few seconds, which no effort is charged with
 _FOR_SEARCH = 0.7  # share of the effort, the rest being for the check
 _DIRECT = 4000  # boxes that are looked at first where runs need few steps
+_SLOW, _DOUBT = 200, 1e-9  # runs from what is not proved; of the box's volume
 _PARTS = np.array([1.0, 3.0, 9.0])  # of a box in each direction, on which the memory of errors is tried
 _MENDED = 20  # leaves that the checker may refuse
 
@@ -152,7 +155,7 @@ def _simulated(result: ReachResult, goal: Goal, tools: Tools) -> ReachResult:
         simulation = Simulation(goal.loop, goal.expressions, options.begin, goal.turned)
         runs = simulation.runs(options.within, Effort(_RUNS))
         if runs.longest is None and runs.failing is None:  # they take long
-            runs = simulation.runs(options.within, Effort(_RUNS), slice(1))
+            runs = simulation.runs(options.within, Effort(_RUNS), begins(options.begin)[:1])
     result = replace(result, runs=runs)
     if runs.failing is None:
         return result
@@ -203,7 +206,7 @@ def _proved(
     steps = steps_from(Ranked(leaves_of(certificate), goal.ellipsoid, turned), options.begin)
     if steps is None:
         why = "the effort is over" if not found.done else "no leaf is left whose halves could gain anything"
-        return replace(result, reason=f"of the box only a part is proved, or none: {why}")
+        return replace(result, reason=f"{_part(result, goal, leaves_of(certificate))}: {why}")
     return replace(result, verdict=Verdict.PROVED, reason="requested", steps=steps)
 
 
@@ -244,6 +247,28 @@ def _within(evidence: RankTree, most: int | None) -> RankTree | None:
     if most is not None:
         evidence = evidence.without(evidence.ranks > most)
     return evidence if np.any(evidence.proved) else None
+
+
+def _part(result: ReachResult, goal: Goal, tree: RankTree) -> str:
+    """The part of the box that is proved, in words; and where the rest lies, and how long runs from there take."""
+    begin = result.options.begin or ()
+    least, most = (np.array([float(pair[k]) for pair in begin]) for k in (0, 1))
+    lower, upper = leaves_within(tree.tree, tree.lo, tree.hi)
+    lower, upper = np.maximum(lower, least), np.minimum(upper, most)
+    wide = most > least
+    met = np.all(upper >= lower, axis=1)
+    sizes = np.where(met, np.prod((upper - lower)[:, wide] / (most - least)[wide], axis=1), 0.0)
+    rest = ~tree.proved & (sizes > 0)
+    percent = math.floor(1e4 * (1 - math.fsum(sizes[rest]))) / 100
+    if abs(math.fsum(sizes) - 1) > _DOUBT or percent <= 0:  # angles, and leaves that meet at the box, count twice
+        return "of the box only a part is proved, or none"
+    largest = np.flatnonzero(rest)[np.argsort(-sizes[rest])][:_SLOW]
+    states = 0.5 * lower[largest] + 0.5 * upper[largest]
+    runs = Simulation(goal.loop, goal.expressions, begin, goal.turned).runs(None, Effort(_RUNS), states)
+    slowest = "do not all get there" if runs.failing is not None else f"take up to {runs.longest:,} steps"
+    values = result.values([Fraction(v) for v in states[0].tolist()])
+    where = ", ".join(f"{name} = {float(q):.6g}" for name, q in values.items())
+    return f"{percent:g} % of the box is proved; of the rest, with a part around {where}, runs {slowest}"
 
 
 def _without_leaf(certificate: Stated, at: str) -> Stated | None:

@@ -75,10 +75,10 @@ class Simulation:
         self.step = self.flow.fitting(_FINER * time_scales(self.flow)[0])
 
     @np.errstate(all="ignore")
-    def runs(self, within: int | None, effort: Effort, some: slice = slice(None)) -> Runs:
-        """Runs from states of the box, or from some of these, of which the first is its middle; `within` is the number
-        of steps after which the target is to be reached."""
-        x, most = begins(self.begin)[some], LONG if within is None else within
+    def runs(self, within: int | None, effort: Effort, states: Array | None = None) -> Runs:
+        """Runs from states of the box, those of `begins` or others (N, n); `within` is the number of steps after which
+        the target is to be reached."""
+        x, most = begins(self.begin) if states is None else states, LONG if within is None else within
         start, alive, arrivals, failing = x, np.arange(len(x)), list[int](), list[Run]()
         for k in range(most + 1):
             there = self.beyond(self._place(x), self.flow.policy(x), ()).max(-1) <= _CLOSE
