@@ -101,6 +101,15 @@ def test_either_value_exactly_where_the_argument_is_0(by: Fraction, rule: Any) -
         assert found(on_unit(plus(["/", "x", "2"], times(5, wrong)))) == rule
 
 
+def test_an_end_that_is_0_within_rounding() -> None:
+    """Three thirds of x less 1, at x = 1."""
+    third = ["/", "x", "3"]
+    for by, rule in (("-1000000001/1000000000", None), ("-1", FIRST)):
+        never = plus(third, third, third, by)
+        for wrong in (H(never), ["-", "1", H(["-", never])]):
+            assert found(on_unit(plus(["/", "x", "2"], times(5, wrong)))) == rule
+
+
 @pytest.mark.parametrize(("by", "rule"), [(HAIR, None), (Fraction(0), FIRST), (-HAIR, FIRST)])
 def test_a_sign_that_terms_of_second_order_show(by: Fraction, rule: Any) -> None:
     """(x - 1/2)^2 + by on [0, 1]."""
