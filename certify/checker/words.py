@@ -96,6 +96,7 @@ def stated(c: Certificate) -> list[str]:
             for name, pair in zip(c.uncertain, c.ranges, strict=True)
         ),
         *(f"  {name}{after} = {expression(tree)}" for name, tree in zip(c.states, c.dynamics.trees, strict=True)),
+        *(["  heaviside(v) is 1 where v > 0, 0 where v < 0, either where v = 0"] if c.dynamics.jumps else []),
         *(f"  domain {name} in {interval(pair)}" for name, pair in zip(c.states, c.domain, strict=True)),
         *(f"  input {name} in {interval(pair)}, u_eq = {number(u)}" for name, pair, u in inputs),
         *(f"network {network.name}: {_network(network)}" for network in c.networks),

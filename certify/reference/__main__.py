@@ -86,7 +86,8 @@ def further(c: Certificate) -> str:
 
 def of_ranks(c: Certificate) -> str:
     """The statement of a claim without V."""
-    head = f"{c.plant.name}, policy {c.policy.sha256}{stepping(c)}: {from_leaves(c)}"
+    either = ", a heaviside of 0 being 0 or 1 at each step anew" if c.plant.dynamics.jumps else ""
+    head = f"{c.plant.name}, policy {c.policy.sha256}{stepping(c)}{either}: {from_leaves(c)}"
     if c.target is None:
         return f"{head}{on_the_way(c)}; nothing is said of where it goes among these boxes"
     return (
