@@ -260,7 +260,8 @@ def _part(result: ReachResult, goal: Goal, tree: RankTree) -> str:
     sizes = np.where(met, np.prod((upper - lower)[:, wide] / (most - least)[wide], axis=1), 0.0)
     rest = ~tree.proved & (sizes > 0)
     percent = math.floor(1e4 * (1 - math.fsum(sizes[rest]))) / 100
-    if abs(math.fsum(sizes) - 1) > _DOUBT or percent <= 0:  # angles, and leaves that meet at the box, count twice
+    twice = abs(math.fsum(sizes) - 1) > _DOUBT  # angles, and leaves that meet at the box
+    if twice or percent <= 0 or not np.any(rest):
         return "of the box only a part is proved, or none"
     largest = np.flatnonzero(rest)[np.argsort(-sizes[rest])][:_SLOW]
     states = 0.5 * lower[largest] + 0.5 * upper[largest]
