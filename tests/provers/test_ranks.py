@@ -287,14 +287,14 @@ def test_a_box_whose_parts_lead_straight_there_has_a_tree_of_its_own() -> None:
     asked = replace(turning_slowly(), memory=4)
     lo, hi = np.array([0.5, 0.2]), np.array([0.6, 0.3])
     for direct, own in ((100, True), (0, False)):
-        wanted = Wanted(lo, hi, direct=direct, longest=45)
+        wanted = Wanted(lo, hi, direct=direct, arrivals=(45,))
         found = prove_ranks(asked, Effort(UNIT), ThreadRunner(), wanted=wanted)
         assert found is not None and found.done
         corners = found.evidence.lo.tolist(), found.evidence.hi.tolist()
         assert (corners == (lo.tolist(), hi.tolist())) is own
         box_ = tuple((Fraction(a), Fraction(b)) for a, b in zip(lo.tolist(), hi.tolist(), strict=True))
         assert steps_from(Ranked(found.evidence, None, ()), box_) is not None
-    short = Wanted(np.array([-1.5, -1.5]), np.array([1.5, 1.5]), direct=3, longest=1)
+    short = Wanted(np.array([-1.5, -1.5]), np.array([1.5, 1.5]), direct=3, arrivals=(1,))
     other = prove_ranks(asked, Effort(UNIT / 100), ThreadRunner(), wanted=short)
     assert other is None or other.evidence.lo.tolist() != [-1.5, -1.5]
 

@@ -11,6 +11,7 @@ from certify.provers.boxes.partition import LEAF
 from certify.provers.ranks.targets import TURN
 
 _SLACK = 1e-12  # of a turn
+_POINT = 1e-300  # width of a point
 
 
 class Cover:
@@ -101,6 +102,16 @@ class Cover:
             owner = np.concatenate([owner, owner[under], owner[over]])
             low, high = np.hstack([low, more[0]]), np.hstack([high, more[1]])
         return owner, low, high
+
+    def overlap(self, lo: Array, hi: Array, leaf: Index) -> Array:
+        """The shares of boxes (n, B) of places that lie in these leaves, one for each."""
+        low, high = self.low[:, leaf], self.high[:, leaf]
+        for i in self.angles:
+            turns = TURN * np.rint((low[i] + high[i] - lo[i] - hi[i]) / (2 * TURN))
+            low[i], high[i] = low[i] - turns, high[i] - turns
+        both = np.maximum(np.minimum(hi, high) - np.maximum(lo, low), 0.0)
+        shares: Array = ((both + _POINT) / (hi - lo + _POINT)).prod(0)
+        return shares
 
     def preorder(self, kept: Mask) -> tuple[bytes, Index]:
         """The tree's bytes, and the leaves in their order there; a node below which no leaf is `kept`, (N,), is a leaf

@@ -19,14 +19,12 @@ from certify.certificates.claims import UNPROVED
 from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.ranks.cover import Cover
 from certify.provers.ranks.images import Course, Images
-from certify.provers.ranks.targets import TURN
 
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 _FIRST = 2**10  # leaves of the first tree
 _BEFORE, _GAIN = 1 / 8, 1e-4  # relative growth of what is proved, since so few boxes, below which the search ends
 _SHARE = 0.5  # share of all promise in the leaves that are halved next
 _ANYWAY = 0.05  # share of a leaf that may gain a rank where its image, or a few of its states, say that nothing does
-_POINT = 1e-300  # width of a point
 _POINTS = 5  # of a leaf, from which it is seen if the target may be reached
 Promising = Callable[[Array], Mask]
 """True (N,) for states (N, n) that seem to reach the target."""
@@ -187,20 +185,10 @@ class Search:
         part of each box that lies in such leaves is noted."""
         known = self.rank[leaf] < UNPROVED
         box, leaf = box[known], leaf[known]
-        parts = np.bincount(box, self._overlap(lo[:, box], hi[:, box], leaf), minlength=len(owners))
+        parts = np.bincount(box, self.cover.overlap(lo[:, box], hi[:, box], leaf), minlength=len(owners))
         np.maximum.at(self.part, owners, parts)
         found: Index = owners[np.unique(box)]
         return found
-
-    def _overlap(self, lo: Array, hi: Array, leaf: Index) -> Array:
-        """The shares of boxes (n, B) of places that lie in these leaves, one for each."""
-        low, high = self.cover.low[:, leaf], self.cover.high[:, leaf]
-        for i in self.cover.angles:
-            turns = TURN * np.rint((low[i] + high[i] - lo[i] - hi[i]) / (2 * TURN))
-            low[i], high[i] = low[i] - turns, high[i] - turns
-        both = np.maximum(np.minimum(hi, high) - np.maximum(lo, low), 0.0)
-        shares: Array = ((both + _POINT) / (hi - lo + _POINT)).prod(0)
-        return shares
 
     def _better(self, best: Index, by: Index, nodes: Index, ranks: Index, steps: Index) -> None:
         """Keep the lowest rank of each node, and its steps."""
