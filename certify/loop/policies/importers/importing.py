@@ -147,17 +147,7 @@ def import_bytes(
     if evaluate is not None:
         reading = replace(reading, evaluate=_either(evaluate, reading.evaluate), program="the module itself, run")
     _require_answers(kind, reading, options, plant)
-    if reading.scores and reading.m != plant.m:
-        raise InputError(
-            f"the policy has a score for each of {reading.m} actions, so {plant.name} must have {reading.m} inputs, "
-            f"which are these scores; it has {plant.m}. Its equations take the largest with heaviside."
-        )
-    if (reading.n, reading.m) != (n, plant.m):
-        raise InputError(
-            f"the policy must read the {n} {'states' if reads.index else 'observations'} {reads.words} and command the "
-            f"{plant.m} inputs of {plant.name}; it reads {reading.n} and commands {reading.m}. Name what it reads with "
-            "--states."
-        )
+    _require_shape(reading, reads, plant)
     x_eq = [plant.exact_x_eq()[i] for i in reads.index or ()]
     moved = shift(x_eq, options)
     normaliser = _normaliser(reading, options, n)
@@ -262,6 +252,21 @@ def _require_answers(kind: Content, reading: Reading, options: ImportOptions, pl
             raise InputError(f"{option} must be left out: a file of {kind} says it itself.")
     if reading.scores:
         _require_scores(options)
+
+
+def _require_shape(reading: Reading, reads: Observed, plant: System) -> None:
+    """Refuse a policy that reads or gives other numbers than the plant has."""
+    if reading.scores and reading.m != plant.m:
+        raise InputError(
+            f"the policy has a score for each of {reading.m} actions, so {plant.name} must have {reading.m} inputs, "
+            f"which are these scores; it has {plant.m}. Its equations take the largest with heaviside."
+        )
+    if (reading.n, reading.m) != (reads.count, plant.m):
+        raise InputError(
+            f"the policy must read the {reads.count} {'states' if reads.index else 'observations'} {reads.words} and "
+            f"command the {plant.m} inputs of {plant.name}; it reads {reading.n} and commands {reading.m}. Name what "
+            "it reads with --states."
+        )
 
 
 def _require_scores(options: ImportOptions) -> None:

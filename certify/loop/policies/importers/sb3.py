@@ -240,7 +240,7 @@ def _means(net: Evaluate, quantiles: int) -> Evaluate:
 
 
 def _quantiles(given: Mapping[str, Any], what: str) -> int:
-    """How many quantiles each action has."""
+    """The number of quantiles of each action."""
     count = given.get("n_quantiles", _QUANTILES)
     if type(count) is not int or not 0 < count <= _MOST_QUANTILES:
         raise InputError(
