@@ -303,6 +303,8 @@ def checked(difference: Difference, compared_with: str | None, assumed: str, not
 
 def _centring(found: Imported) -> str:
     centre = found.policy.network.centre
+    if found.policy.training["imported"].get("scores"):
+        return "none, as of scores there is none"
     if centre != "none" and not found.centring:
         return f"the file's own, {'inside the squash' if centre == 'preactivation' else 'of the output'}"
     changes = [f"{name} changes u by up to {value:.3g}" for name, value in found.centring.items()]

@@ -9,6 +9,8 @@ from certify.certificates import AnyCertificate, Certificate
 from certify.certificates.ellipsoids import Ellipsoid
 from certify.certificates.membership import Region, region_of
 from certify.errors import CertifyError
+from certify.loop.expressions import Number, jumping, nodes, substitute
+from certify.loop.plants import System
 from certify.loop.policies.nonlinearity import Nonlinearity, nonlinearity
 
 Array = NDArray[np.float64]
@@ -21,17 +23,28 @@ def nonlinearity_of(read: AnyCertificate) -> Nonlinearity | None:
     """The policy's nonlinearity on the set of a certificate; None where floats cannot tell.
 
     The states are uniform in the tube's start, or in {V <= c2}; with an outer set or ranks in the whole set. Claims
-    without V need no equilibrium: their linear part is a fit.
+    without V need no equilibrium: their linear part is a fit. Where inputs are scores of actions nothing is said: with
+    scores that are near others may be the largest.
     """
+    system = read.system
+    if _are_scores(system):
+        return None
     try:
         with np.errstate(all="ignore"):
             states = states_in(region_of(read), _box_of(read))
             if states is None or not np.all(np.isfinite(states)):
                 return None
-            u_eq = read.system.exact_u_eq()
+            u_eq = system.exact_u_eq()
             return nonlinearity(read.network, u_eq, states, fitted=not isinstance(read, Certificate))
     except (CertifyError, ValueError, ArithmeticError):  # a rejected file need not make sense
         return None
+
+
+def _are_scores(system: System) -> bool:
+    """True if the inputs decide nothing but how the equations jump."""
+    jumps = dict.fromkeys(jumping(*system.dynamics), Number(0))
+    others = set(nodes(*(substitute(expression, jumps) for expression in system.dynamics)))
+    return bool(jumps) and others.isdisjoint(system.inputs)
 
 
 def states_in(region: Region, box: tuple[Array, Array]) -> Array | None:

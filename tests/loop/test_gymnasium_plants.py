@@ -45,7 +45,9 @@ def stepped(name: str, env: Any, x: Array, u: float) -> Array:
 
 
 def test_all_are_here() -> None:
-    assert sorted(path.stem for path in FOLDER.glob("*.toml")) == sorted([*ENVIRONMENTS, "mountain_car_goal"])
+    assert sorted(path.stem for path in FOLDER.glob("*.toml")) == sorted(
+        [*ENVIRONMENTS, "mountain_car_goal", "mountain_car_actions"]
+    )
 
 
 def test_the_car_on_its_way_to_the_flag() -> None:
@@ -67,6 +69,28 @@ def test_the_car_on_its_way_to_the_flag() -> None:
         if abs(ours[0] - 0.45) > 1e-5 and abs(ours[1]) > 1e-5:
             assert ended == (ours[0] >= 0.45 and ours[1] >= 0)
     assert walled > 20 and arrived > 20
+
+
+def test_the_car_with_three_actions() -> None:
+    """The plant takes the action with the largest score; a step from anywhere is Gymnasium's, at the wall too."""
+    gymnasium = pytest.importorskip("gymnasium")
+    system, env = plant("mountain_car_actions"), gymnasium.make("MountainCar-v0").unwrapped
+    f, random, stopped, arrived, taken = system.function(), np.random.default_rng(0), 0, 0, set[int]()
+    for k in range(1500):
+        x = random.uniform([-1.2, -0.07], [0.6 if k % 3 else -1.1, 0.07])
+        scores = random.normal(size=3) * 10.0 ** random.integers(-3, 4)
+        action = int(scores.argmax())
+        env.reset(seed=0)
+        env.state = tuple(x)
+        _, _, ended, *_ = env.step(action)
+        faster = np.clip(x[1] + (action - 1) * 0.001 - 0.0025 * np.cos(3 * x[0]), -0.07, 0.07)
+        if abs(x[0] + faster + 1.2) < 1e-9 or x[0] + faster > 0.6:
+            continue  # rounding decides which of the two it is, or the road ends behind the flag
+        np.testing.assert_allclose(f(x, scores), env.state, rtol=1e-12, atol=1e-15)
+        taken.add(action)
+        stopped, arrived = stopped + (env.state[0] == -1.2), arrived + ended
+        assert ended == (env.state[0] >= 0.5 and env.state[1] >= 0)
+    assert taken == {0, 1, 2} and stopped > 50 and arrived > 20
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)

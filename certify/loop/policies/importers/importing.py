@@ -147,12 +147,7 @@ def import_bytes(
     if evaluate is not None:
         reading = replace(reading, evaluate=_either(evaluate, reading.evaluate), program="the module itself, run")
     _require_answers(kind, reading, options, plant)
-    if (reading.n, reading.m) != (n, plant.m):
-        raise InputError(
-            f"the policy must read the {n} {'states' if reads.index else 'observations'} {reads.words} and command the "
-            f"{plant.m} inputs of {plant.name}; it reads {reading.n} and commands {reading.m}. Name what it reads with "
-            "--states."
-        )
+    _require_shape(reading, reads, plant)
     x_eq = [plant.exact_x_eq()[i] for i in reads.index or ()]
     moved = shift(x_eq, options)
     normaliser = _normaliser(reading, options, n)
@@ -188,7 +183,7 @@ def import_bytes(
         not_read=reading.unread,
         at_origin=np.asarray(bare(np.zeros(plant.n), u_eq)),
         u_eq=np.array([float(u) for u in u_eq]),
-        centring={} if own != "none" else _centrings(bare, u_eq, x, values),
+        centring={} if own != "none" or reading.scores else _centrings(bare, u_eq, x, values),
     )
 
 
@@ -217,6 +212,8 @@ def _record(reading: Reading, options: ImportOptions, plant: System, difference:
     record["compared_with"] = reading.program
     record["largest_difference" if reading.program is not None else "folding_difference"] = difference.largest
     record["not_read"] = dict(reading.unread)
+    if reading.scores:
+        record["scores"] = True
     if reading.beside:
         record["beside_sha256"] = dict(reading.beside)
     return record
@@ -235,7 +232,7 @@ def _require_answers(kind: Content, reading: Reading, options: ImportOptions, pl
         wanted.append("--squash identity, tanh or relu-tanh (after the last layer)")
     if options.normaliser is None and reading.normaliser is None and kind != "two-stage":
         wanted.append("--normaliser FILE or none (what was done to observations)")
-    if options.action_scale is None and not _are_bounds(reading.action, plant):
+    if options.action_scale is None and not reading.scores and not _are_bounds(reading.action, plant):
         wanted.append("--action-scale (u = scale * action + offset in the plant's units: 1 if they are the same)")
     if options.observes is None and any(plant.exact_x_eq()) and (options.states or not plant.observations):
         wanted.append(f"--observes absolute or deviation (the operating point of {plant.name} is not 0)")
@@ -253,6 +250,36 @@ def _require_answers(kind: Content, reading: Reading, options: ImportOptions, pl
     ):
         if value is not None and not belongs:
             raise InputError(f"{option} must be left out: a file of {kind} says it itself.")
+    if reading.scores:
+        _require_scores(options)
+
+
+def _require_shape(reading: Reading, reads: Observed, plant: System) -> None:
+    """Refuse a policy that reads or gives other numbers than the plant has."""
+    if reading.scores and reading.m != plant.m:
+        raise InputError(
+            f"the policy has a score for each of {reading.m} actions, so {plant.name} must have {reading.m} inputs, "
+            f"which are these scores; it has {plant.m}. Its equations take the largest with heaviside."
+        )
+    if (reading.n, reading.m) != (reads.count, plant.m):
+        raise InputError(
+            f"the policy must read the {reads.count} {'states' if reads.index else 'observations'} {reads.words} and "
+            f"command the {plant.m} inputs of {plant.name}; it reads {reading.n} and commands {reading.m}. Name what "
+            "it reads with --states."
+        )
+
+
+def _require_scores(options: ImportOptions) -> None:
+    """Refuse options that would change scores of actions."""
+    given = {
+        "--action-scale": options.action_scale,
+        "--action-offset": options.action_offset,
+        "--clip": options.clip,
+        "--centre": options.centre,
+    }
+    for option, value in given.items():
+        if value is not None:
+            raise InputError(f"{option} must be left out: the outputs are scores of actions, which stay as they are.")
 
 
 def _are_bounds(action: Sequence[tuple[Fraction, Fraction]] | None, plant: System) -> bool:

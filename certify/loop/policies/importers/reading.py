@@ -50,6 +50,7 @@ class Reading:
     assumed : without a program, the source of the functions between the numbers.
     unread : the reason why each unread tensor is left out, by its name.
     beside : SHA-256 of each other file that was read with it, by its name.
+    scores : True if the outputs are scores of a discrete set of actions, of which the largest is taken.
 
     Raises
     ------
@@ -68,6 +69,7 @@ class Reading:
     assumed: str = ""
     unread: Mapping[str, str] = field(default_factory=dict)
     beside: Mapping[str, str] = field(default_factory=dict)
+    scores: bool = False
 
     def __post_init__(self) -> None:
         if _reads(self.steps) is None:

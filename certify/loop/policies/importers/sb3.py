@@ -1,11 +1,13 @@
-"""The zip files of stable-baselines3 and sb3-contrib: PPO, A2C, TRPO, SAC, TQC, TD3, DDPG and ARS.
+"""The zip files of stable-baselines3 and sb3-contrib: PPO, A2C, TRPO, SAC, TQC, TD3, DDPG, ARS, DQN and QRDQN.
 
 The numbers come from `policy.pth`, their meaning from `data`: JSON with other objects as pickles in base64, which are
 read as data. The classes of the policies say the rest: PPO, A2C and TRPO *clip* their actions to the bounds of the
 action space; SAC, TQC, TD3 and DDPG squash them by tanh and scale them to the bounds, and have ReLU by default. With
 state-dependent exploration SAC and TQC clip the mean before its tanh (`clip_mean`), and PPO and A2C may squash theirs
-(`squash_output`). Several arrays of observations are joined in the order of their names. The file does not say whether
-observations went through VecNormalize.
+(`squash_output`). Where actions are a discrete set, all take the one with the largest score: DQN its value, QRDQN the
+mean of its quantiles, PPO, A2C, TRPO and ARS the last layer's number; the scores are then the outputs, as they are.
+Several arrays of observations are joined in the order of their names. The file does not say whether observations went
+through VecNormalize.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import flint
@@ -24,10 +27,11 @@ import numpy as np
 from certify.errors import InputError
 from certify.loop.activations import ACTIVATIONS
 from certify.loop.files.archives import Archive
-from certify.loop.files.arrays import Numbers, array_of
-from certify.loop.files.pickles import Call, Name, brief, read_pickle
+from certify.loop.files.arrays import Numbers
+from certify.loop.files.pickles import Name, brief, read_pickle
 from certify.loop.policies.importers.options import WITH_TANH
-from certify.loop.policies.importers.reading import Observations, Reading, Values, between, perceptron, widths
+from certify.loop.policies.importers.reading import Evaluate, Observations, Reading, Values, between, perceptron, widths
+from certify.loop.policies.importers.sb3_spaces import spaces_of
 from certify.loop.policies.importers.steps import Affine, Clip, Diagonal, Step, Tanh, exactly, linear
 from certify.loop.policies.importers.tensors import load_tensors
 from certify.loop.policies.importers.unread import braced, unread
@@ -46,6 +50,7 @@ class _Class:
     others : beginnings of the keys of its tensors for training alone.
     squashed : True if its actions are squashed and scaled by default, False if they are clipped.
     joined : True if its observation is a dictionary of arrays.
+    actions : what its actions may be, `box`, `discrete` or both.
     """
 
     words: str
@@ -55,19 +60,21 @@ class _Class:
     others: tuple[str, ...]
     squashed: bool
     joined: bool = False
+    actions: tuple[str, ...] = ("box",)
 
 
 _SDE = "sde_features_extractor."
 _BOTH = ("mlp_extractor.shared_net", "mlp_extractor.policy_net")  # versions before 2 have layers that both share
 _ACTOR = ("actor.log_std", f"actor.{_SDE}", "critic", "critic_target")
 _SPREAD = ("mlp_extractor.value_net", "value_net.", "log_std", _SDE)
+_ANY, _DISCRETE = ("box", "discrete"), ("discrete",)
 
 
 def _classes(joined: bool, a: str, s: str, t: str) -> dict[Name, _Class]:
     """The classes for one array of observations, or for several, by where they are defined."""
     return {
         Name("stable_baselines3.common.policies", a): _Class(
-            "PPO, A2C or TRPO", "tanh", _BOTH, "action_net", _SPREAD, squashed=False, joined=joined
+            "PPO, A2C or TRPO", "tanh", _BOTH, "action_net", _SPREAD, squashed=False, joined=joined, actions=_ANY
         ),
         Name("stable_baselines3.sac.policies", s): _Class(
             "SAC", "relu", ("actor.latent_pi",), "actor.mu", _ACTOR, squashed=True, joined=joined
@@ -78,15 +85,23 @@ def _classes(joined: bool, a: str, s: str, t: str) -> dict[Name, _Class]:
         Name("stable_baselines3.td3.policies", t): _Class(
             "TD3 or DDPG", "relu", ("actor.mu",), "", ("actor_target", "critic", "critic_target"), True, joined
         ),
+        Name("stable_baselines3.dqn.policies", s.replace("SAC", "DQN")): _Class(
+            "DQN", "relu", ("q_net.q_net",), "", ("q_net_target.",), False, joined, _DISCRETE
+        ),
+        Name("sb3_contrib.qrdqn.policies", s.replace("SAC", "QRDQN")): _Class(
+            "QRDQN", "relu", ("quantile_net.quantile_net",), "", ("quantile_net_target.",), False, joined, _DISCRETE
+        ),
     }
 
 
 _CLASSES = {
     **_classes(False, "ActorCriticPolicy", "SACPolicy", "TD3Policy"),
     **_classes(True, "MultiInputActorCriticPolicy", "MultiInputPolicy", "MultiInputPolicy"),
-    Name("sb3_contrib.ars.policies", "ARSPolicy"): _Class("ARS", "relu", ("action_net",), "", (), squashed=True),
+    Name("sb3_contrib.ars.policies", "ARSPolicy"): _Class(
+        "ARS", "relu", ("action_net",), "", (), squashed=True, actions=_ANY
+    ),
     Name("sb3_contrib.ars.policies", "ARSLinearPolicy"): _Class(
-        "linear ARS", "relu", ("action_net",), "", (), squashed=False
+        "linear ARS", "relu", ("action_net",), "", (), squashed=False, actions=_ANY
     ),
 }
 _COMPOSED = {
@@ -107,11 +122,14 @@ _HARMLESS = {  # they change how a policy was trained, or are seen in its tensor
 _READ = {"activation_fn", "use_sde", "squash_output", "clip_mean", "features_extractor_class"}
 _CLIP_MEAN = 2.0  # where nothing is said
 _BITS = 320
+_QUANTILES, _MOST_QUANTILES = 200, 10_000  # of an action, where nothing is said; and at most
+_NAMED = 8  # actions that are named each
+_OF_TRAINING = "the value, or the spread of actions, of training"
 _BELOW = ("features_extractor", "pi_features_extractor")
 
 
 def read_sb3(archive: Archive, what: str, ignored: tuple[str, ...] | None = None) -> Reading:
-    """The deterministic policy of an SB3 file.
+    """The deterministic policy of an SB3 file; where its actions are a discrete set, their scores.
 
     Parameters
     ----------
@@ -120,32 +138,69 @@ def read_sb3(archive: Archive, what: str, ignored: tuple[str, ...] | None = None
     Raises
     ------
     InputError : the file is damaged, its policy is of another class or activation, holds a tensor that could belong to
-        it, or a space is no box.
+        it, or a space is no box and, of actions, no discrete set.
     """
+    data = _data(archive, what)
+    policy, given = _value(data, "policy_class"), _value(data, "policy_kwargs")
+    if not isinstance(policy, Name) or policy not in _CLASSES:
+        raise InputError(
+            f"the policy of {what} must be MlpPolicy or MultiInputPolicy of PPO, A2C, TRPO, SAC, TQC, TD3, DDPG, ARS, "
+            f"DQN or QRDQN; it is {brief(policy)}. Export it to ONNX and import that."
+        )
+    kind, given = _CLASSES[policy], {} if given is None else given
+    activation = _activation(kind, given, what)
+    spaces = spaces_of(_value(data, "observation_space"), _value(data, "action_space"), kind.joined, what)
+    found = "discrete" if spaces.bounds is None else "box"
+    if found not in kind.actions:
+        raise InputError(f"action_space of {what} must be {kind.actions[0]} for {kind.words}; it is {found}.")
+    scores = spaces.bounds is None
+    squashed, bound = (False, None) if scores else _end(kind, given, data.get("use_sde"), what)
+    if scores and (given.get("use_sde", data.get("use_sde")) or (kind.others and given.get("squash_output"))):
+        raise InputError(f"{what} must have neither use_sde nor squash_output, as its actions are discrete.")
+    tensors = load_tensors(archive.read("policy.pth"), f"policy.pth in {what}")
+    if any(name.startswith(_BELOW) for name in tensors):
+        raise InputError(f"{what} must have no features extractor of its own; its tensors have one.")
+    layers, left = _layers(tensors, kind, bound is not None, what, ignored)
+    quantiles = _quantiles(given, what) if kind.words == "QRDQN" else 1
+    n, m = spaces.observations, spaces.actions
+    if layers[0].weight.shape[1] != n or len(layers[-1].bias) != m * quantiles:
+        raise InputError(f"the spaces of {what} must match its layers; they have {n} and {m * quantiles} numbers.")
+    net = perceptron(layers, "identity", activation)
+    shape = f"stable-baselines3 {kind.words} {widths(layers)}{spaces.joined}"
+    who = "what its policy_kwargs say" if "activation_fn" in given else "the default of its kind"
+    reading = partial(
+        Reading,
+        assumed=f"{activation} between the layers is {who}, the rest is how stable-baselines3 documents its policies",
+        unread=left | _elsewhere(archive),
+    )
+    steps = between(layers, activation)
+    if spaces.bounds is None:
+        end, words = _scores(m, quantiles)
+        return reading(f"{shape}, {words}", (*steps, *end), _means(net, quantiles), scores=True)
+    low, high = spaces.bounds
+    said = "squashed by tanh" if squashed else "clipped"
+    within = "" if bound is None else f", their means clipped to {bound:g} before it"
+    return reading(
+        f"{shape}, actions {said}{within}",
+        (*steps, *_to_the_bounds(low, high, squashed, bound, what)),
+        _bounded(net, low, high, squashed, bound),
+        action=tuple(zip(exactly(low), exactly(high), strict=True)) if np.all(np.isfinite(spaces.bounds)) else None,
+    )
+
+
+def _data(archive: Archive, what: str) -> dict[str, Any]:
+    """The file's JSON."""
     try:
         data = json.loads(archive.read("data"))
     except (ValueError, RecursionError) as error:
         raise InputError(f"data in {what} must be JSON: {error}.") from error
     if not isinstance(data, dict):
         raise InputError(f"data in {what} must be a JSON object; found {brief(data)}.")
-    policy, given = _value(data, "policy_class"), _value(data, "policy_kwargs")
-    if not isinstance(policy, Name) or policy not in _CLASSES:
-        raise InputError(
-            f"the policy of {what} must be MlpPolicy or MultiInputPolicy of PPO, A2C, TRPO, SAC, TQC, TD3, DDPG or "
-            f"ARS; it is {brief(policy)}. Export it to ONNX and import that."
-        )
-    kind, given = _CLASSES[policy], {} if given is None else given
-    activation = _activation(kind, given, what)
-    squashed, bound = _end(kind, given, data.get("use_sde"), what)
-    n, joined, bounds = _spaces(data, kind, what)
-    tensors = load_tensors(archive.read("policy.pth"), f"policy.pth in {what}")
-    if any(name.startswith(_BELOW) for name in tensors):
-        raise InputError(f"{what} must have no features extractor of its own; its tensors have one.")
-    layers, left = _layers(tensors, kind, bound is not None, what, ignored)
-    if layers[0].weight.shape[1] != n or len(layers[-1].bias) != bounds.shape[1]:
-        raise InputError(f"the spaces of {what} must match its layers; they have {n} and {bounds.shape[1]} numbers.")
-    low, high = bounds
-    net = perceptron(layers, "identity", activation)
+    return data
+
+
+def _bounded(net: Evaluate, low: Numbers, high: Numbers, squashed: bool, bound: float | None) -> Evaluate:
+    """The network's values, clipped or squashed and scaled to the bounds of the action space."""
 
     def evaluate(x: Observations, double: bool) -> Values:
         y = net(x, double)
@@ -158,18 +213,40 @@ def read_sb3(archive: Archive, what: str, ignored: tuple[str, ...] | None = None
         scaled: Values = lower + 0.5 * (y + 1) * (upper - lower)
         return scaled
 
-    finite = bool(np.all(np.isfinite(bounds)))
-    who = "what its policy_kwargs say" if "activation_fn" in given else "the default of its kind"
-    said = "squashed by tanh" if squashed else "clipped"
-    within = "" if bound is None else f", their means clipped to {bound:g} before it"
-    return Reading(
-        words=f"stable-baselines3 {kind.words} {widths(layers)}{joined}, actions {said}{within}",
-        steps=(*between(layers, activation), *_to_the_bounds(low, high, squashed, bound, what)),
-        evaluate=evaluate,
-        action=tuple(zip(exactly(low), exactly(high), strict=True)) if finite else None,
-        assumed=f"{activation} between the layers is {who}, the rest is how stable-baselines3 documents its policies",
-        unread=left | _elsewhere(archive),
-    )
+    return evaluate
+
+
+def _scores(actions: int, quantiles: int) -> tuple[tuple[Step, ...], str]:
+    """The steps from the last layer to the scores of so many actions, and what they are, for people."""
+    names = ", ".join(map(str, range(actions))) if actions <= _NAMED else f"0, 1, ..., {actions - 1}"
+    words = f"outputs are the scores of actions {names} in this order, of which the largest is taken"
+    if quantiles == 1:
+        return (), f"{words} (deterministic=True)"
+    # Of each quantile the scores of all actions come one behind the other.
+    share = Diagonal((Fraction(1, quantiles),), (Fraction(0),))
+    total = Affine(np.tile(np.eye(actions), quantiles), np.zeros(actions))
+    return (share, total), f"{words} (deterministic=True), each the mean of {quantiles} quantiles"
+
+
+def _means(net: Evaluate, quantiles: int) -> Evaluate:
+    """The network's values; of several quantiles their means."""
+
+    def evaluate(x: Observations, double: bool) -> Values:
+        y = net(x, double)
+        means: Values = y.reshape(len(y), quantiles, -1).mean(1)
+        return means
+
+    return evaluate
+
+
+def _quantiles(given: Mapping[str, Any], what: str) -> int:
+    """The number of quantiles of each action."""
+    count = given.get("n_quantiles", _QUANTILES)
+    if type(count) is not int or not 0 < count <= _MOST_QUANTILES:
+        raise InputError(
+            f"n_quantiles of {what} must be a whole number from 1 to {_MOST_QUANTILES}; found {brief(count)}."
+        )
+    return count
 
 
 def _to_the_bounds(low: Numbers, high: Numbers, squashed: bool, bound: float | None, what: str) -> list[Step]:
@@ -264,43 +341,6 @@ def _end(kind: _Class, given: Mapping[str, Any], exploration: Any, what: str) ->
     return squash, float(bound) if bound > 0 else None
 
 
-def _spaces(data: Mapping[str, Any], kind: _Class, what: str) -> tuple[int, str, Numbers]:
-    """The number of observations, their names where they are joined, and low and high of the actions, (2, m)."""
-    space = _value(data, "observation_space")
-    boxes = _parts(space, what) if kind.joined else {"": space}
-    sizes = {name: _box(box, f"observation_space {name}".rstrip() + f" of {what}") for name, box in boxes.items()}
-    action = _box(_value(data, "action_space"), f"action_space of {what}")
-    shapes = [low.shape for low, _ in sizes.values()]
-    if any(len(shape) != 1 for shape in shapes) or action[0].ndim != 1 or action[0].shape != action[1].shape:
-        raise InputError(f"the spaces of {what} must be boxes of one axis; found {shapes[0]}.")
-    named = ", ".join(f"{name} ({low.size})" for name, (low, _) in sizes.items())
-    return sum(shape[0] for shape in shapes), f" of {named}" if kind.joined else "", np.stack(action)
-
-
-def _parts(space: Any, what: str) -> dict[str, Any]:
-    """The spaces of a dictionary by their names; of another order versions of torch make different ones."""
-    found = None
-    if isinstance(space, Call) and isinstance(space.function, Name) and space.function.name == "Dict":
-        state = space.states[0] if len(space.states) == 1 and isinstance(space.states[0], dict) else {}
-        found = state.get("spaces")
-    if not isinstance(found, dict) or not found or not all(isinstance(name, str) for name in found):
-        raise InputError(f"observation_space of {what} must be a dictionary of boxes; found {brief(space)}.")
-    if list(found) != sorted(found):
-        raise InputError(f"the observations of {what} must be in the order of their names; found {', '.join(found)}.")
-    return found
-
-
-def _box(space: Any, what: str) -> tuple[Numbers, Numbers]:
-    """The bounds of a box, low and high."""
-    if not isinstance(space, Call) or not isinstance(space.function, Name) or space.function.name != "Box":
-        raise InputError(f"{what} must be a box; found {brief(space)}.")
-    state = space.states[0] if len(space.states) == 1 and isinstance(space.states[0], dict) else {}
-    low, high = (array_of(state.get(name), f"{name} of {what}") for name in ("low", "high"))
-    if any(a.dtype.kind != "f" or a.dtype.itemsize < 4 for a in (low, high)):
-        raise InputError(f"{what} must be of single or double precision; found {low.dtype}.")
-    return low, high
-
-
 def _layers(
     tensors: Mapping[str, Numbers], kind: _Class, within: bool, what: str, ignored: tuple[str, ...] | None
 ) -> tuple[list[Affine], dict[str, str]]:
@@ -327,7 +367,6 @@ def _layers(
             f"found {braced(tensors) or 'none'}."
         )
     layers = [linear(tensors[f"{name}.weight"], tensors.get(f"{name}.bias")) for name in names]
-    known = {
-        name: "the value, or the spread of actions, of training" for name in tensors if name.startswith(kind.others)
-    }
+    why = _OF_TRAINING if "box" in kind.actions else "the target network of training"
+    known = {name: why for name in tensors if name.startswith(kind.others)}
     return layers, unread(tensors, wanted, kind.hidden[-1], len(layers[-1].bias), ignored, known)
