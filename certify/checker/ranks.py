@@ -159,10 +159,6 @@ class Steps(Moving):
     def cover(self) -> Cover:
         return Cover(self.case)
 
-    @property
-    def batch(self) -> int:
-        return max(1, super().batch >> self.c.dynamics.jumps)
-
     def leaves(self) -> Iterator[Batch]:
         """The tree's leaves in batches; the cover is made before there are several processes."""
         self.cover  # noqa: B018
@@ -211,15 +207,28 @@ class Steps(Moving):
     def step(self, x: Form, numbers: Array, course: Course) -> tuple[Form, Array]:
         """The images of forms after a step, and which form each is of; and what the rules say of it. Of a form
         (1 + n + p n, n, B) the first n coefficients are those of the leaf's symbols, then come those of errors, n for
-        each step, the last step first.
+        each step, the last step first. Leaves may have more images than a batch has leaves.
         """
+        images, of = list[Form](), list[Array]()
+        for some in np.array_split(np.arange(len(numbers)), -(-len(numbers) // self.batch)):
+            for later, which in self.images(x[:, some], numbers[some], course):
+                images.append(later)
+                of.append(some[which])
+        which = np.concatenate(of)
+        left = np.bincount(which, minlength=len(numbers)) > 0
+        course.note("ranks", left, numbers, "every step is excluded")
+        error = Above(np.concatenate([v.error.top + 0 * v.value[0] for v in images], -1))
+        return Form(np.concatenate([v.value for v in images], -1), error), which
+
+    def images(self, x: Form, numbers: Array, course: Course) -> Iterator[tuple[Form, Array]]:
+        """The same, some images at a time."""
         c = self.c
         u = enclose_on_boxes(self.net, x)
         if not self.case.bounded:
             course.note("inputs", np.all(self.inputs_kept(x, u), axis=0), numbers, "an input may leave its bounds")
         states, inputs = self.models(x, u)
-        motions = list(self.motions(states, inputs))
-        motion, _ = motions[0]
+        held = [*inputs, *self.quantities(len(numbers))]
+        motion = Motion([], [states], held) if c.dynamics.jumps else self.motion(states, inputs)
         if c.sample:
             hold = self.in_domain(*motion.ends)
             course.note("flow", hold, numbers, "the state may leave the domain during a period")
@@ -228,38 +237,42 @@ class Steps(Moving):
             course.note("keep", np.all(hold, axis=0), numbers, "a constraint may be violated")
         hold = self.in_domain(*x.range.ends)
         course.note("ranks", hold, numbers, "the state may leave the domain")
-        each = [([x.at(some) for x in states], [g.at(some) for g in motion.G]) for motion, some in motions]
-        of = np.concatenate([some for _, some in motions])
-        later = self.form(
-            [joined(of_state) for of_state in zip(*(self.after(*moving) for moving in each), strict=True)]
+        every = (
+            self.jumped(states, held) if c.dynamics.jumps else [(self.after(states, motion.G), np.arange(len(hold)))]
         )
-        course.note("ranks", np.all(np.isfinite(later.size.top), axis=0), numbers[of], "F may be undefined")
-        return later, of
+        for models, some in filter(lambda each: len(each[1]), every):
+            later = self.form(models)
+            course.note("ranks", np.all(np.isfinite(later.size.top), axis=0), numbers[some], "F may be undefined")
+            yield later, some
 
-    def motions(self, states: list[Taylor], inputs: list[Taylor]) -> Iterator[tuple[Motion, Array]]:
-        """The motion on forms, and the forms on which it may be so: all, or where equations jump, for each choice of
-        heavisides those where none of them certainly is the other number."""
-        batch, jumps = len(states[0].c), self.c.dynamics.jumps
-        if not jumps:
-            yield self.motion(states, inputs), np.arange(batch)
-            return
-        held = [*inputs, *self.quantities(batch)]
-        for choice in product((0, 1), repeat=jumps):
+    def jumped(self, states: list[Taylor], held: list[Taylor]) -> Iterator[tuple[list[Taylor], Array]]:
+        """F on the forms where the signs of all arguments of heavisides are certain; for each choice of values, on
+        those others where none of them certainly is the other number."""
+        certain = np.ones(len(states[0].c), dtype=bool)
+
+        def choose(a: Taylor) -> Taylor:
+            above = upper_bound(-a) < 0
+            certain[np.logical_not(above | (upper_bound(a) < 0))] = False
+            return existing(a, above)
+
+        F, some = self.f(states, held, choose), np.flatnonzero(certain)
+        yield [v.at(some) for v in F], some
+        some = np.flatnonzero(np.logical_not(certain))
+        states, held = [v.at(some) for v in states], [v.at(some) for v in held]
+        for choice in product((0, 1), repeat=self.c.dynamics.jumps) if len(some) else ():
             F, possible = self.chosen(states, held, choice)
-            G = [f + -x for f, x in zip(F, states, strict=True)]
-            yield Motion(G, [states], held), np.flatnonzero(possible)
+            yield [v.at(possible) for v in F], some[possible]
 
     def chosen(self, states: list[Taylor], held: list[Taylor], choice: Sequence[int]) -> tuple[list[Taylor], Array]:
-        """F with these values of heavisides, and the forms (B,) where each may have its value."""
+        """F with these values of heavisides, and the forms where each may have its value."""
         values, possible = iter(choice), np.ones(len(states[0].c), dtype=bool)
 
         def choose(a: Taylor) -> Taylor:
             value = next(values)
             possible[upper_bound(a if value else -a) < 0] = False
-            chosen, exists = constants(a)(Fraction(value)), 0 * a.size.top
-            return Taylor(chosen.c, chosen.p, Above(exists))
+            return existing(a, np.full_like(possible, value))
 
-        return self.f(states, held, choose), possible
+        return self.f(states, held, choose), np.flatnonzero(possible)
 
     def form(self, models: list[Taylor]) -> Form:
         """Models in the symbols that they keep, and in new ones of errors that have all else."""
@@ -317,10 +330,10 @@ class Steps(Moving):
         return [reduce(add, [*V, number(Fraction(-self.c.c2))])]
 
 
-def joined(models: Sequence[Taylor]) -> Taylor:
-    """Models on several batches as those on one."""
-    r = np.concatenate([v.r.top + 0 * v.c for v in models])
-    return Taylor(np.concatenate([v.c for v in models]), np.concatenate([v.p for v in models], -1), Above(r))
+def existing(a: Taylor, values: Array) -> Taylor:
+    """0 or 1 on each form, and nothing where a may not exist."""
+    zero = constants(a)(Fraction(0))
+    return Taylor(np.where(values, 1.0, 0.0), zero.p, Above(0 * a.size.top))
 
 
 def moved(x: Array, turns: Array) -> tuple[Array, Array]:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from certify.analysis import acceptance
 from certify.analysis.reaching import ReachOptions, certify_reach
 from certify.analysis.reaching.runs import Simulation
 from certify.certificates import parse_any
@@ -24,12 +23,6 @@ from tests.support.foreign import ROOT
 from tests.support.loops import box
 
 PLANT = ROOT / "examples" / "plants" / "gymnasium" / "mountain_car_actions.toml"
-
-
-@pytest.fixture(autouse=True)
-def without_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The reference does not read jumps yet; where there is much to examine it is not asked."""
-    monkeypatch.setattr(acceptance, "_LEAVES", 0)
 
 
 @pytest.fixture(scope="module")

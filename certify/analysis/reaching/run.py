@@ -223,7 +223,7 @@ def _searched(
     if options.begin is not None:
         lo, hi = (np.array([float(pair[k]) for pair in options.begin]) for k in (0, 1))
         most = UNPROVED - 1 if options.within is None else options.within
-        direct = _DIRECT if 0 < max(arrivals, default=0) <= MOST_STEPS else 0
+        direct = _DIRECT if 0 < min(filter(None, arrivals), default=0) <= MOST_STEPS else 0
         wanted = Wanted(np.nextafter(lo, -np.inf), np.nextafter(hi, np.inf), most, direct, arrivals)
     found = prove_ranks(question, effort, runner, report, wanted)
     if runner.remark is not None:

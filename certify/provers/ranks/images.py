@@ -12,7 +12,7 @@ FORMAT.md has the same in its chapter on ranks; boxes here are wider by more tha
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import product as choices
 from typing import NamedTuple
@@ -254,19 +254,27 @@ class Course:
         return self.form(after), of, kept[of] & finite, lost[of]
 
     def _stepped(self, values: Mapping[Symbol, Taylor], like: Taylor) -> tuple[list[Taylor], Index]:
-        """The next states in discrete time, for each choice of heavisides those that may have it, one after the other
-        of the same state; and of which states they are."""
-        each, some = list[list[Taylor]](), list[Index]()
+        """The next states in discrete time, and of which states each is: of those where the signs of all arguments of
+        heavisides are certain; of others those that each choice of values may lead to."""
+        each, of = list[list[Taylor]](), list[Index]()
+
+        def follow(some: Index, choice: Sequence[int] | None) -> Mask:
+            models, known = _Chosen(like.at(some), choice), dict[Expression, Taylor]()
+            here = {symbol: v.at(some) for symbol, v in values.items()}
+            after = [evaluate(expression, here, models, known) for expression in self.dynamics]
+            there = np.flatnonzero(models.possible)
+            each.append([v.at(there) for v in after])
+            of.append(some[there])
+            return models.possible
+
+        every = np.arange(len(like.c))
+        left = every[~follow(every, None)]
+        if not len(left):
+            return each[0], of[0]
         for choice in choices((0, 1), repeat=self.jumps):
-            models, known = _Chosen(like, choice), dict[Expression, Taylor]()
-            after = [evaluate(expression, values, models, known) for expression in self.dynamics]
-            if not self.jumps:
-                return after, np.arange(len(like.c))
-            some.append(np.flatnonzero(models.possible))
-            each.append([v.at(some[-1]) for v in after])
-        of = np.concatenate(some)
-        order = np.argsort(of, kind="stable")
-        return [_joined(of_state).at(order) for of_state in zip(*each, strict=True)], of[order]
+            follow(left, choice)
+        order = np.argsort(np.concatenate(of), kind="stable")
+        return [_joined(of_state).at(order) for of_state in zip(*each, strict=True)], np.concatenate(of)[order]
 
     def in_domain(self, below: Array, above: Array) -> Mask:
         """True on boxes (n, B) inside the domain, but for angles."""
@@ -292,17 +300,22 @@ class Course:
 
 
 class _Chosen(Models):
-    """Models with chosen values of heavisides, in the order of evaluation, and the boxes where each may be."""
+    """Models with chosen values of heavisides, in the order of evaluation, and the boxes where each may be; without a
+    choice those that are certain."""
 
-    def __init__(self, like: Taylor, choice: Sequence[int]) -> None:
+    def __init__(self, like: Taylor, choice: Sequence[int] | None) -> None:
         super().__init__(like)
-        self.left, self.possible = iter(choice), np.ones(len(like.c), dtype=bool)
+        self.left, self.possible = None if choice is None else iter(choice), np.ones(len(like.c), dtype=bool)
 
     def function(self, name: str, value: Taylor) -> Taylor:
         if name != JUMP:
             return super().function(name, value)
+        above, below = upper_bound(value.scaled(-1.0))[0] < 0, upper_bound(value)[0] < 0
+        if self.left is None:
+            self.possible &= above | below
+            return replace(self.zero, c=np.where(above, 1.0, 0.0))
         chosen = next(self.left)
-        self.possible &= ~(upper_bound(value.scaled(1.0 if chosen else -1.0))[0] < 0)
+        self.possible &= ~(below if chosen else above)
         return self.constant(Fraction(chosen))
 
 
