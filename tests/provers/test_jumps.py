@@ -12,6 +12,7 @@ import pytest
 
 from certify import heaviside
 from certify.analysis.reaching import ReachOptions, ReachResult, certify_reach
+from certify.certificates import run_checker
 from certify.certificates.verdict import Verdict
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
@@ -21,6 +22,7 @@ from certify.loop.policies import PolicyNetwork
 from certify.loop.rigorous import states_after
 from certify.provers.ranks.images import Course
 from certify.provers.ranks.targets import Nothing
+from certify.report.drawn import page_of
 from tests.support.loops import box
 from tests.support.reference import judge_bytes
 
@@ -173,3 +175,11 @@ u = [-1, 1]
         with pytest.raises(InputError) as error:
             load_system(path)
         assert right in str(error.value)
+
+
+def test_pages_and_both_checkers_say_what_a_jump_is(tmp_path: Path) -> None:
+    path = asked(saw("3/10"), tmp_path, "x**2 <= 0.01", begin=((Fraction(0), Fraction(3, 2)),)).certificate
+    assert path is not None
+    assert "where v = 0 it may be either, at each step anew" in page_of(path.read_bytes(), path, None, None)
+    assert "0 where v < 0, either where v = 0" in "\n".join(run_checker(path)["text"])
+    assert "a heaviside of 0 being 0 or 1 at each step anew" in str(run_checker(path, program="reference"))

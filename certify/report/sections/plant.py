@@ -8,7 +8,7 @@ from fractions import Fraction
 from typing import Any
 
 from certify.certificates import AnyCertificate, Certificate
-from certify.loop.expressions import Expression, Number, Symbol, nodes
+from certify.loop.expressions import Expression, Number, Symbol, jumping, nodes
 from certify.loop.plants import System, input_errors
 from certify.report.mathml import identifier, is_long, multiplied_out, typeset
 from certify.report.measured import Measured
@@ -44,6 +44,7 @@ def plant_of(certificate: AnyCertificate) -> dict[str, Any]:
     return {
         "name": system.name,
         "equations": [_equation(s, e, steps=steps) for s, e in zip(system.states, expressions, strict=True)],
+        "jumps": bool(jumping(*expressions)),
         "rounded": any(map(is_long, _numbers(expressions, system.exact_u_eq()))),
         "domain": [interval(s.name, b) for s, b in zip(system.states, system.domain, strict=True)],
         "inputs": [interval(s.name, b) for s, b in zip(system.inputs, system.input_bounds, strict=True)],
