@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from certify.checker.ranks import Steps
 from certify.reference import rules
 from certify.reference.document import read
 from tests.support.certificates import edited
@@ -480,16 +481,21 @@ def drawn(chance: random.Random, n: int) -> tuple[list[Any], list[Any]]:
     return trees, jumps
 
 
+def in_pieces(chance: random.Random) -> tuple[Document, list[Any], list[list[tuple[float, float]]], list[int]]:
+    """A claim to remain in leaves, the jumps, the leaves, and how many steps each takes."""
+    n = chance.randint(1, 2)
+    trees, jumps = drawn(chance, n)
+    depth = chance.choice([0, 1, 2, 3])
+    _, leaves = uniform([-1.0] * n, [1.0] * n, depth)
+    steps = [chance.choice([1, 1, 2, 2, 0]) if depth else chance.randint(1, 2) for _ in leaves]
+    return document(trees, [-1.0] * n, [1.0] * n, depth, [2 if k else NO for k in steps], steps), jumps, leaves, steps
+
+
 def test_affine_pieces_as_rationals_have_them() -> None:
     """All coefficients are multiples of 1/16, so that many edges coincide exactly, and nothing is rounded."""
     chance, count = random.Random(5), {True: 0, False: 0}
     for _ in range(120):
-        n = chance.randint(1, 2)
-        trees, jumps = drawn(chance, n)
-        depth = chance.choice([0, 1, 2, 3])
-        _, leaves = uniform([-1.0] * n, [1.0] * n, depth)
-        steps = [chance.choice([1, 1, 2, 2, 0]) if depth else chance.randint(1, 2) for _ in leaves]
-        data = document(trees, [-1.0] * n, [1.0] * n, depth, [2 if k else NO for k in steps], steps)
+        data, jumps, leaves, steps = in_pieces(chance)
         kept = list(zip(leaves, map(bool, steps), strict=True))
         good = all(stays(data, jumps, leaf, k, kept) for leaf, k in zip(leaves, steps, strict=True) if k)
         assert (found(data) is None) == good
@@ -532,3 +538,18 @@ def test_the_checker_has_the_same_limits() -> None:
     assert by_checker(document([GROWS], [-4.0], [4.0], 4, [3] * 16, [1, 2, 3, 1] * 4)) is None
     assert by_checker(on_unit(plus("1/2", H(APART), ["-", H(plus("x", "-1/2"))]))) is None
     assert by_checker(on_unit(plus("x", H(["-", ["sin", "x"], "1/2"])), -3.25, 3.25, angles=("x",))) is None
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_the_checker_says_the_same_in_small_batches(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A leaf may then have more images than a batch has places, and all leaves must keep their own."""
+    chance = random.Random(11)
+    every = [in_pieces(chance)[0] for _ in range(60)]
+    every += [document([GROWS], [-4.0], [4.0], 4, [3] * 16, [1, 2, 3, 1] * 4), *(d for _, d in within(HAIR))]
+    for first in (12, 11, 10):
+        left = [k if i < first else 0 for i, k in enumerate([1, 2, 3, 1] * 4)]
+        every.append(document([GROWS], [-4.0], [4.0], 4, [3 if k else NO for k in left], left))
+    said = [by_checker(data) for data in every]
+    assert None in said and any(said)
+    monkeypatch.setattr(Steps, "batch", size)
+    assert [by_checker(data) for data in every] == said
