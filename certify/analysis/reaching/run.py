@@ -178,18 +178,17 @@ def _proved(
     """The result of the search, and of the check of what it finds."""
     options, system = result.options, goal.loop.system
     whole = tuple(zip(*map(_exactly, root_box(goal.loop)), strict=True))
-    longest = 0 if result.runs is None or result.runs.longest is None else result.runs.longest
+    arrivals = () if result.runs is None else result.runs.arrivals
     clerk = tools.clerk(path, options.jobs, True, options.cluster)
     search = effort.share(_FOR_SEARCH)
     question = goal.question(begins(options.begin or whole)[:_PROBES].T, search, clerk.tried)
     if options.begin is not None:
         with tools.timing("ranks"):
-            most = min(longest or MOST_STEPS, MOST_STEPS)
+            most = min(max(arrivals, default=0) or MOST_STEPS, MOST_STEPS)
             question = with_memory(question, *_parts(options.begin), most, search)
     angles = system.angles if goal.given is None else tuple(system.states[i].name for i in goal.turned)
     require_periodic(system, angles, question.root, partial(goal.certificate, question, provenance={}), clerk)
     with tools.timing("ranks"), runner_at(options.cluster) as runner:
-        arrivals = () if result.runs is None else result.runs.arrivals
         found = _searched(question, options, arrivals, search, runner, tools)
     evidence = None if found is None else _within(found.evidence, options.within)
     if found is None or evidence is None:

@@ -10,7 +10,7 @@ from collections.abc import Collection, Sequence
 
 _MODULES = ("np", "numpy", "math", "cmath", "sympy", "sp", "torch", "jnp", "jax", "scipy", "casadi", "ca", "tf")
 _NO_JUMPS = "equations must have no jumps but heaviside, in discrete time"
-_STEP = f"{_NO_JUMPS}; in other time a step from 0 to 1 where y changes its sign is (1 + tanh(50*y))/2"
+_STEP = f"{_NO_JUMPS}; in continuous time a step from 0 to 1 where y changes its sign is (1 + tanh(50*y))/2"
 _ANGLE = "an angle needs no wrapping, since sin and cos repeat"
 _TABLE = "a table with lines between its points is a sum such as y0 + k0*(x - x0) + (k1 - k0)*max(x - x1, 0) + ..."
 # {x} and {y} are the arguments, {X} and {Y} the same in brackets where they need some.

@@ -154,7 +154,7 @@ def _check_jumps(system: System) -> None:
     if jumps and system.time != "discrete":
         y = jumps[0].operands[0]
         raise InputError(
-            f"equations may jump in discrete time alone, and {system.name} has {jumps[0]}. Smooth it in other time, as "
+            f"equations may jump in discrete time alone, and {system.name} has {jumps[0]}. Smooth it, as "
             f"in (1 + tanh(50*({y})))/2."
         )
     if len(jumps) > MOST_JUMPS:

@@ -119,10 +119,10 @@ class Search:
 
     def take(self, nodes: Index, found: Images) -> None:
         """Take in the images of leaves."""
-        further, lo, hi = np.where(found.there[:, :, None], np.nan, 0.0), found.lo, found.hi
+        further = np.where(found.there[:, :, None], np.nan, 0.0)
         self.place[nodes] = len(self.known[0]) + np.arange(len(nodes))
-        self.lo = np.concatenate([self.lo, (lo + further)[:, : self.kept]], -1)
-        self.hi = np.concatenate([self.hi, (hi + further)[:, : self.kept]], -1)
+        self.lo = np.concatenate([self.lo, (found.lo + further)[:, : self.kept]], -1)
+        self.hi = np.concatenate([self.hi, (found.hi + further)[:, : self.kept]], -1)
         self.known = np.concatenate([self.known, found.known], -1)
         self.there = np.concatenate([self.there, found.arrived], -1)
         self.steep[:, nodes] = found.steep
