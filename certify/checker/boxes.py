@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from itertools import chain, islice
 from typing import Any, TypeVar
 
@@ -129,13 +130,12 @@ class Boxes(ABC):
 
     def f(self, states: list[Taylor], held: list[Taylor], choose: Any = None) -> list[Taylor]:
         """f of states, and of inputs and uncertain quantities; `choose` gives the value of a heaviside."""
-        constant, variables = constants(held[0]), [*states, *held]
-        if not self.c.dynamics.calls:
-            return evaluate(self.c.dynamics, constant, variables, None, choose)
-        from .calls import entries
+        calling = None
+        if self.c.dynamics.calls:
+            from .calls import entries
 
-        calling = lambda call, given: entries(call, given, self.calls)  # noqa: E731
-        return evaluate(self.c.dynamics, constant, variables, calling, choose)
+            calling = partial(entries, first=self.calls)
+        return evaluate(self.c.dynamics, constants(held[0]), [*states, *held], calling, choose)
 
     def kept(self, courses: list[list[Taylor]], held: list[Taylor], gaps: Sequence[Callable[[Array], Taylor]]) -> Array:
         """True for each constraint and box on which it is negative at all of these states where no gap is, (K, B)."""
