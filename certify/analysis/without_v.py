@@ -164,7 +164,7 @@ def require_periodic(
     """
     if not angles:
         return
-    nothing = RankTree(*root, bytes([LEAF]), np.array([UNPROVED], np.uint16), np.zeros(1, np.uint8))
+    nothing = RankTree(*root, bytes([LEAF]), np.array([UNPROVED], np.uint16), np.zeros(1, np.uint16))
     answer = clerk.tried(certificate(nothing, Ranks(angles, 1)))
     if answer.get("rule") == "angles":
         raise InputError(

@@ -17,6 +17,7 @@ from certify.errors import InputError
 
 Array = NDArray[np.float64]
 _OF_A_BALL = ("J", "multipliers", "weight")
+_MOST_OF_A_BYTE = 255
 _OF_A_PATH = ("share", "edge", "motion", "joint")
 
 
@@ -131,7 +132,7 @@ class RankTree:
     hi: Array
     tree: bytes
     ranks: NDArray[np.uint16]
-    steps: NDArray[np.uint8]
+    steps: NDArray[np.uint16]
     frame: Array | None = None
     memory: int = 1
 
@@ -159,7 +160,7 @@ class RankTree:
     def without(self, dropped: NDArray[np.bool_]) -> RankTree:
         """The same without the ranks of some leaves, (N,)."""
         ranks = np.where(dropped, UNPROVED, self.ranks).astype(np.uint16)
-        return replace(self, ranks=ranks, steps=np.where(dropped, 0, self.steps).astype(np.uint8))
+        return replace(self, ranks=ranks, steps=np.where(dropped, 0, self.steps).astype(np.uint16))
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,7 +294,8 @@ def _read_outer_tree(data: Mapping[str, Any], n: int) -> OuterTree:
 
 
 def _rank_tree(evidence: RankTree) -> dict[str, Any]:
-    numbers = {"ranks": evidence.ranks.astype("<u2").tobytes(), "steps": evidence.steps.astype("u1").tobytes()}
+    size = "<u2" if evidence.steps.max(initial=0) > _MOST_OF_A_BYTE else "u1"
+    numbers = {"ranks": evidence.ranks.astype("<u2").tobytes(), "steps": evidence.steps.astype(size).tobytes()}
     parts = {"tree": evidence.tree, **numbers}
     others: dict[str, Any] = {} if evidence.frame is None else {"frame": encode(evidence.frame)}
     others |= {} if evidence.memory == 1 else {"memory": evidence.memory}
@@ -305,7 +307,8 @@ def _read_rank_tree(data: Mapping[str, Any], n: int) -> RankTree:
     tree, ranks, steps = (base64.b64decode(data[name]) for name in ("tree", "ranks", "steps"))
     corners = decode(data["lo"], (n,)), decode(data["hi"], (n,))
     frame = decode(data["frame"], (n, n)) if "frame" in data else None
-    of_leaves = np.frombuffer(ranks, "<u2").astype(np.uint16), np.frombuffer(steps, np.uint8)
+    size = "<u2" if len(steps) == len(ranks) else "u1"
+    of_leaves = (np.frombuffer(octets, kind).astype(np.uint16) for octets, kind in ((ranks, "<u2"), (steps, size)))
     return RankTree(*corners, tree, *of_leaves, frame, data.get("memory", 1))
 
 

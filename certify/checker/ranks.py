@@ -28,7 +28,7 @@ from .near import Above, Array, Form, Near, all_near, near, near_ball
 from .network import enclose_on_boxes
 from .periodic import is_periodic
 from .ring import Motion, Moving
-from .sections import MAX_RANK
+from .sections import MAX_RANK, Ranks
 from .taylor import Taylor, affine, combination, constants, upper_bound
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class Cover:
         self.axis = np.frombuffer(ranks.tree, dtype=np.uint8).astype(np.int64)
         self.split, self.right = np.zeros(count), np.zeros(count, dtype=np.int64)
         self.most, self.least = np.full(count, MAX_RANK), np.zeros(count, dtype=np.int64)
-        self._fill(ranks.tree, ranks.lo.tolist(), ranks.hi.tolist(), two_bytes(ranks.ranks).tolist())
+        self._fill(ranks.tree, ranks.lo.tolist(), ranks.hi.tolist(), numbers_of(ranks)[0].tolist())
 
     def _fill(self, tree: bytes, lo: list[float], hi: list[float], ranks: list[int]) -> None:
         """Splits, upper halves, and the highest and the lowest rank below each node, in preorder."""
@@ -152,7 +152,7 @@ class Steps(Moving):
         self.order = self.ranks.order
         self.frame = np.eye(n) if self.ranks.frame is None else self.ranks.frame
         self.back = all_near(fraction(v) for v in given(inverse(exactly(self.frame))).transpose().entries())
-        self.rank, self.count = two_bytes(self.ranks.ranks), np.frombuffer(self.ranks.steps, np.uint8).astype(np.int64)
+        self.rank, self.count = numbers_of(self.ranks)
         self.straight = [i for i in range(n) if i not in self.ranks.angles]  # states that are no angles
 
     @cached_property
@@ -342,9 +342,11 @@ def moved(x: Array, turns: Array) -> tuple[Array, Array]:
     return np.where(turns == 0, x, below), np.where(turns == 0, x, above)
 
 
-def two_bytes(octets: bytes) -> Array:
-    """Numbers of two bytes each, the lower first."""
-    return np.frombuffer(octets, dtype="<u2").astype(np.int64)
+def numbers_of(ranks: Ranks) -> tuple[Array, Array]:
+    """The ranks and the steps of all leaves: numbers of two bytes, the lower first, of steps also of one."""
+    size = "<u2" if len(ranks.steps) == len(ranks.ranks) else "u1"
+    rank, steps = np.frombuffer(ranks.ranks, dtype="<u2"), np.frombuffer(ranks.steps, dtype=size)
+    return rank.astype(np.int64), steps.astype(np.int64)
 
 
 def is_stated(case: Case) -> Failures:
@@ -357,9 +359,9 @@ def is_stated(case: Case) -> Failures:
     if ranks.frame is not None and inverse(exactly(ranks.frame)) is None:
         yield "evidence.ranks.frame", "it must have an inverse"
     leaves = yield from is_whole(ranks.tree, range(n), "ranks, ")
-    if (len(ranks.ranks), len(ranks.steps)) != (2 * leaves, leaves):
-        yield "evidence.ranks", f"there must be two bytes of ranks and one of steps for each of {leaves} leaves"
-    rank, count = two_bytes(ranks.ranks), np.frombuffer(ranks.steps, dtype=np.uint8).astype(np.int64)
+    if len(ranks.ranks) != 2 * leaves or len(ranks.steps) not in (leaves, 2 * leaves):
+        yield "evidence.ranks", f"there must be two bytes of ranks and one or two of steps for each of {leaves} leaves"
+    rank, count = numbers_of(ranks)
     resting = (rank == 0) | (rank == MAX_RANK)
     hold = np.where(resting, count == 0, (count > 0) & (count <= rank) & (rank <= ranks.most))
     if not np.all(hold):

@@ -81,6 +81,11 @@ def follow(some: Sequence[Box], cover: Cover, walk: Walk, target: Target | None)
                 cover.leads_to(rows, UNRANKED - 1 if target is None else rank - count, at)
 
 
+def pairs(octets: bytes) -> list[int]:
+    """Numbers of two bytes each, the lower first."""
+    return [low + 256 * high for low, high in zip(octets[::2], octets[1::2], strict=True)]
+
+
 class Cover:
     """The tree with what is needed to find the leaves that a box meets."""
 
@@ -94,9 +99,9 @@ class Cover:
             require(whole, RULE, name, "an angle's ends are not certain to be more than 2 pi apart")
         count = structure(self.tree, range(c.n), RULE)
         require(len(ranking.ranks) == 2 * count, RULE, "ranks", f"two bytes for each of {count} leaves were expected")
-        require(len(ranking.steps) == count, RULE, "steps", f"a byte for each of {count} leaves was expected")
-        self.ranks = [ranking.ranks[2 * i] + 256 * ranking.ranks[2 * i + 1] for i in range(count)]
-        self.steps = list(ranking.steps)
+        one, two = (len(ranking.steps) == size * count for size in (1, 2))
+        require(one or two, RULE, "steps", f"one or two bytes for each of {count} leaves were expected")
+        self.ranks, self.steps = pairs(ranking.ranks), pairs(ranking.steps) if two else list(ranking.steps)
         for i, (r, k) in enumerate(zip(self.ranks, self.steps, strict=True)):
             good = k == 0 if r in (0, UNRANKED) else 0 < k <= r <= stated.steps
             require(good, RULE, f"ranks leaf {i}", f"{k} steps with rank {r}, of at most {stated.steps}")

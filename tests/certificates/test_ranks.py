@@ -169,7 +169,7 @@ def one_row() -> Ranked:
     certificate = made.linear()
     tree = RankTree(
         np.zeros(1), np.full(1, 4.0), bytes([0, 0, 255, 255, 0, 255, 255]),
-        np.array([0, 3, UNPROVED, 9], dtype=np.uint16), np.array([0, 1, 0, 1], dtype=np.uint8),
+        np.array([0, 3, UNPROVED, 9], dtype=np.uint16), np.array([0, 1, 0, 1], dtype=np.uint16),
     )  # fmt: skip
     inner = replace(region_of(certificate).ellipsoids[0], P=np.eye(1), level=0.25)
     return Ranked(tree, inner)

@@ -188,6 +188,32 @@ def test_ranks_that_run_in_a_circle(sign: str) -> None:
         assert verdicts(loop.document([-2.0], [2.0], tree, two_bytes(ranks), bytes(steps))) == ("ranks", "ranks")
 
 
+# -------------------------------------------------------------------------------------------------------- many steps
+
+
+def slow(count: int, steps: bytes) -> Document:
+    """x+ = x - 1/64 from [1, 2] to below 0, one leaf with a rank of so many steps; all numbers are exact."""
+    loop = Loop([["-", "x", "1/64"]], [affine([[0.0]])], ["x"])
+    return loop.document([1.0], [2.0], b"\xff", two_bytes([count]), steps)
+
+
+def test_steps_have_one_byte_or_two() -> None:
+    """The upper end is at 0 after 128 steps, an image that may have them rounded outward after 129."""
+    assert verdicts(slow(129, bytes([129]))) == verdicts(slow(129, two_bytes([129]))) == (None, None)
+    assert verdicts(slow(128 - 1, bytes([127]))) == verdicts(slow(127, two_bytes([127]))) == ("ranks", "ranks")
+    assert verdicts(slow(385, two_bytes([129]))) == (None, None)  # a rank may be higher
+    for octets in (b"", b"\x81\0\0", b"\x81\1", b"\0\x81"):  # none, three, 385 steps of a rank of 129, 33,024
+        assert verdicts(slow(129, octets)) == ("ranks", "ranks")
+
+
+@pytest.mark.parametrize(("speed", "rule"), [("1/200", None), ("1/201", "ranks")])
+def test_a_leaf_may_have_more_steps_than_a_byte_can_say(speed: str, rule: str | None) -> None:
+    """After 401 steps of 1/200 the upper end of [1, 2] is below 0, after as many of 1/201 it is not."""
+    loop = Loop([["-", "x", speed]], [affine([[0.0]])], ["x"])
+    assert verdicts(loop.document([1.0], [2.0], b"\xff", two_bytes([401]), two_bytes([401]))) == (rule, rule)
+    assert verdicts(loop.document([1.0], [2.0], b"\xff", two_bytes([401]), bytes([401 - 256]))) == ("ranks", "ranks")
+
+
 # -------------------------------------------------------------------------------------------------------------- words
 
 

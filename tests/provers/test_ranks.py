@@ -362,7 +362,7 @@ def test_more_effort_proves_more() -> None:
 
 def test_without_a_leaf_higher_ranks_go() -> None:
     tree = RankTree(
-        np.zeros(1), np.ones(1), b"\x00\x00\xff\xff\xff", np.array([0, 3, 5], np.uint16), np.array([0, 3, 2], np.uint8)
+        np.zeros(1), np.ones(1), b"\x00\x00\xff\xff\xff", np.array([0, 3, 5], np.uint16), np.array([0, 3, 2], np.uint16)
     )
     left = without_leaf(tree, 2)
     assert left is not None

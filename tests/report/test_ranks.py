@@ -132,7 +132,7 @@ def made_up(n: int) -> Certificate:
     read = parse_certificate(raw, "cube")
     assert isinstance(read.evidence, PartitionTree)
     tree = RankTree(-np.ones(n), np.ones(n), bytes([0, 255, 255]), np.array([4, UNPROVED], np.uint16),
-                    np.array([4, 0], np.uint8))  # fmt: skip
+                    np.array([4, 0], np.uint16))  # fmt: skip
     claim = replace(read.claim, ranks=Ranks((), 4))
     return replace(read, claim=claim, evidence=replace(read.evidence, ranks=tree))
 

@@ -122,7 +122,7 @@ def with_ranks(
     tree = uniform(depth, len(lo))
     turned = [s.name in system.angles for s in system.states]
     ranks = search(made, image, lo, hi, tree, turned)
-    steps = np.where((ranks > 0) & (ranks != UNPROVED), STEPS, 0).astype(np.uint8)
+    steps = np.where((ranks > 0) & (ranks != UNPROVED), STEPS, 0).astype(np.uint16)
     evidence = replace(made.evidence, ranks=RankTree(lo, hi, tree, ranks, steps))
     most = int(ranks[ranks != UNPROVED].max())
     kept = tuple(system.uncertain_constraints().values()) if keep else ()

@@ -43,9 +43,10 @@ class Images(NamedTuple):
 
     Parameters
     ----------
-    lo, hi : (K, R, n, B); NaN where there are no more images, as of those that were in the target before.
-    there : (K, R, B), the image lies in the target.
-    known : (K, B), all images of the box are of use.
+    lo, hi : (k, R, n, B), of the first k numbers of steps; NaN where there are no more images, as of those that were
+        in the target before.
+    there : (k, R, B), the image lies in the target.
+    known, arrived : (K, B), all images of the box are of use; all are, or were before, in the target.
     inside, meets : (B,), the box itself does; it may have states there.
     loose : (B,), all that is asked for in the first step may hold in a part of the box, though not in all of it.
     fails : (B,), the first step violates a constraint from everywhere in the box, or leaves the domain.
@@ -58,6 +59,7 @@ class Images(NamedTuple):
     hi: Array
     there: Mask
     known: Mask
+    arrived: Mask
     inside: Mask
     meets: Mask
     loose: Mask
@@ -68,15 +70,9 @@ class Images(NamedTuple):
 
     @property
     def widths(self) -> Array:
-        """The largest width of a box's images, (K, n, B); NaN where they are of no use."""
+        """The largest width of a box's images, (k, n, B); NaN where they are of no use."""
         widths: Array = np.fmax.reduce(self.hi - self.lo, axis=1)
         return widths
-
-    @property
-    def arrived(self) -> Mask:
-        """True where all of a box's images are, or were before, in the target, (K, B)."""
-        arrived: Mask = self.known & (self.there | np.isnan(self.lo[:, :, 0])).all(1)
-        return arrived
 
 
 @dataclass(frozen=True)
@@ -107,7 +103,7 @@ class Course:
     angles : the states that are angles, by their numbers.
     keep : expressions that have to stay negative.
     root : the widths of the root box, (n,).
-    counts : the numbers of steps after which images are wanted, ascending.
+    counts : the numbers of steps after which images are wanted, ascending; corners of the first `kept` alone, or all.
     order : of the series in time, where inputs are held.
     frame : N, (n, n), in whose coordinates N x errors are bounded; None: in those of the states.
     memory : p, the number of steps for which errors stay symbols.
@@ -123,12 +119,14 @@ class Course:
         keep: Sequence[Expression],
         root: Array,
         counts: Sequence[int],
+        kept: int | None = None,
         order: int = 2,
         frame: Array | None = None,
         memory: int = 1,
     ) -> None:
         self.system, self.target, self.constraints = loop.system, target, ConstraintModels(loop.system, keep)
-        self.angles, self.root, self.counts, self.frame = tuple(angles), root, tuple(counts), frame
+        self.angles, self.root, self.frame = tuple(angles), root, frame
+        self.counts, self.kept = tuple(counts), len(counts) if kept is None else kept
         self.into = np.eye(self.system.n) if frame is None else frame
         self.back = np.linalg.inv(self.into)
         self.doubt = 1e-12 + 16 * EPS * float(np.linalg.cond(self.into))  # relative, of errors: also of the inverse
@@ -154,15 +152,16 @@ class Course:
 
     def _followed(self, lo: Array, hi: Array) -> Images:
         """The same for as many boxes as memory is meant for."""
-        n, batch, K = *lo.shape, len(self.counts)
+        (n, batch), K, k = lo.shape, len(self.counts), self.kept
         centre = 0.5 * lo + 0.5 * hi
         radius = np.maximum(hi - centre, centre - lo) * (1 + EPS)
         slopes, errors = np.eye(n)[:, :, None] * radius, np.zeros((n, self.symbols - n, batch))
         form = Form(np.concatenate([centre[:, None], slopes, errors], 1))
         found = Images(
-            np.full((K, self.ways, n, batch), np.nan),
-            np.full((K, self.ways, n, batch), np.nan),
-            np.zeros((K, self.ways, batch), dtype=bool),
+            np.full((k, self.ways, n, batch), np.nan),
+            np.full((k, self.ways, n, batch), np.nan),
+            np.zeros((k, self.ways, batch), dtype=bool),
+            np.zeros((K, batch), dtype=bool),
             np.zeros((K, batch), dtype=bool),
             self.is_there(form),
             ~self.target.misses(form.x, self.angles),
@@ -213,8 +212,10 @@ class Course:
         n, starts = self.system.n, np.flatnonzero(np.diff(of, prepend=-1))
         there, (below, above), box = self.is_there(form), form.box, of[starts]
         number = np.arange(len(of)) - np.repeat(starts, np.diff(starts, append=len(of)))
-        found.known[k, box], found.there[k, number, of] = True, there
-        found.lo[k, number, :, of], found.hi[k, number, :, of] = below.T, above.T
+        found.known[k, box], found.arrived[k, box] = True, np.logical_and.reduceat(there, starts)
+        if k < self.kept:
+            found.there[k, number, of] = there
+            found.lo[k, number, :, of], found.hi[k, number, :, of] = below.T, above.T
         width = np.maximum.reduceat(self._width(form), starts)
         steep = np.abs(form.x[:, 1 : n + 1]) / self.root[:, None, None]
         further = width > widest[box]

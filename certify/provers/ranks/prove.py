@@ -59,11 +59,11 @@ class Question:
     frame: Array | None = None
     memory: int = 1
 
-    def course(self, counts: Sequence[int]) -> Course:
-        """The course of boxes through the loop, with images after so many steps."""
+    def course(self, counts: Sequence[int], kept: int | None = None) -> Course:
+        """The course of boxes through the loop, with images after so many steps, of the first `kept` or all."""
         (lo, hi), angles = self.root, turning(self.loop)
         by = self.order, self.frame, self.memory
-        return Course(self.loop, self.target, angles, self.keep, hi - lo, counts, *by)
+        return Course(self.loop, self.target, angles, self.keep, hi - lo, counts, kept, *by)
 
 
 def with_order(
@@ -229,7 +229,7 @@ def prove_ranks(
     else:
         searches = [SearchFrom(question.course(COUNTS_FROM), *question.root, wanted)]
         if wanted.direct:
-            searches.insert(0, Direct(question.course(wanted.straight), *question.root, wanted))
+            searches.insert(0, Direct(question.course(wanted.straight, 0), *question.root, wanted))
     boxes = rounds = 0
     for search in searches:
         with shared(runner, search.course) as bound:

@@ -31,10 +31,7 @@ Promising = Callable[[Array], Mask]
 
 
 class Search:
-    """Ranks of the leaves of a tree that grows; leaves with no `promising` state are halved last. Of the images of a
-    leaf after each number of steps so many are `kept`, or else all."""
-
-    kept: int | None = None
+    """Ranks of the leaves of a tree that grows; leaves with no `promising` state are halved last."""
 
     def __init__(self, course: Course, lo: Array, hi: Array, promising: Promising | None = None) -> None:
         self.promising, self.hope = promising, np.full(1, np.nan)
@@ -42,7 +39,7 @@ class Search:
         K, n = len(course.counts), len(lo)
         self.rank, self.steps = np.full(1, UNPROVED), np.zeros(1, dtype=np.int64)
         self.place = np.zeros(1, dtype=np.int64)  # of a leaf's images among all; the first ones are none
-        self.lo, self.hi = np.full((2, K, course.ways, n, 1), np.nan)[:, :, : self.kept]
+        self.lo, self.hi = np.full((2, course.kept, course.ways, n, 1), np.nan)
         self.known, self.there = np.zeros((2, K, 1), dtype=bool)
         self.steep = np.zeros((n, 1))
         self.meets, self.loose = np.zeros(1, dtype=bool), np.zeros(1, dtype=bool)
@@ -121,8 +118,8 @@ class Search:
         """Take in the images of leaves."""
         further = np.where(found.there[:, :, None], np.nan, 0.0)
         self.place[nodes] = len(self.known[0]) + np.arange(len(nodes))
-        self.lo = np.concatenate([self.lo, (found.lo + further)[:, : self.kept]], -1)
-        self.hi = np.concatenate([self.hi, (found.hi + further)[:, : self.kept]], -1)
+        self.lo = np.concatenate([self.lo, found.lo + further], -1)
+        self.hi = np.concatenate([self.hi, found.hi + further], -1)
         self.known = np.concatenate([self.known, found.known], -1)
         self.there = np.concatenate([self.there, found.arrived], -1)
         self.steep[:, nodes] = found.steep
@@ -162,8 +159,8 @@ class Search:
     def images(self, nodes: Index) -> tuple[Index, Index, Index, Array, Array]:
         """The images of leaves that do not lie in the target: for each number of steps of a leaf that number's index
         and the leaf, and for each image the index of these, and its corners (n, I)."""
-        places = self.place[nodes]
-        k, at = np.nonzero(self.known[:, places] & ~self.there[:, places])
+        places, kept = self.place[nodes], self.course.kept
+        k, at = np.nonzero(self.known[:kept, places] & ~self.there[:kept, places])
         node = nodes[at]
         lo, hi = self.lo[k, :, :, places[at]], self.hi[k, :, :, places[at]]
         image, way = np.nonzero(np.isfinite(lo[:, :, 0]))
@@ -223,7 +220,7 @@ class Search:
         steps = np.where(known[leaves], self.steps[leaves], 0)
         lo, hi = (end[:, 0].copy() for end in self.cover.root)
         return RankTree(
-            lo, hi, tree, rank.astype(np.uint16), steps.astype(np.uint8), self.course.frame, self.course.memory
+            lo, hi, tree, rank.astype(np.uint16), steps.astype(np.uint16), self.course.frame, self.course.memory
         )
 
 

@@ -18,7 +18,7 @@ from certify.provers.ranks.images import Course, Images
 from certify.provers.ranks.search import Search
 
 COUNTS_FROM = (*range(1, 13), 14, 16, 20, 24, 32, 40, 50, 64, 80, 100, 120)
-MOST_STEPS = 255  # of a leaf
+MOST_STEPS = 2_000  # of a leaf that are looked at
 _GROWTH = 1.5  # of an image, relative to its leaf, that counts as none
 _NARROW = 1e-11  # share of the root box below which leaves are not halved
 _FALLS = 0.95  # of the volume without a rank from one round to the next, at most
@@ -142,9 +142,7 @@ class SearchFrom(Search):
 
 class Direct(SearchFrom):
     """Ranks of parts of a box whose own images lie in the target: its tree is one of the box itself, but for angles,
-    of which a tree has a turn. No other image is of use, or kept."""
-
-    kept = 0
+    of which a tree has a turn. No other image is of use."""
 
     def __init__(self, course: Course, lo: Array, hi: Array, wanted: Wanted) -> None:
         turning = np.isin(np.arange(len(lo)), course.angles)
