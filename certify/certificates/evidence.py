@@ -121,6 +121,7 @@ class RankTree:
         steps at the latest, 0 within it, 65,535 where nothing is said.
     steps : (N,), of each leaf: after so many steps its image lies in leaves of lower ranks, or in the target.
     frame : N, (n, n), in whose coordinates N x errors of images are bounded; None: in those of the states.
+    moving : they are bounded in directions that turn with them.
     memory : the steps for which errors of images stay symbols.
 
     Raises
@@ -134,6 +135,7 @@ class RankTree:
     ranks: NDArray[np.uint16]
     steps: NDArray[np.uint16]
     frame: Array | None = None
+    moving: bool = False
     memory: int = 1
 
     def __post_init__(self) -> None:
@@ -298,6 +300,7 @@ def _rank_tree(evidence: RankTree) -> dict[str, Any]:
     numbers = {"ranks": evidence.ranks.astype("<u2").tobytes(), "steps": evidence.steps.astype(size).tobytes()}
     parts = {"tree": evidence.tree, **numbers}
     others: dict[str, Any] = {} if evidence.frame is None else {"frame": encode(evidence.frame)}
+    others |= {"moving": True} if evidence.moving else {}
     others |= {} if evidence.memory == 1 else {"memory": evidence.memory}
     corners = {"lo": encode(evidence.lo), "hi": encode(evidence.hi)}
     return corners | others | {name: base64.b64encode(part).decode("ascii") for name, part in parts.items()}
@@ -309,7 +312,7 @@ def _read_rank_tree(data: Mapping[str, Any], n: int) -> RankTree:
     frame = decode(data["frame"], (n, n)) if "frame" in data else None
     size = "<u2" if len(steps) == len(ranks) else "u1"
     of_leaves = (np.frombuffer(octets, kind).astype(np.uint16) for octets, kind in ((ranks, "<u2"), (steps, size)))
-    return RankTree(*corners, tree, *of_leaves, frame, data.get("memory", 1))
+    return RankTree(*corners, tree, *of_leaves, frame, "moving" in data, data.get("memory", 1))
 
 
 def _ball(evidence: LocalBall | Slab) -> dict[str, str]:

@@ -126,8 +126,9 @@ class Tube:
 
 @dataclass(frozen=True)
 class RankTree:
-    """A partition tree of the box lo <= x <= hi, and of each leaf its rank and the number of its steps. `frame` is N of
-    the coordinates N x in which errors are bounded, None for the identity; errors stay symbols for `memory` steps."""
+    """A partition tree of the box lo <= x <= hi, and of each leaf its rank and the number of its steps. `frame` is F of
+    the coordinates F x in which errors are bounded, None for the identity, turned with them where it is `moving`; errors
+    stay symbols for `memory` steps."""
 
     lo: Row
     hi: Row

@@ -34,7 +34,7 @@ from certify.provers.ranks import (
     prove_ranks,
     root_box,
     with_frame,
-    with_memory,
+    with_errors,
     without_leaf,
 )
 from certify.provers.ranks.cover import Cover
@@ -268,17 +268,17 @@ def test_memory_is_taken_where_it_is_worth_its_price() -> None:
     turning, straight = turning_slowly(), question(bistable(), 0.01)
     begin = np.array([[0.5], [0.2]])
     box, effort = (begin - 0.05, begin + 0.05), Effort()
-    found = with_memory(turning, *box, 45, effort)
+    found = with_errors(turning, *box, 45, effort)
     assert found.memory > 1
     assert effort.spent >= 45 * found.course((1,)).operations
-    assert with_memory(straight, np.array([[0.1]]), np.array([[0.11]]), 10, UNLIMITED).memory == 1
+    assert with_errors(straight, np.array([[0.1]]), np.array([[0.11]]), 10, UNLIMITED).memory == 1
 
 
 def test_memory_is_not_tried_when_the_effort_is_over() -> None:
     """More memory takes more operations a step: one image is all that a run without effort is charged with."""
     turning, begin = turning_slowly(), np.array([[0.5], [0.2]])
     effort = Effort(1.0)
-    assert with_memory(turning, begin - 0.05, begin + 0.05, 45, effort).memory == 1
+    assert with_errors(turning, begin - 0.05, begin + 0.05, 45, effort).memory == 1
     assert effort.spent <= 45 * turning.course((1,)).operations
 
 

@@ -51,7 +51,7 @@ from certify.provers.ranks import (
     Wanted,
     prove_ranks,
     root_box,
-    with_memory,
+    with_errors,
     without_leaf,
 )
 
@@ -61,7 +61,8 @@ _RUNS = 1e10  # operations for simulated runs, a few seconds, which no effort is
 _FOR_SEARCH = 0.7  # share of the effort, the rest being for the check
 _DIRECT = 4000  # boxes that are looked at first where runs need few steps
 _SLOW, _DOUBT = 200, 1e-9  # runs from what is not proved; of the box's volume
-_PARTS = np.array([1.0, 3.0, 9.0])  # of a box in each direction, on which the memory of errors is tried
+_PARTS = np.array([1.0, 3.0, 9.0])  # of a box in each direction, on which ways to bound errors are tried
+_NARROW, _PLACES = np.array([2.0**9, 2.0**18]), 12  # the same elsewhere in it
 _MENDED = 20  # leaves that the checker may refuse
 
 
@@ -185,7 +186,8 @@ def _proved(
     if options.begin is not None:
         with tools.timing("ranks"):
             most = min(max(arrivals, default=0) or MOST_STEPS, MOST_STEPS)
-            question = with_memory(question, *_parts(options.begin), most, search)
+            lo, hi, weights = _parts(options.begin)
+            question = with_errors(question, lo, hi, most, search, weights)
     angles = system.angles if goal.given is None else tuple(system.states[i].name for i in goal.turned)
     require_periodic(system, angles, question.root, partial(goal.certificate, question, provenance={}), clerk)
     with tools.timing("ranks"), runner_at(options.cluster) as runner:
@@ -230,11 +232,14 @@ def _searched(
     return found
 
 
-def _parts(box: Box) -> tuple[Array, Array]:
-    """Corners (n, B) of a box and of smaller ones in its middle."""
+def _parts(box: Box) -> tuple[Array, Array, Array]:
+    """Corners (n, B) of a box, of smaller ones in its middle and of narrow ones anywhere, and weights that make each of
+    these two kinds as important as the other."""
     lo, hi = (np.array([float(pair[k]) for pair in box])[:, None] for k in (0, 1))
-    middle, reach = 0.5 * (lo + hi), 0.5 * (hi - lo) / _PARTS
-    return middle - reach, middle + reach
+    at = np.random.default_rng(0).uniform(0.1, 0.9, (len(lo), _PLACES)).repeat(len(_NARROW), 1)
+    middle = np.hstack([(0.5 * (lo + hi)).repeat(len(_PARTS), 1), lo + at * (hi - lo)])
+    reach = 0.5 * (hi - lo) / np.append(_PARTS, np.tile(_NARROW, _PLACES))
+    return middle - reach, middle + reach, np.repeat((at.shape[1], len(_PARTS)), (len(_PARTS), at.shape[1]))
 
 
 def _exactly(corner: Array) -> list[Fraction]:

@@ -11,8 +11,8 @@ from certify.provers.ranks.prove import (
     prove_remaining,
     root_box,
     turning,
+    with_errors,
     with_frame,
-    with_memory,
     with_order,
 )
 from certify.provers.ranks.targets import Nothing, Region, Sublevel
@@ -31,8 +31,8 @@ __all__ = [
     "prove_remaining",
     "root_box",
     "turning",
+    "with_errors",
     "with_frame",
-    "with_memory",
     "with_order",
     "without_leaf",
 ]

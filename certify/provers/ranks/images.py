@@ -4,7 +4,8 @@ The n errors of a step are symbols of their own in the next steps, as many as th
 answer to them cancels them there, as it does in truth; what is not of first order in the symbols is a new error, and
 so are the oldest ones (Kuehn 1998, Girard 2005). Errors are those of N x for a matrix N, the frame: where its rows are
 left eigenvectors of the step's map, errors shrink as fast as states do, while those of single states may grow by a
-factor with each step (the wrapping effect; Moore 1966, Lohner 1987).
+factor with each step (the wrapping effect; Moore 1966). A frame that moves turns with the errors (Lohner 1987), which
+costs more and pays where many steps follow one another.
 Where equations jump, a box has an image for each choice of heavisides that may occur, as many as `ways` says.
 FORMAT.md has the same in its chapter on ranks; boxes here are wider by more than rounding makes of them.
 """
@@ -23,7 +24,7 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import JUMP, Expression, Symbol, evaluate, jumping
 from certify.loop.policies import bounded_by_form
 from certify.provers.bounds import Flow, Models, Taylor, loop_models, policy_enclosure, upper_bound
-from certify.provers.bounds.arrays import Array, Index, Mask, joined, pieces, product
+from certify.provers.bounds.arrays import Array, Index, Mask, joined, pieces
 from certify.provers.bounds.taylor import EPS, TINY
 from certify.provers.boxes.kept import ConstraintModels
 from certify.provers.boxes.rule import input_bounds_kept, operations_of_box
@@ -35,6 +36,7 @@ _WIDEST = 0.15  # share of the root box beyond which an image is of no use
 _MORE_THAN_ROUNDING = 1e-13  # relative, of sums whose terms may cancel
 _NUMBERS = 2**16  # half a mebibyte of a model of second order at a time, of which a step of a loop has hundreds
 _WAYS = 4  # images of a box at once that are of use
+_APART = 2.0**-20  # of a column's size, by which columns are kept from being dependent
 _MORE = 1.5  # operations of a step of a box, relative to those of a box's bound, whose symbols are fewer
 
 
@@ -106,6 +108,7 @@ class Course:
     counts : the numbers of steps after which images are wanted, ascending; corners of the first `kept` alone, or all.
     order : of the series in time, where inputs are held.
     frame : N, (n, n), in whose coordinates N x errors are bounded; None: in those of the states.
+    moving : errors are bounded in directions that turn with them.
     memory : p, the number of steps for which errors stay symbols.
     """
 
@@ -122,10 +125,11 @@ class Course:
         kept: int | None = None,
         order: int = 2,
         frame: Array | None = None,
+        moving: bool = False,
         memory: int = 1,
     ) -> None:
         self.system, self.target, self.constraints = loop.system, target, ConstraintModels(loop.system, keep)
-        self.angles, self.root, self.frame = tuple(angles), root, frame
+        self.angles, self.root, self.frame, self.moving = tuple(angles), root, frame, moving
         self.counts, self.kept = tuple(counts), len(counts) if kept is None else kept
         self.into = np.eye(self.system.n) if frame is None else frame
         self.back = np.linalg.inv(self.into)
@@ -295,9 +299,21 @@ class Course:
         n, kept = len(models), self.symbols - len(models)
         first = np.stack([np.concatenate([v.c[None], v.g[:kept]]) for v in models])
         rest = np.stack([np.concatenate([v.g[kept:], v.Q.reshape(-1, v.Q.shape[-1])]) for v in models])
-        e = np.abs(product(self.into, rest)).sum(1) + product(np.abs(self.into), np.stack([v.r for v in models]))
-        e = e * (1 + self.doubt) + _MORE_THAN_ROUNDING * product(np.abs(self.into), np.abs(rest).sum(1))
-        return Form(np.concatenate([first[:, : n + 1], self.back[:, :, None] * e, first[:, n + 1 :]], 1))
+        into, back = self._frames(rest[:, :n])
+        e = np.abs(turned(into, rest)).sum(1) + turned(np.abs(into), np.stack([v.r for v in models])[:, None])[:, 0]
+        e = e * (1 + self.doubt) + _MORE_THAN_ROUNDING * turned(np.abs(into), np.abs(rest).sum(1)[:, None])[:, 0]
+        return Form(np.concatenate([first[:, : n + 1], back * e, first[:, n + 1 :]], 1))
+
+    def _frames(self, oldest: Array) -> tuple[Array, Array]:
+        """The matrix by which errors are bounded and its inverse, (n, n, 1): N; or where it moves Q'N, (n, n, B), Q the
+        orthogonal factor of N times the coefficients (n, n, B) of the oldest errors, each column on the scale of 1."""
+        if not self.moving:
+            return self.into[:, :, None], self.back[:, :, None]
+        columns = turned(self.into[:, :, None], oldest)
+        columns = np.nan_to_num(columns / np.abs(columns).sum(0), posinf=0.0, neginf=0.0)
+        columns[np.diag_indices(len(oldest))] += _APART
+        Q = np.linalg.qr(columns.transpose(2, 0, 1))[0].transpose(1, 2, 0)
+        return turned(Q.transpose(1, 0, 2), self.into[:, :, None]), turned(self.back[:, :, None], Q)
 
 
 class _Chosen(Models):
@@ -318,6 +334,14 @@ class _Chosen(Models):
         chosen = next(self.left)
         self.possible &= ~(below if chosen else above)
         return self.constant(Fraction(chosen))
+
+
+def turned(N: Array, columns: Array) -> Array:
+    """N, (n, n, 1) or (n, n, B), times columns (n, K, B)."""
+    found: Array = N[:, 0, None] * columns[0]
+    for j in range(1, len(columns)):
+        found += N[:, j, None] * columns[j]
+    return found
 
 
 def _joined(models: Sequence[Taylor]) -> Taylor:

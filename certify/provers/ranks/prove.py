@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -48,6 +49,7 @@ class Question:
     root : corners lo and hi (n,) of the box, in deviations; of an angle more than a turn apart.
     order : of the series in time, where inputs are held.
     frame : N, (n, n), in whose coordinates N x errors of images are bounded; None: in those of the states.
+    moving : they are bounded in directions that turn with them.
     memory : the number of steps for which errors of images stay symbols.
     """
 
@@ -57,12 +59,13 @@ class Question:
     root: tuple[Array, Array]
     order: int = 2
     frame: Array | None = None
+    moving: bool = False
     memory: int = 1
 
     def course(self, counts: Sequence[int], kept: int | None = None) -> Course:
         """The course of boxes through the loop, with images after so many steps, of the first `kept` or all."""
         (lo, hi), angles = self.root, turning(self.loop)
-        by = self.order, self.frame, self.memory
+        by = self.order, self.frame, self.moving, self.memory
         return Course(self.loop, self.target, angles, self.keep, hi - lo, counts, kept, *by)
 
 
@@ -108,22 +111,24 @@ def with_frame(question: Question, x: Array, effort: Effort) -> Question:
     return other if widths(other) < widths(question) else question
 
 
-def with_memory(question: Question, lo: Array, hi: Array, steps: int, effort: Effort) -> Question:
-    """The question with the memory of errors that is worth most for boxes (n, B) that are to be in the target after so
-    many steps: the boxes that are needed grow with the root of an image's width in each state, and each has its
-    operations."""
+def with_errors(
+    question: Question, lo: Array, hi: Array, steps: int, effort: Effort, weights: Array | None = None
+) -> Question:
+    """The question with the way to bound errors that is worth most for boxes (n, B), of these weights (B,), that are to
+    be in the target after so many steps: how long they stay symbols, and if their directions move. The boxes that are
+    needed grow with the root of an image's width in each state, and each has its operations."""
     root = (question.root[1] - question.root[0])[:, None]
 
     best, least = question, math.inf
-    for memory in _MEMORIES:
-        asked = replace(question, memory=memory)
-        course = asked.course((steps,))
+    for memory, moving in product(_MEMORIES, (False, True)):
+        asked = replace(question, memory=memory, moving=moving)
+        course = asked.course(range(1, steps + 1))
         found = _images(course, lo, hi, effort)
-        widths = np.nan_to_num((found.widths / root).max(1), nan=1.0)
-        boxes = np.log(np.where(found.arrived, _THERE, widths)).mean() * len(lo) / 2
+        widths = np.nan_to_num((found.widths[-1] / root).max(0), nan=1.0)
+        boxes = np.average(np.log(np.where(found.arrived.any(0), _THERE, widths)), weights=weights) * len(lo) / 2
         if boxes + math.log(course.operations) < least:
             best, least = asked, boxes + math.log(course.operations)
-        if np.all(found.arrived) or effort.over:  # more memory has more operations, and no fewer boxes
+        if np.all(found.arrived.any(0)) or effort.over:  # more memory has more operations, and no fewer boxes
             break
     return best
 

@@ -219,9 +219,8 @@ class Search:
         rank = np.where(known[leaves], self.rank[leaves], UNPROVED)
         steps = np.where(known[leaves], self.steps[leaves], 0)
         lo, hi = (end[:, 0].copy() for end in self.cover.root)
-        return RankTree(
-            lo, hi, tree, rank.astype(np.uint16), steps.astype(np.uint16), self.course.frame, self.course.memory
-        )
+        errors = self.course.frame, self.course.moving, self.course.memory
+        return RankTree(lo, hi, tree, rank.astype(np.uint16), steps.astype(np.uint16), *errors)
 
 
 def together(of: Index, inside: Mask, pair: Index, leaf: Index) -> tuple[Index, Index, Index]:
