@@ -100,11 +100,13 @@ class Covering:
 @dataclass(frozen=True)
 class Ranking:
     """A tree over the box from `lo` to `hi`, whose leaves have two bytes of `ranks` each and one of `steps`; errors of
-    images are bounded after the matrix `frame`, and have symbols of their own for `memory` steps."""
+    images are bounded after the matrix `frame`, turned along with them if `moving`, and have symbols of their own for
+    `memory` steps."""
 
     lo: array[float]
     hi: array[float]
     frame: fmpq_mat | None
+    moving: bool
     memory: int
     tree: bytes
     ranks: bytes
@@ -249,14 +251,16 @@ def read_ranked(value: Any, n: int, claim: str, sampled: bool) -> Ranked:
 
 def read_ranking(value: Any, n: int) -> Ranking:
     at = "evidence.ranks"
-    ranking = keys(value, at, "lo", "hi", "tree", "ranks", "steps", maybe=("frame", "memory"))
+    ranking = keys(value, at, "lo", "hi", "tree", "ranks", "steps", maybe=("frame", "moving", "memory"))
     lo, hi = (numbers(ranking[end], f"{at}.{end}", n) for end in ("lo", "hi"))
     frame = square(ranking["frame"], f"{at}.frame", n) if "frame" in ranking else None
+    moves = ranking.get("moving", True) is True  # which 1 equals
+    require(moves, "format", f"{at}.moving", "no value but true was expected")
     memory = ranking.get("memory", 1)
     good = type(memory) is int and 1 <= memory <= MAX_MEMORY  # True is an int to isinstance
     require(good, "format", f"{at}.memory", f"an integer from 1 to {MAX_MEMORY} was expected")
     tree, ranks, steps = (decoded(ranking[key], f"{at}.{key}") for key in ("tree", "ranks", "steps"))
-    return Ranking(lo, hi, frame, memory, tree, ranks, steps)
+    return Ranking(lo, hi, frame, "moving" in ranking, memory, tree, ranks, steps)
 
 
 def read_fit(value: Any, fitted: Fitted) -> Fit:

@@ -19,6 +19,7 @@ from flint import arb, arb_mat, fmpq, fmpq_mat
 
 from .balls import ZERO, total
 from .batches import in_batches
+from .directions import Frame
 from .document import Certificate, Ranks
 from .evidence import REMAINS, Ranked, Ranking, Tree
 from .keep import kept
@@ -164,7 +165,8 @@ class Cover:
 
 class Walk(Motion):
     """Steps of boxes: of the states' symbols the first n are the leaf's, then come n for the errors of each of the last
-    steps, the last one first. What is not affine in those that stay is an error, bounded after the matrix `frame`."""
+    steps, the last one first. What is not affine in those that stay is an error, bounded after the matrix `frame`, or
+    after one that moves along with the oldest errors."""
 
     rule = RULE
 
@@ -177,7 +179,7 @@ class Walk(Motion):
         exact = one if ranking.frame is None else ranking.frame
         short = exact.nrows() * bits(exact) <= MAX_FRAME_BITS
         require(short and exact.det() != 0, RULE, "frame", "the matrix has no inverse, or one that takes minutes")
-        self.frame, self.back = (arb_mat(M).tolist() for M in (exact, exact.inv()))
+        self.frame, self.moves = Frame(arb_mat(exact), arb_mat(exact.inv())), ranking.moving
 
     def start(self, box: Box) -> Rows:
         """x = centre + radius d."""
@@ -230,9 +232,10 @@ class Walk(Motion):
         errors, is an error, and so are the radii of the balls, which would grow many times over with each step."""
         require(all(v.is_finite() for v in models), RULE, at, "the next state has no finite model")
         first = [[v.c, *v.slopes(self.symbols)[: self.stay]] for v in models]
+        frame = self.moved_frame(models, at) if self.moves else self.frame
         loose = [total(arb(b.rad()) for b in row) for row in first]
         errors = list[arb]()
-        for turned in self.frame:
+        for turned in frame.N.tolist():
             v = Taylor(ZERO)
             for k, model in zip(turned, models, strict=True):
                 v += model.scaled(k)
@@ -240,10 +243,15 @@ class Walk(Motion):
             rounded = total(abs(k) * r for k, r in zip(turned, loose, strict=True))
             errors.append(arb((others + v.second + v.r + rounded).upper()))
         rows, leaf = list[list[arb]](), self.n + 1
-        for row, back in zip(first, self.back, strict=True):
+        for row, back in zip(first, frame.inverse.tolist(), strict=True):
             stay = [b.mid() for b in row]
             rows.append([*stay[:leaf], *(k * e for k, e in zip(back, errors, strict=True)), *stay[leaf:]])
         return rows
+
+    def moved_frame(self, models: list[Taylor], at: str) -> Frame:
+        """The frame in the directions of the oldest errors, which do not stay."""
+        oldest = arb_mat([v.slopes(self.symbols)[self.stay : self.stay + self.n] for v in models])
+        return self.frame.moved(oldest, self.rule, at)
 
 
 class Choice:
