@@ -311,7 +311,7 @@ def _read_rank_tree(data: Mapping[str, Any], n: int) -> RankTree:
     corners = decode(data["lo"], (n,)), decode(data["hi"], (n,))
     frame = decode(data["frame"], (n, n)) if "frame" in data else None
     size = "<u2" if len(steps) == len(ranks) else "u1"
-    of_leaves = (np.frombuffer(octets, kind).astype(np.uint16) for octets, kind in ((ranks, "<u2"), (steps, size)))
+    of_leaves = np.frombuffer(ranks, "<u2").astype(np.uint16), np.frombuffer(steps, size).astype(np.uint16)
     return RankTree(*corners, tree, *of_leaves, frame, "moving" in data, data.get("memory", 1))
 
 

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 TURN = near_ball(2 * arb.pi())
 _MOST_NODES = 2**14  # of the tree that an image may meet
+_APART = 2.0**-20  # of a column's size, by which columns are kept from being dependent
 _MOST_IMAGES = 64  # of a leaf, at once
 Failing = tuple[str, str]  # a place, and what fails there
 
@@ -278,10 +279,15 @@ class Steps(Moving):
         """Models in the symbols that they keep, and in new ones of errors that have all else."""
         n, kept, batch = self.n, self.ranks.memory * self.n, models[0].c.shape[-1]
         first = np.stack([np.concatenate([v.c[None], v.g[:kept]]) for v in models], 1)
-        rest = np.stack([v.p[kept:] for v in models]).reshape(n, -1)
-        others = Near(rest).through(self.frame).size.shaped(n, -1, batch)
-        bound = others.sum(1) + Above(np.stack([v.r.top + 0 * v.c for v in models])).through(self.frame)
-        errors = Near(bound.top[:, None]) * Near(self.back.value.reshape(n, n, 1), self.back.error.shaped(n, n, 1))
+        others = Near(np.stack([v.p[kept:] for v in models]).reshape(n, -1)).through(self.frame)
+        others = Near(others.value.reshape(n, -1, batch), others.error.shaped(n, -1, batch))
+        more = Above(np.stack([v.r.top + 0 * v.c for v in models])).through(self.frame)
+        back = Near(self.back.value.reshape(n, n, 1), self.back.error.shaped(n, n, 1))
+        if self.ranks.moving:
+            bound, back = turned(others, more, back)
+        else:
+            bound = others.size.sum(1) + more
+        errors = Near(bound.top[:, None]) * back
         return Form(np.concatenate([first[: n + 1], errors.value, first[n + 1 :]]), errors.error.sum(0))
 
     def after(self, states: list[Taylor], G: list[Taylor]) -> list[Taylor]:
@@ -328,6 +334,24 @@ class Steps(Moving):
         rows = [combination(*zip(row, states, strict=True)) for row in self.c.P.tolist()]
         V = [x * row for x, row in zip(states, rows, strict=True)]
         return [reduce(add, [*V, number(Fraction(-self.c.c2))])]
+
+
+def turned(others: Near, more: Above, back: Near) -> tuple[Above, Near]:
+    """Bounds b (n, B) of the numbers y = Q^-1 v, where v are sums of columns `others` (n, K, B), the oldest errors'
+    first, with symbols in [-1, 1], and of numbers up to `more` (n, B); and (N^-1 Q)' (n, n, B), of (N^-1)' (n, n, B).
+
+    Nothing is believed of the Q that numpy finds: E = I - Q'Q is bounded; unless it is below 1/2 in the norm of row
+    sums nothing is known. So Q has an inverse, and y = Q'v + E y gives |y_i| <= |Q'v|_i + |E| |y|, and |y| <= 2 |Q'v|.
+    """
+    n = len(others.value)
+    columns = others.value[:, :n] / np.sum(np.abs(others.value[:, :n]), axis=0)
+    columns = np.where(np.isfinite(columns), columns, 0.0) + _APART * np.eye(n)[:, :, None]
+    Q = np.moveaxis(np.linalg.qr(np.moveaxis(columns, -1, 0))[0], 0, -1)
+    away = ((Near(Q[:, :, None]) * Near(Q[:, None])).sum() - Near(np.eye(n)[:, :, None])).size.sum(1).max()
+    rows = [(Near(Q[:, i, None]) * others).sum().size.sum() + (more * np.abs(Q[:, i])).sum() for i in range(n)]
+    b = Above(np.stack([row.top for row in rows]))
+    b = b + b.max() * away.over(np.where(away.top < 0.5, 0.5, np.nan))
+    return b, (Near(back.value[:, None], back.error.shaped(n, 1, n, -1)) * Near(Q[:, :, None])).sum()
 
 
 def existing(a: Taylor, values: Array) -> Taylor:

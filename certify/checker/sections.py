@@ -124,11 +124,16 @@ class Tube:
     slabs: tuple[Slab, ...]
 
 
+def _true(value: Value, sizes: Mapping[str, int]) -> bool:
+    value.must(value.raw is True, "true")
+    return True
+
+
 @dataclass(frozen=True)
 class RankTree:
-    """A partition tree of the box lo <= x <= hi, and of each leaf its rank and the number of its steps. `frame` is F of
-    the coordinates F x in which errors are bounded, None for the identity, turned with them where it is `moving`; errors
-    stay symbols for `memory` steps."""
+    """A partition tree of the box lo <= x <= hi, and of each leaf its rank and the number of its steps. `frame` is N of
+    the coordinates N x in which errors are bounded, None for the identity; they turn with the errors where they are
+    `moving`. Errors stay symbols for `memory` steps."""
 
     lo: Row
     hi: Row
@@ -136,6 +141,7 @@ class RankTree:
     ranks: Octets
     steps: Octets
     frame: Annotated[Array | None, shaped("n", "n")] = field(default=None, kw_only=True)
+    moving: Annotated[bool, _true] = field(default=False, kw_only=True)
     memory: Memory = field(default=1, kw_only=True)
 
 

@@ -132,7 +132,7 @@ class Course:
         self.angles, self.root, self.frame, self.moving = tuple(angles), root, frame, moving
         self.counts, self.kept = tuple(counts), len(counts) if kept is None else kept
         self.into = np.eye(self.system.n) if frame is None else frame
-        self.back = np.linalg.inv(self.into)
+        self.back = np.linalg.inv(self.into).astype(np.float64)
         self.doubt = 1e-12 + 16 * EPS * float(np.linalg.cond(self.into))  # relative, of errors: also of the inverse
         self.straight = [i for i in range(self.system.n) if i not in self.angles]
         self.memory, self.symbols = memory, self.system.n * (1 + memory)
@@ -312,7 +312,7 @@ class Course:
         columns = turned(self.into[:, :, None], oldest)
         columns = np.nan_to_num(columns / np.abs(columns).sum(0), posinf=0.0, neginf=0.0)
         columns[np.diag_indices(len(oldest))] += _APART
-        Q = np.linalg.qr(columns.transpose(2, 0, 1))[0].transpose(1, 2, 0)
+        Q: Array = np.linalg.qr(columns.transpose(2, 0, 1))[0].transpose(1, 2, 0)
         return turned(Q.transpose(1, 0, 2), self.into[:, :, None]), turned(self.back[:, :, None], Q)
 
 
