@@ -37,6 +37,7 @@ _MORE_THAN_ROUNDING = 1e-13  # relative, of sums whose terms may cancel
 _NUMBERS = 2**16  # half a mebibyte of a model of second order at a time, of which a step of a loop has hundreds
 _WAYS = 4  # images of a box at once that are of use
 _APART = 2.0**-20  # of a column's size, by which columns are kept from being dependent
+_OF_A_STEP = 1e6  # operations
 _MORE = 1.5  # operations of a step of a box, relative to those of a box's bound, whose symbols are fewer
 
 
@@ -153,6 +154,11 @@ class Course:
         cut = pieces(lo.shape[1], self.most)
         both = zip(np.array_split(lo, cut, 1), np.array_split(hi, cut, 1), strict=True)
         return Images(*map(joined, zip(*(self._followed(*each) for each in both), strict=True)))
+
+    def cost(self, found: Images) -> float:
+        """The operations that images took; a step of a batch takes some, however few boxes it has."""
+        batches = pieces(len(found.taken), self.most)
+        return max(self.operations * float(found.taken.sum()), _OF_A_STEP * batches * float(found.taken.max(initial=0)))
 
     def _followed(self, lo: Array, hi: Array) -> Images:
         """The same for as many boxes as memory is meant for."""

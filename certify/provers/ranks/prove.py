@@ -126,8 +126,9 @@ def with_errors(
         found = _images(course, lo, hi, effort)
         widths = np.nan_to_num((found.widths[-1] / root).max(0), nan=1.0)
         boxes = np.average(np.log(np.where(found.arrived.any(0), _THERE, widths)), weights=weights) * len(lo) / 2
-        if boxes + math.log(course.operations) < least:
-            best, least = asked, boxes + math.log(course.operations)
+        cost = boxes + math.log(course.operations)
+        if cost < least or (moving and cost == least):  # directions that move may pay on the way of other boxes
+            best, least = asked, cost
         if np.all(found.arrived.any(0)) or effort.over:  # more memory has more operations, and no fewer boxes
             break
     return best
@@ -136,7 +137,7 @@ def with_errors(
 def _images(course: Course, lo: Array, hi: Array, effort: Effort) -> Images:
     """Images of boxes (n, B), whose steps are charged."""
     found = course(lo, hi, 0.0, 0.0)
-    effort.charge(float(found.taken.sum()) * course.operations)
+    effort.charge(course.cost(found))
     return found
 
 
@@ -310,7 +311,7 @@ def _grow(
     new, rounds = search.begin(_AT_FIRST * effort.left / (course.counts[-1] * course.operations)), 0
     while True:
         found = bound(search.cover.low[:, new], search.cover.high[:, new], 0.0, 0.0)
-        effort.charge(float(found.taken.sum()) * course.operations)
+        effort.charge(course.cost(found))
         search.take(new, found)
         near, rounds = search.spread(), rounds + 1
         effort.charge(_OF_A_PAIR * search.pairs + _OF_A_LEAF * len(new))
