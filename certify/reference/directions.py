@@ -51,17 +51,19 @@ def shares(column: list[arb]) -> list[float]:
 def orthogonal(columns: Rows) -> Rows:
     """The rows of Q in Q R, nearly, where R has no entries below its diagonal: a product of Householder's reflections.
 
-    All of it is orthogonal whatever the columns are, which are changed.
+    All of it is orthogonal whatever the columns are, which are changed. What is 0 below the diagonal is not reflected:
+    the signs are LAPACK's, and those of the next columns depend on them.
     """
     n = len(columns)
     Q = [[float(i == k) for k in range(n)] for i in range(n)]
     for k, column in enumerate(columns):
+        if not any(column[k + 1 :]):
+            continue
         normal = [0.0] * k + column[k:]
         normal[k] += math.copysign(math.hypot(*normal), normal[k])
         size = math.hypot(*normal)
-        if size > 0:
-            for v in (*columns[k + 1 :], *Q):
-                reflect(v, [x / size for x in normal])
+        for v in (*columns[k + 1 :], *Q):
+            reflect(v, [x / size for x in normal])
     return Q
 
 
