@@ -346,7 +346,8 @@ def turned(others: Near, more: Above, back: Near) -> tuple[Above, Near]:
     n = len(others.value)
     columns = others.value[:, :n] / np.sum(np.abs(others.value[:, :n]), axis=0)
     columns = np.where(np.isfinite(columns), columns, 0.0) + _APART * np.eye(n)[:, :, None]
-    Q = np.moveaxis(np.linalg.qr(np.moveaxis(columns, -1, 0))[0], 0, -1)
+    Q, R = (np.moveaxis(M, 0, -1) for M in np.linalg.qr(np.moveaxis(columns, -1, 0)))
+    Q = Q * np.where(R[range(n), range(n)] < 0, -1.0, 1.0)
     away = ((Near(Q[:, :, None]) * Near(Q[:, None])).sum() - Near(np.eye(n)[:, :, None])).size.sum(1).max()
     rows = [(Near(Q[:, i, None]) * others).sum().size.sum() + (more * np.abs(Q[:, i])).sum() for i in range(n)]
     b = Above(np.stack([row.top for row in rows]))

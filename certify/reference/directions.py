@@ -28,7 +28,7 @@ class Frame:
     inverse: arb_mat
 
     def moved(self, C: arb_mat, rule: str, at: str) -> Frame:
-        """Q^-1 N, where Q is that of the QR decomposition of N C + 2^-20 I with shares for the columns of N C."""
+        """Q^-1 N, Q being that of the QR decomposition of N C + 2^-20 I, R_ii >= 0, with shares for columns of N C."""
         columns = [shares(column) for column in (self.N * C).transpose().tolist()]
         for i, column in enumerate(columns):
             column[i] += LITTLE
@@ -49,21 +49,19 @@ def shares(column: list[arb]) -> list[float]:
 
 
 def orthogonal(columns: Rows) -> Rows:
-    """The rows of Q in Q R, nearly, where R has no entries below its diagonal: a product of Householder's reflections.
-
-    All of it is orthogonal whatever the columns are, which are changed. What is 0 below the diagonal is not reflected:
-    the signs are LAPACK's, and those of the next columns depend on them.
-    """
+    """The rows of Q in Q R, nearly, where R has no entries below its diagonal and none below 0 on it: a product of
+    Householder's reflections and of signs. All of it is orthogonal whatever the columns are, which are changed."""
     n = len(columns)
     Q = [[float(i == k) for k in range(n)] for i in range(n)]
     for k, column in enumerate(columns):
-        if not any(column[k + 1 :]):
-            continue
         normal = [0.0] * k + column[k:]
         normal[k] += math.copysign(math.hypot(*normal), normal[k])
         size = math.hypot(*normal)
-        for v in (*columns[k + 1 :], *Q):
-            reflect(v, [x / size for x in normal])
+        if size > 0:
+            for v in (*columns[k + 1 :], *Q):
+                reflect(v, [x / size for x in normal])
+        for row in Q if normal[k] > 0 else ():
+            row[k] = -row[k]
     return Q
 
 

@@ -33,8 +33,8 @@ from certify.provers.ranks import (
     Sublevel,
     prove_ranks,
     root_box,
-    with_frame,
     with_errors,
+    with_frame,
     without_leaf,
 )
 from certify.provers.ranks.cover import Cover
@@ -264,22 +264,39 @@ def turning_slowly() -> Question:
     return question((system, network), 0.01)
 
 
-def test_memory_is_taken_where_it_is_worth_its_price() -> None:
+def test_errors_are_followed_where_that_is_worth_its_price() -> None:
     turning, straight = turning_slowly(), question(bistable(), 0.01)
     begin = np.array([[0.5], [0.2]])
     box, effort = (begin - 0.05, begin + 0.05), Effort()
     found = with_errors(turning, *box, 45, effort)
-    assert found.memory > 1
+    assert found.moving and found.memory == 1
     assert effort.spent >= 45 * found.course((1,)).operations
-    assert with_errors(straight, np.array([[0.1]]), np.array([[0.11]]), 10, UNLIMITED).memory == 1
+    found = with_errors(straight, np.array([[0.1]]), np.array([[0.11]]), 10, UNLIMITED)
+    assert found.memory == 1 and not found.moving
 
 
-def test_memory_is_not_tried_when_the_effort_is_over() -> None:
+def test_nothing_else_is_tried_when_the_effort_is_over() -> None:
     """More memory takes more operations a step: one image is all that a run without effort is charged with."""
     turning, begin = turning_slowly(), np.array([[0.5], [0.2]])
-    effort = Effort(1.0)
-    assert with_errors(turning, begin - 0.05, begin + 0.05, 45, effort).memory == 1
-    assert effort.spent <= 45 * turning.course((1,)).operations
+    box, effort = (begin - 0.05, begin + 0.05), Effort(1.0)
+    assert with_errors(turning, *box, 45, effort) == replace(turning, moving=False, memory=1)
+    course = turning.course(range(1, 46))
+    assert effort.spent == course.cost(course(*box, 0.0, 0.0))
+
+
+def test_directions_that_move_follow_a_turn() -> None:
+    """A box that turns and shrinks does so; in directions that stand still its errors grow until no image is left."""
+    turning, begin = turning_slowly(), np.array([[0.5], [0.2]])
+    box = (begin - 0.01, begin + 0.01)
+    still, moving = (replace(turning, moving=m).course((20, 300))(*box, 0.0, 0.0) for m in (False, True))
+    assert not still.known[1].any() and moving.known.all() and np.all(moving.widths[1] < 1e-6)
+    x, y = box[0] + np.random.default_rng(0).uniform(size=(2, 500)) * (box[1] - box[0])
+    c, s = (round(v * 10**6) / 10**6 for v in (0.95 * np.cos(0.3), 0.95 * np.sin(0.3)))
+    for k in range(1, 301):
+        x, y = c * x - s * y + x * y / 4, s * x + c * y + x * x / 8
+        for at in np.flatnonzero(np.array([20, 300]) == k):
+            lo, hi = moving.lo[at, 0], moving.hi[at, 0]
+            assert np.all((lo <= [x, y]) & (hi >= [x, y]))
 
 
 def test_a_box_whose_parts_lead_straight_there_has_a_tree_of_its_own() -> None:

@@ -318,7 +318,8 @@ class Course:
         columns = turned(self.into[:, :, None], oldest)
         columns = np.nan_to_num(columns / np.abs(columns).sum(0), posinf=0.0, neginf=0.0)
         columns[np.diag_indices(len(oldest))] += _APART
-        Q: Array = np.linalg.qr(columns.transpose(2, 0, 1))[0].transpose(1, 2, 0)
+        Q, R = (M.transpose(1, 2, 0) for M in np.linalg.qr(columns.transpose(2, 0, 1)))
+        Q = Q * np.where(R[np.diag_indices(len(R))] < 0, -1.0, 1.0)
         return turned(Q.transpose(1, 0, 2), self.into[:, :, None]), turned(self.back[:, :, None], Q)
 
 
