@@ -39,19 +39,15 @@ def test_the_last_image_of_the_last_leaf_counts() -> None:
         assert by_checker(data) == (rule and rule[0])
 
 
-@pytest.mark.parametrize("size", [1, 2, 3])
+@pytest.mark.parametrize("size", [1, 2, 3, 4096])
 def test_each_image_counts_for_its_own_leaf(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """x/8 + 9/16 + 3/8 H(x - 499/1000) on four leaves of [0, 1] leads from the first two to the third, of rank 1, and
-    from the second and all others beyond 9/10. The first has a rank that would do for all."""
-    f = plus(["/", "x", "8"], "9/16", times(Fraction(3, 8), H(["-", "x", "499/1000"])))
+    """x + 17/16 - H(5/2 - x)/2 on eight leaves of [0, 8] leads from the third in two steps to the fourth to sixth, of
+    ranks 4, 3 and 2, but to the fourth by the last image alone; from the others too, and at last beyond 69/10."""
+    f = plus("x", "17/16", times(Fraction(-1, 2), H(["-", "5/2", "x"])))
     monkeypatch.setattr(Steps, "batch", size)
-    for ranks, at in (
-        ([5, 2, 1, 1], None),
-        ([5, 1, 1, 1], "rank leaf 1"),
-        ([5, 3, 2, 1], None),
-        ([5, 2, 2, 1], "rank leaf 1"),
-    ):
-        assert place(document([f], [0.0], [1.0], 2, ranks, target=[["-", "9/10", "x"]])) == at
+    for third, at in ((6, None), (5, "rank leaf 2")):
+        ranks, steps = [10, 8, third, 4, 3, 2, 1, 0], [2] * 6 + [1, 0]
+        assert place(document([f], [0.0], [8.0], 3, ranks, steps, target=[["-", "69/10", "x"]])) == at
 
 
 def test_constraints_and_jumps_have_the_states_in_their_order() -> None:
