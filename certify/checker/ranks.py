@@ -245,7 +245,8 @@ class Steps(Moving):
         )
         for models, some in filter(lambda each: len(each[1]), every):
             later = self.form(models)
-            course.note("ranks", np.all(np.isfinite(later.size.top), axis=0), numbers[some], "F may be undefined")
+            exist = np.isfinite(np.concatenate([later.size.top, u.size.top[:, some]]))
+            course.note("ranks", np.all(exist, axis=0), numbers[some], "F may be undefined")
             yield later, some
 
     def jumped(self, states: list[Taylor], held: list[Taylor]) -> Iterator[tuple[list[Taylor], Array]]:
