@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial, reduce
 from math import nextafter
@@ -94,8 +94,10 @@ class InRows(Algebra[Dual]):
         return _repeated(v, step.size) * _repeated(w, step.size)
 
     def observe(self, step: Observe, v: Dual) -> Dual:
-        made: list[Dual] = evaluate(step.tape, _numbers(v.value), _rows(v))
-        return _stacked(made)
+        """Also what no expression reads must exist."""
+        made = _stacked(evaluate(step.tape, _numbers(v.value), _rows(v)))
+        N, exists = made.value, np.all(np.isfinite(v.value.size.top), axis=0)
+        return replace(made, value=Taylor(N.c, N.p, N.r.where(exists, Above(np.nan))))
 
     def entries(self, call: Call, arguments: list[Dual]) -> list[Dual]:
         """A call in equations."""

@@ -180,23 +180,12 @@ class Steps(Moving):
                 break
             x, of = self.step(x[:, left], numbers[moving[left]], course)
             moving = moving[left[of]]
-            if self.c.dynamics.jumps:
-                left = self.going_on(x, moving, numbers, course)
-                moving, x = moving[left], x[:, left]
             done = np.flatnonzero(count[moving] == k)
             arrived = moving[done]
             bound = np.full(len(arrived), MAX_RANK - 1) if self.c.claim == "remains" else rank[arrived] - k
             hold = self.arrives(x[:, done], bound)
             course.note("ranks", hold, numbers[arrived], "the steps may lead neither to the target nor to such ranks")
         return course
-
-    def going_on(self, x: Form, of: Array, numbers: Array, course: Course) -> Array:
-        """The images, of leaves `of`, that are followed further: those outside the target, of leaves that have not too
-        many."""
-        left = np.flatnonzero(np.logical_not(self.is_in_target(x)))
-        few = np.bincount(of[left], minlength=len(numbers)) <= _MOST_IMAGES
-        course.note("ranks", few, numbers, f"a leaf may have no more than {_MOST_IMAGES} images at once")
-        return left[few[of[left]]]
 
     def start(self, lo: Array, hi: Array) -> Form:
         """The boxes with these corners, in their symbols."""
@@ -206,23 +195,37 @@ class Steps(Moving):
         return Form(np.concatenate([centre[None], slopes, errors]), Above(np.zeros_like(centre)))
 
     def step(self, x: Form, numbers: Array, course: Course) -> tuple[Form, Array]:
-        """The images of forms after a step, and which form each is of; and what the rules say of it. Of a form
-        (1 + n + p n, n, B) the first n coefficients are those of the leaf's symbols, then come those of errors, n for
-        each step, the last step first. Leaves may have more images than a batch has leaves.
+        """The images of forms, of leaves with these numbers, after a step, and which form each is of; and what the
+        rules say of it.
+
+        Of a form (1 + n + p n, n, B) the first n coefficients are those of the leaf's symbols, then come those of
+        errors, n for each step, the last step first. With jumps images in the target are left out, and those of leaves
+        that have too many. Before that a leaf may have thousands, so none of them waits for the others.
         """
-        images, of = list[Form](), list[Array]()
+        images, of, jumps = list[Form](), list[Array](), self.c.dynamics.jumps > 0
+        leaves, leaf = np.unique(numbers, return_inverse=True)
+        leads, met = np.zeros(len(numbers), dtype=bool), np.zeros(len(leaves), dtype=np.int64)
         for some in np.array_split(np.arange(len(numbers)), -(-len(numbers) // self.batch)):
             for later, which in self.images(x[:, some], numbers[some], course):
-                images.append(later)
-                of.append(some[which])
-        which = np.concatenate(of)
-        left = np.bincount(which, minlength=len(numbers)) > 0
-        course.note("ranks", left, numbers, "every step is excluded")
+                form, left = some[which], np.arange(len(which))
+                leads[form] = True
+                if jumps:
+                    left = np.flatnonzero(np.logical_not(self.is_in_target(later)))
+                    met += np.bincount(leaf[form[left]], minlength=len(met))
+                    left = left[met[leaf[form[left]]] <= _MOST_IMAGES]
+                images.append(later[:, left])
+                of.append(form[left])
+        course.note("ranks", leads, numbers, "every step is excluded")
+        few = met <= _MOST_IMAGES
+        if jumps:
+            course.note("ranks", few, leaves, f"a leaf may have no more than {_MOST_IMAGES} images at once")
+        form = np.concatenate(of)
         error = Above(np.concatenate([v.error.top + 0 * v.value[0] for v in images], -1))
-        return Form(np.concatenate([v.value for v in images], -1), error), which
+        every, left = Form(np.concatenate([v.value for v in images], -1), error), np.flatnonzero(few[leaf[form]])
+        return every[:, left], form[left]
 
     def images(self, x: Form, numbers: Array, course: Course) -> Iterator[tuple[Form, Array]]:
-        """The same, some images at a time."""
+        """The images of forms, of leaves with these numbers, some at a time, and which form each is of."""
         c = self.c
         u = enclose_on_boxes(self.net, x)
         if not self.case.bounded:
@@ -243,7 +246,8 @@ class Steps(Moving):
         )
         for models, some in filter(lambda each: len(each[1]), every):
             later = self.form(models)
-            course.note("ranks", np.all(np.isfinite(later.size.top), axis=0), numbers[some], "F may be undefined")
+            exist = np.isfinite(np.concatenate([later.size.top, u.size.top[:, some]]))
+            course.note("ranks", np.all(exist, axis=0), numbers[some], "F may be undefined")
             yield later, some
 
     def jumped(self, states: list[Taylor], held: list[Taylor]) -> Iterator[tuple[list[Taylor], Array]]:

@@ -165,11 +165,12 @@ class BoxSteps:
         return Enclosed(Form(h.value), added, passed, ball, self.k)
 
     def observe(self, step: Observe, v: Enclosed) -> Enclosed:
+        """Also what no expression reads must exist."""
         x = models(v.h, v.error)
         y = evaluate(step.tape, constants(x[0]), x)
-        h = forms(y)
-        self.boxes.added[-1] = h.error
-        return Enclosed(Form(h.value), h.error, ZERO, ZERO, self.k)
+        h, exists = forms(y), np.all([np.isfinite(entry.size.top) for entry in x], axis=0)
+        error = self.boxes.added[-1] = h.error.where(exists, Above(np.nan))
+        return Enclosed(Form(h.value), error, ZERO, ZERO, self.k)
 
     def before(self, k: int, step: Step, weight: Uniform) -> list[tuple[int, Uniform]]:
         """The weights with which errors of the vectors that step k reads reach the value through it."""
