@@ -65,7 +65,7 @@ def covered(chance: np.random.Generator, n: int, angles: tuple[int, ...]) -> tup
     """A root box, and boxes that are in it but for their angles."""
     lo = chance.choice([-3.1416, -3.25, 0.0, 7.0, -100.0], n)
     hi = lo + chance.choice([6.28319, 6.3, 7.0, 12.6, 13.0, 40.0], n)
-    ranks = SimpleNamespace(lo=lo, hi=hi, angles=angles, tree=b"\xff", ranks=b"\0\0")
+    ranks = SimpleNamespace(lo=lo, hi=hi, angles=angles, tree=b"\xff", ranks=b"\0\0", steps=b"\0")
     centre = chance.uniform(-30, 30, (n, 30))
     wide = chance.choice([0.0, 1e-9, 0.1, 1.0, 3.0, 6.0, 6.3, 10.0], (n, 30))
     low, high = centre - wide, centre + wide

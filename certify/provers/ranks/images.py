@@ -305,22 +305,12 @@ class Course:
         n, kept = len(models), self.symbols - len(models)
         first = np.stack([np.concatenate([v.c[None], v.g[:kept]]) for v in models])
         rest = np.stack([np.concatenate([v.g[kept:], v.Q.reshape(-1, v.Q.shape[-1])]) for v in models])
-        into, back = self._frames(rest[:, :n])
+        into, back = self.into[:, :, None], self.back[:, :, None]
+        if self.moving:
+            into, back = moved(into, back, rest[:, :n])
         e = np.abs(turned(into, rest)).sum(1) + turned(np.abs(into), np.stack([v.r for v in models])[:, None])[:, 0]
         e = e * (1 + self.doubt) + _MORE_THAN_ROUNDING * turned(np.abs(into), np.abs(rest).sum(1)[:, None])[:, 0]
         return Form(np.concatenate([first[:, : n + 1], back * e, first[:, n + 1 :]], 1))
-
-    def _frames(self, oldest: Array) -> tuple[Array, Array]:
-        """The matrix by which errors are bounded and its inverse, (n, n, 1): N; or where it moves Q'N, (n, n, B), Q the
-        orthogonal factor of N times the coefficients (n, n, B) of the oldest errors, each column on the scale of 1."""
-        if not self.moving:
-            return self.into[:, :, None], self.back[:, :, None]
-        columns = turned(self.into[:, :, None], oldest)
-        columns = np.nan_to_num(columns / np.abs(columns).sum(0), posinf=0.0, neginf=0.0)
-        columns[np.diag_indices(len(oldest))] += _APART
-        Q, R = (M.transpose(1, 2, 0) for M in np.linalg.qr(columns.transpose(2, 0, 1)))
-        Q = Q * np.where(R[np.diag_indices(len(R))] < 0, -1.0, 1.0)
-        return turned(Q.transpose(1, 0, 2), self.into[:, :, None]), turned(self.back[:, :, None], Q)
 
 
 class _Chosen(Models):
@@ -341,6 +331,17 @@ class _Chosen(Models):
         chosen = next(self.left)
         self.possible &= ~(below if chosen else above)
         return self.constant(Fraction(chosen))
+
+
+def moved(into: Array, back: Array, oldest: Array) -> tuple[Array, Array]:
+    """A frame N and its inverse, (n, n, 1), turned with the oldest errors, whose coefficients are (n, n, B): Q'N and
+    N^-1 Q, Q the orthogonal factor of N times these, each column on the scale of 1."""
+    columns = turned(into, oldest)
+    columns = np.nan_to_num(columns / np.abs(columns).sum(0), posinf=0.0, neginf=0.0)
+    columns[np.diag_indices(len(oldest))] += _APART
+    Q, R = (M.transpose(1, 2, 0) for M in np.linalg.qr(columns.transpose(2, 0, 1)))
+    Q = Q * np.where(R[np.diag_indices(len(R))] < 0, -1.0, 1.0)
+    return turned(Q.transpose(1, 0, 2), into), turned(back, Q)
 
 
 def turned(N: Array, columns: Array) -> Array:
