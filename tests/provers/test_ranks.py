@@ -175,8 +175,8 @@ def test_images_hold_trajectories(loop: tuple[System, PolicyNetwork], framed: bo
         lo, hi = form.box
         assert np.all(kept)
         assert np.all((lo <= x.T + 1e-12) & (hi + 1e-12 >= x.T))
-        away = course.into @ (x.T - form.x[:, 0] - (form.x[:, 1 : n + 1] * d).sum(1))
-        bounds = np.abs(np.einsum("ij,jkb->ikb", course.into, form.x[:, n + 1 :])).sum(1)
+        away = course.errors.into[:, :, 0] @ (x.T - form.x[:, 0] - (form.x[:, 1 : n + 1] * d).sum(1))
+        bounds = np.abs(np.einsum("ij,jkb->ikb", course.errors.into[:, :, 0], form.x[:, n + 1 :])).sum(1)
         assert np.all(np.abs(away) <= bounds + 1e-12)
 
 
@@ -205,7 +205,7 @@ def test_errors_in_a_frame_that_is_nearly_singular_are_not_less_than_they_are(se
     frame = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-7]]) * generator.uniform(0.5, 1.0, (2, 1))
     course = followed(swinging(), frame)
     rest = [Taylor(np.zeros(1), np.zeros((7, 1)), np.zeros((7, 7, 1)), r) for r in generator.uniform(0, 1, (2, 1))]
-    found = np.abs(course.form(rest).x[:, 3:, 0]).sum(1)
+    found = np.abs(course.errors.form(rest, course.symbols).x[:, 3:, 0]).sum(1)
     exact = fmpq_mat([[fmpq(*v.as_integer_ratio()) for v in row] for row in frame.tolist()]).inv().tolist()
     bound = np.abs(frame) @ np.array([v.r[0] for v in rest])
     assert np.all(

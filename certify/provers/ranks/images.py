@@ -132,9 +132,7 @@ class Course:
         self.system, self.target, self.constraints = loop.system, target, ConstraintModels(loop.system, keep)
         self.angles, self.root, self.frame, self.moving = tuple(angles), root, frame, moving
         self.counts, self.kept = tuple(counts), len(counts) if kept is None else kept
-        self.into = np.eye(self.system.n) if frame is None else frame
-        self.back = np.linalg.inv(self.into).astype(np.float64)
-        self.doubt = 1e-12 + 16 * EPS * float(np.linalg.cond(self.into))  # relative, of errors: also of the inverse
+        self.errors = Errors(self.system.n, frame, moving)
         self.straight = [i for i in range(self.system.n) if i not in self.angles]
         self.memory, self.symbols = memory, self.system.n * (1 + memory)
         self.most = min(self.piece, max(2, _NUMBERS // (self.symbols + self.system.m + 1) ** 2))
@@ -262,7 +260,7 @@ class Course:
         for g in self.constraints.during(during):
             kept, lost = kept & (upper_bound(g)[0] < 0), lost | (upper_bound(g.scaled(-1.0))[0] < 0)
         finite = np.all([np.isfinite(v.c + v.radius()) for v in after], axis=0)
-        return self.form(after), of, kept[of] & finite, lost[of]
+        return self.errors.form(after, self.symbols), of, kept[of] & finite, lost[of]
 
     def _stepped(self, values: Mapping[Symbol, Taylor], like: Taylor) -> tuple[list[Taylor], Index]:
         """The next states in discrete time, and of which states each is: of those where the signs of all arguments of
@@ -300,17 +298,35 @@ class Course:
         """True where the states lie in the target."""
         return self.target.holds(form.x, self.angles)
 
-    def form(self, models: Sequence[Taylor]) -> Form:
-        """The part of models that is of first order in all symbols but the oldest; all else is an error."""
-        n, kept = len(models), self.symbols - len(models)
+
+class Errors:
+    """The way in which errors of n states are bounded: in coordinates N x, N being `frame` or the identity, or in
+    directions that move with them in these coordinates."""
+
+    def __init__(self, n: int, frame: Array | None, moving: bool) -> None:
+        N, self.n, self.moving = np.eye(n) if frame is None else frame, n, moving
+        self.into, self.back = N[:, :, None], np.linalg.inv(N).astype(np.float64)[:, :, None]
+        self.doubt = 1e-12 + 16 * EPS * float(np.linalg.cond(N))  # relative, of errors: also of the inverse
+
+    def form(self, models: Sequence[Taylor], symbols: int) -> Form:
+        """The part of models that is of first order in all of so many symbols but the oldest; all else is an error."""
+        n, kept = self.n, symbols - self.n
         first = np.stack([np.concatenate([v.c[None], v.g[:kept]]) for v in models])
         rest = np.stack([np.concatenate([v.g[kept:], v.Q.reshape(-1, v.Q.shape[-1])]) for v in models])
-        into, back = self.into[:, :, None], self.back[:, :, None]
-        if self.moving:
-            into, back = moved(into, back, rest[:, :n])
+        into, back = self.moved(rest[:, :n]) if self.moving else (self.into, self.back)
         e = np.abs(turned(into, rest)).sum(1) + turned(np.abs(into), np.stack([v.r for v in models])[:, None])[:, 0]
         e = e * (1 + self.doubt) + _MORE_THAN_ROUNDING * turned(np.abs(into), np.abs(rest).sum(1)[:, None])[:, 0]
         return Form(np.concatenate([first[:, : n + 1], back * e, first[:, n + 1 :]], 1))
+
+    def moved(self, oldest: Array) -> tuple[Array, Array]:
+        """Q'N and N^-1 Q, (n, n, B), Q the orthogonal factor of N times the oldest errors' coefficients (n, n, B),
+        each column on the scale of 1."""
+        columns = turned(self.into, oldest)
+        columns = np.nan_to_num(columns / np.abs(columns).sum(0), posinf=0.0, neginf=0.0)
+        columns[np.diag_indices(self.n)] += _APART
+        Q, R = (M.transpose(1, 2, 0) for M in np.linalg.qr(columns.transpose(2, 0, 1)))
+        Q = Q * np.where(R[np.diag_indices(self.n)] < 0, -1.0, 1.0)
+        return turned(Q.transpose(1, 0, 2), self.into), turned(self.back, Q)
 
 
 class _Chosen(Models):
@@ -331,17 +347,6 @@ class _Chosen(Models):
         chosen = next(self.left)
         self.possible &= ~(below if chosen else above)
         return self.constant(Fraction(chosen))
-
-
-def moved(into: Array, back: Array, oldest: Array) -> tuple[Array, Array]:
-    """A frame N and its inverse, (n, n, 1), turned with the oldest errors, whose coefficients are (n, n, B): Q'N and
-    N^-1 Q, Q the orthogonal factor of N times these, each column on the scale of 1."""
-    columns = turned(into, oldest)
-    columns = np.nan_to_num(columns / np.abs(columns).sum(0), posinf=0.0, neginf=0.0)
-    columns[np.diag_indices(len(oldest))] += _APART
-    Q, R = (M.transpose(1, 2, 0) for M in np.linalg.qr(columns.transpose(2, 0, 1)))
-    Q = Q * np.where(R[np.diag_indices(len(R))] < 0, -1.0, 1.0)
-    return turned(Q.transpose(1, 0, 2), into), turned(back, Q)
 
 
 def turned(N: Array, columns: Array) -> Array:
