@@ -307,8 +307,8 @@ def test_axes_that_stay_are_refused_where_those_that_move_are_not() -> None:
     loop = linear("slow turn", 2.0**-10)
     loop.g = [g / 10**6 for g in loop.g]
     target = [["-", x, "20"] for x in NAMES[:2]]  # far from all that is true
-    assert verdict(moving(loop.document(300, target))) is None
-    assert verdict(loop.document(300, target)) == "ranks"
+    assert verdict(moving(loop.document(400, target))) is None
+    assert verdict(loop.document(400, target)) == "ranks"
 
 
 @pytest.mark.parametrize("memory", [None, 2, 4])
