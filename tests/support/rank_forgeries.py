@@ -98,7 +98,9 @@ class Ranked:
 class Draw:
     """A random loop of one to three states: steps or held inputs, angles, something uncertain, corners."""
 
-    def __init__(self, seed: int, sizes: Sequence[int] = (1, 1, 2, 2, 2, 3), memory: int | None = None) -> None:
+    def __init__(
+        self, seed: int, sizes: Sequence[int] = (1, 1, 2, 2, 2, 3), memory: int | None = None, moving: bool = False
+    ) -> None:
         self.chance = np.random.default_rng(seed)
         self.n = int(self.chance.choice(sizes))
         self.states = ("x", "y", "z")[: self.n]
@@ -106,7 +108,7 @@ class Draw:
         self.angles = [i for i in range(self.n) if self.chance.random() < 0.35]
         self.straight = [i for i in range(self.n) if i not in self.angles]
         self.frames = np.random.default_rng([seed, 1])  # of its own: other draws stay as they are
-        self.memory = memory
+        self.memory, self.moving = memory, moving
 
     def frame(self) -> list[list[float]] | None:
         """None, or a matrix: turned, sheared, nearly singular, or of very different scales."""
@@ -177,6 +179,7 @@ class Draw:
             domain=("-6", "6"),
             frame=self.frame(),
             memory=self.memory,
+            moving=self.moving,
         )
 
     def ranked(self, hair: float = HAIR, depths: Sequence[int] = (6, 8, 9)) -> Ranked:
@@ -196,7 +199,7 @@ class _Each(Course):
         self.good = np.ones(count, dtype=bool)
 
     def note(self, rule: str, hold: Array, numbers: Array, detail: str) -> None:
-        self.good &= hold
+        self.good[numbers] &= hold
 
 
 def solved(
@@ -311,6 +314,8 @@ class Forger:
             yield Forgery("another frame", edited(self.data, f"{ranking}.frame", frame), {rule})
         for memory in (0, 17, 1.5, "2", True, None):
             yield Forgery("a memory that is none", edited(self.data, f"{ranking}.memory", memory), {"format"})
+        for moving in (False, 1, "true", None):
+            yield Forgery("a moving that is none", edited(self.data, f"{ranking}.moving", moving), {"format"})
         some = [i for i, byte in enumerate(made.tree) if byte != 255]
         for i in self.some(some, 1):
             cut = made.tree[:i] + b"\xff" + made.tree[i + 1 :]

@@ -82,6 +82,7 @@ class Loop:
     squash: str = "identity"
     frame: list[list[float]] | None = None
     memory: int | None = None
+    moving: bool = False
 
     def document(self, lo: Sequence[float], hi: Sequence[float], tree: bytes, ranks: bytes, steps: bytes) -> Document:
         n = len(self.states)
@@ -97,6 +98,7 @@ class Loop:
         ranking = {"lo": encode(*lo), "hi": encode(*hi), "tree": raw(tree), "ranks": raw(ranks), "steps": raw(steps)}
         ranking |= {} if self.frame is None else {"frame": encode(*[v for row in self.frame for v in row])}
         ranking |= {} if self.memory is None else {"memory": self.memory}
+        ranking |= {"moving": True} if self.moving else {}
         return {
             "schema": "certify-certificate/9",
             "claim": claim | ({} if self.keep is None else {"keep": self.keep}),
