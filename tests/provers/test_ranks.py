@@ -499,3 +499,10 @@ def test_leaves_without_a_promising_state_wait() -> None:
     assert guided.boxes < 0.9 * plain.boxes
     corners = np.array(leaves_of(guided.evidence))[guided.evidence.proved]
     assert np.all(converge(corners.mean(1)))
+
+
+def test_boxes_are_followed_as_far_as_the_effort_allows_and_the_shortest_run_needs() -> None:
+    wanted = Wanted(np.zeros(1), np.ones(1), arrivals=(40, 100))
+    assert wanted.straight(1000) == tuple(range(38, 153))
+    assert wanted.straight(90) == tuple(range(38, 91))
+    assert wanted.straight(10) == tuple(range(38, 63))

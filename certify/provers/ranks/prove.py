@@ -22,7 +22,7 @@ from certify.provers.ranks.images import Course, Images
 from certify.provers.ranks.remaining import Remaining
 from certify.provers.ranks.search import COUNTS, Promising, Search
 from certify.provers.ranks.targets import TURN, Target
-from certify.provers.ranks.wanted import COUNTS_FROM, Direct, SearchFrom, Wanted
+from certify.provers.ranks.wanted import COUNTS_FROM, MOST_STEPS, Direct, SearchFrom, Wanted
 
 _HALF_TURN = 3.1416  # and a little more
 _SLIVER, _SAMPLES = 1e-6, 64
@@ -35,6 +35,7 @@ _DEPENDENT = 1e8  # condition of a frame that is of no use
 _MEMORIES = (1, 2, 4, 8)
 _THERE = 1e-6  # width of an image in the target, as a share of the root box's
 _COUNTS_BACK = COUNTS[:7]  # the leaf itself or its neighbours are not far away
+_BOXES, _STEPS = 1_000, 255  # that are followed straight to the target, as far as the effort allows; at least so far
 _AT_FIRST = 0.1  # share of the effort for the first tree
 
 
@@ -235,7 +236,9 @@ def prove_ranks(
     else:
         searches = [SearchFrom(question.course(COUNTS_FROM), *question.root, wanted)]
         if wanted.direct:
-            searches.insert(0, Direct(question.course(wanted.straight, 0), *question.root, wanted))
+            affordable = effort.left / (_BOXES * question.course((1,)).operations)
+            counts = wanted.straight(int(np.clip(affordable, _STEPS, MOST_STEPS)))
+            searches.insert(0, Direct(question.course(counts, 0), *question.root, wanted))
     boxes = rounds = 0
     for search in searches:
         with shared(runner, search.course) as bound:

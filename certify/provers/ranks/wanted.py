@@ -41,11 +41,17 @@ class Wanted:
     direct: int = 0
     arrivals: tuple[int, ...] = ()
 
-    @property
-    def straight(self) -> tuple[int, ...]:
-        """The steps after which an image may lie in the target: all around those that runs take."""
+    def straight(self, longest: int) -> tuple[int, ...]:
+        """The steps after which an image may lie in the target: all around those that runs take, up to the longest or
+        as many as suit the shortest run."""
         least, most = min(self.arrivals, default=0), max(self.arrivals, default=0)
-        return tuple(range(max(1, least - _AROUND), min(MOST_STEPS, most + most // 2 + _AROUND) + 1))
+        end = min(max(longest, _later(least)), _later(most))
+        return tuple(range(max(1, least - _AROUND), end + 1))
+
+
+def _later(steps: int) -> int:
+    """The most steps that are looked at where a run takes so many."""
+    return steps + steps // 2 + _AROUND
 
 
 class SearchFrom(Search):
