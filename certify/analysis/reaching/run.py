@@ -49,6 +49,7 @@ from certify.provers.ranks import (
     Question,
     RankProof,
     Wanted,
+    affordable,
     prove_ranks,
     root_box,
     with_errors,
@@ -185,7 +186,7 @@ def _proved(
     question = goal.question(begins(options.begin or whole)[:_PROBES].T, search, clerk.tried)
     if options.begin is not None:
         with tools.timing("ranks"):
-            most = min(max(arrivals, default=0) or MOST_STEPS, MOST_STEPS)
+            most = min(max(arrivals, default=0) or MOST_STEPS, affordable(question, search))
             lo, hi, weights = _parts(options.begin)
             question = with_errors(question, lo, hi, most, search, weights)
     angles = system.angles if goal.given is None else tuple(system.states[i].name for i in goal.turned)

@@ -135,6 +135,11 @@ def with_errors(
     return best
 
 
+def affordable(question: Question, effort: Effort) -> int:
+    """The steps over which a thousand boxes may be followed with the effort; neither few nor very many."""
+    return int(np.clip(effort.left / (_BOXES * question.course((1,)).operations), _STEPS, MOST_STEPS))
+
+
 def _images(course: Course, lo: Array, hi: Array, effort: Effort) -> Images:
     """Images of boxes (n, B), whose steps are charged."""
     found = course(lo, hi, 0.0, 0.0)
@@ -236,8 +241,7 @@ def prove_ranks(
     else:
         searches = [SearchFrom(question.course(COUNTS_FROM), *question.root, wanted)]
         if wanted.direct:
-            affordable = effort.left / (_BOXES * question.course((1,)).operations)
-            counts = wanted.straight(int(np.clip(affordable, _STEPS, MOST_STEPS)))
+            counts = wanted.straight(affordable(question, effort))
             searches.insert(0, Direct(question.course(counts, 0), *question.root, wanted))
     boxes = rounds = 0
     for search in searches:
