@@ -18,6 +18,7 @@ from certify.checker.ranks import Steps
 from certify.reference import rules
 from certify.reference.document import read
 from tests.support.certificates import edited
+from tests.support.marks import slow_after
 from tests.support.rank_forgeries import by_checker
 from tests.support.ranked import UNRANKED, Document, Loop, affine, around_level, dumped, mapped, two_bytes, uniform
 
@@ -540,7 +541,7 @@ def test_the_checker_has_the_same_limits() -> None:
     assert by_checker(on_unit(plus("x", H(["-", ["sin", "x"], "1/2"])), -3.25, 3.25, angles=("x",))) is None
 
 
-@pytest.mark.parametrize("size", [1, 2, 3])
+@pytest.mark.parametrize("size", slow_after(1, [2, 1, 3]))
 def test_the_checker_says_the_same_in_small_batches(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A leaf may then have more images than a batch has places, and all leaves must keep their own."""
     chance = random.Random(11)
