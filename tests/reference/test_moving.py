@@ -28,6 +28,7 @@ from certify.reference.document import read
 from certify.reference.evidence import Ranked
 from certify.reference.leaves import Box
 from certify.reference.ranks import Rows, Walk
+from certify.reference.refusal import Refused
 from tests.support.rank_forgeries import verdicts
 from tests.support.ranked import Document, Loop, affine, around_level, dumped, encode, two_bytes
 
@@ -53,7 +54,7 @@ LOOPS: dict[str, tuple[list[str], str]] = {  # the rows of A, one after the othe
 }
 FRAMES: dict[int, list[list[list[float]] | None]] = {
     1: [None, [[-3.0]]],
-    2: [None, [[1.0, 0.5], [-3.0, 2.0]], [[1.0, 1.0], [1.0, 1.0 + 2.0**-4]]],
+    2: [None, [[1.0, 0.5], [-3.0, 2.0]], [[1000003.0, 1e6], [1e6, 999999.0]]],  # the last has rows that are alike
     3: [None, [[0.0, 0.0, 3.0], [1.0, 2.0, 0.5], [-1.0, 0.25, 0.0]]],
 }
 
@@ -72,7 +73,11 @@ class Linear:
         n = len(self.A)
         rows = [[["*", str(a), x] for a, x in zip(row, NAMES, strict=False)] for row in self.A]
         dynamics = [["+", *row, ["*", str(g), "q"], str(s)] for row, g, s in zip(rows, self.g, self.s, strict=True)]
-        more = {"uncertain": [("q", "-1", "1")], "domain": ("-9999999", "9999999"), "most": 65_534} | more
+        more = {
+            "uncertain": [("q", "-1", "1")],
+            "domain": ("-999999999999999", "999999999999999"),
+            "most": 65_534,
+        } | more
         return Loop(dynamics, [affine([[0.0] * n])], target or [["-", "x", "999"]], NAMES[:n], **more)
 
     def document(self, k: int, target: list[Any] | None = None, **more: Any) -> Document:
@@ -134,15 +139,17 @@ def walked(data: Document, steps: int) -> list[Rows]:
     return found
 
 
-def by_checker(data: Document, steps: int) -> list[tuple[list[Vector], Vector]]:
-    """The checker's forms, exactly, and the bounds of their errors."""
-    found = []
+def known(data: Document, steps: int) -> list[tuple[list[Vector], Vector]]:
+    """The checker's forms, exactly, and the bounds of their errors, as long as these are finite."""
+    found = list[tuple[list[Vector], Vector]]()
     with np.errstate(all="ignore"):
         walk = Steps(Case(document.certificate(json.loads(dumped(data)), "0" * 64)))
         ranking = walk.c.ranks
         x = walk.start(ranking.lo[:, None], ranking.hi[:, None])
         for _ in range(steps):
             x, _ = walk.step(x, np.arange(1), Course())
+            if not np.all(np.isfinite(x.value)) or not np.all(np.isfinite(x.error.top)):
+                break
             rows = [[Fraction(v) for v in row] for row in x.value[:, :, 0].T.tolist()]
             found.append((rows, [Fraction(v) for v in x.error.top[:, 0].tolist()]))
     return found
@@ -183,15 +190,82 @@ def test_images_hold_all_that_is_true(name: str, memory: int) -> None:
     ways += [[Fraction(chance.randint(-9, 9)) for _ in range(n)] for _ in range(6)]
     for frame in FRAMES[n]:
         data = loop.document(7, frame=frame, memory=memory, moving=True)
+        rows_too = [[Fraction(v) for v in row] for row in frame or [] if all(v == int(v) for v in row)]
         with ctx.workprec(64):
-            for k, (rows, (other, error)) in enumerate(zip(walked(data, 7), by_checker(data, 7), strict=True), 1):
+            for k, (rows, (other, error)) in enumerate(zip(walked(data, 7), known(data, 7), strict=True), 1):
                 truth = loop.after(k)
-                for v in ways:
+                for v in ways + rows_too:
                     true, allowed = loose(v, rows, truth)
                     assert true <= allowed, (frame, k, v)
                     bounds = along(v, zip(*(row[n + 1 :] for row in other), strict=True))
                     more = dot([abs(a) for a in v], error)
                     assert away(v, [row[: n + 1] for row in other], truth) <= bounds + more, (frame, k, v)
+
+
+@pytest.mark.parametrize("memory", [1, 3])
+@pytest.mark.parametrize("name", ["turn", "contraction", "stretch", "a screw"])
+def test_both_programs_have_the_same_directions(name: str, memory: int) -> None:
+    """Where no errors are roundings alone, whose columns are as long as others."""
+    loop = linear(name)
+    loop.g = [g + Fraction(1, 13) for g in loop.g]
+    for frame in FRAMES[len(loop.A)][:2]:
+        data = loop.document(7, frame=frame, memory=memory, moving=True)
+        with ctx.workprec(64):
+            each = zip(walked(data, 7), known(data, 7), strict=True)
+            for balls, (rows, _) in each:
+                for row, other in zip(balls, rows, strict=True):
+                    most = max(map(abs, other))
+                    assert all(abs(exactly(v) - w) <= most / 10**9 for v, w in zip(row, other, strict=True))
+
+
+def of_no_use(chance: np.random.Generator, n: int, kind: str) -> Any:
+    """A matrix that is not orthogonal, or not one of numbers."""
+    Q = np.linalg.qr(chance.standard_normal((n, n)))[0]
+    if kind == "near":
+        return Q + 1e-3 * chance.standard_normal((n, n))
+    if kind == "far":
+        return Q @ np.diag([0.75, 1.2, 0.9][:n]) + 0.03 * chance.standard_normal((n, n))
+    if kind == "any":
+        return chance.standard_normal((n, n))
+    if kind == "singular":
+        return Q * np.array([0.0, 1.0, 1.0])[:n]
+    Q[0, 0] = np.nan
+    return Q
+
+
+@pytest.mark.parametrize("kind", ["near", "far", "any", "singular", "nan"])
+def test_nothing_is_believed_of_the_directions(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images hold what is true, or none are known, whatever is taken for the directions."""
+    chance, found = np.random.default_rng(3), 0
+    for name, memory in itertools.product(("turn", "contraction", "one state is set", "a screw", "a line"), (1, 2)):
+        loop = linear(name)
+        n = len(loop.A)
+        ways = [[Fraction(int(i == j)) for j in range(n)] for i in range(n)]
+        ways += [[Fraction(int(a)) for a in chance.integers(-9, 10, n)] for _ in range(4)]
+        with monkeypatch.context() as patch, ctx.workprec(64):
+            Q = [of_no_use(chance, n, kind) for _ in range(3)]
+            data = loop.document(3, memory=memory, moving=True)
+            once, again = iter(Q), iter(Q)
+            patch.setattr("certify.reference.directions.orthogonal", lambda columns, some=once: next(some).tolist())
+            patch.setattr(np.linalg, "qr", lambda columns, some=again: (next(some)[None],))
+            try:
+                balls = walked(data, 3)
+            except Refused:
+                balls = []
+            rows = known(data, 3)
+        for k in range(3):
+            for v in ways:
+                if balls:
+                    with ctx.workprec(64):
+                        true, allowed = loose(v, balls[k], loop.after(k + 1))
+                    assert true <= allowed
+                if k < len(rows):
+                    other, error = rows[k]
+                    bounds = along(v, zip(*(row[n + 1 :] for row in other), strict=True))
+                    more = dot([abs(a) for a in v], error)
+                    assert away(v, [row[: n + 1] for row in other], loop.after(k + 1)) <= bounds + more
+        found += len(balls) + len(rows)
+    assert (found > 0) == (kind not in ("singular", "nan"))
 
 
 @pytest.mark.parametrize("memory", [1, 2])
