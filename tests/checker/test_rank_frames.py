@@ -21,8 +21,8 @@ from flint import arb, ctx, fmpq, fmpq_mat
 
 from certify.checker import document
 from certify.checker.case import Case
-from certify.checker.near import Above
-from certify.checker.ranks import Course, Steps
+from certify.checker.near import Above, Near
+from certify.checker.ranks import Course, Steps, turned
 from certify.checker.taylor import Taylor
 from certify.reference.document import read
 from certify.reference.evidence import Ranked
@@ -303,3 +303,23 @@ def test_which_frames_are_read(name: str) -> None:
     data = leading(loop, [-1.0, -1.0], [1.0, 1.0], 2)
     data["evidence"]["ranks"]["frame"] = encode(*entries)
     assert verdicts(data) == (rule, rule)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+def test_bounds_in_directions_that_move_hold_for_all_errors(n: int) -> None:
+    """Of columns with symbols in [-1, 1] and of numbers known by their size alone; Q is what the rule says of it."""
+    chance, batch, K = np.random.default_rng(n), 7, n + 4
+    columns, sizes = (
+        chance.normal(size=(n, K, batch)) * 10.0 ** chance.integers(-6, 3, (K, 1)),
+        chance.uniform(0, 3, (n, batch)),
+    )
+    identity = Near(np.eye(n)[:, :, None], Above(np.zeros((n, n, 1))))
+    bound, back = turned(Near(columns), Above(sizes), identity)
+    for b in range(batch):
+        Q = back.value[:, :, b].T  # (N^-1 Q)', N the identity
+        N = np.linalg.inv(Q)
+        most = np.abs(N @ columns[:, :, b]).sum(1) + np.abs(N) @ sizes[:, b]
+        assert np.all(bound.top[:, b] >= most * (1 - 1e-12))
+        assert np.all(bound.top[:, b] <= most.max() * 1e-12 + most * (1 + 1e-12))
+        R = N @ (columns[:, :n, b] / np.abs(columns[:, :n, b]).sum(0) + 2.0**-20 * np.eye(n))
+        assert np.allclose(np.tril(R, -1), 0, atol=1e-12) and np.all(np.diagonal(R) >= 0)
