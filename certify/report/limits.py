@@ -31,20 +31,23 @@ _OF_OUTER = {
 AT_A_POINT = frozenset({"domain", "vdot", "input", "keep"})
 """Kinds of limits that are met at a state, which is named; of others a run knows along which states it was hard."""
 _TOUCHING = Fraction(1, 10**6)  # relative distance from the domain's limit below which a set is said to touch it
+_CUT_SHORT = frozenset({"boxes", "effort", "time"})  # ends of a search that are no limit of a set that touches it
 
 
 def limited_by(result: Mapping[str, Any]) -> str:
     """The limit of a result's level, in words; a reason that is a sentence already stays as it is.
 
     An engine may stop short of the domain's limit by a margin of its own, such as a solver's precision. Then the
-    margin limits, and it is named with its size.
+    margin limits, and it is named with its size. A search that ends a rounding short of the domain's limit has met it.
     """
     reason = str(result["reason"])
     levels = result["levels"]
     level, limit = levels.get("roa"), levels.get("domain_limit")
-    if reason == "domain" and level and limit:
+    if reason in {"domain", *_CUT_SHORT} and level and limit:
         short = 1 - Fraction(level) / Fraction(limit)
-        if short > _TOUCHING:
+        if short <= _TOUCHING:
+            reason = "domain"
+        elif reason == "domain":
             solver: Mapping[str, Any] = result.get("solver") or {}
             precision = solver.get("precision")
             apart = f"{number(float(100 * short), 3)} % below the domain's limit {below(limit)}"

@@ -870,6 +870,14 @@ def test_what_limits_is_the_margin_and_not_the_domain(trusted_case: Case) -> Non
     assert limited_by(close) == "the domain"
 
 
+@pytest.mark.parametrize("ended", ["boxes", "effort", "time"])
+def test_a_search_that_ends_at_the_domain_is_limited_by_it(ended: str) -> None:
+    levels = {"roa": 1 - 3.4e-7, "domain_limit": 1.0}
+    assert limited_by({"reason": ended, "levels": levels}) == "the domain"
+    assert "more may be provable" in limited_by({"reason": ended, "levels": {**levels, "roa": 1 - 3e-6}})
+    assert "more may be provable" in limited_by({"reason": ended, "levels": {"roa": None, "domain_limit": 1.0}})
+
+
 def test_trusted_is_a_verdict_of_its_own() -> None:
     assert Verdict.TRUSTED.exit_status == Verdict.UNKNOWN.exit_status == 3
     assert Verdict("TRUSTED") is not Verdict.PROVED
