@@ -58,7 +58,7 @@ _SAME, _BELOW = 1e-6, 0.99  # relative: rates that are as good as equal; a rate 
 _FEW = 3  # states, for which a function beyond the ellipsoid is suggested
 _ALL = 0.995  # share of the box that has ranks: more effort gains little
 _HALVINGS = 6  # of a period that is too long, before the policy is to blame
-_ENDED = (Stop.EFFORT, Stop.BOXES, Stop.LOCAL)
+_ENDED = (Stop.EFFORT, Stop.BOXES, Stop.SMALL, Stop.LOCAL)
 
 
 def diagnose(
@@ -189,7 +189,7 @@ def _next(
         return boxes
     if (amiss := commands_too_much(*asked)) is not None:
         return Step((), amiss)
-    ended = result.stop in (Stop.INPUTS, Stop.BOXES, Stop.STALLED) or result.stop.ran_out
+    ended = result.stop in (Stop.INPUTS, Stop.BOXES, Stop.SMALL, Stop.STALLED) or result.stop.ran_out
     little = result.simulated is not None and (result.simulated.share or 0.0) < NEARLY_ALL
     if (ended or little) and (outside := clipped_outside(*asked)) is not None:
         return Step((), outside)
@@ -226,7 +226,7 @@ def _next(
         return Step((), why + "a policy that bends less there helps", flattens=_can_be_flattened(result))
     if result.stop is Stop.KEEP:
         return _around_a_constraint(result, options)
-    if result.stop in (Stop.WITNESS, Stop.INPUTS):
+    if result.stop in (Stop.WITNESS, Stop.INPUTS, Stop.SMALL):
         return _another_candidate(result, options)
     if result.stop is Stop.REQUESTED and result.levels.roa is not None:
         return Step((), "the level that was asked for is proved; leave --level out for the largest")

@@ -18,6 +18,7 @@ _LIMITS = {
     "time": "the time limit: more may be provable",
     "refused by the checker": "the checker, which refuses some of what was found",
     "boxes": "the limit on boxes: more may be provable",
+    "boxes too small": "boxes too small to be halved: more effort gains nothing",
     "requested": "the level that was asked for",
 }
 _OF_OUTER = {
@@ -26,28 +27,26 @@ _OF_OUTER = {
     "effort": "the effort: more may be provable",
     "time": "the time limit: more may be provable",
     "boxes": "the limit on boxes: more may be provable",
+    "boxes too small": "boxes too small to be halved: more effort gains nothing",
     "requested": "the level that was asked for",
 }
 AT_A_POINT = frozenset({"domain", "vdot", "input", "keep"})
 """Kinds of limits that are met at a state, which is named; of others a run knows along which states it was hard."""
 _TOUCHING = Fraction(1, 10**6)  # relative distance from the domain's limit below which a set is said to touch it
-_CUT_SHORT = frozenset({"boxes", "effort", "time"})  # ends of a search that are no limit of a set that touches it
 
 
 def limited_by(result: Mapping[str, Any]) -> str:
     """The limit of a result's level, in words; a reason that is a sentence already stays as it is.
 
     An engine may stop short of the domain's limit by a margin of its own, such as a solver's precision. Then the
-    margin limits, and it is named with its size. A search that ends a rounding short of the domain's limit has met it.
+    margin limits, and it is named with its size.
     """
     reason = str(result["reason"])
     levels = result["levels"]
     level, limit = levels.get("roa"), levels.get("domain_limit")
-    if reason in {"domain", *_CUT_SHORT} and level and limit:
+    if reason == "domain" and level and limit:
         short = 1 - Fraction(level) / Fraction(limit)
-        if short <= _TOUCHING:
-            reason = "domain"
-        elif reason == "domain":
+        if short > _TOUCHING:
             solver: Mapping[str, Any] = result.get("solver") or {}
             precision = solver.get("precision")
             apart = f"{number(float(100 * short), 3)} % below the domain's limit {below(limit)}"
@@ -96,9 +95,10 @@ def outer_limited_by(outer: Mapping[str, Any]) -> str:
 def limit_in_words(reason: str, timing: TimingInWords = PLAIN) -> str:
     """A reason that is a single word as a reader understands it; sentences stay as they are.
 
-    >>> limit_in_words("time")
-    'the time limit: more may be provable'
+    >>> limit_in_words("time"), limit_in_words("domain: the effort ended 0.2 % below its limit")
+    ('the time limit: more may be provable', 'the domain: the effort ended 0.2 % below its limit')
     """
     if reason == "witness" and not (timing.is_plain and not timing.rate):
         return f"a point where V does not fall{' at the rate asked for' if timing.rate else ''}{timing.over_what}"
-    return _LIMITS.get(reason, reason)
+    what, _, detail = reason.partition(": ")
+    return f"{_LIMITS[what]}: {detail}" if what == "domain" and detail else _LIMITS.get(reason, reason)
