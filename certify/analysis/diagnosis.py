@@ -38,6 +38,7 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, require_equilibrium
 from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import domain_limit, extents, increment_matrix, slowest_decay, volume
+from certify.provers.ball.local import corners_in_a_period
 from certify.provers.base import FEW, Proof
 from certify.provers.tube.tube import Around, find_tube
 from certify.report.timing import TimingInWords
@@ -57,7 +58,7 @@ _SAME, _BELOW = 1e-6, 0.99  # relative: rates that are as good as equal; a rate 
 _FEW = 3  # states, for which a function beyond the ellipsoid is suggested
 _ALL = 0.995  # share of the box that has ranks: more effort gains little
 _HALVINGS = 6  # of a period that is too long, before the policy is to blame
-_ENDED = (Stop.EFFORT, Stop.BOXES, Stop.LOCAL)
+_ENDED = (Stop.EFFORT, Stop.BOXES, Stop.SMALL, Stop.LOCAL)
 
 
 def diagnose(
@@ -188,7 +189,7 @@ def _next(
         return boxes
     if (amiss := commands_too_much(*asked)) is not None:
         return Step((), amiss)
-    ended = result.stop in (Stop.INPUTS, Stop.BOXES, Stop.STALLED) or result.stop.ran_out
+    ended = result.stop in (Stop.INPUTS, Stop.BOXES, Stop.SMALL, Stop.STALLED) or result.stop.ran_out
     little = result.simulated is not None and (result.simulated.share or 0.0) < NEARLY_ALL
     if (ended or little) and (outside := clipped_outside(*asked)) is not None:
         return Step((), outside)
@@ -213,6 +214,8 @@ def _next(
     if result.stop.ran_out or result.stop is Stop.BOXES:
         step = _longer(result, options, proof, effort)
         return step if result.search is None else replace(step, options=(*step.options, ("--resume", "")))
+    if (around := _around_a_corner(result, options)) is not None:
+        return around
     if options.claim == "asymptotic" and options.only is not None and _is_free(options):
         return Step((("--candidate", "auto"),), f"only the candidate {options.only} was tried")
     if result.stop is Stop.STALLED and _may_have_tube(result, options) and _has_tube(result, effort):
@@ -223,11 +226,21 @@ def _next(
         return Step((), why + "a policy that bends less there helps", flattens=_can_be_flattened(result))
     if result.stop is Stop.KEEP:
         return _around_a_constraint(result, options)
-    if result.stop in (Stop.WITNESS, Stop.INPUTS):
+    if result.stop in (Stop.WITNESS, Stop.INPUTS, Stop.SMALL):
         return _another_candidate(result, options)
     if result.stop is Stop.REQUESTED and result.levels.roa is not None:
         return Step((), "the level that was asked for is proved; leave --level out for the largest")
     return Step((), result.reason)
+
+
+def _around_a_corner(result: RoaResult, options: RoaOptions) -> Step | None:
+    """The step where a corner at the operating point leaves no ball around it, and boxes alone may do without one."""
+    system = result.system
+    if result.stop is not Stop.LOCAL or result.claim != "asymptotic" or options.enlarges or options.goes_beyond:
+        return None
+    if system.n > FEW or not corners_in_a_period(system):
+        return None
+    return Step((("--claim", "practical"),), "a set is left out that is as small as its boxes show")
 
 
 def _flatter(result: RoaResult, options: RoaOptions, proof: Proof | None) -> Step | None:

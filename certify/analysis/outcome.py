@@ -23,6 +23,13 @@ from certify.lyapunov import leaves_domain, slowest_decay
 from certify.provers.base import Task
 from certify.provers.falsify import Witness, refutes
 
+_ENDED = {
+    Stop.EFFORT: "the effort ended",
+    Stop.TIME: "the time ended",
+    Stop.BOXES: "the limit on boxes ended the search",
+    Stop.SMALL: "boxes became too small",
+}
+_CLOSE, _TOUCHING = 1e-2, 1e-6  # relative distances below the domain's limit: too little to gain, and a rounding
 _BY_KIND = {"vdot": Stop.WITNESS, "input": Stop.INPUTS, "keep": Stop.KEEP}
 
 
@@ -110,10 +117,21 @@ def lowest_witness(*witnesses: Witness | None) -> Witness | None:
     return min((w for w in witnesses if w is not None), key=lambda w: w.level, default=None)
 
 
-def limit_of(stop: Stop, task: Task, witness: Witness | None) -> Stop:
-    """The limit of a level, from what stopped its proof."""
-    if stop is Stop.WITNESS and witness is not None:
-        return _BY_KIND[witness.kind]
-    if stop is not Stop.REQUESTED or task.exactly:
-        return stop
-    return Stop.DOMAIN if witness is None else _BY_KIND[witness.kind]
+def limited(result: RoaResult, task: Task) -> RoaResult:
+    """The result of a proved level with its limit, from what stopped the proof.
+
+    A search that ends a little below the domain's limit is limited by the domain: to go on would gain next to nothing.
+    """
+    stop, witness = result.stop, result.witness
+    level, limit = result.levels.roa, result.levels.domain_limit
+    if stop in (Stop.WITNESS, Stop.REQUESTED) and witness is not None and not (stop is Stop.REQUESTED and task.exactly):
+        return replace(result, stop=_BY_KIND[witness.kind])
+    if task.exactly or witness is not None:
+        return result
+    if stop is Stop.REQUESTED:
+        return replace(result, stop=Stop.DOMAIN)
+    short = 1.0 if not (level and limit) else 1 - level / limit
+    if stop not in _ENDED or short > _CLOSE:
+        return result
+    by = "" if short <= _TOUCHING else f"{_ENDED[stop]} {100 * short:.2g} % below its limit"
+    return replace(result, stop=Stop.DOMAIN, detail=by)

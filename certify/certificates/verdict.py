@@ -80,6 +80,7 @@ class Stop(Enum):
     STALLED = "nothing gained"
     REFUSED = "refused by the checker"
     BOXES = "boxes"
+    SMALL = "boxes too small"
     CLUSTER = "the cluster went away"
     LOCAL = "local"
     FLOOR = "floor"

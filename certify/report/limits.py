@@ -18,6 +18,7 @@ _LIMITS = {
     "time": "the time limit: more may be provable",
     "refused by the checker": "the checker, which refuses some of what was found",
     "boxes": "the limit on boxes: more may be provable",
+    "boxes too small": "boxes too small to be halved: more effort gains nothing",
     "requested": "the level that was asked for",
 }
 _OF_OUTER = {
@@ -26,6 +27,7 @@ _OF_OUTER = {
     "effort": "the effort: more may be provable",
     "time": "the time limit: more may be provable",
     "boxes": "the limit on boxes: more may be provable",
+    "boxes too small": "boxes too small to be halved: more effort gains nothing",
     "requested": "the level that was asked for",
 }
 AT_A_POINT = frozenset({"domain", "vdot", "input", "keep"})
@@ -93,9 +95,10 @@ def outer_limited_by(outer: Mapping[str, Any]) -> str:
 def limit_in_words(reason: str, timing: TimingInWords = PLAIN) -> str:
     """A reason that is a single word as a reader understands it; sentences stay as they are.
 
-    >>> limit_in_words("time")
-    'the time limit: more may be provable'
+    >>> limit_in_words("time"), limit_in_words("domain: the effort ended 0.2 % below its limit")
+    ('the time limit: more may be provable', 'the domain: the effort ended 0.2 % below its limit')
     """
     if reason == "witness" and not (timing.is_plain and not timing.rate):
         return f"a point where V does not fall{' at the rate asked for' if timing.rate else ''}{timing.over_what}"
-    return _LIMITS.get(reason, reason)
+    what, _, detail = reason.partition(": ")
+    return f"{_LIMITS[what]}: {detail}" if what == "domain" and detail else _LIMITS.get(reason, reason)

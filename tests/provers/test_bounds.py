@@ -138,7 +138,7 @@ def test_budgets_stop_the_pass_with_what_is_proved_so_far(pendulum: System) -> N
 def test_a_level_beyond_the_truth_is_capped_by_a_witness() -> None:
     case = case_of(*scalar_tanh())
     proof = prove_outwards(case.problem, case.T, 0.5, 8.0, Budget(), RUNNER)
-    assert proof.stop in (Stop.WITNESS, Stop.BOXES)
+    assert proof.stop in (Stop.WITNESS, Stop.SMALL)
     assert 0.9 * 1.915008**2 < proof.outer < 1.9150081**2
 
 

@@ -320,3 +320,19 @@ def test_drag_at_rest_is_proved_with_ranges(claim: str, tmp_path: Path) -> None:
     system = plant("v p", f"3*u - p - (1 + w)*v*{moved}", "v", **W)
     result = certify_roa(system, regulator(1.0, 1.73), tmp_path, RoaOptions(effort=0.1, claim=claim))
     assert result.verdict is Verdict.PROVED
+
+
+def test_a_corner_of_a_held_input_at_rest_costs_the_ball_nothing(tmp_path: Path) -> None:
+    """The input does not change within a period, and so the series in time is known."""
+    system = plant("p v", "v", "-p - v + u*abs(u)").with_sample(TENTH)
+    result = certify_roa(system, regulator(0.2, 0.2), tmp_path, RoaOptions(effort=0.1))
+    assert result.verdict is Verdict.PROVED and result.levels.roa is not None and result.levels.roa > 0.99
+
+
+def test_a_corner_at_rest_that_a_state_may_pass_in_a_period_is_named(tmp_path: Path) -> None:
+    system = plant("p v", "v", "-p - v - v*abs(v) + u").with_sample(TENTH)
+    result = certify_roa(system, regulator(0.2, 0.2), tmp_path, RoaOptions(effort=0.1))
+    assert result.verdict is Verdict.UNKNOWN
+    assert result.reason.startswith("local: abs(v) has its corner at the operating point") and "1e-2" in result.reason
+    assert result.diagnosis is not None and result.diagnosis.next.options == (("--claim", "practical"),)
+    assert certify_roa(system, regulator(0.2, 0.2), tmp_path, RoaOptions(claim="practical")).verdict is Verdict.PROVED

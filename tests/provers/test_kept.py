@@ -167,7 +167,7 @@ def test_a_violation_just_inside_the_level_ends_the_search(tmp_path: Path) -> No
     proof = BoundsEngine(case.T, ThreadRunner()).prove(task, Budget(Effort(UNIT)))
     assert proof.claim is not None and proof.claim.roa < level and len(proof.claim.keep) == 1
     assert proof.witness is None or proof.witness.kind == "keep"
-    assert proof.stop in (Stop.WITNESS, Stop.BOXES)
+    assert proof.stop in (Stop.WITNESS, Stop.SMALL)
 
 
 def test_the_optimised_candidate_turns_away_from_a_wall() -> None:

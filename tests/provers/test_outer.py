@@ -388,6 +388,11 @@ def test_an_end_of_the_budget_leaves_a_lower_level(boxes: int) -> None:
         assert boxes < 600
 
 
+def test_boxes_too_small_to_halve_are_no_limit_on_boxes() -> None:
+    found = prove(planar(), wells([[1.0, 0.0], [-0.5, 0.875], [-0.5, -0.875]], 0.75), least_width=0.1)
+    assert found is not None and found.stop is Stop.SMALL
+
+
 def test_no_time_proves_nothing() -> None:
     assert prove(planar(), wells([[1.0, 0.0], [0.0, 1.0]], 0.75), effort=Effort(1.0)) is None
 

@@ -38,6 +38,12 @@ def test_a_pass_in_pieces_is_the_pass_in_one() -> None:
     assert found.leaves == found.tree.count(b"\xff") and pieces.levels == (1e-6, whole.outer)
 
 
+def test_boxes_too_small_to_halve_are_no_limit_on_boxes() -> None:
+    case = case_of(get_system("pendulum"), pendulum_network())
+    found = prove_outwards(case.problem, case.T, 1e-6, 6.0, Budget(batch=16, least_width=0.2), RUNNER)
+    assert found.stop is Stop.SMALL and found.outer < 6.0 and found.boxes < 1000
+
+
 def test_a_snapshot_is_a_proof() -> None:
     """On every leaf that meets the ring of a snapshot the bound is negative with the snapshot's own levels."""
     from certify.certificates.tree import leaves

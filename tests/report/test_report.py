@@ -52,7 +52,7 @@ from certify.report.claims import CLAIMS
 from certify.report.figures import draw
 from certify.report.figures.geometry import PARTS, ellipse, refine, shadow
 from certify.report.flow import Flow, domain_bounds, simulate, time_scales
-from certify.report.limits import limited_by
+from certify.report.limits import limited_by, outer_limited_by
 from certify.report.sampling import quadratic
 from certify.report.sections.status import status_of
 from certify.report.words import above, below, kept_apart, label, number, symbol
@@ -868,6 +868,14 @@ def test_what_limits_is_the_margin_and_not_the_domain(trusted_case: Case) -> Non
     levels = trusted_case.result["levels"]
     close = {**trusted_case.result, "levels": {**levels, "roa": levels["domain_limit"] * (1 - 1e-9)}}
     assert limited_by(close) == "the domain"
+
+
+def test_a_limit_that_is_near_says_how_near() -> None:
+    levels = {"roa": 0.998, "domain_limit": 1.0}
+    near = "domain: the effort ended 0.2 % below its limit"
+    assert limited_by({"reason": near, "levels": levels}) == f"the {near}"
+    small = limited_by({"reason": "boxes too small", "levels": levels})
+    assert "more effort gains nothing" in small and outer_limited_by({"limit": "boxes too small"}) == small
 
 
 def test_trusted_is_a_verdict_of_its_own() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from certify.analysis.acceptance import Accepted, Clerk, Desk
 from certify.analysis.beyond import constraints_in_words, outer_facts, rank_facts, short_of
-from certify.analysis.outcome import limit_of, short_of_target, with_levels
+from certify.analysis.outcome import limited, short_of_target, with_levels
 from certify.analysis.results import RoaResult
 from certify.analysis.stages.state import State, Tools
 from certify.certificates import Certificate, TrustedSolver
@@ -96,7 +96,7 @@ def _concluded(state: State, accepted: Accepted) -> State:
     from certify.analysis.stages.further import holds, named
 
     trial, options, result = state.contest.best.trial, state.options, state.result
-    task, claim, proof, witness = trial.task, accepted.certificate.claim, state.proof, result.witness
+    task, claim, proof = trial.task, accepted.certificate.claim, state.proof
     leaves = 0 if proof is None else proof.leaves
     found = _with_certificate(result, accepted, leaves)
     if options.lyapunov_level is not None and (claim.outer is None or claim.outer.level < options.lyapunov_level):
@@ -114,14 +114,8 @@ def _concluded(state: State, accepted: Accepted) -> State:
         return state.finished(short_of_target(refused, task, claim))
     lowered = state.claim is not None and claim.roa < state.claim.roa
     trusted = isinstance(accepted.certificate.evidence, TrustedSolver)
-    return replace(
-        state,
-        result=replace(
-            found,
-            verdict=Verdict.TRUSTED if trusted else Verdict.PROVED,
-            stop=Stop.REFUSED if lowered else limit_of(result.stop, task, witness),
-        ),
-    )
+    found = replace(found, stop=Stop.REFUSED) if lowered else limited(found, task)
+    return replace(state, result=replace(found, verdict=Verdict.TRUSTED if trusted else Verdict.PROVED))
 
 
 def _with_certificate(result: RoaResult, accepted: Accepted, leaves: int) -> RoaResult:

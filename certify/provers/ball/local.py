@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from certify.certificates import LocalBall
 from certify.certificates.claims import Problem
 from certify.effort import UNLIMITED, Effort
-from certify.loop.plants import corners_at_rest
+from certify.loop.expressions import Expression, symbols_of
+from certify.loop.plants import System, corners_at_rest
 from certify.lyapunov import domain_limit, extents
 from certify.provers.ball.cells import cut, cuts_for
 from certify.provers.ball.decrease import (
@@ -421,7 +422,14 @@ class Rule:
 def order_on(problem: Problem) -> int:
     """The order of the series in time on a ball; 1 where no input is held."""
     system = problem.loop.system
-    return 1 if system.sample is None or corners_at_rest(system) else _ORDER
+    return 1 if system.sample is None or corners_in_a_period(system) else _ORDER
+
+
+def corners_in_a_period(system: System) -> list[Expression]:
+    """The terms with a corner at the operating point that a state may pass while an input is held: their series in
+    time is not known, and the mean of f alone is left. An input does not change in a period."""
+    corners = [] if system.sample is None else corners_at_rest(system)
+    return [term for term in corners if symbols_of(term) & set(system.states)]
 
 
 def _largest(good: Callable[[float], bool], limit: float, effort: Effort, fall: float = _FAR) -> float | None:

@@ -15,7 +15,7 @@ from certify.certificates.claims import Asymptotic, Claim, Practical, Problem
 from certify.certificates.verdict import Stop
 from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
-from certify.provers.ball.local import local_ball, prove_band, prove_local
+from certify.provers.ball.local import corners_in_a_period, local_ball, prove_band, prove_local
 from certify.provers.ball.models import meets_corner, paths
 from certify.provers.base import FEW, Attempt, Budget, Engine, Once, Proof, Report, SearchState, Task
 from certify.provers.boxes.search import Pass, RingProof, empty_ring, outwards, prove_inwards, prove_outwards
@@ -57,7 +57,8 @@ class BoundsEngine(Engine):
         if first is not None and _is_ample(first, task.target):
             return first
         if alone:
-            return first or Proof(None, None, Stop.LOCAL, "no ball shows V to fall around any level; try another P")
+            why = _corner_in_a_period(task.problem) or "no ball shows V to fall around any level; try another P"
+            return first or Proof(None, None, Stop.LOCAL, why)
         if first is not None and budget.effort.left < _FOR_BALL * whole:
             return first
         second = self._by_leaves(task, budget, report)
@@ -235,14 +236,7 @@ class _Outwards:
         if self.hurried:
             return Proof(None, None, Stop.EFFORT, "it ended before a local level was found", seconds=self.seconds)
         if self.inner is None:
-            smaller = ", or a smaller --rate" if self.task.problem.rate else ""
-            why = f"the linearisation does not dominate on any ball; try another --Q{smaller}"
-            if meets_corner(paths(self.task.problem.loop)):
-                why = (
-                    "a unit of relu has its corner at the operating point, and V is not shown to fall in all "
-                    "directions there; try another P, or --claim practical"
-                )
-            return Proof(None, None, Stop.LOCAL, why, seconds=self.seconds)
+            return Proof(None, None, Stop.LOCAL, _why_no_ball(self.task.problem), seconds=self.seconds)
         if self.ring is None:
             ring = empty_ring(self.task.problem, self.engine.T, self.inner)
         else:
@@ -250,3 +244,27 @@ class _Outwards:
         claim = Asymptotic(roa=ring.outer, local=self.inner, **_beside(self.task.problem))
         lost = "" if self.ring is None or self.stop is not Stop.CLUSTER else self.ring.lost
         return replace(self.engine.stated(self.task.problem, ring, claim, dict(self.seconds)), detail=lost)
+
+
+def _why_no_ball(problem: Problem) -> str:
+    """The reason why no ball around the origin shows V to fall, and what may help."""
+    if meets_corner(paths(problem.loop)):
+        return (
+            "a unit of relu has its corner at the operating point, and V is not shown to fall in all "
+            "directions there; try another P, or --claim practical"
+        )
+    smaller = ", or a smaller --rate" if problem.rate else ""
+    dominates = f"the linearisation does not dominate on any ball; try another --Q{smaller}"
+    return _corner_in_a_period(problem) or dominates
+
+
+def _corner_in_a_period(problem: Problem) -> str:
+    """The sentence about a corner at the operating point that a state may pass while an input is held; empty without
+    one."""
+    corners = corners_in_a_period(problem.loop.system)
+    if not corners:
+        return ""
+    return (
+        f"{corners[0]} has its corner at the operating point, where too little is known of what a held input does; try "
+        "--claim practical or a much shorter --sample-time, or round it off, as sqrt(v**2 + 1e-2) does with abs(v)"
+    )

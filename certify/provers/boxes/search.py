@@ -237,7 +237,7 @@ class Pass:
         if small.any():
             self.covered = self.covered and bool(found.smooth[small].all())
             if sweep.stuck(*rule.levels(lo.compress(small, -1), hi.compress(small, -1))):
-                self._stop = Stop.BOXES
+                self._stop = Stop.SMALL
         self.growth.reopen(self.frontier, halves, found, np.zeros(0))  # the order is known without the old keys
         self.frontier.drop_above(sweep.last())
 

@@ -145,7 +145,7 @@ class Cover:
         if halves.small.any():
             bottom = float(found.lowest[halves.small].min())
             if bottom <= self.level:
-                self.level, self.stop = bottom - self.slack, Stop.BOXES
+                self.level, self.stop = bottom - self.slack, Stop.SMALL
         self.done_share += self._share(lo.compress(found.proved, -1), hi.compress(found.proved, -1))
         self.leaves += int(found.proved.sum())
         self.growth.reopen(self.frontier, halves, found, key)
