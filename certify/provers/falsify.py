@@ -30,6 +30,7 @@ Mask = NDArray[np.bool_]
 _RATIO, _LEVELS, _LOWER = 1.4, 60, 13  # a survey: ratio of levels, their number, further steps of 8
 _CALL, _EACH = 3e5, 0.3  # operations of evaluating few states at once; of an operation at one, with its derivative
 _TOGETHER = 15  # levels that are looked at in one batch
+_SPREAD, _WORST = 64, 64  # samples of a level from which a survey climbs: in all directions, and the worst ones
 Kind = Literal["vdot", "input", "keep"]
 _STARTS = 256  # points from which each constraint is looked for
 _APART = 1e-7  # share of a state's or an input's size between the points of a difference
@@ -127,8 +128,8 @@ def is_violated(problem: Problem, T: Array, limit: float, samples: int = 4000, s
 def survey(
     problem: Problem, T: Array, limit: float, samples: int = 512, seed: int = 0, effort: Effort = UNLIMITED
 ) -> list[Band]:
-    """The bands of levels up to `limit` on which no violation was found, the highest first; once the effort
-    is over, samples are not climbed from."""
+    """The bands of levels up to `limit` on which no violation was found, the highest first: by samples, and by ascent
+    from some of them; once the effort is over, samples are not climbed from."""
     search = _Search(problem, T, effort)
     steps = 20 if problem.loop.system.sample is None else 8  # each of many times the work
     generator = np.random.default_rng(seed)
@@ -136,12 +137,15 @@ def survey(
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
 
     def clear(level: Array, steps: int) -> list[bool]:
-        """True for each level (k,) whose samples show no violation after so many steps of ascent."""
+        """True for each level (k,) whose samples show no violation, after so many steps of ascent from some of them."""
         found: list[bool] = []
         for k in range(0, len(level), _TOGETHER):
-            each = np.repeat(level[k : k + _TOGETHER], samples)[:, None]
-            z = search.climb(np.sqrt(each) * np.resize(direction, (len(each), direction.shape[1])), each, steps)
-            found += [not bad.any() for bad in search.bad(z).reshape(-1, samples)]
+            each = level[k : k + _TOGETHER, None, None]
+            z = (np.sqrt(each) * direction).reshape(-1, direction.shape[1])
+            if steps:
+                starts = search.promising(z.reshape(len(each), *direction.shape))
+                z = search.climb(starts, np.repeat(each.ravel(), len(starts) // len(each))[:, None], steps)
+            found += [not bad.any() for bad in search.bad(z).reshape(len(each), -1)]
         return found
 
     def good(levels: list[float]) -> list[bool]:
@@ -287,6 +291,17 @@ class _Search:
         """True (B,) where a condition fails."""
         vdot, excess = self.violation(z)
         return (vdot >= 0) | (excess > 0) if self.asks_more else vdot >= 0
+
+    def promising(self, z: Array) -> Array:
+        """Those of the samples (k, B, n) of each of k spheres to climb from, (k * fewer, n): some in all directions,
+        and those of the largest D', or next to a bound."""
+        vdot, excess = self.violation(z.reshape(-1, z.shape[-1]))
+        every = max(1, z.shape[1] // _SPREAD)
+        found = [z[:, ::every]]
+        for value in (vdot, excess) if self.asks_more else (vdot,):
+            worst = np.argsort(-value.reshape(z.shape[:2]), axis=1, kind="stable")[:, :_WORST]
+            found.append(np.take_along_axis(z, worst[:, :, None], axis=1))
+        return np.concatenate(found, axis=1).reshape(-1, z.shape[-1])
 
     @np.errstate(all="ignore")
     def lowest(self, start: Array) -> Witness | None:

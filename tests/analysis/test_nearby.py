@@ -99,6 +99,16 @@ def test_a_candidate_leaves_half_of_the_effort_to_its_only_heat() -> None:
     assert effort.left == 12.5
 
 
+def test_sampling_other_candidates_leaves_half_to_their_only_heats() -> None:
+    """Of a wide network the samples of all candidates took all the effort, and no heat was run."""
+    state: Any = SimpleNamespace(interruptible=False, options=RoaOptions())
+    tools: Any = SimpleNamespace(whole=100.0)
+    effort = Effort(25.0)
+    granted = _Choice(state, tools, effort, race=cast(Any, None))._for_others()
+    granted.charge(granted.left)
+    assert effort.left == 12.5
+
+
 def test_a_look_at_a_step_is_no_dearer_than_a_step() -> None:
     """Only an input that is held needs a series."""
     plant, law = bumpy()

@@ -184,6 +184,12 @@ class _Trials:
         alone = self.state.interruptible or not self.state.options.goes_beyond
         return _granted(self.effort if alone else self.effort.share(_TO_FIND), self.tools.whole, share)
 
+    def _for_others(self) -> Effort:
+        """The effort for sampling the candidates that are solved for; a search that cannot be interrupted keeps half of
+        what is left to its heats, without which a candidate is worth nothing."""
+        granted = self._granted()
+        return granted if self.state.interruptible else granted.part(min(granted.left, _TO_FIND * self.effort.left))
+
     def _enter_alone(self, trial: Trial, share: float = _SEARCH) -> Contender | None:
         """Enter a trial with a heat of this share of the effort that is left; None if its reach is not worth one."""
         before = len(self.race.contenders)
@@ -273,7 +279,7 @@ class _Choice(_Trials):
         trials = [] if large is None else [large]
         if not self.effort.over or not race.proved:
             with self.tools.timing("candidate"):
-                trials = [*solved(loop, found, state.options, self._granted()), *trials]
+                trials = [*solved(loop, found, state.options, self._for_others()), *trials]
         if state.interruptible:
             return self._among(trials, large)
         for one in by_reach(trials):
