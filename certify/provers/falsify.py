@@ -143,7 +143,7 @@ def survey(
             each = level[k : k + _TOGETHER, None, None]
             z = (np.sqrt(each) * direction).reshape(-1, direction.shape[1])
             if steps:
-                starts = search.promising(z.reshape(len(each), *direction.shape))
+                starts = _promising(search, z.reshape(len(each), *direction.shape))
                 z = search.climb(starts, np.repeat(each.ravel(), len(starts) // len(each))[:, None], steps)
             found += [not bad.any() for bad in search.bad(z).reshape(len(each), -1)]
         return found
@@ -193,6 +193,18 @@ def refutes(problem: Problem, witness: Witness, level: float) -> bool:
     less than a rounding says nothing about it.
     """
     return problem.V.exactly(witness.x) <= Fraction(level) and confirm(problem, witness)
+
+
+def _promising(search: _Search, z: Array) -> Array:
+    """Those of the samples (k, B, n) of each of k spheres to climb from, (k * fewer, n): some in all directions, and
+    those of the largest D', or next to a bound."""
+    vdot, excess = search.violation(z.reshape(-1, z.shape[-1]))
+    every = max(1, z.shape[1] // _SPREAD)
+    found = [z[:, ::every]]
+    for value in (vdot, excess) if search.asks_more else (vdot,):
+        worst = np.argsort(-value.reshape(z.shape[:2]), axis=1, kind="stable")[:, :_WORST]
+        found.append(np.take_along_axis(z, worst[:, :, None], axis=1))
+    return np.concatenate(found, axis=1).reshape(-1, z.shape[-1])
 
 
 class _Search:
@@ -291,17 +303,6 @@ class _Search:
         """True (B,) where a condition fails."""
         vdot, excess = self.violation(z)
         return (vdot >= 0) | (excess > 0) if self.asks_more else vdot >= 0
-
-    def promising(self, z: Array) -> Array:
-        """Those of the samples (k, B, n) of each of k spheres to climb from, (k * fewer, n): some in all directions,
-        and those of the largest D', or next to a bound."""
-        vdot, excess = self.violation(z.reshape(-1, z.shape[-1]))
-        every = max(1, z.shape[1] // _SPREAD)
-        found = [z[:, ::every]]
-        for value in (vdot, excess) if self.asks_more else (vdot,):
-            worst = np.argsort(-value.reshape(z.shape[:2]), axis=1, kind="stable")[:, :_WORST]
-            found.append(np.take_along_axis(z, worst[:, :, None], axis=1))
-        return np.concatenate(found, axis=1).reshape(-1, z.shape[-1])
 
     @np.errstate(all="ignore")
     def lowest(self, start: Array) -> Witness | None:

@@ -31,7 +31,7 @@ from certify.provers.base import Budget, Proof, Task
 from certify.provers.boxes.engine import BoundsEngine
 from certify.provers.boxes.search import prove_inwards
 from certify.provers.execution import ThreadRunner
-from certify.provers.falsify import _Search, survey
+from certify.provers.falsify import _promising, _Search, survey
 from tests.provers.test_bounds import planted, vdot
 from tests.support.cases import Case, case_of
 from tests.support.loops import box, pendulum_network, scalar_tanh
@@ -96,7 +96,7 @@ def test_a_survey_climbs_from_the_worst_samples_and_some_of_the_others() -> None
     case = case_of(*uncentred())
     z = np.random.default_rng(0).standard_normal((3, 512, 2))
     search = _Search(case.problem, case.T)
-    chosen = search.promising(z).reshape(3, -1, 2)
+    chosen = _promising(search, z).reshape(3, -1, 2)
     assert chosen.shape[1] <= 512 / 2  # each costs as much as a hundred samples
     for sphere, some in zip(z, chosen, strict=True):
         assert np.max(search.violation(some)[0]) == np.max(search.violation(sphere)[0])

@@ -31,6 +31,7 @@ from certify.provers.boxes.rule import input_bounds_kept, operations_of_box
 from certify.provers.ranks.targets import Target
 
 _WIDER = 1e-7  # share of a box's width, beyond all that two programs' rounding may differ by
+_MARGIN = 0.03  # share of a width, where directions move: two programs' affine bounds, which differ, turn them
 _ENDS = 1e-9  # relative distance kept from ends of the domain
 _WIDEST = 0.15  # share of the root box beyond which an image is of no use
 _MORE_THAN_ROUNDING = 1e-13  # relative, of sums whose terms may cancel
@@ -84,6 +85,10 @@ class Form:
     last one first: (n, 1 + n + p n, B)."""
 
     x: Array
+
+    def wider(self, by: float) -> Form:
+        """The same with symbols that reach farther."""
+        return Form(np.concatenate([self.x[:, :1], self.x[:, 1:] * (1 + by)], 1))
 
     def at(self, index: Index | Mask) -> Form:
         """Some of the boxes."""
@@ -171,7 +176,7 @@ class Course:
             np.zeros((k, self.ways, batch), dtype=bool),
             np.zeros((K, batch), dtype=bool),
             np.zeros((K, batch), dtype=bool),
-            self.is_there(form),
+            self.target.holds(form.x, self.angles),
             ~self.target.misses(form.x, self.angles),
             np.zeros(batch, dtype=bool),
             np.zeros(batch, dtype=bool),
@@ -218,7 +223,8 @@ class Course:
     def _note(self, found: Images, k: int, of: Index, form: Form, widest: Array) -> Mask:
         """Take in the images of boxes `of` after the k-th number of steps; the images that do not lie in the target."""
         n, starts = self.system.n, np.flatnonzero(np.diff(of, prepend=-1))
-        there, (below, above), box = self.is_there(form), form.box, of[starts]
+        form = form.wider(_MARGIN) if self.errors.moving else form
+        there, (below, above), box = self.target.holds(form.x, self.angles), form.box, of[starts]
         number = np.arange(len(of)) - np.repeat(starts, np.diff(starts, append=len(of)))
         found.known[k, box], found.arrived[k, box] = True, np.logical_and.reduceat(there, starts)
         if k < self.kept:
@@ -293,10 +299,6 @@ class Course:
             slack = _ENDS * (np.abs(low) + np.abs(high))
             inside &= (below[i] > low + slack) & (above[i] < high - slack)
         return inside
-
-    def is_there(self, form: Form) -> Mask:
-        """True where the states lie in the target."""
-        return self.target.holds(form.x, self.angles)
 
 
 class Errors:
