@@ -63,7 +63,7 @@ _FOR_SEARCH = 0.7  # share of the effort, the rest being for the check
 _DIRECT = 4000  # boxes that are looked at first where runs need few steps
 _SLOW, _DOUBT = 200, 1e-9  # runs from what is not proved; of the box's volume
 _PARTS = np.array([1.0, 3.0, 9.0])  # of a box in each direction, on which ways to bound errors are tried
-_NARROW, _PLACES = np.array([2.0**9, 2.0**18]), 12  # the same elsewhere in it
+_NARROW, _PLACES = np.array([2.0**9, 2.0**18]), 24  # the same elsewhere in it
 _MENDED = 20  # leaves that the checker may refuse
 
 
@@ -237,7 +237,7 @@ def _parts(box: Box) -> tuple[Array, Array, Array]:
     """Corners (n, B) of a box, of smaller ones in its middle and of narrow ones anywhere, and weights that make each of
     these two kinds as important as the other."""
     lo, hi = (np.array([float(pair[k]) for pair in box])[:, None] for k in (0, 1))
-    at = np.random.default_rng(0).uniform(0.1, 0.9, (len(lo), _PLACES)).repeat(len(_NARROW), 1)
+    at = np.random.default_rng(0).uniform(0.01, 0.99, (len(lo), _PLACES)).repeat(len(_NARROW), 1)
     middle = np.hstack([(0.5 * (lo + hi)).repeat(len(_PARTS), 1), lo + at * (hi - lo)])
     reach = 0.5 * (hi - lo) / np.append(_PARTS, np.tile(_NARROW, _PLACES))
     return middle - reach, middle + reach, np.repeat((at.shape[1], len(_PARTS)), (len(_PARTS), at.shape[1]))

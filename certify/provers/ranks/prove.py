@@ -33,6 +33,7 @@ _OF_A_PAIR, _OF_A_LEAF = 500.0, 50_000.0  # operations, beside those of the step
 _SMALL, _LOST = 0.002, 1e3  # half-width of a box, as a share of the root box's width; growth that counts for no image
 _DEPENDENT = 1e8  # condition of a frame that is of no use
 _MEMORIES = (1, 2, 4, 8)
+_WORTH = 0.2  # logarithm of a gain in cost below which directions do not move: two programs turn them differently
 _THERE = 1e-6  # width of an image in the target, as a share of the root box's
 _COUNTS_BACK = COUNTS[:7]  # the leaf itself or its neighbours are not far away
 _BOXES, _STEPS = 1_000, 255  # that are followed straight to the target, as far as the effort allows; at least so far
@@ -128,7 +129,7 @@ def with_errors(
         widths = np.nan_to_num((found.widths[-1] / root).max(0), nan=1.0)
         boxes = np.average(np.log(np.where(found.arrived.any(0), _THERE, widths)), weights=weights) * len(lo) / 2
         cost = boxes + math.log(course.operations)
-        if cost < least or (moving and cost == least):  # directions that move may pay on the way of other boxes
+        if cost < least - (_WORTH if moving else 0.0):
             best, least = asked, cost
         if np.all(found.arrived.any(0)) or effort.over:  # more memory has more operations, and no fewer boxes
             break
