@@ -196,7 +196,7 @@ def refutes(problem: Problem, witness: Witness, level: float) -> bool:
 
 
 def _promising(search: _Search, z: Array) -> Array:
-    """Those of the samples (k, B, n) of each of k spheres to climb from, (k * fewer, n): some in all directions, and
+    """Samples to climb from, (k * fewer, n), of those (k, B, n) on each of k spheres: some in all directions, and
     those of the largest D', or next to a bound."""
     vdot, excess = search.violation(z.reshape(-1, z.shape[-1]))
     every = max(1, z.shape[1] // _SPREAD)

@@ -121,7 +121,7 @@ def test_a_cluster_that_lies_proves_nothing(tmp_path: Path, monkeypatch: pytest.
     vector, many, each = (2,), (len(COUNTS),), (len(COUNTS), 1)
     images = [
         *(("lo", "f8", each + vector), ("hi", "f8", each + vector)),
-        *(("there", "u1", each), ("known", "u1", many)),
+        *(("there", "u1", each), ("known", "u1", many), ("arrived", "u1", many)),
     ]
     row = np.dtype(
         [
