@@ -87,7 +87,8 @@ def answers(c: Certificate, tally: Tally) -> dict[str, Any]:
         leaves = {"leaves": c.outer.tree.count(LEAF), "face_leaves": tally.rules["faces"]}
         answer["outer"] = {"level": c.outer.level, **leaves}
     if c.ranks is not None:
-        answer["ranks"] = {"leaves": len(c.ranks.steps), "steps": c.ranks.most, "of": sum(map(bool, c.ranks.steps))}
+        _, steps = c.ranks.numbers
+        answer["ranks"] = {"leaves": len(steps), "steps": c.ranks.most, "of": sum(map(bool, steps.tolist()))}
     if c.then is not None and tally.then is not None:
         stated = {"claim": c.then.claim, "levels": c.then.levels}
         of_rules = {"rules": tally.then.rules, "margins": tally.then.margins, "leaves": tally.then.rules["tree"]}

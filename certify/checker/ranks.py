@@ -28,7 +28,7 @@ from .near import Above, Array, Form, Near, all_near, near, near_ball
 from .network import enclose_on_boxes
 from .periodic import is_periodic
 from .ring import Motion, Moving
-from .sections import MAX_RANK, Ranks
+from .sections import MAX_RANK
 from .taylor import Taylor, affine, combination, constants, upper_bound
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ class Cover:
         self.axis = np.frombuffer(ranks.tree, dtype=np.uint8).astype(np.int64)
         self.split, self.right = np.zeros(count), np.zeros(count, dtype=np.int64)
         self.most, self.least = np.full(count, MAX_RANK), np.zeros(count, dtype=np.int64)
-        self._fill(ranks.tree, ranks.lo.tolist(), ranks.hi.tolist(), numbers_of(ranks)[0].tolist())
+        self._fill(ranks.tree, ranks.lo.tolist(), ranks.hi.tolist(), ranks.numbers[0].tolist())
 
     def _fill(self, tree: bytes, lo: list[float], hi: list[float], ranks: list[int]) -> None:
         """Splits, upper halves, and the highest and the lowest rank below each node, in preorder."""
@@ -153,7 +153,7 @@ class Steps(Moving):
         self.order = self.ranks.order
         self.frame = np.eye(n) if self.ranks.frame is None else self.ranks.frame
         self.back = all_near(fraction(v) for v in given(inverse(exactly(self.frame))).transpose().entries())
-        self.rank, self.count = numbers_of(self.ranks)
+        self.rank, self.count = self.ranks.numbers
         self.straight = [i for i in range(n) if i not in self.ranks.angles]  # states that are no angles
 
     @cached_property
@@ -371,13 +371,6 @@ def moved(x: Array, turns: Array) -> tuple[Array, Array]:
     return np.where(turns == 0, x, below), np.where(turns == 0, x, above)
 
 
-def numbers_of(ranks: Ranks) -> tuple[Array, Array]:
-    """The ranks and the steps of all leaves: numbers of two bytes, the lower first, of steps also of one."""
-    size = "<u2" if len(ranks.steps) == len(ranks.ranks) else "u1"
-    rank, steps = np.frombuffer(ranks.ranks, dtype="<u2"), np.frombuffer(ranks.steps, dtype=size)
-    return rank.astype(np.int64), steps.astype(np.int64)
-
-
 def is_stated(case: Case) -> Failures:
     """`ranks`: a root box with its tree, that has all places of an angle, and for each leaf a rank and its steps."""
     ranks, n = given(case.c.ranks), len(case.c.states)
@@ -390,7 +383,7 @@ def is_stated(case: Case) -> Failures:
     leaves = yield from is_whole(ranks.tree, range(n), "ranks, ")
     if len(ranks.ranks) != 2 * leaves or len(ranks.steps) not in (leaves, 2 * leaves):
         yield "evidence.ranks", f"there must be two bytes of ranks and one or two of steps for each of {leaves} leaves"
-    rank, count = numbers_of(ranks)
+    rank, count = ranks.numbers
     resting = (rank == 0) | (rank == MAX_RANK)
     hold = np.where(resting, count == 0, (count > 0) & (count <= rank) & (rank <= ranks.most))
     if not np.all(hold):

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Annotated, NamedTuple
 
+import numpy as np
+
 from .document import (
     EMPTY,
     MAX_CUTS,
@@ -143,6 +145,13 @@ class RankTree:
     frame: Annotated[Array | None, shaped("n", "n")] = field(default=None, kw_only=True)
     moving: Annotated[bool, _true] = field(default=False, kw_only=True)
     memory: Memory = field(default=1, kw_only=True)
+
+    @property
+    def numbers(self) -> tuple[Array, Array]:
+        """The ranks and the steps of all leaves: numbers of two bytes, the lower first, of steps also of one."""
+        size = "<u2" if len(self.steps) == len(self.ranks) else "u1"
+        rank, steps = np.frombuffer(self.ranks, dtype="<u2"), np.frombuffer(self.steps, dtype=size)
+        return rank.astype(np.int64), steps.astype(np.int64)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from certify.checker import document, words
+from certify.checker import clauses, document, rules, words
 from certify.checker.case import Case
 from certify.checker.ranks import Cover
 from certify.reference import rules as reference_rules
@@ -65,7 +65,7 @@ def covered(chance: np.random.Generator, n: int, angles: tuple[int, ...]) -> tup
     """A root box, and boxes that are in it but for their angles."""
     lo = chance.choice([-3.1416, -3.25, 0.0, 7.0, -100.0], n)
     hi = lo + chance.choice([6.28319, 6.3, 7.0, 12.6, 13.0, 40.0], n)
-    ranks = SimpleNamespace(lo=lo, hi=hi, angles=angles, tree=b"\xff", ranks=b"\0\0", steps=b"\0")
+    ranks = SimpleNamespace(lo=lo, hi=hi, angles=angles, tree=b"\xff", numbers=(np.zeros(1, int), np.zeros(1, int)))
     centre = chance.uniform(-30, 30, (n, 30))
     wide = chance.choice([0.0, 1e-9, 0.1, 1.0, 3.0, 6.0, 6.3, 10.0], (n, 30))
     low, high = centre - wide, centre + wide
@@ -204,6 +204,13 @@ def test_steps_have_one_byte_or_two() -> None:
     assert verdicts(slow(385, two_bytes([129]))) == (None, None)  # a rank may be higher
     for octets in (b"", b"\x81\0\0", b"\x81\1", b"\0\x81"):  # none, three, 385 steps of a rank of 129, 33,024
         assert verdicts(slow(129, octets)) == ("ranks", "ranks")
+
+
+@pytest.mark.parametrize(("count", "steps"), [(129, bytes([129])), (129, two_bytes([129])), (257, two_bytes([257]))])
+def test_an_answer_counts_leaves_and_not_their_bytes(count: int, steps: bytes) -> None:
+    c = document.certificate(json.loads(dumped(slow(count, steps))), "0" * 64)
+    said = clauses.answers(c, rules.check(c))["ranks"]
+    assert (said["leaves"], said["of"]) == (1, 1)
 
 
 @pytest.mark.parametrize(("speed", "rule"), [("1/200", None), ("1/201", "ranks")])
