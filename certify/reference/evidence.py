@@ -99,9 +99,11 @@ class Covering:
 
 @dataclass(frozen=True)
 class Ranking:
-    """A tree over the box from `lo` to `hi`, whose leaves have two bytes of `ranks` each and one or two of `steps`; errors
-    of images are bounded after the matrix `frame`, turned along with them if `moving`, and have symbols of their own for
-    `memory` steps."""
+    """A tree over the box from `lo` to `hi`, whose leaves have two bytes of `ranks` each and one or two of `steps`.
+
+    Errors of images are bounded after the matrix `frame`, turned along with them if `moving`, and have symbols of their
+    own for `memory` steps.
+    """
 
     lo: array[float]
     hi: array[float]
