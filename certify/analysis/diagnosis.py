@@ -29,6 +29,7 @@ from certify.analysis.suggested import (
     clipped_outside,
     commands_too_much,
     side,
+    wider,
 )
 from certify.certificates.verdict import Stop, Verdict
 from certify.effort import UNIT, UNLIMITED, WHOLE, Effort
@@ -477,10 +478,10 @@ def _wider_domain(result: RoaResult, options: RoaOptions, effort: Effort) -> Ste
             which = "a V that is stretched along with the domain" if stretched else "this V"
             why = f"if the equations hold there, samples allow {grown:.3g} times the volume to {which}"
             other = (("--candidate", "auto"),) if stretched and options.only not in (None, "optimised") else ()
-            return Step((("--domain", side(system, i, factor)), *other), why)
+            return Step((("--domain", side(wider(system, i, factor), i)), *other), why)
         if len(found) < len(kinds):  # samples cannot tell, or the operations for them have ended
             why = "if the equations hold there, the set may be larger"
-            return Step((("--domain", side(system, i, _WIDER)),), why)
+            return Step((("--domain", side(wider(system, i, _WIDER), i)),), why)
     which = ", and to one that is stretched along with the domain," if free else ""
     where = " or ".join(symbol(system.states[i].name) for i in binding)
     return Step((), f"samples allow hardly more to this V{which} where the domain is wider in {where}")
@@ -502,16 +503,15 @@ def _reach(
     system, problem = result.system, result.problem
     if problem is None or (result.claim in ("practical", "nearby") and system.n > FEW):
         return None
-    lo, hi = system.domain[i]
-    wider = system.with_domain({system.states[i].name: (factor * lo, factor * hi)})
+    there = wider(system, i, factor)
     scale = np.ones(system.n)
     scale[i] = 1 / float(factor) if stretched else 1.0
     P = scale[:, None] * problem.V.P * scale
     try:
-        allowed = volume(P, domain_limit(P, wider.domain))
+        allowed = volume(P, domain_limit(P, there.domain))
         if allowed < least:
             return allowed
-        found = trial(ClosedLoop(wider, result.network), P, "", options, effort)
+        found = trial(ClosedLoop(there, result.network), P, "", options, effort)
     except InputError:
         return 0.0
     return None if effort.over else found.volume

@@ -5,6 +5,7 @@ Runs are no proof. A step says what they found, and the command that follows fro
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from fractions import Fraction
 
@@ -32,6 +33,7 @@ _ROUNDING = Fraction(2) ** -23  # of a number: where single precision rounds it
 _ENDED = ("effort", "boxes")  # limits of an outer set that more effort lifts
 _TAUGHT = 1.0  # an effort below it ends the lessons of a function before they are over
 _LOOK = 3 * UNIT  # operations for one look
+_DIGITS = 2  # of the width of a side, in the ends of one that is suggested
 
 
 def centring(system: System, network: PolicyNetwork) -> Centre | None:
@@ -194,16 +196,17 @@ def _in_a_wider_domain(result: RoaResult, effort: Effort) -> Step | None:
         if i in turned:
             continue
         try:
-            wider = system.with_domain({system.states[i].name: (WIDER * lo, WIDER * hi)})
-            there = _share(ClosedLoop(wider, result.network), result.problem.V, result.levels.roa, effort)
+            there = wider(system, i, WIDER)
+            share = _share(ClosedLoop(there, result.network), result.problem.V, result.levels.roa, effort)
         except InputError:
             continue
-        found.append((0.0 if there is None else float(WIDER) * there / here, i))
+        ratio = float((there.domain[i][1] - there.domain[i][0]) / (hi - lo))
+        found.append((0.0 if share is None else ratio * share / here, i))
     grown, i = max(found, default=(0.0, 0))
     if grown < _WORTH:
         return None
     why = f"if the equations hold there, runs converge in simulation from {grown:.3g} times the volume"
-    return Step((("--domain", side(system, i, WIDER)),), why)
+    return Step((("--domain", side(wider(system, i, WIDER), i)),), why)
 
 
 def _share(loop: ClosedLoop, V: Quadratic, level: float, effort: Effort) -> float | None:
@@ -219,8 +222,21 @@ def _converging(result: RoaResult) -> float | None:
     return result.simulated.converging / result.simulated.runs
 
 
-def side(system: System, i: int, factor: Fraction) -> str:
-    """The option's value for a state's side of the domain that is wider by this factor: values, not deviations."""
-    name, (lo, hi) = system.states[i].name, (factor * end for end in system.domain[i])
-    at = system.operating_point().get(name, Fraction(0))
-    return f"{name}={float(hi):g}" if lo == -hi else f"{name}={float(lo + at):g}..{float(hi + at):g}"
+def wider(system: System, i: int, factor: Fraction) -> System:
+    """The plant on a domain that is wider by this factor on a state's side, about: its ends are rounded as values, and
+    a state that is positive or negative in the domain stays so."""
+    lo, hi = system.domain[i]
+    at = system.exact_x_eq()[i]
+    decimals = _DIGITS - math.floor(math.log10(hi - lo))
+    ends = [round(at + factor * end, decimals) for end in (lo, hi)]
+    if lo + at >= 0 > ends[0]:
+        ends[0] = (lo + at) / 2
+    if hi + at <= 0 < ends[1]:
+        ends[1] = (hi + at) / 2
+    return system.with_domain({system.states[i].name: (min(ends[0] - at, lo), max(ends[1] - at, hi))})
+
+
+def side(system: System, i: int) -> str:
+    """The option's value for a state's side of the domain: values, not deviations."""
+    lo, hi = (float(end + system.exact_x_eq()[i]) for end in system.domain[i])
+    return f"{system.states[i].name}={hi:.12g}" if lo == -hi else f"{system.states[i].name}={lo:.12g}..{hi:.12g}"

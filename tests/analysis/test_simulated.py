@@ -23,7 +23,7 @@ from certify.analysis.simulated import Simulator, simulated_region
 from certify.analysis.stages import simulation
 from certify.analysis.stages.candidate import Candidate
 from certify.analysis.stages.state import State
-from certify.analysis.suggested import beyond_the_ellipsoid
+from certify.analysis.suggested import beyond_the_ellipsoid, side, wider
 from certify.certificates import Certificate
 from certify.certificates.verdict import Verdict
 from certify.effort import UNIT, Effort
@@ -347,3 +347,22 @@ def test_a_function_that_was_taught_little_is_taught_more_before_a_wider_domain(
     assert first is not None and first.options == (("--effort", "1.6"),)
     for other in (step(850, effort=0.4), step(400, effort=1.0), step(400, effort=0.4, lyapunov=SQUARE)):
         assert other is None or "--effort" not in dict(other.options)
+
+
+@pytest.mark.parametrize(
+    ("x_eq", "ends", "factor", "printed"),
+    [
+        ("2/3", (Fraction(1, 20), Fraction(11, 5)), Fraction(3, 2), "x=0.025..2.97"),  # positive: it stays so
+        ("0", (Fraction(0), Fraction(2)), Fraction(3, 2), "x=0..3"),
+        ("-1", (Fraction(-2), Fraction(-1, 10)), Fraction(3, 2), "x=-2.5..-0.05"),
+        ("300", (Fraction(298), Fraction(303)), Fraction(5, 4), "x=297.5..303.75"),
+        ("0", (Fraction(-1, 3), Fraction(1, 3)), Fraction(3, 2), "x=0.5"),
+    ],
+)
+def test_a_wider_side_has_round_ends_and_keeps_its_sign(
+    x_eq: str, ends: tuple[Fraction, Fraction], factor: Fraction, printed: str
+) -> None:
+    at = Fraction(x_eq)
+    system = plant(lo=-2)
+    system = replace(system, x_eq=(Number(at),)).with_domain({"x": tuple(end - at for end in ends)})
+    assert side(wider(system, 0, factor), 0) == printed
