@@ -172,11 +172,14 @@ def held_at(system: System) -> str:
 
 
 def at_rest(names: Sequence[str], x_eq: Sequence[Fraction], units: Sequence[str]) -> str:
-    """The operating point in words, such as `h = 0.01 m, v = 0 m/s`; nothing where it is 0 in all states."""
-    if not any(x_eq):
-        return ""
-    each = zip(names, x_eq, units, strict=True)
-    return ", ".join(f"{symbol(name)} = {number(float(q))} {pretty_unit(unit)}".rstrip() for name, q, unit in each)
+    """The operating point in words; nothing where it is 0 in all states.
+
+    Sets are said in deviations from it, which may be smaller than the sixth digit: it has all digits of a float.
+
+    >>> at_rest(["h", "v"], [Fraction(18, 17), Fraction(0)], ["m", "m/s"])
+    'h = 1.0588235294117647 m, v = 0 m/s'
+    """
+    return point(names, x_eq, units) if any(x_eq) else ""
 
 
 def point(names: Sequence[str], values: Sequence[float | Fraction], units: Sequence[str]) -> str:
