@@ -240,9 +240,13 @@ def _exact(text: str, name: str) -> Fraction:
     from certify.loop.plants import exact
 
     try:
-        return exact(text, name)
+        found = exact(text, name)
+        float(found)
     except InputError as error:
         raise OptionError(str(error)) from error
+    except OverflowError as error:
+        raise OptionError(f"`{name}` must be a number below 1.8e308 in size; found {text:.80}.") from error
+    return found
 
 
 _READERS: Mapping[str, Callable[[Any, str], Any]] = {

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -79,13 +79,15 @@ def plant_of(stored: Policy, system: System | str | None, changes: PlantChanges,
 
     Raises
     ------
-    InputError : there is no such plant, or the plant cannot have a change.
+    InputError : there is no such plant, the plant cannot have a change, or the policy would read other numbers there
+        than the file that it was imported from.
     """
     from certify.analysis.suggested import clipped_outside, commands_too_much
     from certify.loop.plants import System
 
     plant, own = (system, False) if isinstance(system, System) else named_plant(stored, system)
     plant = changes.of(plant)
+    require_same_reading(stored, plant)
     if not own:
         tell_of_other(stored, plant, tell)
     plant = where_valid(stored, plant, tell)
@@ -149,6 +151,46 @@ def tell_of_other(stored: Policy, plant: System, tell: Tell) -> None:
         off = [f"{p} = {v}" for p, v in stored.parameters.items()]
     if off:
         tell(f"the policy was trained with {', '.join(off)}; --system says otherwise, and counts")
+
+
+def require_same_reading(stored: Policy, plant: System) -> None:
+    """Refuse a policy whose import says that it would read something else of this plant than its file does.
+
+    Where a file's network reads the states' values, the operating point is in the numbers of the policy, which reads
+    deviations: at another operating point it is another function of the values.
+
+    Raises
+    ------
+    InputError : the states come in another order, the operating point is another one, or so are the observations.
+    """
+    from certify.loop.plants.system import observations_of
+
+    record = stored.training.get("imported")
+    if not isinstance(record, Mapping):
+        return
+    names = [s.name for s in plant.states]
+    then, at, read = record.get("plant_states"), record.get("x_eq"), record.get("observations")
+    if isinstance(then, list) and then != names and {*then} & {*names} and not _same_places(then, names):
+        raise _other_reading(f"the states {', '.join(map(str, then))} in this order", f"{', '.join(names)}")
+    now = [str(q) for q in plant.exact_x_eq()]
+    if isinstance(at, list) and at != now:
+        raise _other_reading(f"values of states with the operating point {', '.join(map(str, at))}", ", ".join(now))
+    if isinstance(read, str) and plant.observations:
+        shown = ", ".join(map(str, observations_of(plant)))
+        if shown != read:
+            raise _other_reading(f"the observations {read}", shown)
+
+
+def _same_places(then: Sequence[Any], names: Sequence[str]) -> bool:
+    """True if no state that both lists have stands at another place in the one than in the other."""
+    return all(then[names.index(name)] == name for name in names if name in then and names.index(name) < len(then))
+
+
+def _other_reading(then: str, now: str) -> InputError:
+    return InputError(
+        f"the policy was imported to read {then}; this plant has {now}. Import its file again for this plant "
+        "(certify import, or the file itself for --policy)."
+    )
 
 
 def function_in(text: str, plant: System, tell: Tell) -> StoredLyapunov | Symbolic:

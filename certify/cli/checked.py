@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import zipfile
+from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from certify.cli.terminal import say, tell
+
+if TYPE_CHECKING:
+    from certify.loop.policies import Policy
 
 
 def checked(
@@ -19,17 +25,23 @@ def checked(
     """Check a certificate, print the answer, and return the exit status; the parameters are the command's."""
     from certify.certificates.checking import ask
 
-    wanted = None
+    stored, wanted = None, None
     if policy is not None:
         from certify.loop.policies import load_policy
 
-        wanted = load_policy(policy).network.sha256()
+        stored = load_policy(policy)
+        wanted = stored.network.sha256()
     status, answer = ask(certificate, "reference" if reference else "checker", jobs)
     lines = answer.pop("text", [])
+    detail = ""
     if wanted is not None and "policy_sha256" in answer and answer["policy_sha256"] != wanted:
         detail = f"the certificate is about policy {answer['policy_sha256']}, not about {policy} ({wanted})"
-        answer = {"result": "REJECTED", "rule": "policy", "at": "policy.sha256", "detail": detail}
-        status, lines = 1, [f"REJECTED rule=policy at=policy.sha256: {detail}"]
+    elif stored is not None and answer.get("result") in ("ACCEPTED", "TRUSTED"):
+        detail = _beside(stored, certificate, answer["certificate_sha256"])
+    if detail:
+        at = "policy.sha256" if answer["policy_sha256"] != wanted else "policy"
+        answer = {"result": "REJECTED", "rule": "policy", "at": at, "detail": detail}
+        status, lines = 1, [f"REJECTED rule=policy at={at}: {detail}"]
     if "error" in answer and not as_json:
         tell(f"certify: {answer['error'].rstrip('.')}.{_next_step(certificate)}")
         return status
@@ -44,6 +56,33 @@ def checked(
             tell(f"certify: {old}")
     say(json.dumps(answer) if as_json else "\n".join(lines))
     return status
+
+
+def _beside(stored: Policy, certificate: Path, sha256: str) -> str:
+    """A difference between the certificate and what a policy file says beside its numbers: the box in which they are
+    the policy that it was imported from, and the input that it is centred at; empty if there is none."""
+    if stored.valid is None and stored.beta is None:
+        return ""
+    from certify.certificates import parse_any, read_raw
+    from certify.errors import CertifyError, InputError
+
+    raw = read_raw(certificate)
+    if hashlib.sha256(raw).hexdigest() != sha256:
+        raise CertifyError(f"{certificate} was changed while it was checked; check it again.")
+    system, origin = (read := parse_any(raw, str(certificate))).system, read.network.origin.tolist()
+    try:
+        stored.beta_shift(system.exact_u_eq())
+    except InputError as error:
+        return f"the certificate's u_eq is not that of {stored.system}'s policy file: {error}".rstrip(".")
+    for symbol, ends, (lo, hi), at in zip(
+        system.states, system.domain, [] if stored.valid is None else stored.valid.tolist(), origin, strict=False
+    ):
+        if not (ends[0] + Fraction(at) >= lo and ends[1] + Fraction(at) <= hi):
+            return (
+                f"the certificate's domain of {symbol} must lie in [{lo}, {hi}], where the policy file says "
+                "that its numbers are the policy that it was imported from"
+            )
+    return ""
 
 
 def _next_step(path: Path) -> str:

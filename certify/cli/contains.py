@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from certify.certificates.ellipsoids import Box
     from certify.certificates.located import Located
     from certify.loop.plants import System
+
+_LONGEST = 24  # of a number's text
 
 
 def contains(
@@ -99,5 +102,12 @@ def text(found: Located, box: Box, system: System) -> str:
     )
 
 
-def _number(q: Any) -> str:
-    return f"{float(q):.6g}"
+def _number(q: Fraction) -> str:
+    """A number that an answer is about: rounded it may lie on the other side of the boundary, so that a long one is
+    said to be rounded; the JSON has it exactly.
+
+    >>> _number(Fraction(-1, 10)), _number(Fraction(1, 3)), _number(Fraction(31399999, 10**7)), _number(Fraction(0.1))
+    ('-0.1', '1/3', '3.1399999', 'about 0.10000000000000001')
+    """
+    shown = (f"{float(q):.6g}", repr(float(q)), str(q))
+    return next((text for text in shown if len(text) <= _LONGEST and Fraction(text) == q), f"about {float(q):.17g}")

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from certify.report.reached import steps_of
-from certify.report.words import below, nonlinearity_in_words, volume_name
+from certify.report.words import below, nonlinearity_in_words, percent, volume_name
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -89,7 +89,7 @@ def _boxes(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if simulated is not None and simulated["share"] is not None:
         yield (
             "simulated",
-            f"about {100 * simulated['share']:.0f} % of what stays {simulated['steps']:,} steps is proved",
+            f"about {percent(simulated['share'])} of what stays {simulated['steps']:,} steps is proved",
         )
     back = steps_of(result, ranks["steps"])
     yield (

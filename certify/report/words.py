@@ -27,6 +27,7 @@ _SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _DOT = "\u0307"
 PRACTICAL = frozenset({"practical", "nearby"})
 """The claims whose inner set is the one in which trajectories end."""
+_ROUNDS_TO_ALL = 0.995
 _A_GAIN = ((0.05, ": a gain does nearly the same"), (0.2, ""))
 _NO_GAIN = ": its own gain does not do the same"
 """Conclusions for a reader, by the rms."""
@@ -171,11 +172,14 @@ def held_at(system: System) -> str:
 
 
 def at_rest(names: Sequence[str], x_eq: Sequence[Fraction], units: Sequence[str]) -> str:
-    """The operating point in words, such as `h = 0.01 m, v = 0 m/s`; nothing where it is 0 in all states."""
-    if not any(x_eq):
-        return ""
-    each = zip(names, x_eq, units, strict=True)
-    return ", ".join(f"{symbol(name)} = {number(float(q))} {pretty_unit(unit)}".rstrip() for name, q, unit in each)
+    """The operating point in words; nothing where it is 0 in all states.
+
+    Sets are said in deviations from it, which may be smaller than the sixth digit: it has all digits of a float.
+
+    >>> at_rest(["h", "v"], [Fraction(18, 17), Fraction(0)], ["m", "m/s"])
+    'h = 1.0588235294117647 m, v = 0 m/s'
+    """
+    return point(names, x_eq, units) if any(x_eq) else ""
 
 
 def point(names: Sequence[str], values: Sequence[float | Fraction], units: Sequence[str]) -> str:
@@ -233,7 +237,7 @@ def share_of_runs(found: Mapping[str, Any]) -> str:
     'about 73 % of what converges is proved: 774 of the 1,063 states that do so in the domain, of 2,000 drawn'
     """
     proved, converging, runs = (f"{found[name]:,}" for name in ("proved", "converging", "runs"))
-    about = f"about {100 * found['share']:.0f} % of what converges is proved"
+    about = f"about {percent(found['share'])} of what converges is proved"
     return f"{about}: {proved} of the {converging} states that do so in the domain, of {runs} drawn"
 
 
@@ -243,10 +247,11 @@ def nonlinearity_in_words(found: Mapping[str, Any]) -> str:
     >>> nonlinearity_in_words(
     ...     {"rms": 0.0312, "largest": 0.121, "bend": 0.2, "saturated": 0.0, "states": 1000, "fitted": False}
     ... )
-    'the policy is within 12 % of its saturated linear part on the set, 3.1 % rms (bend 20 %, saturated at 0 %): \
+    'the policy is within 13 % of its saturated linear part on the set, 3.1 % rms (bend 20 %, saturated at 0 %): \
 a gain does nearly the same; sampled at 1,000 states, no part of the proof'
     """
-    rms, largest, bend, saturated = (_percent(found[name]) for name in ("rms", "largest", "bend", "saturated"))
+    rms, bend, saturated = (_percent(found[name]) for name in ("rms", "bend", "saturated"))
+    largest = _at_most(found["largest"])
     part = "the nearest saturated linear feedback" if found["fitted"] else "its saturated linear part"
     does = ""
     if found["rms"] is not None:
@@ -258,7 +263,33 @@ a gain does nearly the same; sampled at 1,000 states, no part of the proof'
 
 
 def _percent(share: float | None) -> str:
-    return "any share" if share is None else f"{100 * share:.2g} %" if share < 1 else f"{100 * share:.0f} %"
+    """A share in two digits, above 1 in whole per cent.
+
+    >>> _percent(0.0312), _percent(0.9987), _percent(2.126), _percent(None)
+    ('3.1 %', '99 %', '213 %', 'any share')
+    """
+    if share is None:
+        return "any share"
+    return f"{100 * share:.2g} %" if share < _ROUNDS_TO_ALL else percent(share)
+
+
+def _at_most(share: float | None) -> str:
+    """The same rounded up, as the words `is within` ask for.
+
+    >>> _at_most(0.0374), _at_most(0.121), _at_most(0.9987)
+    ('3.8 %', '13 %', '99.9 %')
+    """
+    return _percent(share) if share is None or share >= 1 else f"{above(100 * share, 2 + (share > 0.99))} %"
+
+
+def percent(share: float, digits: int = 0) -> str:
+    """A share of 1 rounded to so many decimals of per cent; 100 % is all of it and nothing else.
+
+    >>> percent(0.728), percent(1999 / 2000), percent(1.0), percent(0.99999, 1)
+    ('73 %', '99 %', '100 %', '99.9 %')
+    """
+    shown = f"{100 * share:.{digits}f}"
+    return f"{100 - 10.0**-digits:.{digits}f} %" if share < 1 and float(shown) == 100 else f"{shown} %"
 
 
 def estimated(volume: float, deviation: float, unit: str) -> str:

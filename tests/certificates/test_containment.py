@@ -288,6 +288,29 @@ def test_the_command_in_words(disc: Path, capsys: pytest.CaptureFixture[str]) ->
     assert capsys.readouterr().out.startswith("CONTAINED  x0 = 2.5, x1 = 0")
 
 
+@pytest.mark.parametrize(
+    ("given", "shown"),
+    [
+        ("x0=2.99999999,x1=0", "CONTAINED  x0 = 2.99999999, x1 = 0"),
+        ("x0=3.00000001,x1=0", "NOT CONTAINED  x0 = 3.00000001, x1 = 0"),
+        ("x0=7/3,x1=0", "CONTAINED  x0 = 7/3, x1 = 0"),
+        ("x0=2..2.9999999,x1=0", "CONTAINED  x0 = 2..2.9999999, x1 = 0"),
+        ("x0=2.99999999999999999999999999,x1=0", "CONTAINED  x0 = about 3, x1 = 0"),
+    ],
+)
+def test_an_answer_is_about_the_number_that_it_shows(
+    disc: Path, capsys: pytest.CaptureFixture[str], given: str, shown: str
+) -> None:
+    """Six digits of a state next to the boundary may be a state on its other side."""
+    _run(["contains", str(disc), given], False)
+    assert capsys.readouterr().out.startswith(shown)
+
+
+def test_a_number_beyond_all_floats_is_refused(disc: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, data = ask(capsys, "contains", disc, "x0=1e400")
+    assert status == 2 and data["error"] == "`x0` must be a number below 1.8e308 in size; found 1e400."
+
+
 def test_bad_usage(disc: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert ask(capsys, "contains", disc, "y=1") == (2, {"error": "still has no state 'y'; it has: x0, x1."})
     status, data = ask(capsys, "contains", tmp_path / "none.json", "x0=1")

@@ -108,6 +108,25 @@ def test_check_accepts_and_compares_the_policy(
     assert run(capfd, "check", tmp_path / "missing.json")[0] == 2
 
 
+def test_check_compares_what_a_policy_file_says_beside_its_numbers(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The box in which an imported policy is that of its file, and the input that beta centres it at."""
+    policy, plain, other = load_policy(SHIPPED), tmp_path / "plain.pt", tmp_path / "other.pt"
+    ways = ["--candidate", "ellipsoid", "--effort", "0.2", "--quiet", "--out", tmp_path / "o"]
+    assert run(capfd, "roa", "--policy", SHIPPED, *ways)[0] == 0
+    where = np.array([[-3.15, 3.15], [-np.inf, np.inf]])
+    narrow = np.array([[-3.15, 3.0], [-np.inf, np.inf]])
+    shifted = policy.network.beta(get_system("pendulum").exact_u_eq())
+    save_policy(plain, replace(policy, valid=where, beta=shifted))
+    certificate = tmp_path / "o" / "certificate.json"
+    assert run(capfd, "check", certificate, "--policy", plain)[0] == 0
+    for changed, said in (({"valid": narrow}, "domain of theta must lie in"), ({"beta": shifted + 0.1}, "u_eq is not")):
+        save_policy(other, replace(policy, **changed))
+        status, out, _ = run(capfd, "check", certificate, "--policy", other)
+        assert status == 1 and out.startswith("REJECTED rule=policy at=policy: ") and said in out
+
+
 def test_report_of_a_certificate(tmp_path: Path, certificate: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, _ = run(capsys, "report", certificate)
     assert status == 0 and "ACCEPTED" in out and (tmp_path / "report.html").exists()

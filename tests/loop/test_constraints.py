@@ -19,6 +19,7 @@ from certify.loop.plants import (
     with_input_errors,
     with_origin,
 )
+from certify.loop.plants.constraints import in_words, kept_constraints
 
 CART = """
 name = "cart"
@@ -122,3 +123,17 @@ def test_a_plant_in_python_is_held_to_the_same(tmp_path: Path) -> None:
         replace(system, angles=("p", "p"))
     with pytest.raises(InputError, match="uses z"):
         replace(system, constraints={"wall": Symbol("z") - 1})
+
+
+@pytest.mark.parametrize("at", ["m", "2*m - 0.5"])
+def test_words_are_of_the_states_values_where_the_operating_point_is_a_parameters(at: str, tmp_path: Path) -> None:
+    """They were `0.5 + (p - m) - 1.9 < 0`, in which p is the value and m is 0.5."""
+    path = tmp_path / "wall.toml"
+    path.write_text(
+        'name = "wall"\nstates = ["p", "v"]\ninputs = ["F"]\nparameters = { m = 0.5 }\n[dynamics]\np = "v"\n'
+        f'v = "F - v - (p - ({at}))"\n[u_eq]\nF = 0\n[x_eq]\np = "{at}"\n[domain]\np = [-2, 2]\nv = [-4, 4]\n'
+        '[input_bounds]\nF = [-10, 10]\n[constraints]\nwall = "p <= 1.9"\n'
+    )
+    system = load_system(path)
+    assert in_words(system) == {"wall": "p - 1.9 < 0"}
+    assert in_words(replace(system, constraints=kept_constraints(system))) == {"wall": "p - 1.9 < 0"}

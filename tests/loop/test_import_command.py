@@ -259,3 +259,64 @@ def test_layer_norm_is_an_option(run: Run) -> None:
     assert status == 0 and "with layer normalisation" in out
     status, _, err = run(*given, "--norm", "layer-before", "--norm-epsilon", "1,2")
     assert status == 2 and "--norm-epsilon takes one number" in err
+
+
+MOVED = """
+name = "moved"
+states = ["p", "v"]
+inputs = ["F"]
+[parameters]
+m = 0.5
+[dynamics]
+p = "v"
+v = "F - v - (p - m)"
+[u_eq]
+F = 0
+[x_eq]
+p = "m"
+[domain]
+p = [-2, 2]
+v = [-4, 4]
+[input_bounds]
+F = [-10, 10]
+"""
+GAIN = ("--states", "p,v", *SAID[2:])
+
+
+@pytest.mark.parametrize(
+    ("plant", "more", "message"),
+    [
+        (MOVED, ("--param", "m=1.5"), "with the operating point 1/2, 0; this plant has 3/2, 0"),
+        (MOVED.replace("m = 0.5", "m = 1.5"), (), "with the operating point 1/2, 0; this plant has 3/2, 0"),
+        (MOVED.replace('"p", "v"', '"v", "p"'), (), "the states p, v in this order; this plant has v, p"),
+    ],
+)
+def test_an_imported_policy_reads_what_its_file_reads(
+    plant: str, more: tuple[str, ...], message: str, run: Run
+) -> None:
+    """u = -p - v + 1/2 of the values rests elsewhere where the plant does: its numbers hold the operating point."""
+    torch.save({"0.weight": torch.tensor([[-1.0, -1.0]]), "0.bias": torch.tensor([0.5])}, "gain.pt")
+    Path("moved.toml").write_text(MOVED)
+    Path("other.toml").write_text(plant)
+    assert run("import", "gain.pt", "--system", "moved.toml", *GAIN, "--observes", "absolute", "--out", "p.pt")[0] == 0
+    status, out, err = run("roa", "--policy", "p.pt", "--system", "other.toml", *more, "--effort", "0.2")
+    assert status == 2 and not out and message in err and "Import its file again" in err
+
+
+def test_a_policy_of_deviations_goes_with_another_operating_point(run: Run) -> None:
+    torch.save({"0.weight": torch.tensor([[-1.0, -1.0]]), "0.bias": torch.zeros(1)}, "gain.pt")
+    Path("moved.toml").write_text(MOVED)
+    assert run("import", "gain.pt", "--system", "moved.toml", *GAIN, "--observes", "deviation", "--out", "p.pt")[0] == 0
+    more = ("--param", "m=1.5", "--candidate", "ellipsoid", "--effort", "0.2")
+    status, out, _ = run("roa", "--policy", "p.pt", "--system", "moved.toml", *more)
+    assert status == 0 and "attracted by the operating point" in " ".join(out.split())
+
+
+def test_observations_are_those_of_the_import(run: Run) -> None:
+    """The parameters of observations are numbers of the policy."""
+    torch.save({"0.weight": torch.tensor([[-1.0, -1.0]]), "0.bias": torch.zeros(1)}, "gain.pt")
+    plant = MOVED.replace('[x_eq]\np = "m"', '[observations]\nscaled = "p/k"\nv = "v"').replace("(p - m)", "p")
+    Path("moved.toml").write_text(plant.replace("m = 0.5", "k = 2"))
+    assert run("import", "gain.pt", "--system", "moved.toml", *SAID[2:], "--out", "p.pt")[0] == 0
+    status, _, err = run("roa", "--policy", "p.pt", "--system", "moved.toml", "--param", "k=3", "--effort", "0.2")
+    assert status == 2 and "the observations p/2, v; this plant has p/3, v" in err

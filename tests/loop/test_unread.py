@@ -308,3 +308,13 @@ def test_from_python_the_same_is_asked_and_told(tmp_path: Path) -> None:
         result = certify_roa("pendulum", state, importing=said | {"ignore": ignore}, max_boxes=1, effort=0.04)
         told = "\n".join(result.notices)
         assert "not read K: `ignore` names it" in told and "nothing was compared with the file" in told
+
+
+@pytest.mark.parametrize("name", ["00.bias", ".0.bias", "actor.00.bias", "actor.00.weight"])
+def test_a_name_that_only_looks_like_a_layers_is_refused(name: str) -> None:
+    """It was left out without a word, and the layer had no bias."""
+    prefix = "actor." if name.startswith("actor.") else ""
+    tensors = {prefix + k: v for k, v in mlp().state_dict().items()}
+    tensors[name] = tensors.pop(f"{prefix}0.bias") if name.endswith("bias") else torch.ones(2, 2)
+    with pytest.raises(InputError, match=rf"found {name.replace('.', chr(92) + '.')}, which is neither"):
+        import_state_dict(tensors, plant(), LAYERS)

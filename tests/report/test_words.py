@@ -66,7 +66,7 @@ def test_where_a_loop_rests_is_said_by_the_states_values(beside: RoaResult) -> N
         h == pytest.approx(0.01 + float(beside.rest.x[0]), abs=1e-12) == pytest.approx(float(at), abs=1e-9) and v == 0
     )
     text = printed(beside)
-    assert re.search(rf"operating point h = {float(at):.6g} m, v = 0 m/s, the loop's equilibrium; the set lies", text)
+    assert re.search(rf"operating point h = {float(at)!r} m, v = 0 m/s, the loop's equilibrium; the set lies", text)
     assert re.search(rf"equilibrium h = {h:.9g} m, v = 0 m/s; eigenvalues there", text)
     around = certify_roa(
         load_system(MAGLEV), replace(beside.network, origin=np.zeros(2)), beside.certificate.parent / "o",  # type: ignore[union-attr]

@@ -13,7 +13,16 @@ from collections.abc import Collection, Iterable
 from dataclasses import replace
 
 from certify.errors import InputError, OptionError
-from certify.loop.expressions import Expression, Number, Operation, Symbol, constant_of, symbols_of, total
+from certify.loop.expressions import (
+    Expression,
+    Number,
+    Operation,
+    Symbol,
+    constant_of,
+    substitute,
+    symbols_of,
+    total,
+)
 from certify.loop.plants.deviations import constraints_of_values, in_deviations
 from certify.loop.plants.equations import parse_comparison
 from certify.loop.plants.system import System
@@ -125,5 +134,10 @@ def _sums(terms: list[tuple[Expression, ...]]) -> list[Expression]:
 
 
 def in_words(system: System) -> dict[str, str]:
-    """The constraints by name, over the states' values, as in `p - 1.5 < 0`."""
+    """The constraints by name, over the states' values, as in `p - 1.5 < 0`; with numbers for the parameters on which
+    the operating point depends, which stand in a claim's constraints as numbers already."""
+    numbers = {s: Number(system.parameters[s.name]) for s in symbols_of(*system.x_eq)}
+    if numbers:
+        held = {name: substitute(g, numbers) for name, g in system.constraints.items()}
+        system = replace(system, x_eq=tuple(substitute(e, numbers) for e in system.x_eq), constraints=held)
     return {name: f"{g} < 0" for name, g in constraints_of_values(system).items()}

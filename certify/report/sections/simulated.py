@@ -15,14 +15,14 @@ from certify.report.claims import words_for
 from certify.report.sampling import SimulatedRoa
 from certify.report.sections.shared import timing_of
 from certify.report.timing import TimingInWords
-from certify.report.words import ABSENT, TIMES, number, share_of_runs, volume_name
+from certify.report.words import ABSENT, TIMES, number, percent, share_of_runs, volume_name
 
 
 def simulated_of(roa: SimulatedRoa, certificate: Certificate) -> dict[str, str]:
     """The counts of a grid of runs, and their integration in words."""
     timing = timing_of(certificate)
     return {
-        "fraction": ABSENT if np.isnan(roa.fraction) else f"{100 * roa.fraction:.1f} %",
+        "fraction": ABSENT if np.isnan(roa.fraction) else percent(roa.fraction, 1),
         "grid": f" {TIMES} ".join(str(len(a)) for a in roa.axes),
         "attracted": f"{int(roa.attracted.sum()):,} of {roa.attracted.size:,}",
         "how": _integrated(roa, timing),

@@ -172,7 +172,7 @@ def import_bytes(
     difference = compare_reading(reading, before, after, reads(x), values, reads.is_inexact)
     known = {"file": name, "sha256": hashlib.sha256(raw).hexdigest(), "kind": kind}
     known |= {"policy": reading.words, "states": reads.words}
-    record = known | _record(reading, options, plant, difference)
+    record = known | _record(reading, options, plant, reads.words, difference)
     return Imported(
         policy=Policy(network, plant.name, _parameters(plant), {"imported": record}, reading.beta, valid),
         words=reading.words,
@@ -201,7 +201,9 @@ def _either(own: Evaluate, read: Evaluate) -> Evaluate:
     return evaluate
 
 
-def _record(reading: Reading, options: ImportOptions, plant: System, difference: Difference) -> dict[str, Any]:
+def _record(
+    reading: Reading, options: ImportOptions, plant: System, words: str, difference: Difference
+) -> dict[str, Any]:
     """The origin of a policy, for its file."""
     record: dict[str, Any] = {
         "plant_states": [s.name for s in plant.states],
@@ -209,6 +211,7 @@ def _record(reading: Reading, options: ImportOptions, plant: System, difference:
     }
     if isinstance(options.normaliser, Path):
         record["normaliser_sha256"] = hashlib.sha256(read_bytes(options.normaliser)).hexdigest()
+    record |= _read_of(options, plant, words)
     record["compared_with"] = reading.program
     record["largest_difference" if reading.program is not None else "folding_difference"] = difference.largest
     record["not_read"] = dict(reading.unread)
@@ -217,6 +220,15 @@ def _record(reading: Reading, options: ImportOptions, plant: System, difference:
     if reading.beside:
         record["beside_sha256"] = dict(reading.beside)
     return record
+
+
+def _read_of(options: ImportOptions, plant: System, words: str) -> dict[str, Any]:
+    """The plant's facts that are in the policy's numbers: its operating point where the network reads the states'
+    values, and its observations where it reads these. Used with a plant that has others, it is another policy."""
+    own = bool(plant.observations) and options.states is None
+    if options.observes == "deviation" and not own:
+        return {}
+    return {"x_eq": [str(q) for q in plant.exact_x_eq()]} | ({"observations": words} if own else {})
 
 
 def _require_answers(kind: Content, reading: Reading, options: ImportOptions, plant: System) -> None:

@@ -364,7 +364,11 @@ def _numbers(tensors: Mapping[str, Numbers], prefix: str) -> list[int]:
                 f"the layers of a policy must be affine, with weight and bias; {name} belongs to one of another kind. "
                 f"{advice}"
             )
-        numbers.add(int(match["number"]))
+        numbers.add(number := int(match["number"]))
+        if name != f"{root}{number}.{match['rest']}":
+            raise InputError(
+                f"layers must be called {root}0.weight, {root}0.bias and so on; found {name}, which is neither."
+            )
     if not numbers or any(f"{root}{k}.weight" not in tensors for k in numbers):
         found = ", ".join(f"--prefix {name}" if name else "layers without a prefix" for name in _groups(tensors))
         raise InputError(f"there must be layers {root}0.weight and so on; found {found or ', '.join(tensors)}.")
