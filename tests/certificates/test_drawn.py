@@ -15,6 +15,7 @@ from certify.certificates.ellipsoids import sublevel_set, tube_start
 from certify.certificates.membership import Region
 from certify.loop.policies.nonlinearity import nonlinearity
 from certify.lyapunov.sublevel import Sublevel
+from certify.report.words import above
 
 PENDULUM = Path(__file__).parents[2] / "examples" / "policies" / "pendulum.pt"
 P = np.array([[3.0, 1.0], [1.0, 0.5]])
@@ -44,7 +45,7 @@ def test_a_result_its_file_and_its_page_say_the_same(tmp_path):
     system, network = result.system, load_policy(PENDULUM).network
     x = states_in(Region((sublevel_set(result.P, result.levels.roa),)), BOX)
     assert found == nonlinearity(network, system.exact_u_eq(), x)
-    assert f"{100 * found.largest:.2g} % of its saturated linear part on the set" in result.report().read_text("utf-8")
+    assert f"{above(100 * found.largest, 2)} % of its saturated linear part on the set" in result.report().read_text("utf-8")
 
 
 def test_an_ellipsoid_that_is_none_has_no_states(tmp_path):
