@@ -29,7 +29,7 @@ from certify.certificates.verdict import Verdict
 from certify.effort import UNIT, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import Expression, Number, Symbol
+from certify.loop.expressions import Expression, Number, Symbol, tanh
 from certify.loop.policies import load_policy
 from certify.lyapunov import Polynomial
 from certify.lyapunov.function import Quadratic
@@ -99,6 +99,26 @@ def test_states_from_which_an_input_leaves_its_bounds_do_not_count(period: float
 
 def test_runs_that_cannot_be_decided_tell_nothing() -> None:
     assert simulated_region(Simulator(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 0.5), Effort(1.0)) is None
+
+
+@pytest.mark.parametrize("time", ["continuous", "held", "discrete"])
+def test_runs_last_until_a_saturated_input_has_brought_them_home(time: str) -> None:
+    """x' = -tanh(60 x) decays at 60 about 0, 15 time constants of which are 1/4; from 2 the way takes two units."""
+    fast = -tanh(60 * x)
+    system = plant(x + fast / 100, -2, time="discrete") if time == "discrete" else plant(fast, -2)
+    if time == "held":
+        system = replace(system, sample=(Fraction(1, 100), Fraction(1, 100)))
+    runs = Simulator(ClosedLoop(system, REST), Quadratic(np.eye(1)), 1e-3)
+    found = simulated_region(runs, Effort(10 * UNIT))
+    assert found is not None and len(found.converging) == found.runs >= 1000
+
+
+def test_runs_that_go_round_for_ever_are_not_followed_for_longer() -> None:
+    """x' = x (x - 1) (x + 3) rests at 1 too: what is there neither converges nor leaves."""
+    runs = Simulator(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 0.5)
+    before, here = (runs.horizon, runs.farther), np.array([[1.0], [-1.0]])
+    assert runs.converge(here, Effort(10 * UNIT)).tolist() == [False, True]
+    assert (runs.horizon, runs.farther) == before and not runs.doublings
 
 
 def test_the_default_goes_beyond_the_ellipsoid(by_default: RoaResult) -> None:
