@@ -34,6 +34,7 @@ from certify.loop.policies import load_policy
 from certify.lyapunov import Polynomial
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.learning import Learned, Learner
+from certify.provers.ranks import search
 from certify.report.rows import rows_of
 from certify.report.sections.simulated import drawn_of
 from tests.support.marks import slow_after
@@ -354,6 +355,27 @@ def test_more_effort_comes_before_a_wider_domain_where_little_is_proved(tmp_path
     assert first is not None and first.options == (("--effort", "1.6"),) and "grows with the effort" in first.why
     for other in (step(True, 400), step(True, 850)):
         assert other is None or "--effort" not in dict(other.options)
+
+
+@pytest.mark.parametrize("periods", [None, ("1/50", "1/20")])
+def test_no_effort_is_suggested_where_images_meet_too_many_boxes(
+    periods: tuple[str, str] | None, tmp_path: Path
+) -> None:
+    """The search ended for its size, so that more effort finds the same."""
+    result = proved(tmp_path, STEPS)
+    assert result.ranks is not None
+    ranks = replace(result.ranks, done=True, full=True)
+    system = result.system if periods is None else plant().with_sample((Fraction(periods[0]), Fraction(periods[1])))
+    changed = replace(result, ranks=ranks, simulated=SimulatedFacts(1000, 900, 400), system=system)
+    step = beyond_the_ellipsoid(changed, RoaOptions(), Effort(10 * UNIT))
+    assert step is not None and "more effort finds the same" in step.why
+    assert step.options == (() if periods is None else (("--sample-time", "0.0425..0.05"),))
+
+
+def test_a_search_for_ranks_says_that_it_ended_for_its_size(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(search, "_MOST_PAIRS", 10)
+    result = proved(tmp_path, STEPS, ranks=True)
+    assert result.ranks is not None and result.ranks.full and result.ranks.done
 
 
 def test_a_function_that_was_taught_little_is_taught_more_before_a_wider_domain(by_default: RoaResult) -> None:
