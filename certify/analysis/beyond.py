@@ -47,7 +47,9 @@ def rank_facts(certificate: AnyCertificate, search: RankProof | None = None) -> 
     names = [s.name for s in certificate.system.states]
     found = count(tree, [names.index(name) for name in ranks.angles])
     facts = RankFacts(tree, ranks.angles, found.leaves, found.proved, found.share, found.volume, found.steps)
-    return facts if search is None else replace(facts, rounds=search.rounds, done=search.done)
+    if search is None:
+        return facts
+    return replace(facts, rounds=search.rounds, done=search.done or search.full, full=search.full)
 
 
 def constraints_in_words(certificate: AnyCertificate) -> dict[str, str]:

@@ -135,6 +135,7 @@ class RankFacts:
     steps : the most steps from one of them.
     rounds : of the search; None if it was not counted.
     done : more effort would gain next to nothing.
+    full : and that is because images of boxes meet too many of them.
     """
 
     tree: RankTree
@@ -146,6 +147,7 @@ class RankFacts:
     steps: int
     rounds: int | None = None
     done: bool = False
+    full: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: the numbers, and the corners of the box that was cut."""

@@ -32,6 +32,8 @@ MOST, NEARLY_ALL = 0.8, 0.9
 with the second hardly more is to be proved in this domain."""
 _LEAST, _ENOUGH, _MOST = 250, 1000, 4000  # states drawn at once at least, that converge, and in all
 _QUICK = 10.0  # multiplications of many runs at once that are worth an operation
+_LATE, _DOUBLINGS = 0.01, 6  # share of the runs that converges in twice their time for it to be doubled; how often
+_LONGEST = 3000  # steps of one length: of runs over more time each state has a step of its own
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +83,7 @@ class Simulator:
         whole = math.inf if flow.discrete or flow.period else time_scales(flow, most=math.inf)[1]
         self.farther = whole if self.horizon < whole < math.inf else 0.0
         self.flow, self.step, self.V, self.level = flow, flow.fitting(step), V, level
+        self.doublings = _DOUBLINGS
 
     @property
     def operations(self) -> float:
@@ -90,10 +93,34 @@ class Simulator:
     def converge(self, x: Array, effort: Effort) -> Mask:
         """True (N,) for states (N, n) whose runs converge before the effort, an operation of which is worth several
         multiplications here, is over."""
-        left = Effort(_QUICK * effort.left)
-        found, _, _ = run_until_near(self.flow, x, self.V.P, self.level, self.step, self.horizon, left, self.farther)
-        effort.charge(left.spent / _QUICK)
+        found, undecided = self._runs(x, effort, (self.horizon, self.farther))
+        while self.doublings and undecided.sum() >= _LATE * len(x) and not effort.over:
+            some, times = effort.share(0.5), self._longer()
+            late, never = self._runs(x[undecided], some, times)
+            if some.over or not late.sum() >= _LATE * len(x):
+                self.doublings = 0
+                break
+            self.doublings, (self.horizon, self.farther) = self.doublings - 1, times
+            at = np.flatnonzero(undecided)
+            found[at[late]], undecided[at] = True, never
         return found
+
+    def _longer(self) -> tuple[float, float]:
+        """Twice the horizon of the runs, and the time that those with steps of their own may take."""
+        if self.farther:
+            return self.horizon, 2 * self.farther
+        follows = not (self.flow.discrete or self.flow.period)
+        if follows and 2 * self.horizon > _LONGEST * self.step:
+            return _LONGEST * self.step, 2 * self.horizon
+        return 2 * self.horizon, 0.0
+
+    def _runs(self, x: Array, effort: Effort, times: tuple[float, float]) -> tuple[Mask, Mask]:
+        """The runs that converge, and those that do neither that nor leave, (N,) each."""
+        worth = Effort(_QUICK * effort.left)
+        horizon, farther = times
+        found, left, _ = run_until_near(self.flow, x, self.V.P, self.level, self.step, horizon, worth, farther)
+        effort.charge(worth.spent / _QUICK)
+        return found, ~found & ~left
 
 
 def simulated_region(runs: Simulator, effort: Effort) -> SimulatedRegion | None:

@@ -34,6 +34,7 @@ _ENDED = ("effort", "boxes")  # limits of an outer set that more effort lifts
 _TAUGHT = 1.0  # an effort below it ends the lessons of a function before they are over
 _LOOK = 3 * UNIT  # operations for one look
 _DIGITS = 2  # of the width of a side, in the ends of one that is suggested
+_NARROWER = Fraction(1, 4)  # of a range of periods, with which boxes are tried next
 
 
 def centring(system: System, network: PolicyNetwork) -> Centre | None:
@@ -162,12 +163,24 @@ def beyond_the_ellipsoid(result: RoaResult, options: RoaOptions, effort: Effort)
     young = outer is not None and options.lyapunov is None and options.effort < _TAUGHT
     if (grows or young) and simulated.share < MOST:
         return more
+    if result.ranks is not None and result.ranks.full and simulated.share < MOST:
+        return _in_shorter_images(result, said)
     wider = _in_a_wider_domain(result, effort)
     if wider is not None:
         return wider
     if simulated.share >= NEARLY_ALL:
         return Step((), f"{said}, and hardly more converges in a wider domain: a larger set needs another policy")
     return more if grows else None
+
+
+def _in_shorter_images(result: RoaResult, said: str) -> Step:
+    """The step where images of boxes meet too many boxes for more effort to help: a narrower range of periods."""
+    lo, hi = result.system.sample or (Fraction(0), Fraction(0))
+    many = f"{said}; images of boxes meet so many boxes that more effort finds the same"
+    if lo == hi:
+        return Step((), f"{many}: narrower ranges of what is uncertain, or another policy, may show more")
+    narrower = f"{float(hi - _NARROWER * (hi - lo)):g}..{float(hi):g}"
+    return Step((("--sample-time", narrower),), f"{many}; if periods differ no more than that, images are shorter")
 
 
 def by_learning(result: RoaResult, options: RoaOptions, candidate: str) -> Step | None:

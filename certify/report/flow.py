@@ -119,8 +119,12 @@ class Flow:
         return self.policy(x) if held is None or k % self.steps_between(step) == 0 else held
 
     def operations(self, states: int) -> float:
-        """Multiplications' worth of a step of so many states."""
-        return (1 if self.discrete else _STAGES) * self.cost * states + _AROUND
+        """Multiplications' worth of a step of so many states: a held input asks the policy once, not at each stage."""
+        if self.discrete:
+            each = self.cost
+        else:
+            each = _STAGES * self.cost if not self.period else self.cost + (_STAGES - 1) * min(_EQUATIONS, self.cost)
+        return each * states + _AROUND
 
     def steps_at(self, x: Array, least: float, most: float) -> Array:
         """A step in seconds for each state (N, n), (N, 1): the fastest time constant there, between two bounds."""

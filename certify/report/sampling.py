@@ -30,6 +30,7 @@ SETTLED = 1e-3
 _GRID = {1: 401, 2: 35}
 _FINER = 8  # of the step, in runs that are asked again because they contradict what is claimed
 _HALVINGS = 2  # of the grid's cells along the boundary of the region
+_LATE, _DOUBLINGS = 0.01, 6  # share of the runs that settles in twice their time for it to be doubled; how often
 _FEWEST_STEPS = 100  # of a run with steps of its own
 _WIDTH = 4  # fine cells to either side that a smoothed value knows of
 _OUTSIDE = 1.01  # times the level: a run that starts below it and comes so high has left the set
@@ -70,9 +71,15 @@ class SimulatedRoa:
 
     @property
     def fraction(self) -> float:
-        """Certified grid points over attracted grid points; NaN if nothing was attracted."""
+        """Certified grid points over attracted grid points; NaN if nothing was attracted, or the runs tell little."""
         count = int(self.attracted.sum())
-        return float(self.certified.sum()) / count if count else math.nan
+        return float(self.certified.sum()) / count if count and self.tells else math.nan
+
+    @property
+    def tells(self) -> bool:
+        """False if most runs from certified grid points had not settled within the horizon, nor left: then the runs
+        were too short to say what is attracted."""
+        return 2 * self.slow <= int(self.certified.sum())
 
     @property
     def contradictions(self) -> int:
@@ -182,7 +189,8 @@ def simulated_roa_fraction(
     system, network : the closed loop; one or two states.
     P, level : the proved set.
     points : grid points along each state; default 401 for one state, 35 for two.
-    step, horizon : in seconds; defaults from the eigenvalues, see `time_scales`.
+    step, horizon : in seconds; defaults from the eigenvalues, see `time_scales`; the default horizon is doubled as
+        long as that lets more runs settle.
     settled : the level that a run has to reach; default `SETTLED * level`, near the origin.
     effort : counted work; where it is over the simulation ends wherever it is.
     start, centre : (n, n) and (n,), of the ellipsoid {(x - c)'P(x - c) <= 1} that belongs to the proved set too,
@@ -197,6 +205,7 @@ def simulated_roa_fraction(
         raise InputError(f"a grid needs a plant with one or two states; {system.name} has {system.n}.")
     flow = Flow.of(system, network)
     default_step, default_horizon = time_scales(flow)
+    given = horizon is not None
     step = default_step if step is None else step
     horizon = default_horizon if horizon is None else horizon
     points = _GRID[system.n] if points is None else points
@@ -208,13 +217,31 @@ def simulated_roa_fraction(
     x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, system.n)
     certified = _in_sets(x, P, level, start, centre, beyond)
     target = SETTLED * level if settled is None else settled
-    attracted, left, reached = run_until_near(flow, x, P, target, step, horizon, effort)
+    decide = run_until_near if given else _until_decided
+    attracted, left, reached = decide(flow, x, P, target, step, horizon, effort)
     suspects = np.flatnonzero(certified & left)
     if suspects.size and not flow.discrete:
         again, gone, _ = run_until_near(flow, x[suspects], P, target, step / _FINER, reached, effort)
         attracted[suspects], left[suspects] = again, gone
     shape = (points,) * system.n
     return SimulatedRoa(axes, attracted.reshape(shape), left.reshape(shape), certified.reshape(shape), step, reached)
+
+
+def _until_decided(
+    flow: Flow, x: Array, P: Array, target: float, step: float, horizon: float, effort: Effort
+) -> tuple[Mask, Mask, float]:
+    """As `run_until_near`, in twice the horizon as long as more runs come near in it: where the input saturates the way
+    may take long."""
+    attracted, left, reached = run_until_near(flow, x, P, target, step, horizon, effort)
+    for _ in range(_DOUBLINGS):
+        undecided = np.flatnonzero(~attracted & ~left)
+        if len(undecided) < _LATE * len(x) or effort.over:
+            break
+        late, gone, longer = run_until_near(flow, x[undecided], P, target, step, 2 * reached, effort)
+        if effort.over or late.sum() < _LATE * len(x):
+            break
+        attracted[undecided], left[undecided], reached = late, gone, longer
+    return attracted, left, reached
 
 
 def run_until_near(

@@ -29,11 +29,12 @@ from certify.certificates.verdict import Verdict
 from certify.effort import UNIT, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import Expression, Number, Symbol
+from certify.loop.expressions import Expression, Number, Symbol, tanh
 from certify.loop.policies import load_policy
 from certify.lyapunov import Polynomial
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.learning import Learned, Learner
+from certify.provers.ranks import search
 from certify.report.rows import rows_of
 from certify.report.sections.simulated import drawn_of
 from tests.support.marks import slow_after
@@ -99,6 +100,26 @@ def test_states_from_which_an_input_leaves_its_bounds_do_not_count(period: float
 
 def test_runs_that_cannot_be_decided_tell_nothing() -> None:
     assert simulated_region(Simulator(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 0.5), Effort(1.0)) is None
+
+
+@pytest.mark.parametrize("time", ["continuous", "held", "discrete"])
+def test_runs_last_until_a_saturated_input_has_brought_them_home(time: str) -> None:
+    """x' = -tanh(60 x) decays at 60 about 0, 15 time constants of which are 1/4; from 2 the way takes two units."""
+    fast = -tanh(60 * x)
+    system = plant(x + fast / 100, -2, time="discrete") if time == "discrete" else plant(fast, -2)
+    if time == "held":
+        system = replace(system, sample=(Fraction(1, 100), Fraction(1, 100)))
+    runs = Simulator(ClosedLoop(system, REST), Quadratic(np.eye(1)), 1e-3)
+    found = simulated_region(runs, Effort(10 * UNIT))
+    assert found is not None and len(found.converging) == found.runs >= 1000
+
+
+def test_runs_that_go_round_for_ever_are_not_followed_for_longer() -> None:
+    """x' = x (x - 1) (x + 3) rests at 1 too: what is there neither converges nor leaves."""
+    runs = Simulator(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 0.5)
+    before, here = (runs.horizon, runs.farther), np.array([[1.0], [-1.0]])
+    assert runs.converge(here, Effort(10 * UNIT)).tolist() == [False, True]
+    assert (runs.horizon, runs.farther) == before and not runs.doublings
 
 
 def test_the_default_goes_beyond_the_ellipsoid(by_default: RoaResult) -> None:
@@ -334,6 +355,27 @@ def test_more_effort_comes_before_a_wider_domain_where_little_is_proved(tmp_path
     assert first is not None and first.options == (("--effort", "1.6"),) and "grows with the effort" in first.why
     for other in (step(True, 400), step(True, 850)):
         assert other is None or "--effort" not in dict(other.options)
+
+
+@pytest.mark.parametrize("periods", [None, ("1/50", "1/20")])
+def test_no_effort_is_suggested_where_images_meet_too_many_boxes(
+    periods: tuple[str, str] | None, tmp_path: Path
+) -> None:
+    """The search ended for its size, so that more effort finds the same."""
+    result = proved(tmp_path, STEPS)
+    assert result.ranks is not None
+    ranks = replace(result.ranks, done=True, full=True)
+    system = result.system if periods is None else plant().with_sample((Fraction(periods[0]), Fraction(periods[1])))
+    changed = replace(result, ranks=ranks, simulated=SimulatedFacts(1000, 900, 400), system=system)
+    step = beyond_the_ellipsoid(changed, RoaOptions(), Effort(10 * UNIT))
+    assert step is not None and "more effort finds the same" in step.why
+    assert step.options == (() if periods is None else (("--sample-time", "0.0425..0.05"),))
+
+
+def test_a_search_for_ranks_says_that_it_ended_for_its_size(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(search, "_MOST_PAIRS", 10)
+    result = proved(tmp_path, STEPS, ranks=True)
+    assert result.ranks is not None and result.ranks.full and result.ranks.done
 
 
 def test_a_function_that_was_taught_little_is_taught_more_before_a_wider_domain(by_default: RoaResult) -> None:

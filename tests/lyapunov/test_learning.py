@@ -12,7 +12,7 @@ import pytest
 from certify.effort import Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import Number, Symbol, symbols
+from certify.loop.expressions import Number, Symbol, symbols, tanh
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
 from certify.lyapunov import Neural, Polynomial
@@ -180,6 +180,16 @@ def test_a_plant_that_is_stiff_far_out_has_steps_by_state() -> None:
     flow = LearningFlow(ClosedLoop(dataclasses.replace(loop.system, dynamics=dynamics), loop.network), UNIT, 0.01)
     assert flow.by_state and flow.steps * flow.step < 5 and not LearningFlow(disc(), UNIT, 0.01).by_state
     assert flow.run(np.array([[0.9, 0.0], [0.3, -0.8]]), np.ones(2)).converged.all()
+
+
+def test_runs_last_until_a_saturated_input_has_brought_them_home() -> None:
+    """x' = -tanh(60 x) decays at 60 about 0, twelve time constants of which are 1/5; from 2 the way takes two units."""
+    loop = disc(n=2)
+    fast = tuple(-tanh(60 * s) for s in loop.system.states)
+    flow = LearningFlow(ClosedLoop(dataclasses.replace(loop.system, dynamics=fast), loop.network), UNIT, 0.01)
+    assert 1.6 <= flow.horizon <= 6.4
+    assert flow.run(flow.uniform(300, np.random.default_rng(1)), np.ones(2)).converged.all()
+    assert LearningFlow(disc(), UNIT, 0.01).horizon == pytest.approx(12)
 
 
 def test_runs_are_as_many_as_the_effort_is_worth() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from fractions import Fraction
 from itertools import count, pairwise
 
 import numpy as np
@@ -20,13 +21,14 @@ from certify.loop.plants.equations import parse_expression
 from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
 from certify.report import simulated_roa_fraction
-from certify.report.figures import draw
+from certify.report.figures import draw, region_of
 from certify.report.figures.portrait import keys
 from certify.report.figures.scene import Detail, Scene
 from certify.report.figures.style import LEAVING, UNSETTLED
 from certify.report.figures.trajectories import runs_from, starts
 from certify.report.flow import Flow, simulate
 from certify.report.sampling import SETTLED, Runs, SimulatedRoa, edge_of, quadratic, runs_of
+from certify.report.sections.simulated import simulated_of
 from tests.support.loops import box
 
 ONE_LEAF = PartitionTree(np.eye(2), np.ones(2), bytes([255]))
@@ -97,6 +99,36 @@ def test_nothing_from_a_certified_set_is_drawn_as_leaving() -> None:
     assert not any("leave" in text for text in texts) and LEAVING not in first.svg.split("</style>")[-1]
     assert UNSETTLED in first.svg.split("</style>")[-1]
     assert roa is not None and roa.contradictions == 0 and not roa.left.any() and roa.slow > 0
+
+
+def test_runs_that_are_too_short_tell_no_share() -> None:
+    """Of the pages' runs hardly one comes near where the effort ends early: then no share of them is stated."""
+    slow = certificate(plane("-x/1000", "-y*50"), 0.9)
+    roa = simulated_roa_fraction(slow.system, QUIET, slow.P, slow.roa)
+    said = simulated_of(roa, slow)
+    assert roa.attracted.any() and not roa.tells and np.isnan(roa.fraction) and not said["tells"]
+    assert region_of(Scene(slow, accepted=True), roa) is None
+    quick = simulated_roa_fraction(plane("-x", "-y"), QUIET, slow.P, slow.roa)
+    assert quick.tells and 0 < quick.fraction < 1
+
+
+def test_a_held_input_is_asked_once_a_step() -> None:
+    """A step of Runge and Kutta has four stages, in each of which a policy that follows at once is asked."""
+    wide = replace(QUIET, network=PolicyNetwork.of_layers((np.zeros((500, 2)), np.zeros((1, 500))),
+                   (np.zeros(500), np.zeros(1)), np.ones(1), np.zeros(1), "tanh", "none").network)  # fmt: skip
+    system = plane("-x", "-y")
+    each = [
+        flow.operations(2) - flow.operations(1)
+        for flow in (Flow.of(system, wide), Flow.of(replace(system, sample=(Fraction(1, 10),) * 2), wide))
+    ]
+    assert each[0] == 4 * Flow.of(system, wide).cost and each[1] < 0.4 * each[0]
+
+
+def test_the_grids_runs_last_until_they_are_home() -> None:
+    """x' = -tanh(60 x) decays at 60 about 0, 15 time constants of which are 1/4; from 1 the way takes one unit."""
+    roa = simulated_roa_fraction(plane("-tanh(60*x)", "-tanh(60*y)"), QUIET, np.eye(2), 0.04)
+    assert roa.attracted.all() and 1.0 <= roa.horizon <= 4.0
+    assert simulated_roa_fraction(plane("-x", "-y"), QUIET, np.eye(2), 0.04).horizon == pytest.approx(15)
 
 
 def test_what_leaves_is_drawn_so() -> None:

@@ -207,7 +207,9 @@ def _proved(
     turned = tuple(i for i, s in enumerate(system.states) if s.name in found.ranks.angles)
     steps = steps_from(Ranked(leaves_of(certificate), goal.ellipsoid, turned), options.begin)
     if steps is None:
-        why = "the effort is over" if not found.done else "no leaf is left whose halves could gain anything"
+        many = "images meet too many boxes for more effort to help"
+        over = many if found.full else "the effort is over"
+        why = over if not found.done else "no leaf is left whose halves could gain anything"
         return replace(result, reason=f"{_part(result, goal, leaves_of(certificate))}: {why}")
     return replace(result, verdict=Verdict.PROVED, reason="requested", steps=steps)
 

@@ -97,7 +97,7 @@ def proved_in_steps(
         state=_state_in(certificate),
         boxes=proof.boxes,
         constraints=constraints_in_words(certificate),
-        following=() if proof.done else (f"--effort {4 * options.effort:g}",),
+        following=() if proof.done or proof.full else (f"--effort {4 * options.effort:g}",),
         certificate=path,
         raw=raw,
         checker=answer,

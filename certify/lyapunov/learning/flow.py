@@ -29,6 +29,7 @@ _STEP = 0.5  # of the time constant of the fastest eigenvalue
 _HORIZON = 12.0  # time constants of the slowest
 _MAX_STEPS, _FEWEST_STEPS = 3000, 100
 _RATE_SAMPLES = 300
+_TRIED, _LATE, _DOUBLINGS = 200, 0.01, 6  # runs, share of them that converges in twice their time for it to be doubled
 _SHELL = 0.75  # of c, inside of which nothing is asked
 _NEAR = 0.93  # of a domain's half-width: from here on its faces are near
 
@@ -92,9 +93,30 @@ class LearningFlow:
         rates = eigenvalues_of(self.rate, self.uniform(_RATE_SAMPLES, generator), self.high - self.low)
         self.step = _STEP / float(np.max(np.abs(rates), initial=1e-9))
         slowest = self._slowest()
-        self.horizon = _HORIZON / max(slowest, 1e-9)
-        self.steps = min(_MAX_STEPS, math.ceil(self.horizon / self.step))
-        self.by_state = slowest > 0 and self.steps * self.step < self.horizon  # one step for all does not come so far
+        self._last(_HORIZON / max(slowest, 1e-9), slowest > 0)
+        if slowest > 0:
+            self._lengthen(self.uniform(_TRIED, generator))
+
+    def _last(self, horizon: float, decays: bool = True) -> None:
+        """Let runs last so long."""
+        self.horizon, self.steps = horizon, min(_MAX_STEPS, math.ceil(horizon / self.step))
+        self.by_state = decays and self.steps * self.step < horizon  # one step for all does not come so far
+
+    def _lengthen(self, x: Array) -> None:
+        """Double the time of runs as long as that lets more of those from x (B, n) converge.
+
+        Where the input saturates the way to the origin may take far longer than the motion about it.
+        """
+        late = _LATE * len(x)
+        for _ in range(_DOUBLINGS):
+            x = x[self.run(x, np.ones(self.n)).fate == Fate.UNDECIDED]
+            if len(x) < late:
+                return
+            before = self.horizon
+            self._last(2 * before)
+            if self.run(x, np.ones(self.n)).converged.sum() < late:
+                self._last(before)
+                return
 
     def _slowest(self) -> float:
         """The rate at which the slowest motion about the origin decays; not positive if one does not."""

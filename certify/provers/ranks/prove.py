@@ -28,7 +28,6 @@ _HALF_TURN = 3.1416  # and a little more
 _SLIVER, _SAMPLES = 1e-6, 64
 _ORDERS = (2, 3, 4, 5, 6, 7, 8)
 _LITTLE, _GAIN = 1e-7, 0.5  # share of the root box that an error may be; a gain that is worth an order
-_MOST_LEAVES, _MOST_PAIRS = 400_000, 10_000_000  # of an image and a leaf that it meets, in one round
 _OF_A_PAIR, _OF_A_LEAF = 500.0, 50_000.0  # operations, beside those of the steps
 _SMALL, _LOST = 0.002, 1e3  # half-width of a box, as a share of the root box's width; growth that counts for no image
 _DEPENDENT = 1e8  # condition of a frame that is of no use
@@ -182,6 +181,7 @@ class RankProof:
     share : of the root box's volume.
     leaves : of finite rank; `boxes` were looked at, in `rounds` rounds.
     done : no leaf is left whose halves could gain anything, or the box that was wanted is proved.
+    full : the search ended because leaves, or those that images meet, are too many: more effort finds the same.
     """
 
     ranks: Ranks
@@ -191,6 +191,7 @@ class RankProof:
     boxes: int
     rounds: int
     done: bool
+    full: bool = False
 
 
 def turning(loop: ClosedLoop) -> list[int]:
@@ -297,7 +298,9 @@ def prove_remaining(
 
 def _proof(search: Search, tree: RankTree, boxes: int, rounds: int, done: bool) -> RankProof:
     """The proof that a search ends with, whose evidence is this tree."""
-    return RankProof(_ranks(search, tree), tree, search.share, int(tree.proved.sum()), boxes, rounds, done)
+    return RankProof(
+        _ranks(search, tree), tree, search.share, int(tree.proved.sum()), boxes, rounds, done, not done and search.full
+    )
 
 
 def _ranks(search: Search, tree: RankTree) -> Ranks:
@@ -326,8 +329,7 @@ def _grow(
         if report is not None:
             report(search.share, search.boxes, len(search.unknown))
         done = search.is_done(near)
-        large = len(search.cover.leaves) > _MOST_LEAVES or search.pairs > _MOST_PAIRS
         satisfied = enough is not None and search.counted(enough.states) >= enough.count
-        if done or satisfied or effort.over or large or search.gives_up:
+        if done or satisfied or effort.over or search.full or search.gives_up:
             return rounds, done
         new = search.further(near)

@@ -25,6 +25,7 @@ _FIRST = 2**10  # leaves of the first tree
 _BEFORE, _GAIN = 1 / 8, 1e-4  # relative growth of what is proved, since so few boxes, below which the search ends
 _SHARE = 0.5  # share of all promise in the leaves that are halved next
 _ANYWAY = 0.05  # share of a leaf that may gain a rank where its image, or a few of its states, say that nothing does
+_MOST_LEAVES, _MOST_PAIRS = 400_000, 10_000_000  # of an image and a leaf that it meets, in one round
 _POINTS = 5  # of a leaf, from which it is seen if the target may be reached
 Promising = Callable[[Array], Mask]
 """True (N,) for states (N, n) that seem to reach the target."""
@@ -62,6 +63,11 @@ class Search:
         self.stands.append((self.boxes, share))
         stalled = before and 0 < share <= (1 + _GAIN) * before[-1]
         return bool(not len(near) or stalled)
+
+    @property
+    def full(self) -> bool:
+        """True if leaves are too many, or those that images meet: then the search ends, whatever effort is left."""
+        return len(self.cover.leaves) > _MOST_LEAVES or self.pairs > _MOST_PAIRS
 
     @property
     def gives_up(self) -> bool:

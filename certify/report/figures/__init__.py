@@ -74,8 +74,8 @@ def simulated_roa(scene: Scene) -> SimulatedRoa | None:
 
 
 def region_of(scene: Scene, roa: SimulatedRoa | None) -> Region | None:
-    """The simulated region of a plane, if it has a boundary in the domain."""
-    if roa is None or len(roa.axes) != 2 or roa.attracted.all() or not roa.attracted.any():
+    """The simulated region of a plane, if it has a boundary in the domain, and runs are long enough to tell it."""
+    if roa is None or len(roa.axes) != 2 or not roa.tells or roa.attracted.all() or not roa.attracted.any():
         return None
     return edge_of(scene.flow, roa, scene.P, scene.settling_level, scene.effort)
 

@@ -23,6 +23,7 @@ def simulated_of(roa: SimulatedRoa, certificate: Certificate) -> dict[str, str]:
     timing = timing_of(certificate)
     return {
         "fraction": ABSENT if np.isnan(roa.fraction) else percent(roa.fraction, 1),
+        "tells": "yes" if roa.tells else "",
         "grid": f" {TIMES} ".join(str(len(a)) for a in roa.axes),
         "attracted": f"{int(roa.attracted.sum()):,} of {roa.attracted.size:,}",
         "how": _integrated(roa, timing),
