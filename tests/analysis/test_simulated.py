@@ -37,6 +37,7 @@ from certify.lyapunov.learning import Learned, Learner
 from certify.provers.ranks import search
 from certify.report.rows import rows_of
 from certify.report.sections.simulated import drawn_of
+from certify.report.words import percent
 from tests.support.marks import slow_after
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
@@ -130,7 +131,7 @@ def test_the_default_goes_beyond_the_ellipsoid(by_default: RoaResult) -> None:
     stated = by_default.to_dict()["simulated"]
     assert stated["proved"] <= stated["converging"] <= stated["runs"] and stated["share"] == share
     said = dict(rows_of(by_default.to_dict(), True))["simulated"]
-    assert f"about {100 * share:.0f} % of what converges is proved" in said and "no part of the proof" in said
+    assert f"about {percent(share)} of what converges is proved" in said and "no part of the proof" in said
 
 
 @pytest.mark.slow

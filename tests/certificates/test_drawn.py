@@ -45,7 +45,8 @@ def test_a_result_its_file_and_its_page_say_the_same(tmp_path):
     system, network = result.system, load_policy(PENDULUM).network
     x = states_in(Region((sublevel_set(result.P, result.levels.roa),)), BOX)
     assert found == nonlinearity(network, system.exact_u_eq(), x)
-    assert f"{above(100 * found.largest, 2)} % of its saturated linear part on the set" in result.report().read_text("utf-8")
+    said = f"{above(100 * found.largest, 2)} % of its saturated linear part on the set"
+    assert said in result.report().read_text("utf-8")
 
 
 def test_an_ellipsoid_that_is_none_has_no_states(tmp_path):

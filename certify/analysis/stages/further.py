@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from certify.analysis.asked import ellipsoid_around, ellipsoid_in
 from certify.analysis.facts import TubeFacts
-from certify.analysis.simulated import Simulator
+from certify.analysis.simulated import NEARLY_ALL, Simulator
 from certify.analysis.stages.state import State, Tools
 from certify.certificates.claims import Problem
 from certify.certificates.ellipsoids import Box, sublevel_set, tube_start
@@ -36,6 +36,7 @@ _FOR_CELLS = 0.7  # the same for a search of boxes with ranks, of which only tho
 _FOR_RANKS = 0.35  # share of the whole effort, even if the search has left less
 _FOR_LEARNING = 0.6  # share of the effort that is left, the rest being for the proof and its check
 _MOST = 0.8  # share of what a learned function promised: with less proved it is taught again
+_MORE = 0.02  # share of the region that another lesson has to promise beyond the last, if that kept its promise
 _LEAST = 0.1  # share of the whole effort, with less of which it is not
 _PROBES = 30  # states at which the order of the series in time is chosen, and the frame of errors
 _BOXES, _LITTLE = 1e4, 0.02  # share of the width of one of so many equal boxes that an error of the series may be
@@ -193,7 +194,8 @@ class Beyond:
             )
 
     def _learned(self, state: State, effort: Effort) -> OuterProof | Nothing:
-        """The largest set of functions learned with shares of the effort, until most of what samples say is proved.
+        """The largest set of functions learned with shares of the effort, until it is nearly all of the region, or
+        another lesson promises no more.
 
         Samples may miss where a function rises, and a proof may not: what it finds is then part of the next lesson.
         """
@@ -203,22 +205,27 @@ class Beyond:
         options, problem, best = state.options, state.contest.best.trial.task.problem, None
         n, neural = problem.loop.system.n, options.learned == "neural"
         model = Network(n, tuple(options.hidden)) if neural else Terms(n, options.degree)
-        share, learner = effort.share(_FOR_LEARNING), None
+        share, learner, promised = effort.share(_FOR_LEARNING), None, 0.0
         while True:
             with self.tools.timing("learn"):
                 self.tools.tell("learn")
                 if learner is None:
                     learner = learner_of(problem.loop, problem.V, state.proved[0].roa, model, options.seed, share)
                 learned = learner.learn(share)
+            if best is not None and learned.cover < promised + _MORE:
+                return best[1]
             found = self._proved(state, learned.function, effort)
             covered = 0.0 if isinstance(found, Nothing) else learner.cover(learned.function, found.outer.level)
             if best is None or covered > best[0]:
                 best = covered, found
-            wrong = found.witness if isinstance(found, Nothing) or found.stop is Stop.WITNESS else None
-            enough = covered >= _MOST * learned.cover or effort.left < _LEAST * self.tools.whole
-            if wrong is None or enough:
+            if effort.left < _LEAST * self.tools.whole or covered >= NEARLY_ALL:
                 return best[1]
-            learner.correct(wrong.x, covered)
+            wrong = found.witness if isinstance(found, Nothing) or found.stop is Stop.WITNESS else None
+            if wrong is not None and covered < _MOST * learned.cover:
+                learner.correct(wrong.x, covered)
+                promised = 0.0
+            else:  # another lesson has to promise more
+                promised = learned.cover
             share = effort.share(_FOR_LEARNING)
 
 

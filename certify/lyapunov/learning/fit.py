@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 _TRIES = 8  # of a step, with more damping each time
 _MORE, _LESS, _LEAST = 3.0, 0.4, 1e-8  # damping
 _ENOUGH = 1e-5  # relative gain of a step, below which the fit ends
-_CALL, _ENTRY, _EACH = 1e6, 0.05, 100.0  # operations of a step, and of a product and an entry of its rows
+_CALL, _ENTRY, _EACH = 4e6, 0.03, 100.0  # operations of a step, and of a product and an entry of its violated rows,
+_VALUE, _CUBE = 2.0, 0.015  # of a parameter in each row, and of solving: a core's seconds, measured
 _DECAY = 1e-6  # of the parameters: small weights make smooth functions
 
 
@@ -85,8 +86,8 @@ def fit(
     least = cost(p)
     rows, size = len(values.z) + len(slopes.z), len(p)
     for _ in range(steps):
-        effort.charge(_CALL + _ENTRY * rows * size * (size + _EACH) + size**3)
-        normal, downhill = _normal_equations(model, p, values, slopes)
+        normal, downhill, violated = _normal_equations(model, p, values, slopes)
+        effort.charge(_CALL + _ENTRY * violated * size * (size + _EACH) + _VALUE * rows * size + _CUBE * size**3)
         diagonal = np.diag(normal)
         floor = 1e-6 * diagonal.max()
         for _ in range(_TRIES):
@@ -111,8 +112,8 @@ def fit(
     return Fit(p, least, damping)
 
 
-def _normal_equations(model: Model, p: Array, values: Values, slopes: Slopes) -> tuple[Array, Array]:
-    """(J'J, -J'r) of the rows that are violated, the decay of the parameters included."""
+def _normal_equations(model: Model, p: Array, values: Values, slopes: Slopes) -> tuple[Array, Array, int]:
+    """(J'J, -J'r) of the rows that are violated, the decay of the parameters included; and how many these are."""
     function = model.function(p)
     r, s = values.residuals(function(values.z)), slopes.residuals(along(function, slopes.z, slopes.v))
     high, rising = r != 0, s != 0
@@ -123,7 +124,7 @@ def _normal_equations(model: Model, p: Array, values: Values, slopes: Slopes) ->
     ):
         normal += rows.T @ rows
         downhill -= rows.T @ residual
-    return normal, downhill
+    return normal, downhill, int(high.sum() + rising.sum())
 
 
 def along(function: LyapunovFunction, z: Array, v: Array) -> Array:

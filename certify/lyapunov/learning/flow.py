@@ -30,6 +30,7 @@ _HORIZON = 12.0  # time constants of the slowest
 _MAX_STEPS, _FEWEST_STEPS = 3000, 100
 _RATE_SAMPLES = 300
 _TRIED, _LATE, _DOUBLINGS = 200, 0.01, 6  # runs, share of them that converges in twice their time for it to be doubled
+_OFTEN = 4  # steps of a run after which its step is chosen anew
 _SHELL = 0.75  # of c, inside of which nothing is asked
 _NEAR = 0.93  # of a domain's half-width: from here on its faces are near
 
@@ -173,20 +174,20 @@ class LearningFlow:
         middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
         fate = np.full(len(starts), Fate.UNDECIDED, dtype=np.int64)
         length, nearness, time = np.zeros((3, len(starts)))
-        x, alive = starts, np.arange(len(starts))
+        x, alive, step = starts, np.arange(len(starts)), np.full(len(starts), self.step)
         with np.errstate(all="ignore"):
-            for _ in range(self.steps):
+            for k in range(self.steps):
                 home, kept = self.is_home(x), self.inside(x)
                 fate[alive[home & kept]], fate[alive[~kept]] = Fate.CONVERGED, Fate.LOST
                 on = kept & ~home & (time[alive] < self.horizon)
-                x, alive = x[on], alive[on]
+                x, alive, step = x[on], alive[on], step[on]
                 if not alive.size:
                     break
                 relative = np.max(np.abs((x - middle) / half), axis=-1)
                 close = np.clip((relative - _NEAR) / (1 - _NEAR), 0.0, 1.0) ** 2
                 nearness[alive] = np.maximum(nearness[alive], close)
                 self.effort.charge(_CALL + 5 * len(x) * self.loop.operations)
-                step = self._steps_at(x) if self.by_state else np.full(len(x), self.step)
+                step = self._steps_at(x) if self.by_state and k % _OFTEN == 0 else step
                 after = rk4_step(self.rate, x, step[:, None])
                 time[alive] += step
                 length[alive] += np.linalg.norm((after - x) / scale, axis=-1)
