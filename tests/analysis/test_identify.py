@@ -418,6 +418,7 @@ def test_the_least_factor_of_a_residual_is_no_larger_than_the_true_one(tmp_path:
     assert identified(tmp_path, transitions()).least_residual == ()
 
 
+@pytest.mark.slow
 def test_factors_are_of_all_residuals_and_of_each_beside_the_others(tmp_path: Path) -> None:
     rows = transitions(noise=1e-4, drag=0.2)
     lacking = RESIDUAL.format('0.4*theta_dot**2"\ntheta = "0.1*theta_dot')
@@ -726,6 +727,7 @@ def test_python_takes_data_as_the_command_does(known: Path) -> None:
     assert again.verdict == "PROVED" and again.to_dict()["data"]["sha256"] == found.to_dict()["data"]["sha256"]
 
 
+@pytest.mark.slow
 def test_a_tube_has_data_too(known: Path) -> None:
     """Both checkers derive the ranges; without the evidence of one transition, or with other ends, they refuse it."""
     network = load_policy(EXAMPLES / "policies" / "pendulum.pt").network

@@ -340,7 +340,7 @@ def levels_of(data: Document, P: np.ndarray) -> Iterator[float]:
         yield found
 
 
-@pytest.mark.parametrize("seed", slow_after(5, range(100)))
+@pytest.mark.parametrize("seed", slow_after(2, range(100)))
 def test_no_pair_parts_over_a_period_of_a_random_plant(seed: int) -> None:
     data = with_P(random_plant(seed))
     P = square(data["lyapunov"]["P"])
@@ -361,9 +361,10 @@ def test_no_pair_parts_over_a_period_of_a_random_plant(seed: int) -> None:
 
 
 def test_some_random_plants_are_accepted() -> None:
-    found = 0
-    for seed in range(16):
+    found = seed = 0
+    while found < 4 and seed < 16:
         data = with_P(random_plant(seed))
         P = square(data["lyapunov"]["P"])
         found += any(passes_the_checker(on_ball(data, P, 2.0**-12, share)) for share in SHARES)
+        seed += 1
     assert found >= 4, found

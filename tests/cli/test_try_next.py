@@ -296,10 +296,11 @@ def require_followed(system: System, options: RoaOptions, changed: Mapping[str, 
     [
         (["--rate", "1.5", "--effort", "0.1"], "--rate", lambda old, new: new["verdict"] == "PROVED" != old["verdict"]),
         (["--sample-time", "4"], "--sample-time", lambda old, new: new["verdict"] == "PROVED" != old["verdict"]),
-        (
+        pytest.param(
             ["--sample-time", "0.2", "--candidate", "ellipsoid", "--effort", "0.1"],
             "--ranks",
             lambda old, new: new["ranks"]["volume"] > 1.2 * old["volume"],
+            marks=pytest.mark.slow,
         ),
         (
             ["--Q", "1,30", "--effort", "0.2"],

@@ -313,7 +313,7 @@ def test_drag_of_the_wrong_sign_is_proved_up_to_where_it_turns(time: str, tmp_pa
         assert beyond.verdict is not Verdict.PROVED
 
 
-@pytest.mark.parametrize("claim", ["asymptotic", "practical", "nearby"])
+@pytest.mark.parametrize("claim", slow_after(1, ["nearby", "asymptotic", "practical"]))
 def test_drag_at_rest_is_proved_with_ranges(claim: str, tmp_path: Path) -> None:
     """The corner moves with w in the last two, so that the loop does not rest at the origin."""
     moved = "abs(v)" if claim == "asymptotic" else "abs(v - w)"

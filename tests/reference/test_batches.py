@@ -18,8 +18,10 @@ from tests.checker.test_rules import HONEST
 from tests.checker.test_rules import honest as of_version_3
 from tests.support.balls import with_ball
 from tests.support.certificates import Document, dump, with_tree, write
+from tests.support.marks import slow_after
 from tests.support.outer import uniform
 
+FAST = ("scalar", "rotor", "sampled", "practical, clipped", "local only", "outer, an expression")
 COMMAND = [sys.executable, "-I", "-m", "certify.reference"]
 
 
@@ -32,7 +34,7 @@ def honest(name: str) -> Document:
     return with_ball(of_version_3(name))
 
 
-@pytest.mark.parametrize("name", HONEST)
+@pytest.mark.parametrize("name", slow_after(len(FAST), [*FAST, *(name for name in HONEST if name not in FAST)]))
 def test_the_answer_is_that_of_one_process(name: str) -> None:
     """Of one leaf and of many, on some of which a rule refuses: the first of these is named."""
     data = honest(name)

@@ -29,6 +29,7 @@ from certify.reference.evidence import Ranked
 from certify.reference.leaves import Box
 from certify.reference.ranks import Rows, Walk
 from certify.reference.refusal import Refused
+from tests.support.marks import slow_after
 from tests.support.rank_forgeries import verdicts
 from tests.support.ranked import Document, Loop, affine, around_level, dumped, encode, two_bytes
 
@@ -366,7 +367,7 @@ def verdicts_near(loop: Linear, k: int, i: int, over: Fraction, **more: Any) -> 
 
 
 @pytest.mark.parametrize("memory", [None, 3])
-@pytest.mark.parametrize("k", [1, 7, 40])
+@pytest.mark.parametrize("k", slow_after(2, [7, 1, 40]))
 @pytest.mark.parametrize("name", ["turn", "slow turn", "swap", "nothing moves", "a line"])
 def test_targets_of_loops_that_only_turn(name: str, k: int, memory: int | None) -> None:
     """Each loop is at the end of its box after some step, and its bound within the 1-norms of all errors."""
