@@ -28,6 +28,7 @@ _DOT = "\u0307"
 PRACTICAL = frozenset({"practical", "nearby"})
 """The claims whose inner set is the one in which trajectories end."""
 _ROUNDS_TO_ALL = 0.995
+_SHORT = 10  # characters of an exact fraction that is written as it is
 _A_GAIN = ((0.05, ": a gain does nearly the same"), (0.2, ""))
 _NO_GAIN = ": its own gain does not do the same"
 """Conclusions for a reader, by the rms."""
@@ -174,12 +175,17 @@ def held_at(system: System) -> str:
 def at_rest(names: Sequence[str], x_eq: Sequence[Fraction], units: Sequence[str]) -> str:
     """The operating point in words; nothing where it is 0 in all states.
 
-    Sets are said in deviations from it, which may be smaller than the sixth digit: it has all digits of a float.
+    Sets are said in deviations from it, which may be smaller than the sixth digit: it is exact where that is short, and
+    has all digits of a float elsewhere.
 
-    >>> at_rest(["h", "v"], [Fraction(18, 17), Fraction(0)], ["m", "m/s"])
-    'h = 1.0588235294117647 m, v = 0 m/s'
+    >>> at_rest(["h", "v", "a"], [Fraction(18, 17), Fraction(0), Fraction(0.1)], ["m", "m/s", ""])
+    'h = 18/17 m, v = 0 m/s, a = 0.1'
     """
-    return point(names, x_eq, units) if any(x_eq) else ""
+    values = [
+        shortest(float(q)) if Fraction(repr(float(q))) == q or len(str(q)) > _SHORT else str(q).replace("-", "−")
+        for q in x_eq
+    ]
+    return _values(names, values, units) if any(x_eq) else ""
 
 
 def point(names: Sequence[str], values: Sequence[float | Fraction], units: Sequence[str]) -> str:

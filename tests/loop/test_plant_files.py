@@ -151,15 +151,15 @@ def test_a_report_and_the_terminal_say_the_operating_point(tmp_path: Path, capsy
     arguments += ["--candidate", "lyapunov"]
     assert _run([*arguments, "--out", str(tmp_path / "o"), "--effort", "0.4"], False) == 0
     out, err = capsys.readouterr()
-    assert "operating point" in out and "level = 0.333333 m" in out and "level − 0.333333 (m)" in out
+    assert "operating point" in out and "level = 1/3 m" in out and "level − 0.333333 (m)" in out
     assert "attracted by the operating point" in out and "lengths are deviations from it" in " ".join(out.split())
     assert "trained" not in err
     page = (tmp_path / "o" / "report.html").read_text()
-    assert "deviations from the operating point level = 0.333333 m, flow = 0.037037 m/s" in page
+    assert "deviations from the operating point level = 1/3 m, flow = 1/27 m/s" in page
     assert "level − 0.333333 (m)" in page
     certificate = tmp_path / "o" / "certificate.json"
     assert _run(["report", str(certificate), "--out", str(tmp_path / "again.html")], False) == 0
-    assert "level = 0.333333 m" in (tmp_path / "again.html").read_text()
+    assert "level = 1/3 m" in (tmp_path / "again.html").read_text()
     # an interval is of values, a half-width of deviations
     assert _run([*arguments, "--out", str(tmp_path / "o"), "--domain", "level=0.1:0.5", "--json"], True) == 0
     reach = json.loads(capsys.readouterr().out.splitlines()[-1])
