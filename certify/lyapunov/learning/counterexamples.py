@@ -13,10 +13,8 @@ from certify.lyapunov.learning.flow import LearningFlow
 from certify.lyapunov.learning.samples import Samples
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 _SAMPLES, _CLIMBERS, _SINKING, _ON_FACES = 30_000, 400, 4000, 2000
 _AROUND = 3000
-_AT_FIRST = 1000  # states that are run before others are
 _CLIMB, _SINK, _STRIDE = 6, 12, 0.03  # steps, and their length in scaled states
 _NEARBY, _BESIDE = 0.15, 0.05  # of the region's standard deviation: around its states, around violations
 
@@ -100,16 +98,9 @@ class Search:
             found.append(z)
         on_faces = np.concatenate([part[:_ON_FACES] for part in (found[0], found[-1])])
         within = np.concatenate([part[_ON_FACES:] for part in (found[0], found[2], found[4])])
-        within = generator.permutation(within[function(within) < below])
-        within = within[~self._converge(within)]
+        within = within[function(within) < below]
+        within = within[~self.flow.run(within * self.scale, self.scale).converged]
         return np.concatenate([on_faces[function(on_faces) < below], within])
-
-    def _converge(self, z: Array) -> Mask:
-        """True for each state (B, n) from which a run converges; taken for granted if all of the first few do."""
-        first, rest = np.split(z * self.scale, [_AT_FIRST])
-        found = self.flow.run(first, self.scale).converged
-        rest_found = np.ones(len(rest), dtype=bool) if found.all() else self.flow.run(rest, self.scale).converged
-        return np.concatenate([found, rest_found])
 
     def _asked(self, z: Array) -> Array:
         x = z * self.scale
