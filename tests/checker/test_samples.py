@@ -58,7 +58,7 @@ def function(
 
 def on_grid(axes: Sequence[Sequence[Any]], error: str | None = "r") -> Document:
     """Evidence of a grid at whose points samples are, in its order."""
-    weights = [[[[k, "1"]]] * 2 for k in range(prod(map(len, axes)))]
+    weights = [[[[k, "1"]], [[k, "1"]]] for k in range(prod(map(len, axes)))]
     return {"error": error, "slopes": [], "axes": list(map(texts, axes)), "weights": weights}
 
 
@@ -112,7 +112,7 @@ def near() -> Document:
 @cache
 def aslant() -> Document:
     """The same, with weights of (1/10, 1/10) and (-1/10, 1/10) for the slope in x, which leave 27/1000."""
-    data = edited(near(), f"{BY}.weights.0", [[[8, "-5"], [18, "5"]]] * 2)
+    data = edited(near(), f"{BY}.weights.0", [[[8, "-5"], [18, "5"]] for _ in range(2)])
     return edited(data, "plant.uncertain.0.range", texts([-1 - Fraction(27, 1000), -1 + Fraction(27, 1000)]))
 
 

@@ -220,7 +220,7 @@ def without_biases(name: str) -> PolicyNetwork:
     return replace(law.with_layers(biases=tuple(0 * b for b in law.biases)), centre="none")
 
 
-@pytest.mark.parametrize("name", ["elu", "softsign"])
+@pytest.mark.parametrize("name", slow_after(1, ["elu", "softsign"]))
 def test_a_corner_with_a_tangent_at_the_operating_point_is_proved(name: str, tmp_path: Path) -> None:
     result = certify_roa(PLANT, without_biases(name), tmp_path, effort=0.3, candidate="ellipsoid")
     assert result.verdict is Verdict.PROVED and result.claim == "asymptotic" and result.levels.floor is None

@@ -24,11 +24,12 @@ from certify.report import render_html
 from tests.report.test_tube import soft_spring
 from tests.support.browser import Browser, find_browser
 from tests.support.loops import chain
+from tests.support.marks import slow_after
 
 PROGRAM = find_browser()
 pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no Chromium is installed (apt-get install chromium)")
 PENDULUM = Path(__file__).parent.parent.parent / "examples" / "policies" / "pendulum.pt"
-WIDTHS = (400, 800, 1400)
+WIDTHS = (400, 1400, 800)
 
 CONTRAST = """(() => {
   const light = c => { const v = c / 255; return v <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4; };
@@ -85,7 +86,7 @@ def keep(name: str, content: bytes) -> None:
 
 
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
-@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("width", slow_after(2, WIDTHS))
 @pytest.mark.parametrize("name", ["pendulum", "chain", "tube", "path"])
 def test_a_page_fits_and_can_be_read(
     browser: Browser, pages: dict[str, Path], name: str, width: int, dark: bool
