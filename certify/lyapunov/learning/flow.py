@@ -109,13 +109,15 @@ class LearningFlow:
         Where the input saturates the way to the origin may take far longer than the motion about it.
         """
         late = _LATE * len(x)
+        fate = self.run(x, np.ones(self.n)).fate
         for _ in range(_DOUBLINGS):
-            x = x[self.run(x, np.ones(self.n)).fate == Fate.UNDECIDED]
+            x = x[fate == Fate.UNDECIDED]
             if len(x) < late:
                 return
             before = self.horizon
             self._last(2 * before)
-            if self.run(x, np.ones(self.n)).converged.sum() < late:
+            fate = self.run(x, np.ones(self.n)).fate
+            if np.sum(fate == Fate.CONVERGED) < late:
                 self._last(before)
                 return
 
