@@ -282,10 +282,12 @@ def _percent(share: float | None) -> str:
 def _at_most(share: float | None) -> str:
     """The same rounded up, as the words `is within` ask for.
 
-    >>> _at_most(0.0374), _at_most(0.121), _at_most(0.9987)
-    ('3.8 %', '13 %', '99.9 %')
+    >>> _at_most(0.0374), _at_most(0.121), _at_most(0.9987), _at_most(1.124)
+    ('3.8 %', '13 %', '99.9 %', '113 %')
     """
-    return _percent(share) if share is None or share >= 1 else f"{above(100 * share, 2 + (share > 0.99))} %"
+    if share is None:
+        return _percent(share)
+    return f"{math.ceil(100 * share)} %" if share >= 1 else f"{above(100 * share, 2 + (share > 0.99))} %"
 
 
 def percent(share: float, digits: int = 0) -> str:
