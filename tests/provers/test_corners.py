@@ -4,6 +4,7 @@ in time nothing unless the corner is far; and what is proved of such plants."""
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,9 @@ import numpy as np
 import pytest
 
 from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import PartitionTree
 from certify.certificates.claims import Problem
+from certify.certificates.reading import read_certificate
 from certify.certificates.verdict import Verdict
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, evaluate
@@ -25,6 +28,7 @@ from certify.provers.ball.jets import Jet, Jets, basis
 from certify.provers.ball.ranged import RangedJets
 from certify.provers.bounds import Flow, compiled, tape
 from certify.provers.bounds.taylor import Models, Taylor
+from certify.provers.boxes.mend import are_shown
 from certify.provers.boxes.order import choose_order
 from certify.provers.boxes.rule import VdotBound
 from tests.support.corners import X, Y, plant, regulator, tree, value
@@ -258,6 +262,17 @@ def test_saturated_plants_are_proved(name: str, tmp_path: Path) -> None:
         else:
             x = rk4_step(lambda y, u=held, q=q: f(y, loop.policy(y) if u is None else u, q), x, step)
     assert np.abs(x).max() < 1e-2
+
+
+def test_leaves_across_a_corner_are_shown_in_the_order_that_they_were_proved_in_alone(tmp_path: Path) -> None:
+    """A series of order 2 does not exist there, and boxes with ranks ask for it: the ring's proof keeps its order."""
+    result = certify_roa(LOOPS["held"][0](), regulator(1.0, 1.73), tmp_path, RoaOptions(candidate="optimised"))
+    assert result.certificate is not None and result.problem is not None
+    read = read_certificate(result.certificate)
+    assert isinstance(read.evidence, PartitionTree) and read.evidence.order == 1
+    assert [are_shown(result.problem, read.evidence, read.claim, order) for order in (1, 2)] == [True, False]
+    whole = replace(read.claim, roa=float(read.claim.roa) * 1.1)  # leaves beyond the level were not asked
+    assert not are_shown(result.problem, read.evidence, whole, 1)
 
 
 FALSE = {

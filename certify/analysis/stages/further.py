@@ -25,6 +25,7 @@ from certify.lyapunov import Neural, Polynomial, of_polynomial, volume
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.symbolic import Symbolic
 from certify.provers.base import Budget, Progress
+from certify.provers.boxes.mend import are_shown
 from certify.provers.ranks import Enough, Question, Sublevel, prove_ranks, root_box, with_frame, with_order
 
 if TYPE_CHECKING:
@@ -257,7 +258,10 @@ class ByRanks:
             question = Question(problem.loop, target, claim.keep, root, evidence.order)
             ring, most = evidence.tree.count(LEAF), _FOR_RING * tools.whole
             little = _LITTLE * _BOXES ** (-1 / len(lo))
-            question = with_frame(with_order(question, probes, share, little, ring, most), probes, share)
+            longer = with_order(question, probes, share, little, ring, most)
+            if longer.order == evidence.order or are_shown(problem, evidence, claim, longer.order):
+                question = longer
+            question = with_frame(question, probes, share)
             promising = partial(Simulator(problem.loop, problem.V, claim.roa).converge, effort=share)
             found = prove_ranks(question, share, tools.runner, told, enough=self.enough, promising=promising)
         if found is None:

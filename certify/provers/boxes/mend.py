@@ -1,4 +1,5 @@
-"""Remedies for leaves that the checker refuses: split them again, or keep the level below one.
+"""Remedies for leaves that the checker refuses: split them again, or keep the level below one. And the leaves that are
+shown, bounded by another series in time.
 
 Producer and checker round in their own ways, and a bound that is barely negative for the one may be barely positive for
 the other. Neither remedy starts anew: the tree stays, with one leaf more finely cut, or with a lower level.
@@ -20,6 +21,7 @@ from certify.provers.boxes.rule import VdotBound
 
 Array = NDArray[np.float64]
 _DEPTH = 3  # halvings of a leaf that was refused
+_TOGETHER = 4096  # leaves that are bounded at once
 _SLACK = 2e-9  # relative distance of a level from the leaves that it leaves out
 
 
@@ -63,3 +65,12 @@ def leaf_levels(problem: Problem, evidence: PartitionTree) -> tuple[Array, Array
     lo, hi = leaves(evidence.tree, evidence.root)
     rule = VdotBound(problem, evidence.T)
     return rule.levels(lo.T.copy(), hi.T.copy())
+
+
+def are_shown(problem: Problem, evidence: PartitionTree, claim: Claim, order: int) -> bool:
+    """True if the leaves hold with a series in time of this order too: across a corner only the first has a bound."""
+    rule = VdotBound(problem, evidence.T, evidence.local is None, order)
+    lo, hi = (corners.T for corners in leaves(evidence.tree, evidence.root))
+    met = np.flatnonzero(rule.levels(lo, hi)[0] <= claim.roa)
+    parts = (met[first : first + _TOGETHER] for first in range(0, len(met), _TOGETHER))
+    return all(rule(lo[:, part], hi[:, part], claim.inner, claim.roa).proved.all() for part in parts)
