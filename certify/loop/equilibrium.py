@@ -1,18 +1,24 @@
-"""The closed loop's equilibrium when it is not the origin: enclosed by Krawczyk's test, with its eigenvalues.
+"""Equilibria of the closed loop that are not the origin: enclosed by Krawczyk's test, with the eigenvalues of one.
 
 An uncentred policy has pi(0) near u_eq at best, so its equilibrium lies beside the origin, if it has one. Newton's
 method finds the point in floats, from the origin or from the end of a trajectory that starts there. The test shows in
 Arb that exactly one equilibrium lies in a box around it:
 `K = x0 - Y F(x0) + (I - Y J)(X - x0)` lies inside X, J being mean slopes of F on X and Y about the inverse of one.
 In discrete time an equilibrium is a fixed point, and F stands for what a step adds to x.
+
+Where some states are fixed exactly there are more components of F than unknowns. Those that are 0, or multiples of
+others, are left out: of a body without speed the rates of its positions.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
+from typing import Any
 
 import flint
 import numpy as np
@@ -20,16 +26,42 @@ from numpy.typing import NDArray
 
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import (
+    JUMP,
+    Algebra,
+    Expression,
+    Number,
+    Operation,
+    Symbol,
+    differentiate,
+    evaluate,
+    in_absolute_values,
+    nodes,
+)
 from certify.loop.plants import with_origin
 from certify.loop.plants.system import Time
-from certify.loop.rigorous import field_on, in_digits, policy_on, precision
+from certify.loop.rigorous import (
+    BallAlgebra,
+    Balls,
+    MeanSlopes,
+    ball,
+    evaluate_arb,
+    field_on,
+    in_digits,
+    policy_on,
+    precision,
+)
 
 Array = NDArray[np.float64]
+Factors = frozenset[tuple[Any, int]]  # symbols, or functions of sums, and their powers
+Terms = dict[Factors, Fraction]
+Change = Callable[[Balls], tuple[Balls, flint.arb_mat]]  # F and its slopes on balls
 _STEPS, _HALVINGS = 100, 30  # of Newton's method, and of a step that does not reduce ||F||
 _REFINEMENTS = 8  # in Arb, each by some ten digits
 _RADIUS = 1e-20  # of the box of the test, in the states' units
 _LEAP = 1e-9  # of a derivative between states so near to each other
 _DIGITS = 12
+_MOST_TERMS = 4096  # of a product that is multiplied out
 _BITS = 40  # of a point from which a loop is looked at
 _WHILE = 100.0  # of a trajectory, in the plant's unit of time
 _MOST_STEPS = 10_000  # of one: where F is no number, time stands still
@@ -98,16 +130,10 @@ def _short(q: Fraction, width: Fraction) -> Fraction:
 
 def _enclosed(loop: ClosedLoop, start: Array) -> Rest | None:
     with precision():
-        x = [flint.arb(float(v)) for v in start]
-        for _ in range(_REFINEMENTS):
-            F, J = _change_on(loop, x)
-            Y = _inverse(J)
-            if Y is None:
-                return None
-            step = Y * flint.arb_mat([[v] for v in F])
-            x = [(v - step[i, 0]).mid() for i, v in enumerate(x)]
-        box = [v + flint.arb(0, _RADIUS) for v in x]
-        if not _is_inside(loop, x, box):
+        box = _zero_of(
+            partial(_change_on, loop), [flint.arb(float(v)) for v in start], [flint.arb(_RADIUS)] * len(start)
+        )
+        if box is None:
             return None
         u, _ = policy_on(loop, box)
         _, J = field_on(loop, box)
@@ -115,6 +141,19 @@ def _enclosed(loop: ClosedLoop, start: Array) -> Rest | None:
             return None
         eigenvalues, stable = _spectrum(J, loop.system.time)
     return Rest(_decimals(box), _decimals(u), eigenvalues, stable)
+
+
+def _zero_of(change: Change, x: Balls, radii: Balls) -> Balls | None:
+    """Balls of these radii, near x, that hold exactly one zero; None if that is not shown."""
+    for _ in range(_REFINEMENTS):
+        F, J = change(x)
+        Y = _inverse(J)
+        if Y is None or not all(v.is_finite() for v in F):
+            return None
+        step = Y * flint.arb_mat([[v] for v in F])
+        x = [(v - step[i, 0]).mid() for i, v in enumerate(x)]
+    box = [v + flint.arb(0, 1) * r for v, r in zip(x, radii, strict=True)]
+    return box if _is_inside(change, x, box) else None
 
 
 def _change_on(loop: ClosedLoop, x: list[flint.arb]) -> tuple[list[flint.arb], flint.arb_mat]:
@@ -127,6 +166,120 @@ def _change_on(loop: ClosedLoop, x: list[flint.arb]) -> tuple[list[flint.arb], f
 
 def _identity(n: int) -> flint.arb_mat:
     return flint.arb_mat([[int(i == j) for j in range(n)] for i in range(n)])
+
+
+def rest_in(loop: ClosedLoop, x: Sequence[Fraction], free: Sequence[int], radii: Sequence[Fraction]) -> Balls | None:
+    """Balls around a state that rests and differs from x in the states `free` alone, in each by less than its radius;
+    None if no such state is shown. At the precision of the caller."""
+    around = [ball(q) + flint.arb(0, 1) * ball(r) if i in free else ball(q)
+              for i, (q, r) in enumerate(zip(x, radii, strict=True))]  # fmt: skip
+    rates = _rates_in(loop, x, free, around)
+    if not free or rates is None or len(rates) != len(free):
+        return None
+
+    def whole(y: Balls) -> Balls:
+        """A state, from its values where it is free."""
+        found = dict(zip(free, y, strict=True))
+        return [found.get(i, v) for i, v in enumerate(around)]
+
+    zero = _zero_of(lambda y: _slopes_by(loop, rates, free, whole(y)), [ball(x[i]) for i in free],
+                    [ball(radii[i] / 2) for i in free])  # fmt: skip
+    inside = zero is not None and all(bool(around[i].contains(v)) for i, v in zip(free, zero, strict=True))
+    return whole(zero) if zero is not None and inside else None
+
+
+def _rates_in(loop: ClosedLoop, x: Sequence[Fraction], free: Sequence[int], around: Balls) -> list[Expression] | None:
+    """The components of F, or of what a step adds, but for those that are 0, or multiples of others, at all states
+    `around` x; None if one has no value there. Corners there are decided, or stay."""
+    system = loop.system
+    values = dict(zip((*system.states, *system.inputs), (*around, *policy_on(loop, around)[0]), strict=True))
+    named = {s: _Multiplied().constant(q) for s, q in zip(system.states, x, strict=True)}
+    named |= {s: {frozenset({(s, 1)}): Fraction(1)} for s in (*(system.states[i] for i in free), *system.inputs)}
+    found: dict[object, Expression] = {}
+    for s, f in zip(system.states, loop.dynamics, strict=True):
+        rate = _decided(f - s if system.time == "discrete" else f, values)
+        if not evaluate_arb(rate, values).is_finite():
+            return None
+        terms = evaluate(rate, named, _Multiplied())
+        if terms:
+            first = terms[min(terms, key=hash)]
+            found.setdefault(frozenset((factors, k / first) for factors, k in terms.items()), rate)
+    return list(found.values())
+
+
+def _decided(expression: Expression, values: Mapping[Symbol, flint.arb]) -> Expression:
+    """An expression that is the same on these balls, with abs and heaviside of what is certain replaced."""
+    found: dict[Expression, Expression] = {}
+    plain = in_absolute_values(expression)
+    for node in nodes(plain):
+        found[node] = node
+        if isinstance(node, Operation):
+            operands = [found[e] for e in node.operands]
+            found[node] = Operation(node.operator, *operands)
+            if node.operator in ("abs", JUMP):
+                v = evaluate_arb(node.operands[0], values)
+                if v > 0:
+                    found[node] = operands[0] if node.operator == "abs" else Number(1)
+                elif v < 0:
+                    found[node] = -operands[0] if node.operator == "abs" else Number(0)
+    return found[plain]
+
+
+class _Multiplied(Algebra[Terms]):
+    """Expressions that are multiplied out: sums of products of powers of symbols and of functions of such sums."""
+
+    def constant(self, q: Fraction) -> Terms:
+        return {frozenset(): q} if q else {}
+
+    def total(self, constant: Fraction | None, terms: Sequence[Terms]) -> Terms:
+        found = self.constant(constant or Fraction(0))
+        for term in terms:
+            for factors, k in term.items():
+                found[factors] = found.get(factors, Fraction(0)) + k
+        return {factors: k for factors, k in found.items() if k}
+
+    def product(self, constant: Fraction | None, factors: Sequence[Terms]) -> Terms:
+        found = self.constant(Fraction(1) if constant is None else constant)
+        for factor in factors:
+            long = len(found) * len(factor) > _MOST_TERMS
+            one, other = (_atom("*", v) if long else v for v in (found, factor))
+            each = ((Counter(dict(a)), Counter(dict(b)), k * q) for a, k in one.items() for b, q in other.items())
+            found = self.total(None, [{frozenset((a + b).items()): q} for a, b, q in each])
+        return found
+
+    def inverse(self, value: Terms) -> Terms:
+        return self.constant(1 / value[frozenset()]) if [*value] == [frozenset()] else _atom("/", value)
+
+    def function(self, name: str, value: Terms) -> Terms:
+        at_0 = None if value else {"cos": 1, "exp": 1, "sign": None, JUMP: None}.get(name, 0)
+        return _atom(name, value) if at_0 is None else self.constant(Fraction(at_0))
+
+
+def _atom(name: str, value: Terms) -> Terms:
+    """A function of a sum, as one thing."""
+    return {frozenset({((name, frozenset(value.items())), 1)}): Fraction(1)}
+
+
+def _slopes_by(
+    loop: ClosedLoop, rates: Sequence[Expression], free: Sequence[int], x: Balls
+) -> tuple[Balls, flint.arb_mat]:
+    """Rates on balls x, and their slopes by the states `free`, the input following them."""
+    system = loop.system
+    u, gain = policy_on(loop, x)
+    values = dict(zip((*system.states, *system.inputs), (*x, *u), strict=True))
+    known: dict[Expression, flint.arb] = {}
+    F = [evaluate(e, values, BallAlgebra(), known) for e in rates]
+    rows = []
+    for e in rates:
+        own, through = ([evaluate(differentiate(e, s), values, MeanSlopes(), known) for s in by]
+                        for by in ([system.states[i] for i in free], system.inputs))  # fmt: skip
+        rows.append(
+            [
+                v + sum((w * gain[k, i] for k, w in enumerate(through)), flint.arb(0))
+                for v, i in zip(own, free, strict=True)
+            ]
+        )
+    return F, flint.arb_mat(rows)
 
 
 def _rates(loop: ClosedLoop) -> Callable[[Array], Array]:
@@ -209,11 +362,11 @@ def _inverse(J: flint.arb_mat) -> flint.arb_mat | None:
         return None
 
 
-def _is_inside(loop: ClosedLoop, x: list[flint.arb], box: list[flint.arb]) -> bool:
+def _is_inside(change: Change, x: Balls, box: Balls) -> bool:
     """Krawczyk's test (Moore, Kearfott, Cloud, Introduction to Interval Analysis, SIAM 2009, chapter 8)."""
     n = len(x)
-    F, _ = _change_on(loop, x)
-    _, J = _change_on(loop, box)
+    F, _ = change(x)
+    _, J = change(box)
     Y = _inverse(J)
     if Y is None:
         return False

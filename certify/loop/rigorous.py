@@ -16,7 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import JUMP, Algebra, Expression, Symbol, differentiate, evaluate, solution_series
+from certify.loop.expressions import (
+    JUMP,
+    Algebra,
+    Expression,
+    Symbol,
+    differentiate,
+    evaluate,
+    solution_series,
+    total,
+)
 from certify.loop.networks import (
     Affine,
     Clip,
@@ -117,7 +126,7 @@ def states_after(loop: ClosedLoop, x: Sequence[Fraction]) -> Iterator[tuple[Ball
         if sample is None:
             state = now
             continue
-        mean = _mean_rate(loop, states, inputs, now, sample[1])
+        mean = _mean_rate(loop.dynamics, states, inputs, now, sample[1])
         state = [v + ball(sample[1]) * g for v, g in zip(state, mean, strict=True)]
 
 
@@ -167,7 +176,7 @@ def evaluate_increment(
         if loop.system.time == "discrete":
             step, G = flint.arb(1), [after - before for after, before in zip(G, state, strict=True)]
         elif period:
-            step, G = ball(period), _mean_rate(loop, states, inputs, G, period)
+            step, G = ball(period), _mean_rate(loop.dynamics, states, inputs, G, period)
         lam, total = flint.arb(float(rate)), flint.arb(0)
         for row, v, own in zip(P, state, G, strict=True):
             p = [flint.arb(float(entry)) for entry in row]
@@ -178,12 +187,16 @@ def evaluate_increment(
 
 def field_at(loop: ClosedLoop, values: Mapping[Symbol, flint.arb]) -> Balls:
     """f at balls around states and inputs, by their symbols."""
+    return _values(loop.dynamics, values)
+
+
+def _values(expressions: Sequence[Expression], values: Mapping[Symbol, flint.arb]) -> Balls:
     known: dict[Expression, flint.arb] = {}
-    return [evaluate(expression, values, BallAlgebra(), known) for expression in loop.dynamics]
+    return [evaluate(expression, values, BallAlgebra(), known) for expression in expressions]
 
 
 def _mean_rate(
-    loop: ClosedLoop,
+    dynamics: Sequence[Expression],
     states: Mapping[Symbol, flint.arb],
     inputs: Mapping[Symbol, flint.arb],
     now: Balls,
@@ -195,15 +208,15 @@ def _mean_rate(
     """
     h, size = ball(period), [v.abs_upper() for v in now]
     for _ in range(_ATTEMPTS):
-        kappa = [(_WIDER * h * v).abs_upper() for v in size]
+        kappa = [(_WIDER * h * v).abs_upper() + flint.arb(2) ** -_PRECISION for v in size]
         around = {s: v + flint.arb(0, k) for (s, v), k in zip(states.items(), kappa, strict=True)}
-        size = [v.abs_upper() for v in field_at(loop, {**around, **inputs})]
+        size = [v.abs_upper() for v in _values(dynamics, {**around, **inputs})]
         if all(bool(h * v < k) for v, k in zip(size, kappa, strict=True)):
             break
     else:
         return [flint.arb.nan()] * len(size)
-    rows = solution_series(loop.dynamics, states, inputs, BallAlgebra(), _ORDER - 1)
-    last = [row[-1] for row in solution_series(loop.dynamics, around, inputs, BallAlgebra(), _ORDER)]
+    rows = solution_series(dynamics, states, inputs, BallAlgebra(), _ORDER - 1)
+    last = [row[-1] for row in solution_series(dynamics, around, inputs, BallAlgebra(), _ORDER)]
     result = last
     for k in reversed(range(_ORDER - 1)):
         result = [row[k] + h * v for row, v in zip(rows, result, strict=True)]
@@ -284,6 +297,33 @@ def field_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
         for by in (system.states, system.inputs)
     )
     return F, A + B * gain
+
+
+def step_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
+    """The state one step later, of several periods the longest, and its Jacobian (n, n), on balls x of a loop in steps.
+
+    The Jacobian is one for mean values, as `policy_on` says. Where the input is held, its columns v solve the
+    variational equation v' = f_x v + f_u w for the directions w of the input, along with the state (Hairer, Norsett and
+    Wanner 1993, I.14).
+    """
+    system = loop.system
+    if system.sample is None:
+        return field_on(loop, x)
+    n, period = system.n, system.sample[1]
+    u, gain = policy_on(loop, x)
+    inputs = dict(zip(system.inputs, u, strict=True))
+    states = dict(zip(system.states, x, strict=True))
+    dynamics = list(loop.dynamics)
+    for j in range(n):
+        of_x, of_u = ([Symbol(f"d{s.name}/d{j}") for s in by] for by in (system.states, system.inputs))
+        along = list(zip((*system.states, *system.inputs), (*of_x, *of_u), strict=True))
+        dynamics += [total(differentiate(f, s) * v for s, v in along) for f in loop.dynamics]
+        states |= {v: flint.arb(int(i == j)) for i, v in enumerate(of_x)}
+        inputs |= {w: gain[i, j] for i, w in enumerate(of_u)}
+    now = _values(dynamics, {**states, **inputs})
+    mean = _mean_rate(dynamics, states, inputs, now, period)
+    after = [v + ball(period) * g for v, g in zip(states.values(), mean, strict=True)]
+    return after[:n], flint.arb_mat([after[n + i :: n] for i in range(n)])
 
 
 def gain_at_origin(loop: ClosedLoop) -> flint.arb_mat:

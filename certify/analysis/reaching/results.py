@@ -8,6 +8,7 @@ from fractions import Fraction
 from typing import Any
 
 from certify.analysis.facts import RankFacts
+from certify.analysis.reaching.never import Stay
 from certify.analysis.reaching.options import ReachOptions, in_words
 from certify.analysis.reaching.runs import Run, Runs
 from certify.analysis.without_v import ResultWithoutV
@@ -24,6 +25,7 @@ class ReachResult(ResultWithoutV):
     steps : after so many every trajectory from the box `options.begin` has been in the region; None if that is not
         proved, or no box was named.
     runs : simulated, from that box.
+    stay : a start in it that never arrives, if one is shown.
     given : the certificate whose set is the target; None for a region.
     """
 
@@ -31,6 +33,7 @@ class ReachResult(ResultWithoutV):
     ranks: RankFacts | None = None
     steps: int | None = None
     runs: Runs | None = None
+    stay: Stay | None = None
     given: Certificate | None = None
 
     @property
@@ -65,8 +68,13 @@ class ReachResult(ResultWithoutV):
             "ranks": None if self.ranks is None else self.ranks.to_dict(),
             "constraints": dict(self.constraints),
             "simulated": None if self.runs is None else self._simulated(self.runs),
+            "never": None if self.stay is None else self._stay(self.stay),
             **self.about_the_run(),
         }
+
+    def _stay(self, stay: Stay) -> dict[str, Any]:
+        x, at = ({name: str(q) for name, q in self.values(v).items()} for v in (stay.x, stay.at))
+        return {"x": x, "error": stay.error, "steps": stay.steps, "at": at, "radius": stay.radius}
 
     def _simulated(self, runs: Runs) -> dict[str, Any]:
         failing = None if runs.failing is None else self._run(runs.failing)
@@ -79,10 +87,25 @@ class ReachResult(ResultWithoutV):
 
     def told(self, run: Run) -> str:
         """The end of a run in words."""
-        state = ", ".join(f"{name} = {float(q):.6g}" for name, q in self.values(run.x).items())
+        state = self._in_words(run.x)
         if run.end == "violates":
             return f"from {state} the constraint {run.constraint} is violated after {run.steps:,} steps"
         where = in_words(self.options.target) if self.given is None else f"V <= {self.given.roa:.6g}"
         if run.end == "left":
             return f"from {state} the domain is left after {run.steps:,} steps, before {where}"
         return f"from {state} {where} does not hold in any of the first {run.steps:,} steps"
+
+    def told_of(self, stay: Stay) -> str:
+        """A start that never arrives, in words."""
+        at, never = self._near(stay.at, stay.radius), "and so never gets there, shown in Arb"
+        if not stay.steps:
+            return f"a state {at} rests {never}"
+        start = self._near(stay.x, stay.error)
+        return f"a run from a state {start} stays {at} from step {stay.steps:,} on {never}"
+
+    def _near(self, x: Sequence[Fraction], error: float) -> str:
+        """A state that is known up to an error, which may be all that is left of a number."""
+        return f"within {error:.1e} of {self._in_words([q if abs(q) > error else Fraction(0) for q in x])}"
+
+    def _in_words(self, x: Sequence[Fraction]) -> str:
+        return ", ".join(f"{name} = {float(q):.6g}" for name, q in self.values(x).items())

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 from certify.analysis.beyond import constraints_in_words, rank_facts
 from certify.analysis.reaching.goals import Goal, Stated, goal_of, leaves_of, with_ranks
+from certify.analysis.reaching.never import Search
 from certify.analysis.reaching.options import ReachOptions
 from certify.analysis.reaching.results import ReachResult
-from certify.analysis.reaching.runs import Simulation, begins, is_refuted
+from certify.analysis.reaching.runs import Simulation, begins, is_nominal, is_refuted
 from certify.analysis.stages.state import Report, effort_of
 from certify.analysis.without_v import Tools, accepted, require_periodic
 from certify.certificates import (
@@ -166,7 +167,23 @@ def _simulated(result: ReachResult, goal: Goal, tools: Tools) -> ReachResult:
     told = result.told(runs.failing)
     if refuted:
         return replace(result, verdict=Verdict.REFUTED, reason=f"{told}, shown in Arb")
-    return replace(result, reason=f"in a simulation, {told}")
+    result = replace(result, reason=f"in a simulation, {told}")
+    late = np.array([[float(q) for q in runs.failing.x]])
+    return _never(result, goal, late, tools) if runs.failing.end == "late" else result
+
+
+def _never(result: ReachResult, goal: Goal, near: Array, tools: Tools) -> ReachResult:
+    """REFUTED, if a start of the box is shown never to arrive; it is looked for near states (N, n) above all."""
+    begin, system = result.options.begin, goal.loop.system
+    if begin is None or goal.turned or not is_nominal(system):
+        return result
+    simulation = Simulation(goal.loop, goal.expressions, begin)
+    with tools.timing("refute"):
+        states = np.concatenate([near, begins(begin)])
+        stay = Search(goal.loop, goal.expressions, begin, simulation, Effort(_RUNS)).found(states)
+    if stay is None:
+        return result
+    return replace(result, verdict=Verdict.REFUTED, stay=stay, reason=f"{result.reason}; {result.told_of(stay)}")
 
 
 def _proved(
@@ -195,7 +212,8 @@ def _proved(
         found = _searched(question, options, arrivals, search, runner, tools)
     evidence = None if found is None else _within(found.evidence, options.within)
     if found is None or evidence is None:
-        return replace(result, reason="no box of the domain is proved to lead into the target")
+        result = replace(result, reason="no box of the domain is proved to lead into the target")
+        return _never(result, goal, begins(options.begin or whole)[:1], tools)
     ranks = Ranks(found.ranks.angles, max(1, evidence.most))
     certificate = goal.certificate(question, evidence, ranks, provenance)
     certificate, raw, answer = accepted(certificate, clerk, _without_leaf, _MENDED)
@@ -210,7 +228,8 @@ def _proved(
         many = "images meet too many boxes for more effort to help"
         over = many if found.full else "the effort is over"
         why = over if not found.done else "no leaf is left whose halves could gain anything"
-        return replace(result, reason=f"{_part(result, goal, leaves_of(certificate))}: {why}")
+        part, states = _part(result, goal, leaves_of(certificate))
+        return _never(replace(result, reason=f"{part}: {why}"), goal, states, tools)
     return replace(result, verdict=Verdict.PROVED, reason="requested", steps=steps)
 
 
@@ -256,8 +275,9 @@ def _within(evidence: RankTree, most: int | None) -> RankTree | None:
     return evidence if np.any(evidence.proved) else None
 
 
-def _part(result: ReachResult, goal: Goal, tree: RankTree) -> str:
-    """The part of the box that is proved, in words; and where the rest lies, and how long runs from there take."""
+def _part(result: ReachResult, goal: Goal, tree: RankTree) -> tuple[str, Array]:
+    """The part of the box that is proved, in words; and where the rest lies, and how long runs from there take. Some
+    states of the rest, (N, n)."""
     begin = result.options.begin or ()
     least, most = (np.array([float(pair[k]) for pair in begin]) for k in (0, 1))
     lower, upper = leaves_within(tree.tree, tree.lo, tree.hi)
@@ -269,14 +289,14 @@ def _part(result: ReachResult, goal: Goal, tree: RankTree) -> str:
     percent = math.floor(1e4 * (1 - math.fsum(sizes[rest]))) / 100
     twice = abs(math.fsum(sizes) - 1) > _DOUBT  # angles, and leaves that meet at the box
     if twice or percent <= 0 or not np.any(rest):
-        return "of the box only a part is proved, or none"
+        return "of the box only a part is proved, or none", begins(begin)[:1]
     largest = np.flatnonzero(rest)[np.argsort(-sizes[rest])][:_SLOW]
     states = 0.5 * lower[largest] + 0.5 * upper[largest]
     runs = Simulation(goal.loop, goal.expressions, begin, goal.turned).runs(None, Effort(_RUNS), states)
     slowest = "do not all get there" if runs.failing is not None else f"take up to {runs.longest:,} steps"
     values = result.values([Fraction(v) for v in states[0].tolist()])
     where = ", ".join(f"{name} = {float(q):.6g}" for name, q in values.items())
-    return f"{percent:g} % of the box is proved; of the rest, with a part around {where}, runs {slowest}"
+    return f"{percent:g} % of the box is proved; of the rest, with a part around {where}, runs {slowest}", states
 
 
 def _without_leaf(certificate: Stated, at: str) -> Stated | None:

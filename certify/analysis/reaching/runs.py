@@ -21,7 +21,7 @@ from certify.certificates.ellipsoids import Box
 from certify.effort import Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, Symbol
-from certify.loop.plants import kept_constraints
+from certify.loop.plants import System, kept_constraints
 from certify.loop.plants.floating_point import function_of
 from certify.loop.rigorous import ball, evaluate_arb, precision, states_after
 from certify.report.flow import Flow, time_scales
@@ -68,7 +68,7 @@ class Simulation:
         system, self.turned = loop.system, list(turned)
         self.flow, self.begin, self.names = Flow.of(system, loop.network), begin, tuple(kept_constraints(system))
         quantities = [s for s, _ in system.uncertain]
-        self.nominal = [float(system.parameters.get(s.name, Fraction(0))) for s in quantities]
+        self.nominal = [float(_nominal(system, s)) for s in quantities]
         self.beyond = function_of(system, tuple(target), (), "numpy")
         kept = tuple(kept_constraints(system).values())
         self.kept = function_of(system, kept, quantities, "numpy") if kept else None
@@ -175,8 +175,7 @@ def is_refuted(loop: ClosedLoop, target: Sequence[Expression], run: Run, within:
     """True if Arb shows that the run breaks the claim: in none of `within` steps is it in the target, or in none until
     it violates the constraint."""
     system = loop.system
-    nominal = {s: system.parameters.get(s.name, Fraction(0)) for s, _ in system.uncertain}
-    if not all(lo <= nominal[s] <= hi for s, (lo, hi) in system.uncertain):
+    if not is_nominal(system):
         return False
     if run.end == "left" or (run.end == "late" and run.steps != within):
         return False
@@ -189,4 +188,14 @@ def is_refuted(loop: ClosedLoop, target: Sequence[Expression], run: Run, within:
         if run.end == "late":
             return True
         violated = kept_constraints(system)[run.constraint]
-        return bool(evaluate_arb(violated, {**values, **{s: ball(q) for s, q in nominal.items()}}) > 0)
+        nominal = {s: ball(_nominal(system, s)) for s, _ in system.uncertain}
+        return bool(evaluate_arb(violated, {**values, **nominal}) > 0)
+
+
+def is_nominal(system: System) -> bool:
+    """True if the nominal values, which runs have, are among those that uncertain quantities may take."""
+    return all(lo <= _nominal(system, s) <= hi for s, (lo, hi) in system.uncertain)
+
+
+def _nominal(system: System, quantity: Symbol) -> Fraction:
+    return system.parameters.get(quantity.name, Fraction(0))

@@ -82,11 +82,14 @@ class PowerSeries(Algebra[Series[V]]):
         return self._follow(rule, y)
 
     def function(self, name: str, value: Series[V]) -> Series[V]:
-        """One of `FUNCTIONS`, by `k w_k = sum_(j>=1) j v_j s_(k-j)`, s the series of the derivative phi'(v); or abs."""
+        """One of `FUNCTIONS`, by `k w_k = sum_(j>=1) j v_j s_(k-j)`, s the series of the derivative phi'(v); or abs, or
+        sign, which is constant where it is certain."""
         if name == "tan":
             return super().function(name, value)
         if name in ("sin", "cos"):
             return self._circle(value)[name == "cos"]
+        if name == "sign":
+            return self.held(self.inner.function(name, self._first(value.coefficients)))
         result: Series[V] = Series()
         if name == "abs":
             return self._follow(self._magnitude(value), result)
