@@ -362,7 +362,7 @@ def test_leaves_that_a_file_calls_proved_are_not_believed(kept: tuple[Unfinished
     """Everything is proved up to above a violation, says a file that is in order: the checker does not agree."""
     assert VIOLATION is not None
     lie = {"tree": packed(b"\xff"), "keys": packed(b""), "target": (1.05 * VIOLATION.level).hex()}
-    lie |= {"outer": lie["target"], "witness": None, "met": None}
+    lie |= {"outer": lie["target"], "inner": (0.05).hex(), "witness": None, "met": None}
     (tmp_path / "search.json").write_bytes(rewritten(kept[1], lie))
     found = result_of(tmp_path, resume=True)
     assert found.levels.roa is not None and found.levels.roa < VIOLATION.level
@@ -387,7 +387,7 @@ PLACES = {  # where Ctrl-C comes, and on which call: from the first candidate to
     "a heat": ("certify.provers.boxes.rule.VdotBound.__call__", 1),
     "the search": ("certify.provers.boxes.rule.VdotBound.__call__", 3),
     "the first check": ("certify.analysis.acceptance.run_checker", 1),
-    "the end": ("certify.analysis.stages.acceptance.limit_of", 1),
+    "the end": ("certify.analysis.stages.acceptance.limited", 1),
 }
 
 
