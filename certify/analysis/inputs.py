@@ -305,12 +305,13 @@ def is_own(path: Path, importing: ImportOptions) -> bool:
 def lines(imported: Imported) -> list[str]:
     """The findings of an import, for people."""
     found, policy = imported, imported.policy
-    origin, target = _row(found.at_origin), _row(found.u_eq)
+    target = _row(found.u_eq)
+    origin = f"u_eq = {target}, exactly" if _centres_itself(found) else f"{_row(found.at_origin)}; u_eq {target}"
     said = [
         f"read     {found.words}; sha256 {policy.training['imported']['sha256']}",
         f"policy   {found.formula}; o = ({policy.training['imported']['states']})",
         *checked(found.difference, found.compared_with, found.assumed, found.not_read),
-        f"pi(0)    {origin}; u_eq {target}",
+        f"pi(0)    {origin}",
         f"centring {_centring(found)}",
     ]
     if policy.valid is not None:
@@ -347,12 +348,17 @@ def _centring(found: Imported) -> str:
     centre = found.policy.network.centre
     if found.policy.training["imported"].get("scores"):
         return "none, as of scores there is none"
-    if centre != "none" and not found.centring:
+    if _centres_itself(found):
         return f"the file's own, {'inside the squash' if centre == 'preactivation' else 'of the output'}"
     changes = [f"{name} changes u by up to {value:.3g}" for name, value in found.centring.items()]
     if centre != "none":
         return f"{centre}, as asked for, which changes u by up to {found.centring[centre]:.3g}"
     return f"none; {', '.join(f'--centre {c}' for c in changes) or 'u_eq is out of reach of any'}"
+
+
+def _centres_itself(found: Imported) -> bool:
+    """True if the file's policy is u_eq at the operating point by its form."""
+    return found.policy.network.centre != "none" and not found.centring
 
 
 def _box(found: Imported) -> str:
