@@ -18,6 +18,7 @@ from certify.certificates.membership import Region
 from certify.effort import Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants.ode import DOUBLINGS, LATE, lengthened
 from certify.lyapunov.function import Quadratic
 from certify.provers.ranks import root_box, turning
 from certify.report.flow import Flow, time_scales
@@ -32,7 +33,6 @@ MOST, NEARLY_ALL = 0.8, 0.9
 with the second hardly more is to be proved in this domain."""
 _LEAST, _ENOUGH, _MOST = 250, 1000, 4000  # states drawn at once at least, that converge, and in all
 _QUICK = 10.0  # multiplications of many runs at once that are worth an operation
-_LATE, _DOUBLINGS = 0.01, 6  # share of the runs that converges in twice their time for it to be doubled; how often
 _LONGEST = 3000  # steps of one length: of runs over more time each state has a step of its own
 
 
@@ -83,7 +83,7 @@ class Simulator:
         whole = math.inf if flow.discrete or flow.period else time_scales(flow, most=math.inf)[1]
         self.farther = whole if self.horizon < whole < math.inf else 0.0
         self.flow, self.step, self.V, self.level = flow, flow.fitting(step), V, level
-        self.doublings = _DOUBLINGS
+        self.doublings = DOUBLINGS
 
     @property
     def operations(self) -> float:
@@ -94,25 +94,26 @@ class Simulator:
         """True (N,) for states (N, n) whose runs converge before the effort, an operation of which is worth several
         multiplications here, is over."""
         found, undecided = self._runs(x, effort, (self.horizon, self.farther))
-        while self.doublings and undecided.sum() >= _LATE * len(x) and not effort.over:
-            some, times = effort.share(0.5), self._longer()
-            late, never = self._runs(x[undecided], some, times)
-            if some.over or not late.sum() >= _LATE * len(x):
-                self.doublings = 0
-                break
-            self.doublings, (self.horizon, self.farther) = self.doublings - 1, times
-            at = np.flatnonzero(undecided)
-            found[at[late]], undecided[at] = True, never
+
+        def again(at: NDArray[np.int64], k: int) -> tuple[Mask, Mask] | None:
+            some = effort.share(0.5)
+            late = self._runs(x[at], some, self._longer(k))
+            return None if some.over else late
+
+        k = lengthened(found, undecided, again, self.doublings)
+        self.doublings = 0 if undecided.sum() >= LATE * len(x) else self.doublings - k  # in vain once is enough
+        self.horizon, self.farther = self._longer(k)
         return found
 
-    def _longer(self) -> tuple[float, float]:
-        """Twice the horizon of the runs, and the time that those with steps of their own may take."""
+    def _longer(self, k: int) -> tuple[float, float]:
+        """2^k times the horizon of the runs, and the time that those with steps of their own may take."""
+        time = 2**k * (self.farther or self.horizon)
         if self.farther:
-            return self.horizon, 2 * self.farther
+            return self.horizon, time
         follows = not (self.flow.discrete or self.flow.period)
-        if follows and 2 * self.horizon > _LONGEST * self.step:
-            return _LONGEST * self.step, 2 * self.horizon
-        return 2 * self.horizon, 0.0
+        if follows and k and time > _LONGEST * self.step:
+            return _LONGEST * self.step, time
+        return time, 0.0
 
     def _runs(self, x: Array, effort: Effort, times: tuple[float, float]) -> tuple[Mask, Mask]:
         """The runs that converge, and those that do neither that nor leave, (N,) each."""

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
 from certify.loop.plants import System
+from certify.loop.plants.ode import DOUBLINGS, lengthened
 from certify.loop.policies import PolicyNetwork
 from certify.report.flow import Flow, simulate, time_scales
 
@@ -30,7 +31,6 @@ SETTLED = 1e-3
 _GRID = {1: 401, 2: 35}
 _FINER = 8  # of the step, in runs that are asked again because they contradict what is claimed
 _HALVINGS = 2  # of the grid's cells along the boundary of the region
-_LATE, _DOUBLINGS = 0.01, 6  # share of the runs that settles in twice their time for it to be doubled; how often
 _FEWEST_STEPS = 100  # of a run with steps of its own
 _WIDTH = 4  # fine cells to either side that a smoothed value knows of
 _OUTSIDE = 1.01  # times the level: a run that starts below it and comes so high has left the set
@@ -230,18 +230,16 @@ def simulated_roa_fraction(
 def _until_decided(
     flow: Flow, x: Array, P: Array, target: float, step: float, horizon: float, effort: Effort
 ) -> tuple[Mask, Mask, float]:
-    """As `run_until_near`, in twice the horizon as long as more runs come near in it: where the input saturates the way
-    may take long."""
+    """As `run_until_near`, in twice the horizon as long as more runs come near in it."""
     attracted, left, reached = run_until_near(flow, x, P, target, step, horizon, effort)
-    for _ in range(_DOUBLINGS):
-        undecided = np.flatnonzero(~attracted & ~left)
-        if len(undecided) < _LATE * len(x) or effort.over:
-            break
-        late, gone, longer = run_until_near(flow, x[undecided], P, target, step, 2 * reached, effort)
-        if effort.over or late.sum() < _LATE * len(x):
-            break
-        attracted[undecided], left[undecided], reached = late, gone, longer
-    return attracted, left, reached
+    undecided = ~attracted & ~left
+
+    def again(at: NDArray[np.int64], k: int) -> tuple[Mask, Mask] | None:
+        late, gone, _ = run_until_near(flow, x[at], P, target, step, 2**k * reached, effort)
+        return None if effort.over else (late, ~late & ~gone)
+
+    reached *= 2 ** lengthened(attracted, undecided, again, DOUBLINGS)
+    return attracted, ~attracted & ~undecided, reached
 
 
 def run_until_near(

@@ -21,7 +21,7 @@ from certify.loop.plants.equations import parse_expression
 from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
 from certify.report import simulated_roa_fraction
-from certify.report.figures import draw, region_of
+from certify.report.figures import draw, region_of, simulated_roa
 from certify.report.figures.portrait import keys
 from certify.report.figures.scene import Detail, Scene
 from certify.report.figures.style import LEAVING, UNSETTLED
@@ -129,6 +129,14 @@ def test_the_grids_runs_last_until_they_are_home() -> None:
     roa = simulated_roa_fraction(plane("-tanh(60*x)", "-tanh(60*y)"), QUIET, np.eye(2), 0.04)
     assert roa.attracted.all() and 1.0 <= roa.horizon <= 4.0
     assert simulated_roa_fraction(plane("-x", "-y"), QUIET, np.eye(2), 0.04).horizon == pytest.approx(15)
+
+
+def test_trajectories_are_drawn_as_long_as_the_grids_runs() -> None:
+    """Of the same plant: half of 1/4 brings none home from the domain's edge, half of a few units does."""
+    scene = Scene(certificate(plane("-tanh(60*x)", "-tanh(60*y)"), 0.04), accepted=True)
+    assert runs_from(scene, starts(scene)).unsettled.any()
+    assert simulated_roa(scene) is not None
+    assert runs_from(scene, starts(scene)).settled.all()
 
 
 def test_what_leaves_is_drawn_so() -> None:
