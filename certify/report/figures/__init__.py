@@ -70,7 +70,8 @@ def simulated_roa(scene: Scene) -> SimulatedRoa | None:
         centre=scene.centre,
         beyond=scene.in_more,
     )
-    scene.horizon = max(scene.horizon, found.horizon)
+    if found.horizon > 1.5 * scene.horizon:  # it was doubled, and half of it brings too few home
+        scene.drawn = found.horizon
     return found
 
 

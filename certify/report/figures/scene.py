@@ -142,6 +142,7 @@ class Scene:
         self.detail = Detail.of(certificate.network, len(self.pairs))
         # With more than two states nothing is simulated from outside the sets.
         self.step, self.horizon = time_scales(self.flow, self.detail.rates, None if self.n <= 2 else self.far)
+        self.drawn = 0.5 * self.horizon  # the time of trajectories
         units = self.system.units
         points = zip(self.system.states, self.system.exact_x_eq(), strict=True)
         self.labels = [deviation(s.name, q, units.get(s.name, "")) for s, q in points]
