@@ -414,8 +414,8 @@ def if_short(value: Fraction, most: int = _LONGEST) -> str | None:
     """A number without rounding, a decimal or a fraction that can be typed, in so many characters at most; None of
     another.
 
-    >>> if_short(Fraction(-1, 10)), if_short(Fraction(1, 3)), if_short(Fraction(31399999, 10**7)), if_short(Fraction(0.1))
-    ('-0.1', '1/3', '3.1399999', None)
+    >>> if_short(Fraction(-1, 10)), if_short(Fraction(1, 3)), if_short(Fraction(314159, 10**5)), if_short(Fraction(0.1))
+    ('-0.1', '1/3', '3.14159', None)
     """
     shown = f"{float(value):.6g}", repr(float(value)), str(value)
     return next((text for text in shown if len(text) <= most and Fraction(text) == value), None)
