@@ -82,7 +82,7 @@ def plant_of(stored: Policy, system: System | str | None, changes: PlantChanges,
     InputError : there is no such plant, the plant cannot have a change, or the policy would read other numbers there
         than the file that it was imported from.
     """
-    from certify.analysis.suggested import clipped_outside, commands_too_much
+    from certify.analysis.suggested import commands_too_much, limited_outside
     from certify.loop.plants import System
 
     plant, own = (system, False) if isinstance(system, System) else named_plant(stored, system)
@@ -91,7 +91,7 @@ def plant_of(stored: Policy, system: System | str | None, changes: PlantChanges,
     if not own:
         tell_of_other(stored, plant, tell)
     plant = where_valid(stored, plant, tell)
-    for notice in (commands_too_much(plant, stored.network), clipped_outside(plant, stored.network)):
+    for notice in (commands_too_much(plant, stored.network), limited_outside(plant, stored.network)):
         if notice is not None:
             tell(notice)
     if shift := stored.beta_shift(plant.exact_u_eq()):

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from certify.analysis.facts import SimulatedFacts
 from certify.certificates.membership import Region
 from certify.effort import Effort
-from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants.ode import DOUBLINGS, LATE, lengthened
 from certify.lyapunov.function import Quadratic
@@ -42,20 +41,25 @@ class SimulatedRegion:
 
     Parameters
     ----------
-    converging : the drawn states whose runs converge, (N, n), in deviations from the operating point.
-    runs : the number of states drawn.
+    converging, others : the drawn states whose runs converge, (N, n), and all others, in deviations from the operating
+        point.
     """
 
     converging: Array
-    runs: int
+    others: Array
 
-    def __post_init__(self) -> None:
-        if not len(self.converging) <= self.runs:
-            raise InputError(f"at most all of {self.runs} runs may converge; found {len(self.converging)}.")
+    @property
+    def runs(self) -> int:
+        """The number of states drawn."""
+        return len(self.converging) + len(self.others)
 
-    def facts(self, region: Region) -> SimulatedFacts:
-        """The counts, with those of the converging runs that start in a proved set."""
-        return SimulatedFacts(self.runs, len(self.converging), int(region.holds_in_floats(self.converging).sum()))
+    def facts(self, region: Region, clipped: Simulator | None, effort: Effort) -> SimulatedFacts:
+        """The counts, with those of the converging runs that start in a proved set, and with those of the `clipped`
+        policy if the effort allows."""
+        proved, more = int(region.holds_in_floats(self.converging).sum()), None
+        if clipped is not None:
+            more = len(self.converging) + int(clipped.converge(self.others, effort).sum())
+        return SimulatedFacts(self.runs, len(self.converging), proved, None if effort.over else more)
 
 
 class Simulator:
@@ -132,12 +136,13 @@ def simulated_region(runs: Simulator, effort: Effort) -> SimulatedRegion | None:
     generator, flow = np.random.default_rng(0), runs.flow
     dear = _QUICK * effort.left / runs.operations  # states that may stay undecided
     batch = int(min(max(dear, _LEAST), _ENOUGH))
-    found, drawn = list[Array](), 0
+    found, others, drawn = list[Array](), list[Array](), 0
     while drawn < _MOST and sum(map(len, found)) < _ENOUGH:
         x = generator.uniform(flow.lo, flow.hi, (batch, len(flow.lo)))
         converge = runs.converge(x, effort)
         if effort.over:
             break
         found.append(x[converge])
+        others.append(x[~converge])
         drawn += batch
-    return SimulatedRegion(np.concatenate(found), drawn) if drawn else None
+    return SimulatedRegion(np.concatenate(found), np.concatenate(others)) if drawn else None

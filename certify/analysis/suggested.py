@@ -29,7 +29,7 @@ WIDER = Fraction(3, 2)
 """Factor of the side of the domain that is tried."""
 _WORTH = 1.1  # growth of the simulated region that is worth a word
 _NEAR = 1e-3  # of the largest level in the domain: a run that comes so low has converged
-_ROUNDING = Fraction(2) ** -23  # of a number: where single precision rounds it
+_ROUNDING, _DOUBLE = Fraction(2) ** -23, Fraction(2) ** -50  # of a number: where a precision rounds it
 _ENDED = ("effort", "boxes")  # limits of an outer set that more effort lifts
 _TAUGHT = 1.0  # an effort below it ends the lessons of a function before they are over
 _LOOK = 3 * UNIT  # operations for one look
@@ -103,13 +103,18 @@ def commands_too_much(system: System, network: PolicyNetwork) -> str | None:
     return None
 
 
-def clipped_outside(system: System, network: PolicyNetwork) -> str | None:
-    """Say which input is clipped beyond its bound by a rounding, as float32's 0.4 is beyond 2/5, and how to mend it."""
-    for one, bounds, *clip in zip(system.inputs, system.input_bounds, *(network.clip or ((), ())), strict=False):
-        for sign, end, bound in zip((-1, 1), clip, bounds, strict=True):
-            if 0 < sign * (Fraction(float(end)) - bound) <= _ROUNDING * abs(bound):
+def limited_outside(system: System, network: PolicyNetwork) -> str | None:
+    """Say which input is clipped or squashed beyond its bound by a rounding, as float32's 0.4 is beyond 2/5, and how to
+    mend it."""
+    ends, how, least = network.clip, "clipped at", Fraction(0)
+    if ends is None and network.squash == "tanh" and network.centre != "output":
+        reach = np.abs(network.scale)
+        ends, how, least = (network.offset - reach, network.offset + reach), "squashed to", _DOUBLE
+    for one, bounds, *pair in zip(system.inputs, system.input_bounds, *(ends or ((), ())), strict=False):
+        for sign, end, bound in zip((-1, 1), pair, bounds, strict=True):
+            if least * abs(bound) < sign * (Fraction(float(end)) - bound) <= _ROUNDING * abs(bound):
                 return (
-                    f"{one.name} is clipped at {float(end):.17g}, by a rounding beyond its bound {float(bound):g}, so "
+                    f"{one.name} is {how} {float(end):.17g}, by a rounding beyond its bound {float(bound):g}, so "
                     f"that nothing can be proved where it saturates there: clip it at {_bounds(system)} (--clip, where "
                     "the file of another program is read), or widen the bound a little"
                 )
@@ -120,21 +125,12 @@ def _bounds(system: System) -> str:
     return ",".join(f"{float(least):g}..{float(most):g}" for least, most in system.input_bounds)
 
 
-def by_clipping(result: RoaResult, asked: tuple[System, PolicyNetwork], effort: Effort) -> Step | None:
+def by_clipping(result: RoaResult, asked: tuple[System, PolicyNetwork]) -> Step | None:
     """The step of a policy that asks for more than the actuator gives, where one that is clipped at the input bounds
-    converges from as many states in simulation."""
+    was simulated."""
     system, network = asked
-    free = network.clip is None and network.squash == "identity" and system.n <= FEW
-    if result.stop is not Stop.INPUTS or not free or result.problem is None or result.levels.roa is None:
-        return None
-    lo, hi = np.array([[float(end) for end in ends] for ends in system.input_bounds]).T
-    try:
-        loop = ClosedLoop(result.system, replace(result.network, clip=(lo, hi)))
-        there = _share(loop, result.problem.V, result.levels.roa, effort)
-    except InputError:
-        return None
-    here = _converging(result)
-    if there is None or here is None or there < here:
+    free, simulated = network.clip is None and network.squash == "identity", result.simulated
+    if result.stop is not Stop.INPUTS or not free or simulated is None or simulated.clipped is None:
         return None
     why = (
         "the policy asks for more than the actuator gives; if the actuator saturates there, clip the policy at "

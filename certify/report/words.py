@@ -238,10 +238,15 @@ def share_of_runs(found: Mapping[str, Any]) -> str:
 
     >>> share_of_runs({"runs": 2000, "converging": 1063, "proved": 774, "share": 774 / 1063})
     'about 73 % of what converges is proved: 774 of the 1,063 states that do so in the domain, of 2,000 drawn'
+    >>> share_of_runs({"runs": 2000, "converging": 50, "proved": 50, "clipped": 1063, "share": 1.0})[-83:]
+    '; 1,013 more would converge if the policy were clipped at the bounds of its inputs'
     """
     proved, converging, runs = (f"{found[name]:,}" for name in ("proved", "converging", "runs"))
     about = f"about {percent(found['share'])} of what converges is proved"
-    return f"{about}: {proved} of the {converging} states that do so in the domain, of {runs} drawn"
+    more = max(0, (found.get("clipped") or 0) - found["converging"])
+    return f"{about}: {proved} of the {converging} states that do so in the domain, of {runs} drawn" + (
+        f"; {more:,} more would converge if the policy were clipped at the bounds of its inputs" if more else ""
+    )
 
 
 def nonlinearity_in_words(found: Mapping[str, Any]) -> str:
