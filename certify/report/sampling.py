@@ -20,7 +20,7 @@ from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
 from certify.loop.plants import System
 from certify.loop.plants.ode import DOUBLINGS, lengthened
-from certify.loop.policies import PolicyNetwork
+from certify.loop.policies import PolicyNetwork, clipped_at
 from certify.report.flow import Flow, simulate, time_scales
 
 Array = NDArray[np.float64]
@@ -44,10 +44,12 @@ class SimulatedRoa:
     ----------
     axes : grid coordinates along each state, the centres of equal cells.
     attracted : runs that stayed in the domain and came near the origin; shape of the grid.
-    left : runs that left the domain; shape of the grid. The others had not settled within the horizon, and count as
-        not attracted.
+    left : runs that left the domain or the inputs' bounds; shape of the grid. The others had not settled within the
+        horizon, and count as not attracted.
     certified : grid points in the proved set; shape of the grid.
     step, horizon : of the integration, in seconds; the horizon is how far it came if the effort was over.
+    clipped : those of `left` that would come near the origin if the policy were clipped at the inputs' bounds; None if
+        its form keeps it within them.
     """
 
     axes: tuple[Array, ...]
@@ -56,6 +58,7 @@ class SimulatedRoa:
     certified: Mask
     step: float
     horizon: float
+    clipped: int | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(len(a) for a in self.axes)
@@ -223,8 +226,13 @@ def simulated_roa_fraction(
     if suspects.size and not flow.discrete:
         again, gone, _ = run_until_near(flow, x[suspects], P, target, step / _FINER, reached, effort)
         attracted[suspects], left[suspects] = again, gone
+    clipped = clipped_at(network, system.input_bounds)
+    more = None
+    if clipped is not None:
+        more = int(run_until_near(Flow.of(system, clipped), x[left], P, target, step, reached, effort)[0].sum())
     shape = (points,) * system.n
-    return SimulatedRoa(axes, attracted.reshape(shape), left.reshape(shape), certified.reshape(shape), step, reached)
+    attracted, left, certified = (mask.reshape(shape) for mask in (attracted, left, certified))
+    return SimulatedRoa(axes, attracted, left, certified, step, reached, None if effort.over else more)
 
 
 def _until_decided(

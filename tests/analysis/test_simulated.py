@@ -99,6 +99,20 @@ def test_states_from_which_an_input_leaves_its_bounds_do_not_count(period: float
     assert found is not None and found.converging.min() < -1.5
 
 
+def test_the_states_that_a_clip_would_add_are_counted(tmp_path: Path) -> None:
+    """The policy commands u = x where |u| <= 1 is allowed: states from below -1 converge if it saturates there."""
+    follows = PolicyNetwork.of_layers((np.ones((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    found = certify_roa(plant(), follows, tmp_path, effort=0.4)
+    assert found.simulated is not None and found.diagnosis is not None
+    counts, clipped = found.simulated, replace(follows, clip=(-np.ones(1), np.ones(1)))
+    assert counts.clipped is not None and counts.clipped > 1.8 * counts.converging
+    said = dict(rows_of(found.to_dict(), True))["simulated"]
+    assert f"{counts.more:,} more would converge if the policy were clipped at the bounds of its inputs" in said
+    whole = certify_roa(plant(), clipped, tmp_path / "clipped", effort=0.4).simulated
+    assert whole is not None and whole.clipped is None and whole.more == 0
+    assert whole.converging / whole.runs == pytest.approx(counts.clipped / counts.runs, abs=0.05)
+
+
 def test_runs_that_cannot_be_decided_tell_nothing() -> None:
     assert simulated_region(Simulator(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 0.5), Effort(1.0)) is None
 

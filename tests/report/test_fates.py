@@ -182,6 +182,10 @@ def test_states_from_which_an_input_leaves_its_bounds_are_outside_the_simulated_
     (bound,) = system.input_bounds
     assert np.array_equal(roa.attracted, np.broadcast_to(np.abs(roa.axes[1]) <= float(bound[1]), roa.attracted.shape))
     assert not roa.attracted.all() and roa.attracted.any()
+    said = simulated_of(roa, certificate(system, 0.5))
+    assert roa.clipped == int(roa.left.sum()) and said["clipped"] and said["bounds"] == " or the bounds of inputs"
+    clipped = simulated_roa_fraction(system, replace(follows, clip=(-np.ones(1), np.ones(1))), np.eye(2), 0.5)
+    assert clipped.attracted.all() and clipped.clipped is None
 
 
 def test_a_curved_edge_is_found_as_if_the_whole_grid_were_fine() -> None:
