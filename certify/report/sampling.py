@@ -227,12 +227,12 @@ def simulated_roa_fraction(
         again, gone, _ = run_until_near(flow, x[suspects], P, target, step / _FINER, reached, effort)
         attracted[suspects], left[suspects] = again, gone
     clipped = clipped_at(network, system.input_bounds)
-    more = None
-    if clipped is not None:
-        more = int(run_until_near(Flow.of(system, clipped), x[left], P, target, step, reached, effort)[0].sum())
+    saturating = None if clipped is None else Flow.of(system, clipped)
+    more = None if saturating is None else run_until_near(saturating, x[left], P, target, step, reached, effort)[0]
     shape = (points,) * system.n
     attracted, left, certified = (mask.reshape(shape) for mask in (attracted, left, certified))
-    return SimulatedRoa(axes, attracted, left, certified, step, reached, None if effort.over else more)
+    count = None if more is None or effort.over else int(more.sum())
+    return SimulatedRoa(axes, attracted, left, certified, step, reached, count)
 
 
 def _until_decided(
