@@ -24,12 +24,14 @@ from certify.loop.policies import Centre, PolicyNetwork
 from certify.lyapunov import domain_limit, slowest_decay, solve_lyapunov
 from certify.lyapunov.function import Quadratic
 from certify.provers.ranks import turning
+from certify.report.words import quantity, symbol
 
 WIDER = Fraction(3, 2)
 """Factor of the side of the domain that is tried."""
 _WORTH = 1.1  # growth of the simulated region that is worth a word
 _NEAR = 1e-3  # of the largest level in the domain: a run that comes so low has converged
 _ROUNDING, _DOUBLE = Fraction(2) ** -23, Fraction(2) ** -50  # of a number: where a precision rounds it
+_INSIDE = 0.9  # of a side of the domain: a state in it is well inside
 _ENDED = ("effort", "boxes")  # limits of an outer set that more effort lifts
 _TAUGHT = 1.0  # an effort below it ends the lessons of a function before they are over
 _LOOK = 3 * UNIT  # operations for one look
@@ -161,6 +163,10 @@ def beyond_the_ellipsoid(result: RoaResult, options: RoaOptions, effort: Effort)
         return more
     if result.ranks is not None and result.ranks.full and simulated.share < MOST:
         return _in_shorter_images(result, said)
+    inside = None if simulated.share >= NEARLY_ALL else _ends_inside(result)
+    if inside is not None:
+        step = by_learning(result, options, "polynomial") if options.goes_on else None
+        return replace(step, why=f"{inside}; {step.why}") if step else Step((), f"{said}; {inside}")
     wider = _in_a_wider_domain(result, effort)
     if wider is not None:
         return wider
@@ -193,6 +199,19 @@ def by_learning(result: RoaResult, options: RoaOptions, candidate: str) -> Step 
 def _share_in_words(result: RoaResult) -> str:
     share = None if result.simulated is None else result.simulated.share
     return f"{100 * (share or 0.0):.2g} % of what converges in simulation is proved"
+
+
+def _ends_inside(result: RoaResult) -> str | None:
+    """Say that N ends at a state well inside of the domain, where a wider one changes nothing; None if it does not."""
+    system, outer = result.system, result.outer
+    if outer is None or outer.limit != "witness" or outer.witness is None:
+        return None
+    ends = zip(outer.witness, system.domain, strict=True)
+    if not all(_INSIDE * lo < x < _INSIDE * hi for x, (lo, hi) in ends):
+        return None
+    each = zip(system.states, outer.witness, system.exact_x_eq(), strict=True)
+    at = ", ".join(f"{symbol(s.name)} = {quantity(x + float(q), system.units.get(s.name, ''), 4)}" for s, x, q in each)
+    return f"N ends where it does not fall, at {at}, well inside of the domain, so that a wider one would not help"
 
 
 def _in_a_wider_domain(result: RoaResult, effort: Effort) -> Step | None:
