@@ -26,8 +26,8 @@ from certify.analysis.suggested import (
     by_centring,
     by_clipping,
     by_learning,
-    clipped_outside,
     commands_too_much,
+    limited_outside,
     side,
     wider,
 )
@@ -191,15 +191,16 @@ def _next(
     if (amiss := commands_too_much(*asked)) is not None:
         return Step((), amiss)
     ended = result.stop in (Stop.INPUTS, Stop.BOXES, Stop.SMALL, Stop.STALLED) or result.stop.ran_out
-    little = result.simulated is not None and (result.simulated.share or 0.0) < NEARLY_ALL
-    if (ended or little) and (outside := clipped_outside(*asked)) is not None:
+    simulated = result.simulated
+    little = simulated is not None and ((simulated.share or 0.0) < NEARLY_ALL or simulated.more > 0)
+    if (ended or little) and (outside := limited_outside(*asked)) is not None:
         return Step((), outside)
     weaker = result.claim in ("practical", "nearby")
     if weaker and (centred := by_centring(result, options, asked, effort)) is not None:
         return centred
     if (flatter := _flatter(result, options, proof)) is not None:
         return flatter
-    if (clipped := by_clipping(result, asked, effort)) is not None:
+    if (clipped := by_clipping(result, asked)) is not None:
         return clipped
     if (beyond := beyond_the_ellipsoid(result, options, effort)) is not None:
         return beyond

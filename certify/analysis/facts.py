@@ -158,16 +158,23 @@ class RankFacts:
 @dataclass(frozen=True, slots=True)
 class SimulatedFacts:
     """Counts of simulated runs from states drawn from the domain, which are no part of a proof: of all `runs`, of those
-    `converging` without leaving the domain, and of these that start in the `proved` set."""
+    `converging` without leaving the domain or the inputs' bounds, of these that start in the `proved` set, and of those
+    that would converge if the policy were `clipped` at the inputs' bounds, None if it is, or that was not simulated."""
 
     runs: int
     converging: int
     proved: int
+    clipped: int | None = None
 
     @property
     def share(self) -> float | None:
         """The share of the simulated region of attraction that is proved; None if nothing converges."""
         return self.proved / self.converging if self.converging else None
+
+    @property
+    def more(self) -> int:
+        """The number that a clip would add."""
+        return max(0, (self.clipped or 0) - self.converging)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON, with the share."""

@@ -82,7 +82,7 @@ def plant_of(stored: Policy, system: System | str | None, changes: PlantChanges,
     InputError : there is no such plant, the plant cannot have a change, or the policy would read other numbers there
         than the file that it was imported from.
     """
-    from certify.analysis.suggested import clipped_outside, commands_too_much
+    from certify.analysis.suggested import commands_too_much, limited_outside
     from certify.loop.plants import System
 
     plant, own = (system, False) if isinstance(system, System) else named_plant(stored, system)
@@ -91,7 +91,7 @@ def plant_of(stored: Policy, system: System | str | None, changes: PlantChanges,
     if not own:
         tell_of_other(stored, plant, tell)
     plant = where_valid(stored, plant, tell)
-    for notice in (commands_too_much(plant, stored.network), clipped_outside(plant, stored.network)):
+    for notice in (commands_too_much(plant, stored.network), limited_outside(plant, stored.network)):
         if notice is not None:
             tell(notice)
     if shift := stored.beta_shift(plant.exact_u_eq()):
@@ -305,12 +305,13 @@ def is_own(path: Path, importing: ImportOptions) -> bool:
 def lines(imported: Imported) -> list[str]:
     """The findings of an import, for people."""
     found, policy = imported, imported.policy
-    origin, target = _row(found.at_origin), _row(found.u_eq)
+    target = _row(found.u_eq)
+    origin = f"u_eq = {target}, exactly" if _centres_itself(found) else f"{_row(found.at_origin)}; u_eq {target}"
     said = [
         f"read     {found.words}; sha256 {policy.training['imported']['sha256']}",
         f"policy   {found.formula}; o = ({policy.training['imported']['states']})",
         *checked(found.difference, found.compared_with, found.assumed, found.not_read),
-        f"pi(0)    {origin}; u_eq {target}",
+        f"pi(0)    {origin}",
         f"centring {_centring(found)}",
     ]
     if policy.valid is not None:
@@ -347,12 +348,17 @@ def _centring(found: Imported) -> str:
     centre = found.policy.network.centre
     if found.policy.training["imported"].get("scores"):
         return "none, as of scores there is none"
-    if centre != "none" and not found.centring:
+    if _centres_itself(found):
         return f"the file's own, {'inside the squash' if centre == 'preactivation' else 'of the output'}"
     changes = [f"{name} changes u by up to {value:.3g}" for name, value in found.centring.items()]
     if centre != "none":
         return f"{centre}, as asked for, which changes u by up to {found.centring[centre]:.3g}"
     return f"none; {', '.join(f'--centre {c}' for c in changes) or 'u_eq is out of reach of any'}"
+
+
+def _centres_itself(found: Imported) -> bool:
+    """True if the file's policy is u_eq at the operating point by its form."""
+    return found.policy.network.centre != "none" and not found.centring
 
 
 def _box(found: Imported) -> str:

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from certify.analysis.facts import SimulatedFacts
 from certify.certificates.membership import Region
 from certify.effort import Effort
-from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants.ode import DOUBLINGS, LATE, lengthened
 from certify.lyapunov.function import Quadratic
 from certify.provers.ranks import root_box, turning
 from certify.report.flow import Flow, time_scales
@@ -32,7 +32,6 @@ MOST, NEARLY_ALL = 0.8, 0.9
 with the second hardly more is to be proved in this domain."""
 _LEAST, _ENOUGH, _MOST = 250, 1000, 4000  # states drawn at once at least, that converge, and in all
 _QUICK = 10.0  # multiplications of many runs at once that are worth an operation
-_LATE, _DOUBLINGS = 0.01, 6  # share of the runs that converges in twice their time for it to be doubled; how often
 _LONGEST = 3000  # steps of one length: of runs over more time each state has a step of its own
 
 
@@ -42,20 +41,25 @@ class SimulatedRegion:
 
     Parameters
     ----------
-    converging : the drawn states whose runs converge, (N, n), in deviations from the operating point.
-    runs : the number of states drawn.
+    converging, others : the drawn states whose runs converge, (N, n), and all others, in deviations from the operating
+        point.
     """
 
     converging: Array
-    runs: int
+    others: Array
 
-    def __post_init__(self) -> None:
-        if not len(self.converging) <= self.runs:
-            raise InputError(f"at most all of {self.runs} runs may converge; found {len(self.converging)}.")
+    @property
+    def runs(self) -> int:
+        """The number of states drawn."""
+        return len(self.converging) + len(self.others)
 
-    def facts(self, region: Region) -> SimulatedFacts:
-        """The counts, with those of the converging runs that start in a proved set."""
-        return SimulatedFacts(self.runs, len(self.converging), int(region.holds_in_floats(self.converging).sum()))
+    def facts(self, region: Region, clipped: Simulator | None, effort: Effort) -> SimulatedFacts:
+        """The counts, with those of the converging runs that start in a proved set, and with those of the `clipped`
+        policy if the effort allows."""
+        proved, more = int(region.holds_in_floats(self.converging).sum()), None
+        if clipped is not None:
+            more = len(self.converging) + int(clipped.converge(self.others, effort).sum())
+        return SimulatedFacts(self.runs, len(self.converging), proved, None if effort.over else more)
 
 
 class Simulator:
@@ -83,7 +87,7 @@ class Simulator:
         whole = math.inf if flow.discrete or flow.period else time_scales(flow, most=math.inf)[1]
         self.farther = whole if self.horizon < whole < math.inf else 0.0
         self.flow, self.step, self.V, self.level = flow, flow.fitting(step), V, level
-        self.doublings = _DOUBLINGS
+        self.doublings = DOUBLINGS
 
     @property
     def operations(self) -> float:
@@ -94,25 +98,26 @@ class Simulator:
         """True (N,) for states (N, n) whose runs converge before the effort, an operation of which is worth several
         multiplications here, is over."""
         found, undecided = self._runs(x, effort, (self.horizon, self.farther))
-        while self.doublings and undecided.sum() >= _LATE * len(x) and not effort.over:
-            some, times = effort.share(0.5), self._longer()
-            late, never = self._runs(x[undecided], some, times)
-            if some.over or not late.sum() >= _LATE * len(x):
-                self.doublings = 0
-                break
-            self.doublings, (self.horizon, self.farther) = self.doublings - 1, times
-            at = np.flatnonzero(undecided)
-            found[at[late]], undecided[at] = True, never
+
+        def again(at: NDArray[np.int64], k: int) -> tuple[Mask, Mask] | None:
+            some = effort.share(0.5)
+            late = self._runs(x[at], some, self._longer(k))
+            return None if some.over else late
+
+        k = lengthened(found, undecided, again, self.doublings)
+        self.doublings = 0 if undecided.sum() >= LATE * len(x) else self.doublings - k  # in vain once is enough
+        self.horizon, self.farther = self._longer(k)
         return found
 
-    def _longer(self) -> tuple[float, float]:
-        """Twice the horizon of the runs, and the time that those with steps of their own may take."""
+    def _longer(self, k: int) -> tuple[float, float]:
+        """2^k times the horizon of the runs, and the time that those with steps of their own may take."""
+        time = 2**k * (self.farther or self.horizon)
         if self.farther:
-            return self.horizon, 2 * self.farther
+            return self.horizon, time
         follows = not (self.flow.discrete or self.flow.period)
-        if follows and 2 * self.horizon > _LONGEST * self.step:
-            return _LONGEST * self.step, 2 * self.horizon
-        return 2 * self.horizon, 0.0
+        if follows and k and time > _LONGEST * self.step:
+            return _LONGEST * self.step, time
+        return time, 0.0
 
     def _runs(self, x: Array, effort: Effort, times: tuple[float, float]) -> tuple[Mask, Mask]:
         """The runs that converge, and those that do neither that nor leave, (N,) each."""
@@ -131,12 +136,13 @@ def simulated_region(runs: Simulator, effort: Effort) -> SimulatedRegion | None:
     generator, flow = np.random.default_rng(0), runs.flow
     dear = _QUICK * effort.left / runs.operations  # states that may stay undecided
     batch = int(min(max(dear, _LEAST), _ENOUGH))
-    found, drawn = list[Array](), 0
+    found, others, drawn = list[Array](), list[Array](), 0
     while drawn < _MOST and sum(map(len, found)) < _ENOUGH:
         x = generator.uniform(flow.lo, flow.hi, (batch, len(flow.lo)))
         converge = runs.converge(x, effort)
         if effort.over:
             break
         found.append(x[converge])
+        others.append(x[~converge])
         drawn += batch
-    return SimulatedRegion(np.concatenate(found), drawn) if drawn else None
+    return SimulatedRegion(np.concatenate(found), np.concatenate(others)) if drawn else None

@@ -24,12 +24,14 @@ from certify.loop.policies import Centre, PolicyNetwork
 from certify.lyapunov import domain_limit, slowest_decay, solve_lyapunov
 from certify.lyapunov.function import Quadratic
 from certify.provers.ranks import turning
+from certify.report.words import quantity, symbol
 
 WIDER = Fraction(3, 2)
 """Factor of the side of the domain that is tried."""
 _WORTH = 1.1  # growth of the simulated region that is worth a word
 _NEAR = 1e-3  # of the largest level in the domain: a run that comes so low has converged
-_ROUNDING = Fraction(2) ** -23  # of a number: where single precision rounds it
+_ROUNDING, _DOUBLE = Fraction(2) ** -23, Fraction(2) ** -50  # of a number: where a precision rounds it
+_INSIDE = 0.9  # of a side of the domain: a state in it is well inside
 _ENDED = ("effort", "boxes")  # limits of an outer set that more effort lifts
 _TAUGHT = 1.0  # an effort below it ends the lessons of a function before they are over
 _LOOK = 3 * UNIT  # operations for one look
@@ -103,13 +105,18 @@ def commands_too_much(system: System, network: PolicyNetwork) -> str | None:
     return None
 
 
-def clipped_outside(system: System, network: PolicyNetwork) -> str | None:
-    """Say which input is clipped beyond its bound by a rounding, as float32's 0.4 is beyond 2/5, and how to mend it."""
-    for one, bounds, *clip in zip(system.inputs, system.input_bounds, *(network.clip or ((), ())), strict=False):
-        for sign, end, bound in zip((-1, 1), clip, bounds, strict=True):
-            if 0 < sign * (Fraction(float(end)) - bound) <= _ROUNDING * abs(bound):
+def limited_outside(system: System, network: PolicyNetwork) -> str | None:
+    """Say which input is clipped or squashed beyond its bound by a rounding, as float32's 0.4 is beyond 2/5, and how to
+    mend it."""
+    ends, how, least = network.clip, "clipped at", Fraction(0)
+    if ends is None and network.squash == "tanh" and network.centre != "output":
+        reach = np.abs(network.scale)
+        ends, how, least = (network.offset - reach, network.offset + reach), "squashed to", _DOUBLE
+    for one, bounds, *pair in zip(system.inputs, system.input_bounds, *(ends or ((), ())), strict=False):
+        for sign, end, bound in zip((-1, 1), pair, bounds, strict=True):
+            if least * abs(bound) < sign * (Fraction(float(end)) - bound) <= _ROUNDING * abs(bound):
                 return (
-                    f"{one.name} is clipped at {float(end):.17g}, by a rounding beyond its bound {float(bound):g}, so "
+                    f"{one.name} is {how} {float(end):.17g}, by a rounding beyond its bound {float(bound):g}, so "
                     f"that nothing can be proved where it saturates there: clip it at {_bounds(system)} (--clip, where "
                     "the file of another program is read), or widen the bound a little"
                 )
@@ -120,21 +127,12 @@ def _bounds(system: System) -> str:
     return ",".join(f"{float(least):g}..{float(most):g}" for least, most in system.input_bounds)
 
 
-def by_clipping(result: RoaResult, asked: tuple[System, PolicyNetwork], effort: Effort) -> Step | None:
+def by_clipping(result: RoaResult, asked: tuple[System, PolicyNetwork]) -> Step | None:
     """The step of a policy that asks for more than the actuator gives, where one that is clipped at the input bounds
-    converges from as many states in simulation."""
+    was simulated."""
     system, network = asked
-    free = network.clip is None and network.squash == "identity" and system.n <= FEW
-    if result.stop is not Stop.INPUTS or not free or result.problem is None or result.levels.roa is None:
-        return None
-    lo, hi = np.array([[float(end) for end in ends] for ends in system.input_bounds]).T
-    try:
-        loop = ClosedLoop(result.system, replace(result.network, clip=(lo, hi)))
-        there = _share(loop, result.problem.V, result.levels.roa, effort)
-    except InputError:
-        return None
-    here = _converging(result)
-    if there is None or here is None or there < here:
+    free, simulated = network.clip is None and network.squash == "identity", result.simulated
+    if result.stop is not Stop.INPUTS or not free or simulated is None or simulated.clipped is None:
         return None
     why = (
         "the policy asks for more than the actuator gives; if the actuator saturates there, clip the policy at "
@@ -165,6 +163,10 @@ def beyond_the_ellipsoid(result: RoaResult, options: RoaOptions, effort: Effort)
         return more
     if result.ranks is not None and result.ranks.full and simulated.share < MOST:
         return _in_shorter_images(result, said)
+    inside = None if simulated.share >= NEARLY_ALL else _ends_inside(result)
+    if inside is not None:
+        step = by_learning(result, options, "polynomial") if options.goes_on else None
+        return replace(step, why=f"{inside}; {step.why}") if step else Step((), f"{said}; {inside}")
     wider = _in_a_wider_domain(result, effort)
     if wider is not None:
         return wider
@@ -197,6 +199,19 @@ def by_learning(result: RoaResult, options: RoaOptions, candidate: str) -> Step 
 def _share_in_words(result: RoaResult) -> str:
     share = None if result.simulated is None else result.simulated.share
     return f"{100 * (share or 0.0):.2g} % of what converges in simulation is proved"
+
+
+def _ends_inside(result: RoaResult) -> str | None:
+    """Say that N ends at a state well inside of the domain, where a wider one changes nothing; None if it does not."""
+    system, outer = result.system, result.outer
+    if outer is None or outer.limit != "witness" or outer.witness is None:
+        return None
+    ends = zip(outer.witness, system.domain, strict=True)
+    if not all(_INSIDE * lo < x < _INSIDE * hi for x, (lo, hi) in ends):
+        return None
+    each = zip(system.states, outer.witness, system.exact_x_eq(), strict=True)
+    at = ", ".join(f"{symbol(s.name)} = {quantity(x + float(q), system.units.get(s.name, ''), 4)}" for s, x, q in each)
+    return f"N ends where it does not fall, at {at}, well inside of the domain, so that a wider one would not help"
 
 
 def _in_a_wider_domain(result: RoaResult, effort: Effort) -> Step | None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from certify.cli.terminal import say, tell
 
 if TYPE_CHECKING:
+    from certify.certificates import AnyCertificate
     from certify.loop.policies import Policy
 
 
@@ -59,24 +60,35 @@ def checked(
 
 
 def _beside(stored: Policy, certificate: Path, sha256: str) -> str:
-    """A difference between the certificate and what a policy file says beside its numbers: the box in which they are
-    the policy that it was imported from, and the input that it is centred at; empty if there is none."""
+    """A difference between the certificate, or the one that takes over, and what a policy file says beside its numbers:
+    the box in which they are the policy that it was imported from, and the input that it is centred at; empty if there
+    is none."""
     if stored.valid is None and stored.beta is None:
         return ""
-    from certify.certificates import parse_any, read_raw
-    from certify.errors import CertifyError, InputError
+    from certify.certificates import Certificate, parse_any, read_raw
+    from certify.errors import CertifyError
 
     raw = read_raw(certificate)
     if hashlib.sha256(raw).hexdigest() != sha256:
         raise CertifyError(f"{certificate} was changed while it was checked; check it again.")
-    system, origin = (read := parse_any(raw, str(certificate))).system, read.network.origin.tolist()
+    read = parse_any(raw, str(certificate))
+    said = _difference(stored, read)
+    if said or not isinstance(read, Certificate) or read.then is None:
+        return said
+    return f"of the claim that takes over, {after}" if (after := _difference(stored, read.then)) else ""
+
+
+def _difference(stored: Policy, read: AnyCertificate) -> str:
+    """The difference from one of a file's claims."""
+    from certify.errors import InputError
+
+    system = read.system
     try:
         stored.beta_shift(system.exact_u_eq())
     except InputError as error:
         return f"the certificate's u_eq is not that of {stored.system}'s policy file: {error}".rstrip(".")
-    for symbol, ends, (lo, hi), at in zip(
-        system.states, system.domain, [] if stored.valid is None else stored.valid.tolist(), origin, strict=False
-    ):
+    valid, origin = [] if stored.valid is None else stored.valid.tolist(), read.network.origin.tolist()
+    for symbol, ends, (lo, hi), at in zip(system.states, system.domain, valid, origin, strict=False):
         if not (ends[0] + Fraction(at) >= lo and ends[1] + Fraction(at) <= hi):
             return (
                 f"the certificate's domain of {symbol} must lie in [{lo}, {hi}], where the policy file says "

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
 from certify.loop.plants import System
-from certify.loop.policies import PolicyNetwork
+from certify.loop.plants.ode import DOUBLINGS, lengthened
+from certify.loop.policies import PolicyNetwork, clipped_at
 from certify.report.flow import Flow, simulate, time_scales
 
 Array = NDArray[np.float64]
@@ -30,7 +31,6 @@ SETTLED = 1e-3
 _GRID = {1: 401, 2: 35}
 _FINER = 8  # of the step, in runs that are asked again because they contradict what is claimed
 _HALVINGS = 2  # of the grid's cells along the boundary of the region
-_LATE, _DOUBLINGS = 0.01, 6  # share of the runs that settles in twice their time for it to be doubled; how often
 _FEWEST_STEPS = 100  # of a run with steps of its own
 _WIDTH = 4  # fine cells to either side that a smoothed value knows of
 _OUTSIDE = 1.01  # times the level: a run that starts below it and comes so high has left the set
@@ -44,10 +44,12 @@ class SimulatedRoa:
     ----------
     axes : grid coordinates along each state, the centres of equal cells.
     attracted : runs that stayed in the domain and came near the origin; shape of the grid.
-    left : runs that left the domain; shape of the grid. The others had not settled within the horizon, and count as
-        not attracted.
+    left : runs that left the domain or the inputs' bounds; shape of the grid. The others had not settled within the
+        horizon, and count as not attracted.
     certified : grid points in the proved set; shape of the grid.
     step, horizon : of the integration, in seconds; the horizon is how far it came if the effort was over.
+    clipped : those of `left` that would come near the origin if the policy were clipped at the inputs' bounds; None if
+        its form keeps it within them.
     """
 
     axes: tuple[Array, ...]
@@ -56,6 +58,7 @@ class SimulatedRoa:
     certified: Mask
     step: float
     horizon: float
+    clipped: int | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(len(a) for a in self.axes)
@@ -223,25 +226,28 @@ def simulated_roa_fraction(
     if suspects.size and not flow.discrete:
         again, gone, _ = run_until_near(flow, x[suspects], P, target, step / _FINER, reached, effort)
         attracted[suspects], left[suspects] = again, gone
+    clipped = clipped_at(network, system.input_bounds)
+    saturating = None if clipped is None else Flow.of(system, clipped)
+    more = None if saturating is None else run_until_near(saturating, x[left], P, target, step, reached, effort)[0]
     shape = (points,) * system.n
-    return SimulatedRoa(axes, attracted.reshape(shape), left.reshape(shape), certified.reshape(shape), step, reached)
+    attracted, left, certified = (mask.reshape(shape) for mask in (attracted, left, certified))
+    count = None if more is None or effort.over else int(more.sum())
+    return SimulatedRoa(axes, attracted, left, certified, step, reached, count)
 
 
 def _until_decided(
     flow: Flow, x: Array, P: Array, target: float, step: float, horizon: float, effort: Effort
 ) -> tuple[Mask, Mask, float]:
-    """As `run_until_near`, in twice the horizon as long as more runs come near in it: where the input saturates the way
-    may take long."""
+    """As `run_until_near`, in twice the horizon as long as more runs come near in it."""
     attracted, left, reached = run_until_near(flow, x, P, target, step, horizon, effort)
-    for _ in range(_DOUBLINGS):
-        undecided = np.flatnonzero(~attracted & ~left)
-        if len(undecided) < _LATE * len(x) or effort.over:
-            break
-        late, gone, longer = run_until_near(flow, x[undecided], P, target, step, 2 * reached, effort)
-        if effort.over or late.sum() < _LATE * len(x):
-            break
-        attracted[undecided], left[undecided], reached = late, gone, longer
-    return attracted, left, reached
+    undecided = ~attracted & ~left
+
+    def again(at: NDArray[np.int64], k: int) -> tuple[Mask, Mask] | None:
+        late, gone, _ = run_until_near(flow, x[at], P, target, step, 2**k * reached, effort)
+        return None if effort.over else (late, ~late & ~gone)
+
+    reached *= 2 ** lengthened(attracted, undecided, again, DOUBLINGS)
+    return attracted, ~attracted & ~undecided, reached
 
 
 def run_until_near(

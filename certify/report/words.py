@@ -28,7 +28,7 @@ _DOT = "\u0307"
 PRACTICAL = frozenset({"practical", "nearby"})
 """The claims whose inner set is the one in which trajectories end."""
 _ROUNDS_TO_ALL = 0.995
-_SHORT = 10  # characters of an exact fraction that is written as it is
+_SHORT, _LONGEST = 10, 24  # characters of an exact number that is written as it is: among others, and alone
 _A_GAIN = ((0.05, ": a gain does nearly the same"), (0.2, ""))
 _NO_GAIN = ": its own gain does not do the same"
 """Conclusions for a reader, by the rms."""
@@ -181,10 +181,7 @@ def at_rest(names: Sequence[str], x_eq: Sequence[Fraction], units: Sequence[str]
     >>> at_rest(["h", "v", "a"], [Fraction(18, 17), Fraction(0), Fraction(0.1)], ["m", "m/s", ""])
     'h = 18/17 m, v = 0 m/s, a = 0.1'
     """
-    values = [
-        shortest(float(q)) if Fraction(repr(float(q))) == q or len(str(q)) > _SHORT else str(q).replace("-", "−")
-        for q in x_eq
-    ]
+    values = [shortest(float(q)) if (short := if_short(q, _SHORT)) is None else _typeset(short) for q in x_eq]
     return _values(names, values, units) if any(x_eq) else ""
 
 
@@ -241,10 +238,15 @@ def share_of_runs(found: Mapping[str, Any]) -> str:
 
     >>> share_of_runs({"runs": 2000, "converging": 1063, "proved": 774, "share": 774 / 1063})
     'about 73 % of what converges is proved: 774 of the 1,063 states that do so in the domain, of 2,000 drawn'
+    >>> share_of_runs({"runs": 2000, "converging": 50, "proved": 50, "clipped": 1063, "share": 1.0})[-83:]
+    '; 1,013 more would converge if the policy were clipped at the bounds of its inputs'
     """
     proved, converging, runs = (f"{found[name]:,}" for name in ("proved", "converging", "runs"))
     about = f"about {percent(found['share'])} of what converges is proved"
-    return f"{about}: {proved} of the {converging} states that do so in the domain, of {runs} drawn"
+    more = max(0, (found.get("clipped") or 0) - found["converging"])
+    return f"{about}: {proved} of the {converging} states that do so in the domain, of {runs} drawn" + (
+        f"; {more:,} more would converge if the policy were clipped at the bounds of its inputs" if more else ""
+    )
 
 
 def nonlinearity_in_words(found: Mapping[str, Any]) -> str:
@@ -411,6 +413,17 @@ def _decimal(exact: Fraction, digits: int, direction: Callable[[Fraction], int])
     exponent -= Fraction(10) ** exponent > size
     last = exponent - digits + 1
     return direction(exact / Fraction(10) ** last), last
+
+
+def if_short(value: Fraction, most: int = _LONGEST) -> str | None:
+    """A number without rounding, a decimal or a fraction that can be typed, in so many characters at most; None of
+    another.
+
+    >>> if_short(Fraction(-1, 10)), if_short(Fraction(1, 3)), if_short(Fraction(314159, 10**5)), if_short(Fraction(0.1))
+    ('-0.1', '1/3', '3.14159', None)
+    """
+    shown = f"{float(value):.6g}", repr(float(value)), str(value)
+    return next((text for text in shown if len(text) <= most and Fraction(text) == value), None)
 
 
 def exact_number(value: Fraction) -> str:

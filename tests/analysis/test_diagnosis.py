@@ -16,6 +16,7 @@ from certify.analysis.facts import SimulatedFacts, Step
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
 from certify.analysis.run import certify_roa
+from certify.analysis.suggested import limited_outside
 from certify.certificates.verdict import Stop, Verdict
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, get_system
@@ -137,6 +138,21 @@ def test_a_clip_that_a_rounding_puts_out_of_bounds_is_named(tmp_path: Path, prec
     assert diagnose(little, quick, None).next.why.startswith("u is clipped at -0.4")
     inside = np.nextafter([0.4], 0)
     assert certify_roa(bounded, replace(network, clip=(-inside, inside)), tmp_path, quick).stop is Stop.DOMAIN
+
+
+def test_a_squash_that_a_rounding_puts_out_of_bounds_is_named(tmp_path: Path) -> None:
+    """float32's 0.4 is above 2/5, and so is the nearest double, by too little to matter. It is named even where nearly
+    all of what converges is proved, if a clip would add to that."""
+    (system, network), quick = chain(1, [-1.0]), RoaOptions(effort=0.01, candidate="lyapunov")
+    bounded = replace(system, input_bounds=((Fraction(-2, 5), Fraction(2, 5)),))
+    single, double = (replace(network, squash="tanh", scale=np.array([v])) for v in (float(np.float32(0.4)), 0.4))
+    said = limited_outside(bounded, single)
+    assert said is not None and said.startswith("u is squashed to -0.4000000059604644")
+    assert limited_outside(bounded, double) is None and limited_outside(system, single) is None
+    result = certify_roa(bounded, single, tmp_path, quick)
+    for clipped, named in ((900, True), (500, False)):
+        nearly = replace(result, stop=Stop.WITNESS, simulated=SimulatedFacts(1000, 500, 490, clipped))
+        assert (diagnose(nearly, quick, None).next.why == said) is named
 
 
 @pytest.mark.parametrize("claim", ["asymptotic", "practical"])

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from certify import PolicyNetwork, System, certify_roa, get_system
+from certify.analysis import suggested
 from certify.analysis.acceptance import Clerk
 from certify.analysis.facts import SimulatedFacts, Step
 from certify.analysis.options import RoaOptions
@@ -37,7 +38,7 @@ from certify.lyapunov.learning import Learned, Learner
 from certify.provers.ranks import search
 from certify.report.rows import rows_of
 from certify.report.sections.simulated import drawn_of
-from certify.report.words import percent
+from certify.report.words import number, percent
 from tests.support.marks import slow_after
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
@@ -97,6 +98,20 @@ def test_states_from_which_an_input_leaves_its_bounds_do_not_count(period: float
     clipped = replace(follows, clip=(-np.ones(1), np.ones(1)))
     found = simulated_region(Simulator(ClosedLoop(system, clipped), Quadratic(np.eye(1)), 0.5), Effort(10 * UNIT))
     assert found is not None and found.converging.min() < -1.5
+
+
+def test_the_states_that_a_clip_would_add_are_counted(tmp_path: Path) -> None:
+    """The policy commands u = x where |u| <= 1 is allowed: states from below -1 converge if it saturates there."""
+    follows = PolicyNetwork.of_layers((np.ones((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    found = certify_roa(plant(), follows, tmp_path, effort=0.4)
+    assert found.simulated is not None and found.diagnosis is not None
+    counts, clipped = found.simulated, replace(follows, clip=(-np.ones(1), np.ones(1)))
+    assert counts.clipped is not None and counts.clipped > 1.8 * counts.converging
+    said = dict(rows_of(found.to_dict(), True))["simulated"]
+    assert f"{counts.more:,} more would converge if the policy were clipped at the bounds of its inputs" in said
+    whole = certify_roa(plant(), clipped, tmp_path / "clipped", effort=0.4).simulated
+    assert whole is not None and whole.clipped is None and whole.more == 0
+    assert whole.converging / whole.runs == pytest.approx(counts.clipped / counts.runs, abs=0.05)
 
 
 def test_runs_that_cannot_be_decided_tell_nothing() -> None:
@@ -390,6 +405,24 @@ def test_a_function_that_was_taught_little_is_taught_more_before_a_wider_domain(
     assert first is not None and first.options == (("--effort", "1.6"),)
     for other in (step(850, effort=0.4), step(400, effort=1.0), step(400, effort=0.4, lyapunov=SQUARE)):
         assert other is None or "--effort" not in dict(other.options)
+
+
+def test_no_wider_domain_is_suggested_where_n_ends_well_inside_of_it(
+    by_default: RoaResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """N does not fall at -3 or 1, of a domain from -4 to 2; near the domain's faces, or with nearly all that converges
+    proved, a wider one is the next step."""
+    domain = Step((("--domain", "x=6"),), "")
+    monkeypatch.setattr(suggested, "_in_a_wider_domain", lambda result, effort: domain)
+    outer = by_default.outer
+    assert outer is not None and outer.limit == "witness" and outer.witness is not None
+    at_a_face = replace(outer, witness=(-3.9,))
+    for found, covered, told in ((outer, 780, True), (outer, 850, False), (at_a_face, 780, False)):
+        changed = replace(by_default, outer=found, simulated=SimulatedFacts(1000, 900, covered))
+        step = beyond_the_ellipsoid(changed, RoaOptions(), Effort(10 * UNIT))
+        assert step is not None and (step == domain) is not told
+        assert (f"N ends where it does not fall, at x = {number(outer.witness[0], 4)}" in step.why) is told
+        assert not told or step.options == (("--candidate", "polynomial"),)
 
 
 @pytest.mark.parametrize(

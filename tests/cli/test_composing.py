@@ -14,6 +14,7 @@ import pytest
 from certify.certificates import parse_certificate
 from certify.certificates.handover import share
 from certify.cli.main import _run
+from certify.loop.policies import Policy, save_policy
 from tests.checker.test_handover import dumped, ellipsoids, far, near, of_forms
 from tests.support.certificates import Document, edited
 
@@ -44,6 +45,24 @@ def test_two_are_joined(two: list[str], tmp_path: Path, capsys: pytest.CaptureFi
     for options in ([], ["--reference"]):
         assert _run(["check", certificate, *options], False) == 0
     assert "of every plant that is one of the certificate above" in capsys.readouterr().out
+
+
+def test_a_policy_file_is_compared_with_both(
+    two: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second claim's domain is wider than the box in which the policy file's numbers are its origin's."""
+    Path(two[2]).write_bytes(dumped(near(domain=[("-4", "4")])))
+    assert _run(two, False) == 0
+    certificate, policy = str(tmp_path / "out" / "certificate.json"), str(tmp_path / "policy.pt")
+    network = parse_certificate(Path(certificate).read_bytes(), "").network
+    for half, said in (
+        (4.0, "ACCEPTED"),
+        (3.5, "of the claim that takes over, the certificate's domain of x must lie in"),
+    ):
+        save_policy(policy, Policy(network, "plant", valid=np.array([[-half, half]])))
+        capsys.readouterr()
+        assert _run(["check", certificate, "--policy", policy], False) == (0 if half == 4 else 1)
+        assert said in capsys.readouterr().out
 
 
 def test_the_words_of_the_terminal(two: list[str], capsys: pytest.CaptureFixture[str]) -> None:

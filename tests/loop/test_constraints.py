@@ -50,7 +50,7 @@ theta = "2*pi"
 wall = "p <= length"
 force = "abs(F) < 8"
 obstacle = "(p - 1)**2 + (theta)**2 >= 0.25"
-plain = "p - 3 + wind"
+plain = "p - 3 + wind < 0"
 """
 p, theta, F, wind = map(Symbol, ("p", "theta", "F", "wind"))
 
@@ -101,6 +101,7 @@ def test_constraints_follow_what_changes_the_plant(tmp_path: Path) -> None:
         ('[angles]\nphi = "2*pi"', "'phi' is no state"),
         ('[constraints]\nwall = "p == 1"', "compare two expressions by <=, <, >= or >"),
         ('[constraints]\nwall = "-1 <= p <= 1"', "write two constraints"),
+        ('[constraints]\nwall = "p - 1.5"', "write 'p - 1.5 <= 0' if it must not be positive, 'p - 1.5 >= 0' if"),
         ('[constraints]\nwall = "q <= 1"', "'q' is no state, input, parameter or disturbance"),
         ('[constraints]\nwall = "1 <= 2"', "must depend on a state or an input"),
         ("[constraints]\nwall = 3", "must be a comparison as text"),

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from certify.analysis.inputs import lines
 from certify.errors import InputError
 from certify.loop.networks import Clip, Map
 from certify.loop.plants import get_system
@@ -288,6 +289,7 @@ def test_a_file_may_centre_its_network_itself(kind: str, form: str, tmp_path: Pa
         found = import_policy(saved(module, form, path), PLANT, SAID)
     assert found.policy.network.centre == centre
     assert ("net(o_eq)" in found.formula) == (centre != "none")
+    assert ("pi(0)    u_eq = 0, exactly" in lines(found)) == (centre != "none")
     agree(found.policy, module)
 
 

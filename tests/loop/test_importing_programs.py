@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from certify.errors import InputError
-from certify.loop.networks import Clip, Concat, Observe, Sum
+from certify.loop.networks import Affine, Clip, Concat, Map, Network, Observe, Sum
+from certify.loop.networks.written import as_written
 from certify.loop.plants import System, get_system, load_system
 from certify.loop.policies import load_policy, save_policy
 from certify.loop.policies.importers import ImportOptions, import_state_dict
@@ -99,6 +100,39 @@ def test_state_dicts_of_every_activation(name: str) -> None:
     for k in (0, 2, 4):
         h = nn.functional.linear(phi(h) if k else h, *(torch.tensor(tensors[f"{k}.{p}"]) for p in ("weight", "bias")))
     assert np.allclose(found.policy.network(STATES, (Fraction(0),)), h.numpy(), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("states", "words"),
+    [
+        (("theta", "theta_dot"), "2-6-5-1 leaky relu (slope 0.01)"),
+        (("sin(theta)", "theta_dot"), "2-6-5-1 leaky relu (slope 0.01) of sin(theta), theta_dot"),
+    ],
+)
+def test_leaky_relu_is_shown_as_it_was_written(states: tuple[str, ...], words: str) -> None:
+    """The widths are those of the layers that the file has; the steps stay as they are."""
+    module = nn.Sequential(nn.Linear(2, 6), nn.LeakyReLU(), nn.Linear(6, 5), nn.LeakyReLU(), nn.Linear(5, 1))
+    network = import_module(module, PLANT, replace(SAID, states=states)).policy.network
+    assert network.words == words and network.layers == (2, 6, 5, 1)
+    assert network.network.functions == ("relu",) and len(network.network.steps) >= 11
+
+
+def test_a_sum_that_is_no_leaky_relu_is_shown_as_steps() -> None:
+    """A skip around relu has factors of another sum than 1, or one function has two arguments."""
+    one, two = Affine((0,), 0.5 * np.eye(2), np.zeros(2)), Affine((2,), 0.25 * np.eye(2), np.zeros(2))
+    relu, last = Map((0,), "relu"), Affine((4,), np.ones((1, 2)), np.zeros(1))
+    good = (one, relu, replace(two, weight=0.5 * np.eye(2)), Sum((1, 3)), last)
+    others = {
+        "another sum": (one, relu, two, Sum((1, 3)), last),
+        "no multiple": (one, relu, replace(two, weight=np.diag([0.5, 0.25])), Sum((1, 3)), last),
+        "a bias": (replace(one, bias=np.ones(2)), *good[1:]),
+        "another function": (one, Map((0,), "tanh"), *good[2:]),
+        "another argument": (one, replace(relu, of=(1,)), *good[2:]),
+        "read twice": (*good[:3], Sum((1, 3)), replace(last, of=(4,)), Concat((5, 2))),
+    }
+    assert as_written(Network(2, good)).functions == ("leaky relu (slope 0.5)",)
+    for name, steps in others.items():
+        assert len(as_written(Network(2, steps)).steps) == len(steps), name
 
 
 def test_every_activation_that_is_named_has_steps() -> None:

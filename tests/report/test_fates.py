@@ -21,7 +21,7 @@ from certify.loop.plants.equations import parse_expression
 from certify.loop.policies import PolicyNetwork
 from certify.lyapunov.function import Quadratic
 from certify.report import simulated_roa_fraction
-from certify.report.figures import draw, region_of
+from certify.report.figures import draw, region_of, simulated_roa
 from certify.report.figures.portrait import keys
 from certify.report.figures.scene import Detail, Scene
 from certify.report.figures.style import LEAVING, UNSETTLED
@@ -131,6 +131,14 @@ def test_the_grids_runs_last_until_they_are_home() -> None:
     assert simulated_roa_fraction(plane("-x", "-y"), QUIET, np.eye(2), 0.04).horizon == pytest.approx(15)
 
 
+def test_trajectories_are_drawn_as_long_as_the_grids_runs() -> None:
+    """Of the same plant: half of 1/4 brings none home from the domain's edge, half of a few units does."""
+    scene = Scene(certificate(plane("-tanh(60*x)", "-tanh(60*y)"), 0.04), accepted=True)
+    assert runs_from(scene, starts(scene)).unsettled.any()
+    assert simulated_roa(scene) is not None
+    assert runs_from(scene, starts(scene)).settled.all()
+
+
 def test_what_leaves_is_drawn_so() -> None:
     """Beyond |x| = 1 everything leaves."""
     pictures, roa = draw(certificate(plane("x**3 - x", "-y", 2), 0.8), accepted=True)
@@ -174,6 +182,10 @@ def test_states_from_which_an_input_leaves_its_bounds_are_outside_the_simulated_
     (bound,) = system.input_bounds
     assert np.array_equal(roa.attracted, np.broadcast_to(np.abs(roa.axes[1]) <= float(bound[1]), roa.attracted.shape))
     assert not roa.attracted.all() and roa.attracted.any()
+    said = simulated_of(roa, certificate(system, 0.5))
+    assert roa.clipped == int(roa.left.sum()) and said["clipped"] and said["bounds"] == " or the bounds of inputs"
+    clipped = simulated_roa_fraction(system, replace(follows, clip=(-np.ones(1), np.ones(1))), np.eye(2), 0.5)
+    assert clipped.attracted.all() and clipped.clipped is None
 
 
 def test_a_curved_edge_is_found_as_if_the_whole_grid_were_fine() -> None:

@@ -19,6 +19,8 @@ from certify.certificates.ellipsoids import sublevel_set
 from certify.certificates.membership import Region, region_of
 from certify.effort import Effort
 from certify.errors import InputError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.policies import clipped_at
 from certify.provers.ranks import Enough
 
 _FOR_RUNS = 0.06  # share of the whole effort for simulated runs
@@ -89,7 +91,19 @@ class Simulation:
         state = state if state.simulated is not None else _simulated(state, self.tools, effort)
         if state.simulated is None:
             return state
-        return state.with_result(simulated=state.simulated.facts(region_of(accepted.certificate)))
+        region, share = region_of(accepted.certificate), effort.part(_FOR_RUNS * self.tools.whole)
+        with self.tools.timing("simulate"):
+            return state.with_result(simulated=state.simulated.facts(region, _clipped(state), share))
+
+
+def _clipped(state: State) -> Simulator | None:
+    """Runs of the policy that saturates at the inputs' bounds; None where its form keeps it within them."""
+    problem, claim = state.contest.best.trial.task.problem, state.claim
+    system = problem.loop.system
+    network = clipped_at(problem.loop.network, system.input_bounds)
+    if network is None or claim is None:
+        return None
+    return Simulator(ClosedLoop(system, network), problem.V, claim.roa)
 
 
 def _simulated(state: State, tools: Tools, effort: Effort) -> State:

@@ -24,7 +24,7 @@ from certify.loop.expressions import (
     total,
 )
 from certify.loop.plants.deviations import constraints_of_values, in_deviations
-from certify.loop.plants.equations import parse_comparison
+from certify.loop.plants.equations import difference, parse_comparison
 from certify.loop.plants.system import System
 
 _MOST_PARTS = 16  # inequalities that one is divided into
@@ -45,7 +45,7 @@ def with_constraints(system: System, keep: Iterable[str], avoid: Iterable[str]) 
             name, smaller, larger = _read(system, option, text)
             if option == "avoid":
                 smaller, larger = larger, smaller
-            g = smaller if larger is Number(0) else smaller - larger
+            g = difference(smaller, larger)
             name = name or _unused(option, found)
             if name in found:
                 raise OptionError(f"`{option}` {text!r}: {system.name} has a constraint {name} already; name another.")

@@ -74,15 +74,27 @@ def parse_constraint(
     known: str = "state, input, parameter or disturbance",
     networks: Mapping[str, Network] | None = None,
 ) -> Expression:
-    """The expression g of a constraint g < 0: of a comparison `a <= b` or `b >= a` the difference a - b, of another
-    text itself. Strict and other comparisons mean the same, since g < 0 is what is proved.
+    """The expression g of a constraint g < 0: of a comparison `a <= b` or `b >= a` the difference a - b. Strict and
+    other comparisons mean the same, since g < 0 is what is proved.
 
     Raises
     ------
-    InputError : the text is neither one comparison of two expressions nor an expression.
+    InputError : the text is no comparison of two expressions.
     """
     sides = parse_comparison(text, names, known, networks)
-    return parse_expression(text, names, known, networks) if sides is None else sides[0] - sides[1]
+    if sides is None:
+        parse_expression(text, names, known, networks)  # whose message comes first, of a text that cannot be read
+        source = " ".join(str(text).split())
+        raise InputError(
+            f"constraint {source!r}: it must compare two expressions; write '{source} <= 0' if it must not be "
+            f"positive, '{source} >= 0' if it must not be negative."
+        )
+    return difference(*sides)
+
+
+def difference(smaller: Expression, larger: Expression) -> Expression:
+    """The expression that is negative where one is smaller than the other, without a zero that was written."""
+    return smaller if larger is Number(0) else smaller - larger
 
 
 def parse_comparison(

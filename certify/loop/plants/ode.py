@@ -1,5 +1,5 @@
-"""The Runge-Kutta step that simulates plants for training, falsification and pictures, never for a proof; and the
-eigenvalues of plants at simulated states.
+"""The Runge-Kutta step that simulates plants for training, falsification and pictures, never for a proof; the
+eigenvalues of plants at simulated states, and the time that runs last.
 
 There is one copy, so that training is reproducible bit by bit.
 """
@@ -13,6 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+LATE, DOUBLINGS = 0.01, 6
+"""Share of the runs that has to converge in twice their time for it to be doubled, and how often it is."""
 _APART = 1e-5  # of the states' widths, between the points of a difference
 T = TypeVar("T")
 
@@ -72,6 +75,33 @@ def fastest_at(field: Callable[[Array], Array], x: Array, widths: Array) -> Arra
     found = np.full(len(x), np.inf)
     found[finite] = np.abs(np.linalg.eigvals(J[finite])).max(-1)
     return found
+
+
+def lengthened(
+    found: Mask, undecided: Mask, again: Callable[[NDArray[np.int64], int], tuple[Mask, Mask] | None], most: int
+) -> int:
+    """Double the time of runs as long as that lets more of them converge, and say how often that was, at most `most`.
+
+    Where an input saturates the way to the origin may take far longer than the motion about it.
+
+    Parameters
+    ----------
+    found, undecided : of each run (N,): that it converges, that it does neither this nor leave; both are brought up to
+        date.
+    again : the same of some runs, by their numbers, in 2^k times the time; None where that costs too much.
+
+    >>> found, needed = np.zeros(4, dtype=bool), np.array([1, 2, 3, 40])
+    >>> lengthened(found, ~found, lambda at, k: (needed[at] <= 2**k, needed[at] > 2**k), DOUBLINGS), found.tolist()
+    (2, [True, True, True, False])
+    """
+    least = max(LATE * len(found), 1)
+    for k in range(most):
+        at = np.flatnonzero(undecided)
+        longer = again(at, k + 1) if len(at) >= least else None
+        if longer is None or longer[0].sum() < least:
+            return k
+        found[at], undecided[at] = longer
+    return most
 
 
 def _jacobians(field: Callable[[Array], Array], x: Array, widths: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certify.loop.policies.exact import bounded_by_form, require_centred
+from certify.loop.policies.exact import bounded_by_form, clipped_at, require_centred
 from certify.loop.policies.file import Policy, load_policy, save_policy
 from certify.loop.policies.network import Centre, PolicyNetwork, program_of
 
@@ -11,6 +11,7 @@ __all__ = [
     "Policy",
     "PolicyNetwork",
     "bounded_by_form",
+    "clipped_at",
     "load_policy",
     "program_of",
     "require_centred",

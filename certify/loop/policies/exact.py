@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -37,6 +38,16 @@ def bounded_by_form(network: PolicyNetwork, bounds: Sequence[tuple[Fraction, Fra
     elif not known:
         return False
     return all(lo <= a and b <= hi for (a, b), (lo, hi) in zip(ranges, bounds, strict=True))
+
+
+def clipped_at(network: PolicyNetwork, bounds: Sequence[tuple[Fraction, Fraction]]) -> PolicyNetwork | None:
+    """The policy that saturates at the inputs' bounds, in floats; None where its form keeps it within them."""
+    if bounded_by_form(network, bounds):
+        return None
+    ends = np.array([[float(end) for end in ends] for ends in bounds])
+    lo, hi = network.clip or (-math.inf, math.inf)
+    clip = np.maximum(lo, ends[:, 0]), np.minimum(hi, ends[:, 1])
+    return replace(network, clip=clip) if np.all(clip[0] < clip[1]) else None
 
 
 def raw_at_origin(network: PolicyNetwork) -> tuple[Fraction | None, ...]:

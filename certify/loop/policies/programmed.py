@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from certify.errors import InputError
 from certify.loop.networks import Affine, Network, layered
+from certify.loop.networks.written import as_written
 
 Array = NDArray[np.float64]
 WHOSE = "the policy"  # in messages
@@ -34,15 +35,16 @@ class Programmed:
 
     @property
     def layers(self) -> tuple[int, ...]:
-        """Widths from what the first layer reads to the input, such as (2, 16, 16, 1)."""
-        return self.network.widths
+        """Widths from what the first layer reads to the input, such as (2, 16, 16, 1), as they were written."""
+        return as_written(self.network).widths
 
     @property
     def words(self) -> str:
         """Widths and functions, such as `2-16-16-1 tanh`, or how many steps there are, for people."""
-        network, functions = self.network, "".join(f" {name}" for name in self.network.functions)
+        network = as_written(self.network)
+        functions = "".join(f" {name}" for name in network.functions)
         if network.is_observed_chain:
-            text = "-".join(map(str, self.layers)) + functions
+            text = "-".join(map(str, network.widths)) + functions
         else:
             text = f"{self.n} to {self.m} in {len(network.steps)} steps" + (functions and f" with{functions}")
         return (

@@ -19,7 +19,7 @@ from certify.effort import UNLIMITED, Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.constraints import keeping
 from certify.loop.plants import corners
-from certify.loop.plants.ode import eigenvalues_of, fastest_at, rk4_step
+from certify.loop.plants.ode import DOUBLINGS, eigenvalues_of, fastest_at, lengthened, rk4_step
 from certify.loop.policies import bounded_by_form
 from certify.lyapunov.function import Quadratic
 
@@ -29,7 +29,7 @@ _STEP = 0.5  # of the time constant of the fastest eigenvalue
 _HORIZON = 12.0  # time constants of the slowest
 _MAX_STEPS, _FEWEST_STEPS = 3000, 100
 _RATE_SAMPLES = 300
-_TRIED, _LATE, _DOUBLINGS = 200, 0.01, 6  # runs, share of them that converges in twice their time for it to be doubled
+_TRIED = 200  # runs by which the time is found that they last
 _OFTEN = 4  # steps of a run after which its step is chosen anew
 _SHELL = 0.75  # of c, inside of which nothing is asked
 _NEAR = 0.93  # of a domain's half-width: from here on its faces are near
@@ -104,22 +104,15 @@ class LearningFlow:
         self.by_state = decays and self.steps * self.step < horizon  # one step for all does not come so far
 
     def _lengthen(self, x: Array) -> None:
-        """Double the time of runs as long as that lets more of those from x (B, n) converge.
+        """Let runs last as long as more of those from x (B, n) converge."""
+        once = self.horizon
 
-        Where the input saturates the way to the origin may take far longer than the motion about it.
-        """
-        late = _LATE * len(x)
-        fate = self.run(x, np.ones(self.n)).fate
-        for _ in range(_DOUBLINGS):
-            x = x[fate == Fate.UNDECIDED]
-            if len(x) < late:
-                return
-            before = self.horizon
-            self._last(2 * before)
-            fate = self.run(x, np.ones(self.n)).fate
-            if np.sum(fate == Fate.CONVERGED) < late:
-                self._last(before)
-                return
+        def runs(at: NDArray[np.int64], k: int) -> tuple[Mask, Mask]:
+            self._last(2**k * once)
+            fate = self.run(x[at], np.ones(self.n)).fate
+            return fate == Fate.CONVERGED, fate == Fate.UNDECIDED
+
+        self._last(2 ** lengthened(*runs(np.arange(len(x)), 0), runs, DOUBLINGS) * once)
 
     def _slowest(self) -> float:
         """The rate at which the slowest motion about the origin decays; not positive if one does not."""

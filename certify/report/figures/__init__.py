@@ -56,13 +56,12 @@ def draw(
 
 
 def simulated_roa(scene: Scene) -> SimulatedRoa | None:
-    """The simulated region of attraction where there is one (n <= 2)."""
+    """The simulated region of attraction where there is one (n <= 2); trajectories are drawn as long as its runs."""
     if scene.n > 2:
         return None
-    network = scene.certificate.network
-    return simulated_roa_fraction(
+    found = simulated_roa_fraction(
         scene.system,
-        network,
+        scene.certificate.network,
         scene.P,
         scene.outer,
         settled=scene.settling_level,
@@ -71,6 +70,9 @@ def simulated_roa(scene: Scene) -> SimulatedRoa | None:
         centre=scene.centre,
         beyond=scene.in_more,
     )
+    if found.horizon > 1.5 * scene.horizon:  # it was doubled, and half of it brings too few home
+        scene.drawn = found.horizon
+    return found
 
 
 def region_of(scene: Scene, roa: SimulatedRoa | None) -> Region | None:

@@ -142,10 +142,10 @@ class Scene:
         self.detail = Detail.of(certificate.network, len(self.pairs))
         # With more than two states nothing is simulated from outside the sets.
         self.step, self.horizon = time_scales(self.flow, self.detail.rates, None if self.n <= 2 else self.far)
-        units = self.system.units
+        self.drawn = 0.5 * self.horizon  # of trajectories
         points = zip(self.system.states, self.system.exact_x_eq(), strict=True)
-        self.labels = [deviation(s.name, q, units.get(s.name, "")) for s, q in points]
-        self.input_labels = [label(s.name, units.get(s.name, "")) for s in self.system.inputs]
+        self.labels = [deviation(s.name, q, self.system.units.get(s.name, "")) for s, q in points]
+        self.input_labels = [label(s.name, self.system.units.get(s.name, "")) for s in self.system.inputs]
         # Another solver's word has no leaves; a partition in z, x = T z, is drawn only if it is small enough.
         evidence = certificate.evidence
         self.T, self.root = np.eye(self.n), np.ones(self.n)

@@ -16,11 +16,11 @@ _MOST_SHORT = 8  # times as many where a period is shorter than a step would be
 
 
 def runs_from(scene: Scene, begin: ArrayLike, steps: int | None = None) -> Runs:
-    """Trajectories with their fates, by default over the tube and half the horizon; smooth for a picture."""
+    """Trajectories with their fates, over the tube and the time that the scene says; smooth for pictures."""
     wanted = PATH_STEP * scene.step
     step = scene.flow.fitting(wanted)
     every = min(max(int(wanted / step), 1), _MOST_SHORT) if scene.flow.period else 1  # of short periods some are kept
-    count = steps or min(int((scene.duration + 0.5 * scene.horizon) / step) + 1, every * scene.detail.steps)
+    count = steps or min(int((scene.duration + scene.drawn) / step) + 1, every * scene.detail.steps)
     starts, target = np.asarray(begin, dtype=np.float64), scene.settling_level
     begins = scene.start, scene.centre, scene.in_more
     runs = runs_of(scene.flow, starts, scene.P, scene.outer, target, step, count, scene.effort, *begins)

@@ -32,6 +32,8 @@ def simulated_of(roa: SimulatedRoa, certificate: Certificate) -> dict[str, str]:
         "left": f"{int(roa.left.sum()):,}",
         "contradictions": f"{roa.contradictions:,}" if roa.contradictions else "",
         "slow": f"{roa.slow:,}" if roa.slow else "",
+        "bounds": "" if roa.clipped is None else " or the bounds of inputs",
+        "clipped": f"{roa.clipped:,}" if roa.clipped else "",
         "of": volume_name(certificate.system.n),
         "who": words_for(certificate.kind).simulated,
     }

@@ -61,7 +61,7 @@ class Imported:
     compared_with : the file's own program that it was compared with, for people; None without a comparison.
     assumed : without a comparison, the source of the functions between the numbers.
     not_read : the reason why each unread tensor of the file is left out, by its name.
-    at_origin : pi(0), shape (m,).
+    at_origin : pi(0) of the file's policy, shape (m,); u_eq where its own centring makes it so.
     u_eq : the plant's equilibrium input, shape (m,).
     centring : for each centring that is possible the largest change of u over the states compared.
     """
@@ -181,8 +181,8 @@ def import_bytes(
         compared_with=reading.program,
         assumed=reading.assumed,
         not_read=reading.unread,
-        at_origin=np.asarray(bare(np.zeros(plant.n), u_eq)),
-        u_eq=np.array([float(u) for u in u_eq]),
+        at_origin=np.array(list(map(float, u_eq))) if own != "none" else np.asarray(bare(np.zeros(plant.n), u_eq)),
+        u_eq=np.array(list(map(float, u_eq))),
         centring={} if own != "none" or reading.scores else _centrings(bare, u_eq, x, values),
     )
 
