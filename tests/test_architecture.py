@@ -10,6 +10,7 @@ from functools import cache
 from graphlib import TopologicalSorter
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -57,18 +58,39 @@ def units() -> dict[str, list[Path]]:
     return found
 
 
+class Source(NamedTuple):
+    """A file's absolute names of the modules that it imports, at any depth of the code; those that it needs when it is
+    loaded or run, each with a name that it takes from there; and its checks by assert and bare excepts."""
+
+    imports: frozenset[str]
+    needed: frozenset[tuple[str, str]]
+    faults: int
+
+
 @cache
-def imports(path: Path) -> frozenset[str]:
-    """Absolute names of the modules that a file imports, at any depth of the code."""
-    found = set()
+def source(path: Path) -> Source:
+    found, needed, faults = set[str](), set[tuple[str, str]](), 0
     package = path.relative_to(ROOT).with_suffix("").parts[:-1]
-    for node in ast.walk(ast.parse(path.read_text())):
+    tree = ast.parse(path.read_text())
+    hidden = {id(n) for block in ast.walk(tree) if _for_types_only(block) for n in ast.walk(block)}
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             base = list(package[: len(package) - node.level + 1]) if node.level else []
             found.add(".".join([*base, *(node.module.split(".") if node.module else [])]))
-    return frozenset(found)
+            if node.module and id(node) not in hidden and not node.level:
+                needed |= {(node.module, alias.name) for alias in node.names}
+        faults += isinstance(node, ast.Assert) or (isinstance(node, ast.ExceptHandler) and node.type is None)
+    return Source(frozenset(found), frozenset(needed), faults)
+
+
+def _for_types_only(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+
+
+def imports(path: Path) -> frozenset[str]:
+    return source(path).imports
 
 
 def modules(name: str) -> list[Path]:
@@ -129,19 +151,9 @@ def module_arrows() -> dict[str, set[str]]:
     names = {".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): p for p in paths}
     found = {}
     for name, path in names.items():
-        tree = ast.parse(path.read_text())
-        hidden = {id(n) for block in ast.walk(tree) if _for_types_only(block) for n in ast.walk(block)}
-        wanted = set()
-        for node in ast.walk(tree):
-            if isinstance(node, ast.ImportFrom) and node.module and id(node) not in hidden and not node.level:
-                inner = [f"{node.module}.{alias.name}" for alias in node.names]
-                wanted |= {i if i in names else node.module for i in inner}
-        found[name] = (wanted & names.keys()) - {name}
+        inner = ((module, f"{module}.{taken}") for module, taken in source(path).needed)
+        found[name] = ({i if i in names else module for module, i in inner} & names.keys()) - {name}
     return found
-
-
-def _for_types_only(node: ast.AST) -> bool:
-    return isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
 
 
 @pytest.mark.parametrize("graph", [arrows, module_arrows])
@@ -252,6 +264,4 @@ def test_help_and_a_check_load_no_arithmetic(command: list[str]) -> None:
 
 def test_no_checks_by_assert_and_no_bare_except() -> None:
     for path in [*ROOT.glob("certify/**/*.py"), *ROOT.glob("controllers/**/*.py")]:
-        for node in ast.walk(ast.parse(path.read_text())):
-            assert not isinstance(node, ast.Assert), path
-            assert not (isinstance(node, ast.ExceptHandler) and node.type is None), path
+        assert not source(path).faults, path

@@ -592,7 +592,8 @@ def test_a_run_that_lost_its_cluster_is_gone_on_with(
     if again:
         end = certified(tmp_path, Troupe(), monkeypatch, resume=True)
     else:
-        end = certify_roa(WIDE, pendulum_network(), tmp_path, RoaOptions(resume=True, effort=0.24))
+        options = RoaOptions(resume=True, candidate="ellipsoid", effort=0.24)
+        end = certify_roa(WIDE, pendulum_network(), tmp_path, options)
     assert end.verdict is Verdict.PROVED and end.search is None and accepted(end)
     assert end.levels.roa is not None and honest.levels.roa is not None and found.levels.roa is not None
     assert end.levels.roa >= found.levels.roa

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from threadpoolctl import threadpool_info
+from threadpoolctl import ThreadpoolController, threadpool_info
 
 from certify.analysis.options import RoaOptions
 from certify.analysis.run import certify_roa
 from certify.loop.plants import get_system
 from certify.loop.policies import load_policy
-from certify.provers.execution import ThreadRunner, in_pieces
+from certify.provers.execution import ThreadRunner, in_pieces, threads
 from certify.provers.execution.threads import cores
 from tests.support.marks import slow_after
 from tests.support.ways import Way, bounded
@@ -41,8 +42,8 @@ def test_the_certificate_has_the_same_bytes(name: str, tmp_path: Path, monkeypat
     system = get_system(policy.system).with_parameters(policy.parameters)
     found = []
     runs: list[tuple[int, Way]] = [(1, "compiled"), (2, "compiled"), (3, "compiled"), (2, "numpy")]
-    for k, (threads, way) in enumerate(runs):
-        monkeypatch.setenv("OMP_NUM_THREADS", str(threads))
+    for k, (count, way) in enumerate(runs):
+        monkeypatch.setenv("OMP_NUM_THREADS", str(count))
         with bounded(way):
             result = certify_roa(system, policy.network, tmp_path / str(k), RUNS[name])
         assert result.certificate is not None
@@ -85,3 +86,22 @@ def test_linear_algebra_is_on_one_thread_while_boxes_are_bounded() -> None:
 
     with ThreadRunner(2).start(seen) as bound:
         assert (bound(np.zeros((1, 600)), np.ones((1, 600)), 0.0, 1.0)[0] == 1).all()
+
+
+def test_libraries_are_looked_for_again_once_there_are_other_modules(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked = list[int]()
+
+    class Controller(ThreadpoolController):
+        def __init__(self) -> None:
+            looked.append(len(sys.modules))
+            super().__init__()
+
+    monkeypatch.setattr(threads, "ThreadpoolController", Controller)
+    threads._libraries.cache_clear()
+    for name in ("first", "second"):
+        for _ in range(3):
+            with threads.one_thread():
+                assert {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"} == {1}
+        monkeypatch.setitem(sys.modules, name, sys)
+    assert len(looked) == 2
+    threads._libraries.cache_clear()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -23,6 +25,16 @@ from tests.support.outer import uniform
 
 FAST = ("scalar", "rotor", "sampled", "practical, clipped", "local only", "outer, an expression")
 COMMAND = [sys.executable, "-I", "-m", "certify.reference"]
+JUDGE = """
+import json, sys
+from certify.reference import batches
+from certify.reference.__main__ import line
+from certify.reference.rules import judge
+batches.COLUMNS = 1
+for asked in sys.stdin:
+    raw, jobs = json.loads(asked)
+    print(json.dumps(line(judge(raw.encode(), jobs=jobs))), flush=True)
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -30,20 +42,39 @@ def small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "COLUMNS", 1)
 
 
+@pytest.fixture(scope="module")
+def judged() -> Iterator[Callable[[bytes, int], str]]:
+    """The answer of a process that has loaded only the reference, with small batches: copies of it cost a tenth of
+    copies of this one."""
+    command = [sys.executable, "-I", "-c", JUDGE]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None and process.stdout is not None
+        ask, answer = process.stdin, process.stdout
+
+        def judged(raw: bytes, jobs: int) -> str:
+            ask.write(json.dumps((raw.decode(), jobs)) + "\n")
+            ask.flush()
+            found: str = json.loads(answer.readline())
+            return found
+
+        yield judged
+
+
 def honest(name: str) -> Document:
     return with_ball(of_version_3(name))
 
 
 @pytest.mark.parametrize("name", slow_after(len(FAST), [*FAST, *(name for name in HONEST if name not in FAST)]))
-def test_the_answer_is_that_of_one_process(name: str) -> None:
+def test_the_answer_is_that_of_one_process(name: str, judged: Callable[[bytes, int], str]) -> None:
     """Of one leaf and of many, on some of which a rule refuses: the first of these is named."""
     data = honest(name)
     n = len(data["plant"]["states"])
     for tree in (None, b"\xff", *(uniform(range(n), depth * n) for depth in (1, 2, 3))):
         raw = dump(data if tree is None else with_tree(data, tree))
-        one = line(judge(raw))
+        one = judged(raw, 1)
+        assert one == line(judge(raw))
         for jobs in (2, 3, 7):
-            assert line(judge(raw, jobs=jobs)) == one
+            assert judged(raw, jobs) == one
 
 
 @pytest.mark.parametrize("jobs", [2, 5])

@@ -8,14 +8,16 @@ would meet at every product.
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from certify.provers.execution.base import Bound, Work
 
@@ -31,8 +33,14 @@ def cores() -> int:
 
 def one_thread() -> AbstractContextManager[Any]:
     """Linear algebra on the thread that asks for it, so that rounding does not depend on how many there are."""
-    limits: AbstractContextManager[Any] = threadpool_limits(1, user_api="blas")
+    limits: AbstractContextManager[Any] = _libraries(len(sys.modules)).limit(limits=1, user_api="blas")
     return limits
+
+
+@lru_cache(maxsize=1)
+def _libraries(modules: int) -> ThreadpoolController:
+    """The libraries that are loaded, looked for again once there are other modules: one comes with a module."""
+    return ThreadpoolController()
 
 
 def in_pieces(bound: Bound, each: Callable[..., Iterable[Any]] = map) -> Bound:
