@@ -66,6 +66,13 @@ def test_a_start_that_ends_at_a_saddle() -> None:
     assert float(stay.x[1]) == 0.5 and np.abs(np.array(stay.at, dtype=float)).max() < 1e-12
 
 
+def test_a_start_beside_a_saddle_does_not_rest() -> None:
+    """The line of starts crosses the saddle's small N at once; the saddle itself is not of the box."""
+    system = stepped("101/100*p + 1000000*p**3", "v/2")
+    stay = searched(system, gain(0.0, 0.0), from_rest("-0.32", "0.31", "1e-8"), "p**2 >= 1/100000")
+    assert stay is not None and stay.steps > 0 and abs(float(stay.x[0])) <= stay.error
+
+
 def test_the_part_that_arrives_is_proved_beside_it(tmp_path: Path) -> None:
     system, network, begin = SADDLE
     result = certify_reach(system, network, tmp_path, ReachOptions(target=(AWAY,), begin=begin, effort=0.02))
