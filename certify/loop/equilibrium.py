@@ -197,9 +197,10 @@ def _rates_in(loop: ClosedLoop, x: Sequence[Fraction], free: Sequence[int], arou
     named |= {s: {frozenset({(s, 1)}): Fraction(1)} for s in (*(system.states[i] for i in free), *system.inputs)}
     found: dict[object, Expression] = {}
     for s, f in zip(system.states, loop.dynamics, strict=True):
-        rate = _decided(f - s if system.time == "discrete" else f, values)
+        rate = f - s if system.time == "discrete" else f
         if not evaluate_arb(rate, values).is_finite():
             return None
+        rate = _decided(rate, values)
         terms = evaluate(rate, named, _Multiplied())
         if terms:
             first = terms[min(terms, key=hash)]

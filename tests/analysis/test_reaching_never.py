@@ -158,10 +158,20 @@ def test_rests_are_shown_within_their_radius_alone() -> None:
         assert both is not None and both[1].contains(0)
 
 
+def test_nothing_rests_where_a_rate_has_no_value() -> None:
+    """Floats take v for 1/3."""
+    loop = ClosedLoop(stepped("p + p/10/heaviside(v - 1/3)", "v"), gain(0.0, 0.0))
+    with precision():
+        for off, shown in ((Fraction(1, 10**30), True), (Fraction(-1, 10**30), False)):
+            found = rest_in(loop, [Fraction(0), Fraction(1, 3) + off], [0], [Fraction(1, 100)] * 2)
+            assert (found is not None) is shown
+
+
 @pytest.mark.parametrize(
     ("p", "v", "size"),
     [
         ("6*p/5 + v**2", "v/2 + p**2", 1e-2),
+        ("6*p/5 + 20*v**2", "v/2", 1e-3),
         ("-6*p/5 + v**2", "v/2 + p**2", 1e-2),
         ("101*p/100 + p**3", "v/2", 1e-2),
         ("101*p/100 - 10*p**3", "v/2", 1e-3),
