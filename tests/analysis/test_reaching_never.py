@@ -14,7 +14,7 @@ from certify.analysis.reaching import ReachOptions, certify_reach
 from certify.analysis.reaching.never import Search, Stay
 from certify.analysis.reaching.options import target_of
 from certify.analysis.reaching.runs import Simulation, begins
-from certify.analysis.reaching.saddle import Saddle, saddle_at
+from certify.analysis.reaching.saddle import Saddle, _norm, _spectral, saddle_at
 from certify.certificates.ellipsoids import Box
 from certify.certificates.verdict import Verdict
 from certify.effort import Effort
@@ -136,6 +136,12 @@ ARRIVE = {
         from_rest("-0.2", "0.3"),
         "p**2 >= 1",
     ),
+    "a step that parts the starts on either side of those of a saddle": (
+        stepped("6*p/5 - v/5 + heaviside(p - 1/7 + 1/1000000000)/2", "v/2"),
+        gain(0.0, 0.0),
+        from_rest("0", "0.3", "0.5"),
+        "p**2 >= 1",
+    ),
 }
 
 
@@ -172,6 +178,7 @@ def test_nothing_rests_where_a_rate_has_no_value() -> None:
     [
         ("6*p/5 + v**2", "v/2 + p**2", 1e-2),
         ("6*p/5 + 20*v**2", "v/2", 1e-3),
+        ("6*p/5", "v/2 + 20*p**2", 1e-3),
         ("-6*p/5 + v**2", "v/2 + p**2", 1e-2),
         ("101*p/100 + p**3", "v/2", 1e-2),
         ("101*p/100 - 10*p**3", "v/2", 1e-3),
@@ -199,14 +206,29 @@ def test_a_saddle_covers_itself(p: str, v: str, size: float) -> None:
         ("p + p**3", "v/2"),  # 1 is not growth
         ("6*p/5", "v"),  # nor is it decay
         ("6*p/5 + 1", "v/2"),  # rests elsewhere
+        ("6*p/5", "v/2 + 1"),  # so does this
         ("6*p/5 + 2*abs(p)", "v/2"),  # both sides go to the right
         ("6*p/5 + heaviside(p)/1000", "v/2"),  # a jump at the place
+        ("6*p/5 + heaviside(p - 1/10000000)/1000", "v/2"),  # and beside it
     ],
 )
 def test_other_places_are_no_saddles(p: str, v: str) -> None:
     loop = ClosedLoop(stepped(p, v), gain(0.0, 0.0))
     with precision():
         assert saddle_at(loop, np.zeros(2), np.ones(2)) is None
+
+
+def test_norms_of_balls_are_of_all_that_lies_in_them() -> None:
+    rng = np.random.default_rng(0)
+    with precision():
+        for n in (1, 2, 3, 4) * 5:
+            middle, radius = rng.normal(size=(n, n)), rng.uniform(0, 0.1, (n, n))
+            balls = flint.arb_mat([[flint.arb(m, r) for m, r in zip(*rows, strict=True)]
+                                   for rows in zip(middle.tolist(), radius.tolist(), strict=True)])  # fmt: skip
+            for end in (middle + rng.uniform(-1, 1, (n, n)) * radius, middle + radius, middle - radius):
+                assert _spectral(balls).upper() >= np.linalg.norm(end, 2) - 1e-9
+                assert _norm(balls.tolist()[0]).upper() >= np.linalg.norm(end[0]) - 1e-9
+        assert not _norm([flint.arb.nan()]) < 1 and _norm([]) == 0
 
 
 def test_a_curve_crosses_from_side_to_side_within() -> None:
@@ -224,6 +246,18 @@ def test_a_curve_crosses_from_side_to_side_within() -> None:
         wide = [flint.arb(0.6, 0.2), flint.arb(0)]  # of a D that may be less
         assert not saddle.is_crossed(points(np.zeros(2)), wide)
         assert not saddle.is_crossed(points(np.zeros(2)), [flint.arb.nan(), flint.arb(0)])
+
+
+@pytest.mark.parametrize(("factor", "crosses"), [(1, True), (1000000, False)])
+def test_a_line_that_is_elsewhere_between_its_ends_does_not_cross(factor: int, crosses: bool) -> None:
+    """After a step its ends and its middle have the speed 0, and there it has no slope."""
+    loop = ClosedLoop(stepped("6*p/5", f"v/2 + {factor}*p**3*(1/100 - p**2)"), gain(0.0, 0.0))
+    beyond, begin = target_of(loop.system, (AWAY,)), from_rest("-0.1", "0.1")
+    search = Search(loop, beyond, begin, Simulation(loop, beyond, begin), Effort(1e10))
+    with precision():
+        saddle = saddle_at(loop, np.zeros(2), np.ones(2))
+        assert saddle is not None
+        assert search._crosses((np.array([-0.1, 0.0]), np.array([0.1, 0.0])), saddle, 1) is crosses
 
 
 @pytest.mark.parametrize("seed", range(6))
