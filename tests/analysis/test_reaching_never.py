@@ -137,10 +137,22 @@ ARRIVE = {
         "p**2 >= 1",
     ),
     "a step that parts the starts on either side of those of a saddle": (
-        stepped("6*p/5 - v/5 + heaviside(p - 1/7 + 1/1000000000)/2", "v/2"),
+        stepped("6*p/5 - v/5 + heaviside(v - 3/10)*(heaviside(p - 1/7 + 1/1000000000) - 1/2)/5", "v/2"),
         gain(0.0, 0.0),
         from_rest("0", "0.3", "0.5"),
         "p**2 >= 1",
+    ),
+    "rest outside of the box by less than floats know": (
+        stepped("p + (p - 1/3)/10", "v/2"),
+        gain(0.0, 0.0),
+        ((Fraction(1, 3) + Fraction(1, 10**20), Fraction(1, 2)), (Fraction(0), Fraction(0))),
+        "p >= 1",
+    ),
+    "rest in the target": (
+        stepped("p + p/10", "v/2"),
+        gain(0.0, 0.0),
+        from_rest("-0.1", "0.1"),
+        "min(1 - p**2, p**2 - 1/10000) <= 0",
     ),
 }
 
@@ -179,6 +191,7 @@ def test_nothing_rests_where_a_rate_has_no_value() -> None:
         ("6*p/5 + v**2", "v/2 + p**2", 1e-2),
         ("6*p/5 + 20*v**2", "v/2", 1e-3),
         ("6*p/5", "v/2 + 20*p**2", 1e-3),
+        ("6*p/5", "9*v/10 + 10*p**2", 1e-3),
         ("-6*p/5 + v**2", "v/2 + p**2", 1e-2),
         ("101*p/100 + p**3", "v/2", 1e-2),
         ("101*p/100 - 10*p**3", "v/2", 1e-3),
@@ -258,6 +271,17 @@ def test_a_line_that_is_elsewhere_between_its_ends_does_not_cross(factor: int, c
         saddle = saddle_at(loop, np.zeros(2), np.ones(2))
         assert saddle is not None
         assert search._crosses((np.array([-0.1, 0.0]), np.array([0.1, 0.0])), saddle, 1) is crosses
+
+
+@pytest.mark.parametrize(("v", "crosses"), [("1/8", False), ("1/64", False), ("3/8", True)])
+def test_a_line_that_meets_the_target_on_the_way_does_not_cross(v: str, crosses: bool) -> None:
+    """The speeds after 0, 1, ... steps are 1, 1/2, ...; a part of the line alone is in the target."""
+    loop = ClosedLoop(stepped("6*p/5", "v/2"), gain(0.0, 0.0))
+    beyond, begin = target_of(loop.system, (f"max(abs(v - {v}), abs(p)) <= 1/1000",)), from_rest("-0.1", "0.1", "1")
+    search = Search(loop, beyond, begin, Simulation(loop, beyond, begin), Effort(1e10))
+    with precision():
+        saddle = Saddle(np.zeros(2), np.eye(2), 0.01)
+        assert search._crosses((np.array([-0.1, 1.0]), np.array([0.1, 1.0])), saddle, 8) is crosses
 
 
 @pytest.mark.parametrize("seed", range(6))
