@@ -19,10 +19,10 @@ from certify.certificates.ellipsoids import Box
 from certify.certificates.verdict import Verdict
 from certify.effort import Effort
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.equilibrium import rest_in
+from certify.loop.equilibrium import _is_inside, rest_in
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
-from certify.loop.rigorous import ball, points, precision, step_on
+from certify.loop.rigorous import Balls, ball, points, precision, step_on
 from tests.support.corners import plant
 
 TENTH = (Fraction(1, 10), Fraction(1, 10))
@@ -148,6 +148,12 @@ ARRIVE = {
         ((Fraction(1, 3) + Fraction(1, 10**20), Fraction(1, 2)), (Fraction(0), Fraction(0))),
         "p >= 1",
     ),
+    "a saddle in the target, which its starts reach late": (
+        stepped("p + u + v/10", "4*v/5"),
+        gain(0.2, 0.0),
+        from_rest("-0.4", "0.3", "0.5"),
+        "min(1 - p**2, max(abs(v), abs(p)) - 1/1000) <= 0",
+    ),
     "rest in the target": (
         stepped("p + p/10", "v/2"),
         gain(0.0, 0.0),
@@ -183,6 +189,47 @@ def test_nothing_rests_where_a_rate_has_no_value() -> None:
         for off, shown in ((Fraction(1, 10**30), True), (Fraction(-1, 10**30), False)):
             found = rest_in(loop, [Fraction(0), Fraction(1, 3) + off], [0], [Fraction(1, 100)] * 2)
             assert (found is not None) is shown
+
+
+@pytest.mark.parametrize(
+    ("p", "v", "rests"),
+    [
+        ("2*p - 1/10", "v + 2*p - 1/5", True),
+        ("2*p - 1/10", "v + (p - 1/10)*(p + 3) - p**2 + p/10", True),
+        ("2*p - 1/10", "v + 2*p - 1/5 + 1/1000000000000000000000000000000", False),
+        ("2*p - 1/10", "v + p - 1/5", False),
+        ("2*p - 1/10", "v + 2*p + 1/5", False),
+        ("2*p - 1/10", "v + 2*p - 1/5*cos(v)*exp(v)", True),
+        ("2*p - 1/10", "v + 2*p - 1/5 + cos(v)/10", False),
+        ("2*p - 1/10", "v + 2*p - 1/5 + exp(v)/10", False),
+        ("p + abs(p - 101/1000)/10 + 1/100000", "v", False),
+        ("p + abs(p - 101/1000)/10 - 1/100000", "v + abs(p - 101/1000)/5 - 1/50000", False),  # two, on both sides
+        ("p + (p - 1/10)*(1 + heaviside(p - 101/1000))", "v", False),
+    ],
+)
+def test_rates_are_one_where_they_are_multiples(p: str, v: str, rests: bool) -> None:
+    with precision():
+        found = rest_in(
+            ClosedLoop(stepped(p, v), gain(0.0, 0.0)), [Fraction(1, 10), Fraction(0)], [0], [Fraction(1, 100)] * 2
+        )
+        assert (found is not None) is rests
+        assert found is None or (found[0].contains(ball(Fraction(1, 10))) and found[1] == 0)
+
+
+@pytest.mark.parametrize(
+    ("at", "slope", "shown"),
+    [(0.4, 0.0, True), (0.51, 0.0, False), (0.6, 0.0, False), (0.2, 0.5, True), (0.3, 0.5, False), (0.0, 1.0, False)],
+)
+def test_a_zero_is_shown_where_all_slopes_lead_into_the_box(at: float, slope: float, shown: bool) -> None:
+    def change(x: Balls) -> tuple[Balls, flint.arb_mat]:
+        return [x[0] - at], flint.arb_mat([[flint.arb(1, slope)]])
+
+    def none(x: Balls) -> tuple[Balls, flint.arb_mat]:
+        return [flint.arb.nan()], flint.arb_mat([[1]])
+
+    with precision():
+        assert _is_inside(change, [flint.arb(0)], [flint.arb(0, 0.5)]) is shown
+        assert not _is_inside(none, [flint.arb(0)], [flint.arb(0, 0.5)])
 
 
 @pytest.mark.parametrize(
