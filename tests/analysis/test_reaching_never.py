@@ -137,7 +137,7 @@ ARRIVE = {
         "p**2 >= 1",
     ),
     "a step that parts the starts on either side of those of a saddle": (
-        stepped("6*p/5 - v/5 + heaviside(v - 3/10)*(heaviside(p - 1/7 + 1/1000000000) - 1/2)/5", "v/2"),
+        stepped("6*p/5 - v/5 - max(v - 3/10, 0)/2 + heaviside(p - 1/7 + 1/1000000000 + 10*(v - 1/2))/5", "v/2"),
         gain(0.0, 0.0),
         from_rest("0", "0.3", "0.5"),
         "p**2 >= 1",
