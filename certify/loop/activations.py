@@ -60,7 +60,7 @@ class Activation(ABC):
 
     @abstractmethod
     def formula(self, v: Any) -> Any:
-        """phi of an Arb ball or series; an activation that is not smooth has that of its side."""
+        """phi of an Arb ball or series; an activation that is not smooth has that of its side, if the ball has one."""
 
     def in_torch(self, x: Any) -> Any:
         """phi of a torch tensor."""
@@ -89,6 +89,8 @@ class Activation(ABC):
     def slope_in_arb(self, v: flint.arb) -> flint.arb:
         """phi' on a ball: of all its points, and so a slope for mean values."""
         middle = v.mid()
+        if not middle.is_finite():
+            return flint.arb.nan()
         here = self.formula(flint.arb_series([middle, 1], prec=2))[1]
         found = here + flint.arb(0, 2 * self.bend) * (v - middle)
         most = flint.arb(0, self.steepest)
@@ -238,7 +240,7 @@ class _Relu(_Bent):
         return np.asarray(0.25 / np.abs(y))
 
     def formula(self, v: Any) -> Any:
-        return v if v >= 0 else flint.arb(0)
+        return v if v >= 0 else flint.arb(0) if v < 0 else flint.arb.nan()
 
     def slope_in_arb(self, v: flint.arb) -> flint.arb:
         return flint.arb(1) if v > 0 else flint.arb(0) if v < 0 else flint.arb(0.5, 0.5)

@@ -197,9 +197,10 @@ def _rates_in(loop: ClosedLoop, x: Sequence[Fraction], free: Sequence[int], arou
     named |= {s: {frozenset({(s, 1)}): Fraction(1)} for s in (*(system.states[i] for i in free), *system.inputs)}
     found: dict[object, Expression] = {}
     for s, f in zip(system.states, loop.dynamics, strict=True):
-        rate = _decided(f - s if system.time == "discrete" else f, values)
+        rate = f - s if system.time == "discrete" else f
         if not evaluate_arb(rate, values).is_finite():
             return None
+        rate = _decided(rate, values)
         terms = evaluate(rate, named, _Multiplied())
         if terms:
             first = terms[min(terms, key=hash)]
@@ -366,9 +367,9 @@ def _is_inside(change: Change, x: Balls, box: Balls) -> bool:
     """Krawczyk's test (Moore, Kearfott, Cloud, Introduction to Interval Analysis, SIAM 2009, chapter 8)."""
     n = len(x)
     F, _ = change(x)
-    _, J = change(box)
+    everywhere, J = change(box)
     Y = _inverse(J)
-    if Y is None:
+    if Y is None or not all(v.is_finite() for v in everywhere):  # at a jump slopes say nothing
         return False
     spread = flint.arb_mat([[b - v] for b, v in zip(box, x, strict=True)])
     K = flint.arb_mat([[v] for v in x]) - Y * flint.arb_mat([[v] for v in F]) + (_identity(n) - Y * J) * spread

@@ -14,15 +14,15 @@ from certify.analysis.reaching import ReachOptions, certify_reach
 from certify.analysis.reaching.never import Search, Stay
 from certify.analysis.reaching.options import target_of
 from certify.analysis.reaching.runs import Simulation, begins
-from certify.analysis.reaching.saddle import Saddle, saddle_at
+from certify.analysis.reaching.saddle import Saddle, _norm, _spectral, saddle_at
 from certify.certificates.ellipsoids import Box
 from certify.certificates.verdict import Verdict
 from certify.effort import Effort
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.equilibrium import rest_in
+from certify.loop.equilibrium import _is_inside, rest_in
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
-from certify.loop.rigorous import ball, points, precision, step_on
+from certify.loop.rigorous import Balls, ball, points, precision, step_on
 from tests.support.corners import plant
 
 TENTH = (Fraction(1, 10), Fraction(1, 10))
@@ -64,6 +64,13 @@ def test_a_start_that_ends_at_a_saddle() -> None:
     assert stay is not None and stay.steps > 0
     assert abs(float(stay.x[0]) + 0.125) <= stay.error < 1e-4
     assert float(stay.x[1]) == 0.5 and np.abs(np.array(stay.at, dtype=float)).max() < 1e-12
+
+
+def test_a_start_beside_a_saddle_does_not_rest() -> None:
+    """The line of starts crosses the saddle's small N at once; the saddle itself is not of the box."""
+    system = stepped("101/100*p + 1000000*p**3", "v/2")
+    stay = searched(system, gain(0.0, 0.0), from_rest("-0.32", "0.31", "1e-8"), "p**2 >= 1/100000")
+    assert stay is not None and stay.steps > 0 and abs(float(stay.x[0])) <= stay.error
 
 
 def test_the_part_that_arrives_is_proved_beside_it(tmp_path: Path) -> None:
@@ -129,6 +136,30 @@ ARRIVE = {
         from_rest("-0.2", "0.3"),
         "p**2 >= 1",
     ),
+    "a step that parts the starts on either side of those of a saddle": (
+        stepped("6*p/5 - v/5 - max(v - 3/10, 0)/2 + heaviside(p - 1/7 + 1/1000000000 + 10*(v - 1/2))/5", "v/2"),
+        gain(0.0, 0.0),
+        from_rest("0", "0.3", "0.5"),
+        "p**2 >= 1",
+    ),
+    "rest outside of the box by less than floats know": (
+        stepped("p + (p - 1/3)/10", "v/2"),
+        gain(0.0, 0.0),
+        ((Fraction(1, 3) + Fraction(1, 10**20), Fraction(1, 2)), (Fraction(0), Fraction(0))),
+        "p >= 1",
+    ),
+    "a saddle in the target, which its starts reach late": (
+        stepped("p + u + v/10", "4*v/5"),
+        gain(0.2, 0.0),
+        from_rest("-0.4", "0.3", "0.5"),
+        "min(1 - p**2, max(abs(v), abs(p)) - 1/1000) <= 0",
+    ),
+    "rest in the target": (
+        stepped("p + p/10", "v/2"),
+        gain(0.0, 0.0),
+        from_rest("-0.1", "0.1"),
+        "min(1 - p**2, p**2 - 1/10000) <= 0",
+    ),
 }
 
 
@@ -151,10 +182,63 @@ def test_rests_are_shown_within_their_radius_alone() -> None:
         assert both is not None and both[1].contains(0)
 
 
+def test_nothing_rests_where_a_rate_has_no_value() -> None:
+    """Floats take v for 1/3."""
+    loop = ClosedLoop(stepped("p + p/10/heaviside(v - 1/3)", "v"), gain(0.0, 0.0))
+    with precision():
+        for off, shown in ((Fraction(1, 10**30), True), (Fraction(-1, 10**30), False)):
+            found = rest_in(loop, [Fraction(0), Fraction(1, 3) + off], [0], [Fraction(1, 100)] * 2)
+            assert (found is not None) is shown
+
+
+@pytest.mark.parametrize(
+    ("p", "v", "rests"),
+    [
+        ("2*p - 1/10", "v + 2*p - 1/5", True),
+        ("2*p - 1/10", "v + (p - 1/10)*(p + 3) - p**2 + p/10", True),
+        ("2*p - 1/10", "v + 2*p - 1/5 + 1/1000000000000000000000000000000", False),
+        ("2*p - 1/10", "v + p - 1/5", False),
+        ("2*p - 1/10", "v + 2*p + 1/5", False),
+        ("2*p - 1/10", "v + 2*p - 1/5*cos(v)*exp(v)", True),
+        ("2*p - 1/10", "v + 2*p - 1/5 + cos(v)/10", False),
+        ("2*p - 1/10", "v + 2*p - 1/5 + exp(v)/10", False),
+        ("p + abs(p - 101/1000)/10 + 1/100000", "v", False),
+        ("p + abs(p - 101/1000)/10 - 1/100000", "v + abs(p - 101/1000)/5 - 1/50000", False),  # two, on both sides
+        ("p + (p - 1/10)*(1 + heaviside(p - 101/1000))", "v", False),
+    ],
+)
+def test_rates_are_one_where_they_are_multiples(p: str, v: str, rests: bool) -> None:
+    with precision():
+        found = rest_in(
+            ClosedLoop(stepped(p, v), gain(0.0, 0.0)), [Fraction(1, 10), Fraction(0)], [0], [Fraction(1, 100)] * 2
+        )
+        assert (found is not None) is rests
+        assert found is None or (found[0].contains(ball(Fraction(1, 10))) and found[1] == 0)
+
+
+@pytest.mark.parametrize(
+    ("at", "slope", "shown"),
+    [(0.4, 0.0, True), (0.51, 0.0, False), (0.6, 0.0, False), (0.2, 0.5, True), (0.3, 0.5, False), (0.0, 1.0, False)],
+)
+def test_a_zero_is_shown_where_all_slopes_lead_into_the_box(at: float, slope: float, shown: bool) -> None:
+    def change(x: Balls) -> tuple[Balls, flint.arb_mat]:
+        return [x[0] - at], flint.arb_mat([[flint.arb(1, slope)]])
+
+    def none(x: Balls) -> tuple[Balls, flint.arb_mat]:
+        return [flint.arb.nan()], flint.arb_mat([[1]])
+
+    with precision():
+        assert _is_inside(change, [flint.arb(0)], [flint.arb(0, 0.5)]) is shown
+        assert not _is_inside(none, [flint.arb(0)], [flint.arb(0, 0.5)])
+
+
 @pytest.mark.parametrize(
     ("p", "v", "size"),
     [
         ("6*p/5 + v**2", "v/2 + p**2", 1e-2),
+        ("6*p/5 + 20*v**2", "v/2", 1e-3),
+        ("6*p/5", "v/2 + 20*p**2", 1e-3),
+        ("6*p/5", "9*v/10 + 10*p**2", 1e-3),
         ("-6*p/5 + v**2", "v/2 + p**2", 1e-2),
         ("101*p/100 + p**3", "v/2", 1e-2),
         ("101*p/100 - 10*p**3", "v/2", 1e-3),
@@ -182,14 +266,29 @@ def test_a_saddle_covers_itself(p: str, v: str, size: float) -> None:
         ("p + p**3", "v/2"),  # 1 is not growth
         ("6*p/5", "v"),  # nor is it decay
         ("6*p/5 + 1", "v/2"),  # rests elsewhere
+        ("6*p/5", "v/2 + 1"),  # so does this
         ("6*p/5 + 2*abs(p)", "v/2"),  # both sides go to the right
         ("6*p/5 + heaviside(p)/1000", "v/2"),  # a jump at the place
+        ("6*p/5 + heaviside(p - 1/10000000)/1000", "v/2"),  # and beside it
     ],
 )
 def test_other_places_are_no_saddles(p: str, v: str) -> None:
     loop = ClosedLoop(stepped(p, v), gain(0.0, 0.0))
     with precision():
         assert saddle_at(loop, np.zeros(2), np.ones(2)) is None
+
+
+def test_norms_of_balls_are_of_all_that_lies_in_them() -> None:
+    rng = np.random.default_rng(0)
+    with precision():
+        for n in (1, 2, 3, 4) * 5:
+            middle, radius = rng.normal(size=(n, n)), rng.uniform(0, 0.1, (n, n))
+            balls = flint.arb_mat([[flint.arb(m, r) for m, r in zip(*rows, strict=True)]
+                                   for rows in zip(middle.tolist(), radius.tolist(), strict=True)])  # fmt: skip
+            for end in (middle + rng.uniform(-1, 1, (n, n)) * radius, middle + radius, middle - radius):
+                assert _spectral(balls).upper() >= np.linalg.norm(end, 2) - 1e-9
+                assert _norm(balls.tolist()[0]).upper() >= np.linalg.norm(end[0]) - 1e-9
+        assert not _norm([flint.arb.nan()]) < 1 and _norm([]) == 0
 
 
 def test_a_curve_crosses_from_side_to_side_within() -> None:
@@ -207,6 +306,29 @@ def test_a_curve_crosses_from_side_to_side_within() -> None:
         wide = [flint.arb(0.6, 0.2), flint.arb(0)]  # of a D that may be less
         assert not saddle.is_crossed(points(np.zeros(2)), wide)
         assert not saddle.is_crossed(points(np.zeros(2)), [flint.arb.nan(), flint.arb(0)])
+
+
+@pytest.mark.parametrize(("factor", "crosses"), [(1, True), (1000000, False)])
+def test_a_line_that_is_elsewhere_between_its_ends_does_not_cross(factor: int, crosses: bool) -> None:
+    """After a step its ends and its middle have the speed 0, and there it has no slope."""
+    loop = ClosedLoop(stepped("6*p/5", f"v/2 + {factor}*p**3*(1/100 - p**2)"), gain(0.0, 0.0))
+    beyond, begin = target_of(loop.system, (AWAY,)), from_rest("-0.1", "0.1")
+    search = Search(loop, beyond, begin, Simulation(loop, beyond, begin), Effort(1e10))
+    with precision():
+        saddle = saddle_at(loop, np.zeros(2), np.ones(2))
+        assert saddle is not None
+        assert search._crosses((np.array([-0.1, 0.0]), np.array([0.1, 0.0])), saddle, 1) is crosses
+
+
+@pytest.mark.parametrize(("v", "crosses"), [("1/8", False), ("1/64", False), ("3/8", True)])
+def test_a_line_that_meets_the_target_on_the_way_does_not_cross(v: str, crosses: bool) -> None:
+    """The speeds after 0, 1, ... steps are 1, 1/2, ...; a part of the line alone is in the target."""
+    loop = ClosedLoop(stepped("6*p/5", "v/2"), gain(0.0, 0.0))
+    beyond, begin = target_of(loop.system, (f"max(abs(v - {v}), abs(p)) <= 1/1000",)), from_rest("-0.1", "0.1", "1")
+    search = Search(loop, beyond, begin, Simulation(loop, beyond, begin), Effort(1e10))
+    with precision():
+        saddle = Saddle(np.zeros(2), np.eye(2), 0.01)
+        assert search._crosses((np.array([-0.1, 1.0]), np.array([0.1, 1.0])), saddle, 8) is crosses
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -20,12 +20,18 @@ from certify.checker.networks import Affine, Map, Network
 from certify.checker.smooth import add as add_smooth
 from certify.errors import InputError
 from certify.loop.activations import ACTIVATIONS, Activation
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Symbol, sqrt
+from certify.loop.networks import Affine as Layer
+from certify.loop.networks import Map as Function
+from certify.loop.networks import Network as Program
+from certify.loop.networks import Observe
 from certify.loop.plants import get_system
 from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_policy
 from certify.loop.policies.exact import raw_at_origin
 from certify.loop.policies.importers import ImportOptions, import_policy
 from certify.loop.policies.importers.memory import import_module, import_state_dict
-from certify.loop.rigorous import precision
+from certify.loop.rigorous import ball, policy_at, precision
 from tests.support.loops import pendulum_network
 
 add_activations()
@@ -257,3 +263,29 @@ def test_an_onnx_graph_is_read(name: str, tmp_path: Path) -> None:
     found = import_policy(tmp_path / "p.onnx", PLANT, SAID)
     most = 1e-6 if name == "gelu" else 1e-12  # the onnx package's own has constants of single precision
     assert found.policy.network.activation == name and found.difference.in_double < most
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_no_number_stays_none_in_arb(name: str) -> None:
+    row = ACTIVATIONS[name]
+    with precision():
+        assert not row.in_arb(flint.arb.nan()).is_finite()
+        row.slope_in_arb(flint.arb.nan())  # of no number any slope
+
+
+def test_a_policy_without_a_value_has_none_behind_a_relu() -> None:
+    """sqrt(theta - 1/3) at a theta that floats take for 1/3."""
+    s = Symbol("theta"), Symbol("theta_dot")
+    root = Observe((0,), s, (sqrt(s[0] - Fraction(1, 3)),))
+    one = np.ones((1, 1)), np.zeros(1)
+    policy = PolicyNetwork(
+        Program(2, (root, Layer((1,), *one), Function((2,), "relu"), Layer((3,), *one))),
+        np.ones(1),
+        np.zeros(1),
+        "tanh",
+        "none",
+    )
+    with precision():
+        for off, known in ((Fraction(1, 10**30), True), (Fraction(-1, 10**30), False)):
+            (u,) = policy_at(ClosedLoop(PLANT, policy), [ball(Fraction(1, 3) + off), ball(Fraction(0))])
+            assert u.is_finite() is known

@@ -25,7 +25,7 @@ from certify.cli.main import _run
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.equilibrium import Rest, find_rest, seen_from
-from certify.loop.expressions import Expression, Number, atan, exp, sin, symbols
+from certify.loop.expressions import Expression, Number, atan, exp, heaviside, sin, symbols
 from certify.loop.float32 import float_error
 from certify.loop.plants import System, domain_of_values, get_system, load_system
 from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_policy
@@ -338,6 +338,16 @@ def test_in_discrete_time_it_is_a_fixed_point() -> None:
         found = find_rest(ClosedLoop(replace(turned.system, time="discrete"), turned.network))
         assert found is not None and found.stable is stable
         assert found.x == (f"{0.25 / (0.5 - gain):.12f}",)
+
+
+def test_no_rest_is_enclosed_across_a_jump() -> None:
+    """A step leads away from the jump on either side, by more than what floats see."""
+    p, v, u = symbols("p v u")
+    at = Fraction(1, 10**21)
+    away = 2 * p - 2 * at + 2 * at * heaviside(p - at)
+    system = System("jump", (p, v), (u,), {}, (away, v / 2), (Number(0),), box(1, 1), box(1), time="discrete")
+    network = PolicyNetwork.of_layers((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    assert find_rest(ClosedLoop(system, network)) is None
 
 
 def test_a_range_moves_the_fixed_point_of_a_map(tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ class Search:
 
     @property
     def _widths(self) -> Array:
-        """Of the domain, (n,)."""
+        """Widths of the domain, (n,)."""
         return np.asarray(self.simulation.flow.hi - self.simulation.flow.lo)
 
     def _missed(self, x: Balls) -> bool:

@@ -40,11 +40,11 @@ class Saddle:
         return [v + flint.arb(0, 1) * reach[i, 0] for i, v in enumerate(points(self.x))]
 
     def crossed_after(self, course: Array) -> int | None:
-        """The number of steps after which the line between two runs, (N, 2, n) in floats, crosses N."""
+        """The number of steps, at least one, after which the line between two runs, (N, 2, n) in floats, crosses N."""
         w = np.linalg.solve(self.V, (course - self.x).reshape(-1, len(self.x)).T).T.reshape(course.shape) / self.r
         apart = (w[:, :, 0].min(1) < -_BEYOND) & (w[:, :, 0].max(1) > _BEYOND)
-        found = np.flatnonzero(apart & (np.linalg.norm(w[:, :, 1:], axis=2).max(1) < _INSIDE))
-        return int(found[0]) if len(found) else None
+        found = np.flatnonzero((apart & (np.linalg.norm(w[:, :, 1:], axis=2).max(1) < _INSIDE))[1:])
+        return 1 + int(found[0]) if len(found) else None
 
     def is_crossed(self, m: Balls, D: Balls) -> bool:
         """True if the curve m + D t, -1 <= t <= 1, whose D may depend on t, crosses N from side to side."""
