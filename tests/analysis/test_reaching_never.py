@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from certify.analysis.reaching.saddle import Saddle, _norm, _spectral, saddle_at
 from certify.certificates.ellipsoids import Box
 from certify.certificates.verdict import Verdict
 from certify.effort import Effort
+from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.equilibrium import _is_inside, rest_in
 from certify.loop.plants import System
@@ -357,3 +359,11 @@ def test_a_corner_within_a_step_has_no_slopes() -> None:
     with precision():
         _, J = step_on(loop, [flint.arb(0), flint.arb(0, 1e-3)])
         assert not all(v.is_finite() for v in J.entries())
+
+
+def test_a_target_that_counts_turns_is_refused_before_anything_is_said_of_it(tmp_path: Path) -> None:
+    """p = 0 rests, and is the same place as 2 pi, which is in p >= 6."""
+    system = replace(stepped("p + sin(p)/10", "v/2", 8.0), angles=("p",))
+    options = ReachOptions(target=("p >= 6",), begin=from_rest("-0.1", "0.1"), effort=0.01)
+    with pytest.raises(InputError, match="the same after a full turn of p"):
+        certify_reach(system, gain(0.0, 0.0), tmp_path, options)

@@ -38,6 +38,7 @@ from certify.provers.ranks import Question, Region, Sublevel, root_box, turning,
 
 Array = NDArray[np.float64]
 Stated = Certificate | ReachCertificate
+_LEAST = 2  # order of the series in time that a search begins with
 _NAMED = {
     "time": "time",
     "states": "states",
@@ -84,14 +85,20 @@ class Goal:
     def question(self, x: Array, effort: Effort, tried: Callable[[Stated], Mapping[str, Any]]) -> Question:
         """The question from where it is reached, for a search around states x (n, N); of a certificate the order of the
         series in time is raised if the checker still accepts it, `tried` so."""
-        system, root = self.loop.system, root_box(self.loop)
-        asked = with_order(Question(self.loop, self.target, tuple(kept_constraints(system).values()), root), x, effort)
+        asked = with_order(replace(self.bare_question(), order=_LEAST), x, effort)
         if self.given is not None:
             known = _tree_of(self.given)
-            higher = replace(self.given, system=system, evidence=replace(known, order=asked.order))
+            higher = replace(self.given, system=self.loop.system, evidence=replace(known, order=asked.order))
             if asked.order <= known.order or tried(higher)["result"] != "ACCEPTED":
                 asked = replace(asked, order=known.order)
         return with_frame(asked, x, effort)
+
+    def bare_question(self) -> Question:
+        """The question with the order that the certificate has, if there is one, and no frame."""
+        kept = tuple(kept_constraints(self.loop.system).values())
+        order = 1 if self.loop.system.sample is None else _LEAST
+        order = order if self.given is None else _tree_of(self.given).order
+        return Question(self.loop, self.target, kept, root_box(self.loop), order)
 
     def certificate(
         self, question: Question, evidence: RankTree, ranks: Ranks, provenance: Mapping[str, Any]

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.analysis.acceptance import Clerk
 from certify.analysis.beyond import constraints_in_words, rank_facts
 from certify.analysis.reaching.goals import Goal, Stated, goal_of, leaves_of, with_ranks
 from certify.analysis.reaching.never import Search
@@ -117,6 +118,8 @@ def certify_reach(
     effort = effort_of(options.effort, options.time_limit, load_seconds)
     with one_thread(), sole_writer(out), earlier_aside(out, tell or (lambda _: None)):
         result = ReachResult(Verdict.UNKNOWN, "", goal.loop.system, goal.loop.network, options, given=goal.given)
+        with tools.timing("target"):
+            _require_periodic(goal, tools.clerk(path, options.jobs, False, options.cluster))
         result = _simulated(result, goal, tools)
         if not result.reason:
             result = _proved(result, goal, effort, tools, path, provenance or {})
@@ -147,6 +150,13 @@ def _require_inside(system: System, options: ReachOptions) -> None:
                 f"`reach_from` must lie in the interior of the domain, {s.name} between {float(least + q):g} and "
                 f"{float(most + q):g}; found {float(lo + q):g}..{float(hi + q):g}. --domain widens it."
             )
+
+
+def _require_periodic(goal: Goal, clerk: Clerk) -> None:
+    """Refuse a question that is not about places, whatever its answer would be: a target that counts turns."""
+    system, question = goal.loop.system, goal.bare_question()
+    angles = system.angles if goal.given is None else tuple(system.states[i].name for i in goal.turned)
+    require_periodic(system, angles, question.root, partial(goal.certificate, question, provenance={}), clerk)
 
 
 def _simulated(result: ReachResult, goal: Goal, tools: Tools) -> ReachResult:
@@ -206,8 +216,6 @@ def _proved(
             most = min(max(arrivals, default=0) or MOST_STEPS, affordable(question, search))
             lo, hi, weights = _parts(options.begin)
             question = with_errors(question, lo, hi, most, search, weights)
-    angles = system.angles if goal.given is None else tuple(system.states[i].name for i in goal.turned)
-    require_periodic(system, angles, question.root, partial(goal.certificate, question, provenance={}), clerk)
     with tools.timing("ranks"), runner_at(options.cluster) as runner:
         found = _searched(question, options, arrivals, search, runner, tools)
     evidence = None if found is None else _within(found.evidence, options.within)
