@@ -238,7 +238,7 @@ def share_of_runs(found: Mapping[str, Any]) -> str:
 
     >>> share_of_runs({"runs": 2000, "converging": 1063, "proved": 774, "share": 774 / 1063})
     'about 73 % of what converges is proved: 774 of the 1,063 states that do so in the domain, of 2,000 drawn'
-    >>> share_of_runs({"runs": 2000, "converging": 50, "proved": 50, "clipped": 1063, "share": 1.0})[-83:]
+    >>> share_of_runs({"runs": 2000, "converging": 50, "proved": 50, "clipped": 1063, "share": 1.0})[-82:]
     '; 1,013 more would converge if the policy were clipped at the bounds of its inputs'
     """
     proved, converging, runs = (f"{found[name]:,}" for name in ("proved", "converging", "runs"))
