@@ -146,7 +146,7 @@ def test_a_small_weight_changes_less():
         [
             ("output", "tanh", 6.0, None),
             ("output", "identity", 6.0, (np.array([-6.0]), np.array([6.0]))),
-            ("preactivation", "tanh", 12.0, (np.array([-6.0]), np.array([6.0]))),
+            ("preactivation", "tanh", 6.0, (np.array([-5.0]), np.array([5.0]))),
         ],
     ),
 )
