@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from certify.analysis.reaching import ReachOptions, certify_reach
+from certify.analysis.reaching import ReachOptions, ReachResult, certify_reach
 from certify.analysis.reaching.never import Search, Stay
 from certify.analysis.reaching.options import target_of
 from certify.analysis.reaching.runs import Simulation, begins
@@ -367,3 +368,16 @@ def test_a_target_that_counts_turns_is_refused_before_anything_is_said_of_it(tmp
     options = ReachOptions(target=("p >= 6",), begin=from_rest("-0.1", "0.1"), effort=0.01)
     with pytest.raises(InputError, match="the same after a full turn of p"):
         certify_reach(system, gain(0.0, 0.0), tmp_path, options)
+
+
+def test_what_is_said_of_a_start_holds_of_its_rounded_numbers() -> None:
+    """Six digits of 1/3 are 3e-7 beside it, however small the error."""
+    loop = stepped("p + p/10", "v/2"), gain(0.0, 0.0)
+    result = ReachResult(Verdict.REFUTED, "", *loop, ReachOptions(target=("p >= 1",)))
+    for p, v, error in ((1 / 3, 1e-17, 1e-12), (-0.1, 0.25, 3e-5), (2e-5, 1.0, 3e-5)):
+        said = result.told_of(Stay((Fraction(p), Fraction(v)), error, (Fraction(p), Fraction(v)), error, 0))
+        found = re.search(r"within (\S+) of p = (\S+), v = (\S+) rests", said)
+        assert found is not None
+        within, *shown = map(float, found.groups())
+        assert within >= error + max(abs(p - shown[0]), abs(v - shown[1]))
+        assert within < 1.2 * (error + 2e-6) + max(abs(p - shown[0]), abs(v - shown[1]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -13,6 +13,8 @@ from certify.analysis.reaching.options import ReachOptions, in_words
 from certify.analysis.reaching.runs import Run, Runs
 from certify.analysis.without_v import ResultWithoutV
 from certify.certificates import Certificate
+
+_UP = 1.06  # a number of two digits is then not below what it stands for
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +106,15 @@ class ReachResult(ResultWithoutV):
         return f"a run from a state {start} stays {at} from step {stay.steps:,} on {never}"
 
     def _near(self, x: Sequence[Fraction], error: float) -> str:
-        """A state that is known up to an error, which may be all that is left of a number."""
-        return f"within {error:.1e} of {self._in_words([q if abs(q) > error else Fraction(0) for q in x])}"
+        """A state that is known up to an error, to which what is left out of its numbers is added."""
+        values = self.values(x)
+        shown = {name: Fraction(f"{float(q):.6g}") if abs(q) > error else Fraction(0) for name, q in values.items()}
+        whole = error + max(float(abs(q - shown[name])) for name, q in values.items())
+        return f"within {_UP * whole:.1e} of {_words(shown)}"
 
     def _in_words(self, x: Sequence[Fraction]) -> str:
-        return ", ".join(f"{name} = {float(q):.6g}" for name, q in self.values(x).items())
+        return _words(self.values(x))
+
+
+def _words(values: Mapping[str, Fraction]) -> str:
+    return ", ".join(f"{name} = {float(q):.6g}" for name, q in values.items())
