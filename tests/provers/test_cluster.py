@@ -272,8 +272,8 @@ def test_ctrl_c_leaves_no_processes(everybody: bool, tmp_path: Path) -> None:
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=ROOT, start_new_session=True,
     )  # fmt: skip
     try:
-        wait_for(lambda: (tmp_path / "certificate.json").exists() or run.poll() is not None, 120)
-        time.sleep(0.5)  # into the search that follows
+        wait_for(lambda: len(descendants(run.pid)) >= 3 or run.poll() is not None, 120)  # scheduler and workers
+        time.sleep(2.0)  # into the search
         assert run.poll() is None, run.communicate()
         started = descendants(run.pid)
         (os.killpg if everybody else os.kill)(run.pid, signal.SIGINT)
@@ -282,10 +282,11 @@ def test_ctrl_c_leaves_no_processes(everybody: bool, tmp_path: Path) -> None:
         if run.poll() is None:
             os.killpg(run.pid, signal.SIGKILL)
             run.wait()
-    assert run.returncode == 130 and err == "certify: interrupted; nothing was left half-written.\n" and not out
+    assert run.returncode == 130 and err.startswith("certify: interrupted; ") and err.count("\n") == 1 and not out
     wait_for(lambda: not any(alive(pid) for pid in started), 15)
     assert len(started) >= 2  # workers
-    assert run_checker(tmp_path / "certificate.json")["result"] == "ACCEPTED"
+    kept = ["search.json"] if "the search is kept" in err else []
+    assert [path.name for path in tmp_path.iterdir()] == kept and (kept or "nothing was left half-written" in err)
 
 
 @pytest.mark.slow
@@ -309,14 +310,14 @@ def test_a_scheduler_killed_in_the_middle_of_a_run_leaves_a_certificate_and_a_se
                 dask.scheduler.kill()
                 killed.append(time.monotonic())
 
-        options = RoaOptions(candidate="lyapunov", cluster=dask.address, effort=2.4)
+        options = RoaOptions(candidate="lqr", cluster=dask.address, effort=2.4)
         found = certify_roa(system, policy.network, tmp_path, options, progress=progress)
         assert killed and time.monotonic() - killed[0] < 60
     assert found.verdict is Verdict.PROVED and found.stop is Stop.CLUSTER and found.search is not None
     assert dask.address in found.reason and dask.address in (found.notice or "")
     assert found.certificate is not None and run_checker(found.certificate)["result"] == "ACCEPTED"
     end = certify_roa(system, policy.network, tmp_path, RoaOptions(resume=True, effort=2.4))
-    whole = certify_roa(system, policy.network, tmp_path / "whole", RoaOptions(candidate="lyapunov", effort=2.4))
+    whole = certify_roa(system, policy.network, tmp_path / "whole", RoaOptions(candidate="lqr", effort=2.4))
     assert end.verdict is whole.verdict is Verdict.PROVED and end.search is None
     assert end.levels.roa is not None and found.levels.roa is not None and end.levels.roa >= found.levels.roa
     assert end.levels.roa == pytest.approx(whole.levels.roa, rel=2e-3)

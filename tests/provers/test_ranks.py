@@ -139,7 +139,7 @@ def test_ranks_are_the_same_whoever_follows_the_boxes(
     assert np.array_equal(one.ranks, other.ranks) and np.array_equal(one.steps, other.steps)
     counts = ("share", "boxes", "rounds", "done")
     assert [getattr(found, c) for c in counts] == [getattr(expected, c) for c in counts] and left[0] == left[1]
-    assert made.answered > 3 and (made.refused > 0) == name.startswith("answers")
+    assert made.answered > (1 if name == "one place" else 3) and (made.refused > 0) == name.startswith("answers")
 
 
 FRAMES = {1: np.array([[-3.0]]), 2: np.array([[1.0, 0.5], [-3.0, 2.0]])}

@@ -98,8 +98,8 @@ def multipliers(data: Document, J: np.ndarray, nodes: Sequence[np.ndarray], R: n
     P = sum(nodes[1:], nodes[0]) / len(nodes)
     if not all(np.isfinite(part).all() for part in (a, Q, E)):
         return ones(n)
-    b = J.T @ P
     with np.errstate(all="ignore"):
+        b = J.T @ P
         left = -(J.T @ R @ J + b @ a + a.T @ b.T)
         if not (np.isfinite(left).all() and np.linalg.eigvalsh(left)[0] > 0):
             return ones(n)

@@ -31,6 +31,7 @@ _DEAF = 20.0  # seconds without a word from the scheduler, after which it is los
 _FETCH = 10.0  # seconds for answers that are there
 _FAREWELL = 5.0  # seconds for taking leave of it
 _OVER = ("error", "lost", "cancelled")
+_NO_INTERRUPTS = "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\n"  # a terminal sends them to all
 _PLAIN = ["dask", "msgpack"]  # serialisers of results: bytes and numbers, nothing that unpickling would run
 
 
@@ -73,6 +74,7 @@ def connect(address: str, patience: float = 30.0) -> Iterator[Client]:
                 threads_per_worker=1,
                 dashboard_address="127.0.0.1:0",  # None is Dask's own port, with a warning where that is taken
                 silence_logs=logging.CRITICAL,
+                preload=_NO_INTERRUPTS,
             )
             address = stack.enter_context(local_one).scheduler_address
         try:

@@ -478,7 +478,7 @@ def test_a_plant_of_ones_own_and_a_policy_that_names_it(tmp_path):
 @pytest.mark.slow
 def test_an_imported_policy(tmp_path):
     """Weights of another program, a clip from its last step, and no record of a training."""
-    network = curved(scale=12.0)
+    network = curved(scale=12.0, gain=GAIN / 2)
     state = {f"{2 * k}.weight": torch.tensor(W).float() for k, W in enumerate(network.weights)}
     state |= {f"{2 * k}.bias": torch.tensor(b).float() for k, b in enumerate(network.biases)}
     torch.save(state, tmp_path / "agent.pth")
