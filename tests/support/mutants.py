@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -658,6 +659,22 @@ def constants(data: Document) -> list[str]:
     return [p for p, v in texts if isinstance(v, str) and v not in names and v not in operators]
 
 
+def divides(data: Document, path: str) -> bool:
+    """True if the number is a factor of a divisor that is a number, which has no value where this one is 0."""
+    parts = path.split(".")
+    for k in range(2, len(parts)):
+        node = get(data, ".".join(parts[:k]))
+        if node[:1] == ["/"] and parts[k] == "2":
+            return all(re.fullmatch(r"[*/]+|-?\d[\d/]*", text) for text in leaves(node[2]))
+    return False
+
+
+def leaves(tree: Any) -> Iterator[str]:
+    """The texts of a tree."""
+    for node in tree if isinstance(tree, list) else [tree]:
+        yield from leaves(node) if isinstance(node, list) else [str(node)]
+
+
 def plants() -> Iterator[Mutant]:
     """Constants, signs and operators of the equations; each with a ball that suits the new ones."""
     for name in BASES:
@@ -665,7 +682,7 @@ def plants() -> Iterator[Mutant]:
         for path in constants(data):
             q = Fraction(get(data, path))
             for factor in (-1, 0, Fraction(1, 2), 2, 10, Fraction(101, 100), 10**300, Fraction(1, 10**300), -(10**9)):
-                if q * factor == q or ("/" in get(data, path.rsplit(".", 1)[0])[:1] and factor == 0):
+                if q * factor == q or (factor == 0 and divides(data, path)):
                     continue
                 new = edited(data, path, str(q * factor))
                 title = f"{float(factor):.4g}" if abs(factor) < 1e300 else "huge"
