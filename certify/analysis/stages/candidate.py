@@ -269,6 +269,8 @@ class _Choice(_Trials):
             with self.tools.timing("candidate"):
                 trials = solved(loop, found, state.options, self._granted())
             rests = loop.network.is_moved and not loop.system.ranges
+            if rests and self._enters_thrifty(partial(economical, loop, found)):
+                return None
             return (self._around_its_rest if rests else self._around_a_level)(trials)
         if state.interruptible and self._enters_thrifty(partial(economical, loop, found)):
             return None
@@ -344,7 +346,7 @@ class _Choice(_Trials):
         return entered.proved > _MOST * entered.trial.volume
 
     def _enters_thrifty(self, make: Callable[[float, RoaOptions, Effort], Trial | None]) -> bool:
-        """Enter a candidate for the boxes that the effort left can bound and check; False if none is made."""
+        """Enter a candidate for the boxes that the effort left can bound and check; False if nothing is proved so."""
         if not (FEW < self.loop.system.n <= MANY and is_forecast(self.loop)) or self.state.options.engine == "dreal":
             return False
         each = operations_of_box(self.loop) + operations_of_check(self.loop)
@@ -352,7 +354,7 @@ class _Choice(_Trials):
         made = self._made(partial(make, boxes)) if boxes >= 1 else None
         if made is not None:
             self.race.enter([made])
-        return made is not None
+        return made is not None and self.race.proved
 
     def _around_a_level(self, trials: list[Trial]) -> None:
         """A practical claim in many states, where no tree of boxes can carry what a ball does not: the candidate made
