@@ -20,19 +20,21 @@ from tests.support.mutants import POLICIES
 BOXES = 30_000
 
 
-@pytest.fixture(scope="module")
-def curved() -> ClosedLoop:
-    """The planar quadrotor under one layer of 24 units, whose slope at the origin is a gain, and which saturate."""
-    system, generator = get_system("quadrotor2d"), np.random.default_rng(0)
+def bent(damping: float = 1.0, seed: int = 0, aside: float = 0.0) -> ClosedLoop:
+    """The planar quadrotor under one layer of 24 units, whose slope at the origin is a gain, with a share of its
+    damping, and which saturate; `aside` keeps the policy from being centred."""
+    system, generator = get_system("quadrotor2d"), np.random.default_rng(seed)
     shipped = ClosedLoop(system, load_policy(POLICIES / "quadrotor2d.pt").network)
     first = 3 * generator.standard_normal((24, 6)) / np.array([3, 3, 1.2, 8, 8, 8])
-    second = -shipped.linearise()[2] @ np.linalg.pinv(first)
-    return ClosedLoop(
-        system,
-        PolicyNetwork.of_layers(
-            [first, second], [np.zeros(24), np.zeros(2)], np.ones(2), shipped.u_eq, "identity", "output"
-        ),
-    )
+    K = shipped.linearise()[2] * np.array([1, 1, 1, damping, 1, damping])
+    layers = [first, -K @ np.linalg.pinv(first)], [np.zeros(24), np.full(2, aside)]
+    centre = "none" if aside else "output"
+    return ClosedLoop(system, PolicyNetwork.of_layers(*layers, np.ones(2), shipped.u_eq, "identity", centre))
+
+
+@pytest.fixture(scope="module")
+def curved() -> ClosedLoop:
+    return bent()
 
 
 def starts(loop: ClosedLoop) -> list[np.ndarray]:
@@ -90,3 +92,19 @@ def test_it_is_made_from_another_candidate_where_more_is_forecast_of_it_than_of_
     assert found is not None and found.name == "economical"
     most = max(volume(one.P, forecast.level(one.P, 20)) for one in (certain, large))
     assert volume(found.P, forecast.level(found.P, 20)) > most
+
+
+def decrease(loop: ClosedLoop, P: np.ndarray) -> float:
+    """The largest r with `A'P + PA <= -2 r P`."""
+    A, half = loop.mean_rate(), np.linalg.inv(np.linalg.cholesky(P))
+    return float(-np.linalg.eigvalsh(half @ (A.T @ P + P @ A) @ half.T).max() / 2)
+
+
+def test_v_falls_in_the_few_directions_that_samples_miss() -> None:
+    loop = bent(damping=0.05, seed=1)
+    P = economical_candidate(loop, starts(loop), BOXES)
+    slowest = -np.linalg.eigvals(loop.mean_rate()).real.max()
+    assert decrease(loop, P) > 0.02 * slowest
+    forecast = Forecast(loop, states=400)
+    assert forecast.decrease(P) == pytest.approx(decrease(loop, P), rel=1e-6)
+    assert volume(P, 1.0) > max(volume(one, forecast.level(one, BOXES)) for one in starts(loop))

@@ -8,6 +8,9 @@ m^(-n/2) boxes, which samples estimate. Halvings that overshoot, boxes that stic
 divided themselves multiply that by a factor, which is measured. For fixed states m is a quotient of a linear and of a
 convex function of P, and does not depend on P's scale: each round minimises the forecast over P in a trust region, and
 then takes the level that the boxes reach.
+
+Directions in which V decreases little, or grows, may be too few for samples. So the slowest decrease of the linear
+part, of a V of length 1, is kept above a share of the slowest mode's.
 """
 
 from __future__ import annotations
@@ -31,6 +34,8 @@ NEAREST = 0.1  # distance from the origin, of 1, from which on they are sampled
 OVERHEAD = 8.0  # boxes for each that is forecast, times 2^(n/2)
 LEAST = 1e-2  # m, of where nothing would be proved
 _SHARE = 0.1  # the size of their boxes
+_SLOW = 0.05  # share of the slowest mode's decrease, below which no direction is to fall
+_HARD = 100.0  # the price of a direction without decrease
 _ROUNDS, _TRUST, _MOST_TRUST, _LEAST_TRUST = 12, 0.15, 0.3, 0.01  # of the entries of X, P = L (1 + X) L'
 _STEPS = 60  # of a minimisation
 _SCALINGS, _CORRECTIONS = 6, 2  # of a level from the domain's limit, and from one near by
@@ -73,6 +78,8 @@ class Forecast:
         sphere = 2 * math.pi ** (n / 2) / math.gamma(n / 2)
         alike = sphere * -math.log(NEAREST) / (2 * _SHARE) ** n  # boxes of this share between the radii
         self.unit = OVERHEAD * 2 ** (n / 2) * alike
+        self.A = loop.mean_rate()
+        self.slow = -_SLOW * float(np.linalg.eigvals(self.A).real.max())
 
     def sampled(self, P: Array, level: float) -> _Sampled:
         """The states of {x'Px <= level}, each with the errors on its box."""
@@ -111,6 +118,8 @@ class Forecast:
     def easier(self, P: Array, level: float, trust: float) -> Array:
         """P (n, n) of the same determinant for which the present states need the fewest boxes, near the present one."""
         n, found, L = len(P), self.sampled(P, level), np.linalg.cholesky(P)
+        slow = min(self.slow, 0.999 * self.decrease(P))
+        A = L.T @ self.A @ np.linalg.inv(L.T)
         rows = np.triu_indices(n)
         z, F, errors = found.x @ L, found.F @ L, found.errors @ L
         along, asked = _products(z, F), _products(z[:, None], errors)
@@ -128,7 +137,14 @@ class Forecast:
             by = np.where(inside, -n / 2 * weight / np.maximum(m, LEAST), 0.0) / total - ~inside
             gradient = np.einsum("k,kij->ij", -by / size, along)
             gradient -= np.einsum("ku,kuij->ij", (by * m / size)[:, None] * np.sign(each), asked)
-            return float(math.log(total) + np.maximum(LEAST - m, 0.0).sum()), gradient[rows] * often
+            value = math.log(total) + np.maximum(LEAST - m, 0.0).sum()
+            if slow > 0:
+                values, vectors = np.linalg.eigh(-(A.T @ M + M @ A) - 2 * slow * M)
+                short = _HARD * np.maximum(2 - values / slow, 0.0)
+                value += (short**2).sum() / (2 * _HARD)
+                along_short = (vectors * short) @ vectors.T
+                gradient += (A @ along_short + along_short @ A.T + 2 * slow * along_short) / slow
+            return float(value), gradient[rows] * often
 
         from scipy.optimize import minimize  # which a proof that asks no forecast does not load
 
@@ -140,7 +156,15 @@ class Forecast:
         values, vectors = np.linalg.eigh(_symmetric(np.asarray(v), rows, n))
         M = (vectors * np.maximum(values, 1 - 2 * trust)) @ vectors.T
         new = L @ M @ L.T / np.linalg.det(M) ** (1 / n)
-        return np.asarray((new + new.T) / 2)
+        new = (new + new.T) / 2
+        while self.decrease(new) < slow:  # which P has, and so have all in some part of the way to it
+            new = (P + new) / 2
+        return np.asarray(new / np.linalg.det(new) ** (1 / n) * np.linalg.det(P) ** (1 / n))
+
+    def decrease(self, P: Array) -> float:
+        """The largest r with `A'P + PA <= -2 r P`."""
+        half = np.linalg.solve(L := np.linalg.cholesky(P), self.A.T @ P + P @ self.A)
+        return float(-np.linalg.eigvalsh(np.linalg.solve(L, half.T)).max() / 2)
 
 
 def is_forecast(loop: ClosedLoop) -> bool:

@@ -269,7 +269,7 @@ class _Choice(_Trials):
             with self.tools.timing("candidate"):
                 trials = solved(loop, found, state.options, self._granted())
             rests = loop.network.is_moved and not loop.system.ranges
-            return (self._around_its_rest if rests else self._around_a_level)(trials)
+            return self._around_its_rest(trials, found) if rests else self._around_a_level(trials)
         if state.interruptible and self._enters_thrifty(partial(economical, loop, found)):
             return None
         large = self._made(partial(optimised, loop)) if state.options.engine != "dreal" else None
@@ -344,15 +344,19 @@ class _Choice(_Trials):
         return entered.proved > _MOST * entered.trial.volume
 
     def _enters_thrifty(self, make: Callable[[float, RoaOptions, Effort], Trial | None]) -> bool:
-        """Enter a candidate for the boxes that the effort left can bound and check; False if none is made."""
+        """Enter a candidate for the boxes that the effort left can bound and check; False if these are not what limits
+        it, since nothing is proved, or its samples have missed a violation."""
         if not (FEW < self.loop.system.n <= MANY and is_forecast(self.loop)) or self.state.options.engine == "dreal":
             return False
         each = operations_of_box(self.loop) + operations_of_check(self.loop)
         boxes = (self.effort.left - OPTIMISING * self.tools.whole) / each
+        cut_short = self.cut_short
         made = self._made(partial(make, boxes)) if boxes >= 1 else None
-        if made is not None:
-            self.race.enter([made])
-        return made is not None
+        if made is None:
+            self.cut_short = cut_short
+            return False
+        self.race.enter([made])
+        return self.race.proved and not (self.race.contenders[-1].attempt.done and self._is_left_for_more())
 
     def _around_a_level(self, trials: list[Trial]) -> None:
         """A practical claim in many states, where no tree of boxes can carry what a ball does not: the candidate made
@@ -411,10 +415,14 @@ class _Choice(_Trials):
             else:
                 high = share
 
-    def _around_its_rest(self, trials: list[Trial]) -> None:
+    def _around_its_rest(self, trials: list[Trial], found: dict[str, Array]) -> None:
         """A practical claim in many states of a loop that rests where V is 0: a ball carries there as much as it does
-        of a loop that rests exactly, and the largest candidates come first as they do there."""
+        of a loop that rests exactly, and the largest candidates come first as they do there, but where boxes limit
+        them."""
         race, large = self.race, self._made(partial(optimised, self.loop))
+        starts = found if large is None else {large.name: large.P, **found}
+        if self._enters_thrifty(partial(economical, self.loop, starts)):
+            return
         if large is not None:
             self._enter_alone(large, _AROUND_FIRST)
         if large is not None and race.best.proved > _NEAR * large.volume:
