@@ -50,7 +50,7 @@ def main(folder: str | Path = "out/examples/swing_up") -> RoaResult:
     x0 = np.stack(np.meshgrid(*(np.linspace(*ends, 21) for ends in BOX)), -1).reshape(-1, 2)
     for name, law in {"the network": loop.policy, **laws(loop.linearise()[2])}.items():
         print(f"simulated: {name} settles from {settled(law, x0).sum()} of {len(x0)} states of the box")
-    result = certify_roa(PLANT, loop.network, folder, ranks=True, effort=0.3)
+    result = certify_roa(PLANT, loop.network, folder, ranks=True, effort=0.4)
     box = proved_set(result.certificate).locate([(Fraction(lo), Fraction(hi)) for lo, hi in BOX])
     print(f"the box is {box.answer.value} in the proved set\n{result}\ncertificate  {result.certificate}")
     return result

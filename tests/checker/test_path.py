@@ -26,7 +26,6 @@ from certify.checker import clauses, tube
 from certify.checker.case import Case
 from certify.checker.decrease import Models, are_finite
 from certify.checker.document import Certificate, Multipliers
-from certify.checker.errors import Rejected
 from certify.checker.exact import exactly
 from certify.checker.sections import Path
 from certify.checker.tube import are_all_usable
@@ -817,12 +816,7 @@ def test_models_of_random_loops_hold_along_random_paths(seed: int) -> None:
         if random.random() < 0.2:
             first, step = first * 10.0 ** random.uniform(-300, 0), step * 10.0 ** random.uniform(-300, 1)
         share = float(random.choice([random.uniform(0.01, 0.99), 2.0**-40, 1 - 2.0**-40]))
-        try:
-            case = Case(parse(placed(base, first.tolist(), (first + step).tolist(), share, J)))
-        except Rejected as no:
-            assert no.detail == "a division by the number 0"
-            continue
-        (piece,) = tube.pieces(case)
+        (piece,) = tube.pieces(Case(parse(placed(base, first.tolist(), (first + step).tolist(), share, J))))
         with np.errstate(all="ignore"):
             jets = seen([*piece.F(), *piece.inputs])
             finite = are_finite([*piece.F(), *piece.inputs])

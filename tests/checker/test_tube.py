@@ -31,6 +31,7 @@ from certify.checker.ball import Ball
 from certify.checker.case import Case
 from certify.checker.decrease import are_finite, are_usable
 from certify.checker.document import Multipliers
+from certify.checker.errors import Rejected
 from certify.checker.exact import MAX_MATRIX_BITS, exactly, is_definite, root_above
 from certify.reference import rules as second
 from tests.support.balls import AT_REST, centred, enlarged_from
@@ -569,6 +570,11 @@ def random_loop(random: np.random.Generator) -> tuple[Document, np.ndarray]:
         u_eq=[str(Fraction(float(v)) * Fraction(random.integers(-9, 9).item(), 10)) for v in scale],
     )  # fmt: skip
     data["evidence"] |= {"local": centred(np.eye(n), np.ones((3, n))), "tube": []}
+    try:
+        parse(data)
+    except Rejected as no:  # by chance
+        assert no.detail == "a division by the number 0"
+        return random_loop(random)
     return data, J
 
 

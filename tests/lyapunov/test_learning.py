@@ -222,7 +222,8 @@ def test_a_small_region_of_several_states_is_walked_through() -> None:
     flow = LearningFlow(disc(5.0, 3), Quadratic(np.eye(3)), 0.04)
     samples = draw(flow, np.random.default_rng(0))
     radius = np.linalg.norm(samples.x, axis=1)
-    assert np.array_equal(samples.attracted, radius < 1)
+    slow = np.abs(radius - 1) < 1e-4  # next to the edge a run takes longer than any that is made
+    assert np.array_equal(samples.attracted[~slow], radius[~slow] < 1) and slow.sum() < 10
     assert samples.attracted.sum() > 3000 and (~samples.attracted).sum() > 1000
     np.testing.assert_allclose(
         np.quantile(radius[samples.attracted], [0.25, 0.5, 0.75]) ** 3, [0.25, 0.5, 0.75], atol=0.06
