@@ -101,7 +101,7 @@ def decrease(loop: ClosedLoop, P: np.ndarray) -> float:
 
 
 def test_v_falls_in_the_few_directions_that_samples_miss() -> None:
-    loop = bent(damping=0.05, seed=1)
+    loop = bent(damping=0.05, seed=2)
     P = economical_candidate(loop, starts(loop), BOXES)
     slowest = -np.linalg.eigvals(loop.mean_rate()).real.max()
     assert decrease(loop, P) > 0.02 * slowest

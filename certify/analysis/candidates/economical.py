@@ -34,7 +34,7 @@ NEAREST = 0.1  # distance from the origin, of 1, from which on they are sampled
 OVERHEAD = 8.0  # boxes for each that is forecast, times 2^(n/2)
 LEAST = 1e-2  # m, of where nothing would be proved
 _SHARE = 0.1  # the size of their boxes
-_SLOW = 0.05  # share of the slowest mode's decrease, below which no direction is to fall
+_SLOW = 0.2  # share of the slowest mode's decrease, below which no direction is to fall
 _HARD = 100.0  # the price of a direction without decrease
 _ROUNDS, _TRUST, _MOST_TRUST, _LEAST_TRUST = 12, 0.15, 0.3, 0.01  # of the entries of X, P = L (1 + X) L'
 _STEPS = 60  # of a minimisation

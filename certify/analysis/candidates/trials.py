@@ -224,11 +224,16 @@ def robust(loop: ClosedLoop, options: RoaOptions, effort: Effort) -> Trial | Non
 
 
 def economical(
-    loop: ClosedLoop, found: Mapping[str, Array], boxes: float, options: RoaOptions, effort: Effort
+    loop: ClosedLoop,
+    found: Mapping[str, Array],
+    boxes: float,
+    options: RoaOptions,
+    effort: Effort,
+    largest: Trial | None = None,
 ) -> Trial | None:
     """The candidate that these boxes are forecast to prove most with, from `solutions` on, or None if they prove more
-    than a small part of what is within the reach of the first of these."""
-    first = trial(loop, next(iter(found.values())), "", options, effort)
+    than a small part of what is within the reach of the largest, or of the first of these."""
+    first = largest or trial(loop, next(iter(found.values())), "", options, effort)
     level = first.task.target * _BOXES_SUFFICE ** (2 / loop.system.n)
     if Forecast(loop, effort, FEW_STATES).boxes(first.P, level) <= boxes:
         return None

@@ -420,8 +420,7 @@ class _Choice(_Trials):
         of a loop that rests exactly, and the largest candidates come first as they do there, but where boxes limit
         them."""
         race, large = self.race, self._made(partial(optimised, self.loop))
-        starts = found if large is None else {large.name: large.P, **found}
-        if self._enters_thrifty(partial(economical, self.loop, starts)):
+        if self._enters_thrifty(partial(economical, self.loop, found, largest=large)):
             return
         if large is not None:
             self._enter_alone(large, _AROUND_FIRST)
