@@ -455,7 +455,7 @@ FORGED: list[tuple[str, str, str, Edit]] = [
     ("outer", "a tree cut short", "two states", tree(lambda old: old[:-1])),
     ("outer", "a byte behind it", "two states", tree(lambda old: old + b"\xff")),
     ("outer", "no such axis", "two states", tree(lambda old: b"\x02" + old + b"\xff")),
-    ("outer", "the other half", "an odd domain", tree(lambda old: bytes([old[0], LEAF]) + old[1:-1])),
+    ("outer", "the other half", "functions", tree(lambda old: bytes([old[0], LEAF]) + old[1:-1])),
     ("outer", "too many boxes wait", "two states", tree(lambda old: bytes([0] * 4097 + [LEAF] * 4098))),
     ("inputs", "beyond the bounds", "a state", regrown(setting("plant.input_bounds", [["-9/10", "9/10"]]),
      setting("policy.centre", "output"), rehash)),
