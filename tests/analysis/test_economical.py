@@ -108,3 +108,10 @@ def test_v_falls_in_the_few_directions_that_samples_miss() -> None:
     forecast = Forecast(loop, states=400)
     assert forecast.decrease(P) == pytest.approx(decrease(loop, P), rel=1e-6)
     assert volume(P, 1.0) > max(volume(one, forecast.level(one, BOXES)) for one in starts(loop))
+
+
+def test_a_round_ends_where_v_does_not_fall_at_all(curved: ClosedLoop) -> None:
+    A, forecast = curved.mean_rate(), Forecast(curved, states=100)
+    P = np.eye(6) + 0.9 * (A + A.T) / np.abs(np.linalg.eigvalsh(A + A.T)).max()
+    assert decrease(curved, P) < 0
+    assert np.all(np.linalg.eigvalsh(forecast.easier(P, 1e-4, 0.1)) > 0)

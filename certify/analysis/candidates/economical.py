@@ -85,7 +85,7 @@ class Forecast:
         """The states of {x'Px <= level}, each with the errors on its box."""
         loop, n = self.loop, self.loop.system.n
         self.effort.charge(len(self.z) * (operations_of_policy(loop.network) + (loop.system.m + 1) * loop.operations))
-        T = diagonalising_coordinates(P, loop.mean_rate(), loop.step)
+        T = diagonalising_coordinates(P, self.A, loop.step)
         T = T / np.sqrt(np.diag(T.T @ P @ T))
         x = math.sqrt(level) * np.linalg.solve(np.linalg.cholesky(P).T, self.z.T).T
         reach = math.sqrt(level) * _SHARE * self.radii
@@ -157,7 +157,7 @@ class Forecast:
         M = (vectors * np.maximum(values, 1 - 2 * trust)) @ vectors.T
         new = L @ M @ L.T / np.linalg.det(M) ** (1 / n)
         new = (new + new.T) / 2
-        while self.decrease(new) < slow:  # which P has, and so have all in some part of the way to it
+        while slow > 0 and self.decrease(new) < slow:  # which P has, and so have all in some part of the way to it
             new = (P + new) / 2
         return np.asarray(new / np.linalg.det(new) ** (1 / n) * np.linalg.det(P) ** (1 / n))
 
