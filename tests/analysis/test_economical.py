@@ -14,7 +14,7 @@ from certify.effort import UNLIMITED, Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import get_system
 from certify.loop.policies import PolicyNetwork, load_policy
-from certify.lyapunov import choose_candidate, volume
+from certify.lyapunov import choose_candidate, slowest_decay, volume
 from tests.support.mutants import POLICIES
 
 BOXES = 30_000
@@ -78,10 +78,49 @@ def test_it_is_asked_for_where_boxes_limit_the_proof_alone(curved: ClosedLoop) -
 
 
 def test_no_forecast_is_made_of_loops_whose_boxes_it_does_not_know(curved: ClosedLoop) -> None:
-    system = curved.system
-    assert is_forecast(curved)
-    assert not is_forecast(ClosedLoop(system.with_sample((Fraction(1, 50), Fraction(1, 50))), curved.network))
-    assert not is_forecast(ClosedLoop(system.with_ranges({"m": (Fraction(45, 100), Fraction(5, 10))}), curved.network))
+    assert is_forecast(curved) and is_forecast(held(curved))
+    ranged = curved.system.with_ranges({"m": (Fraction(45, 100), Fraction(5, 10))})
+    assert not is_forecast(ClosedLoop(ranged, curved.network))
+
+
+def held(loop: ClosedLoop, period: Fraction = Fraction(1, 50)) -> ClosedLoop:
+    return ClosedLoop(loop.system.with_sample((period, period)), loop.network)
+
+
+def test_the_forecast_of_a_short_period_is_that_of_none(curved: ClosedLoop) -> None:
+    short, (P, _) = held(curved, Fraction(1, 10**6)), starts(curved)
+    level = Forecast(curved, states=400).level(P, BOXES)
+    plain, other = (Forecast(loop, states=400) for loop in (curved, short))
+    assert other.boxes(P, level) == pytest.approx(plain.boxes(P, level), rel=1e-3)
+    assert other.decrease(P) == pytest.approx(plain.decrease(P), rel=1e-3)
+    changed = Forecast(held(curved), states=400).boxes(P, level) / plain.boxes(P, level)
+    assert not 0.99 < changed < 1.01
+
+
+def test_over_a_period_it_counts_how_v_ends(curved: ClosedLoop) -> None:
+    """m is a quotient of what V loses in the period and of what inputs that err change in that."""
+    loop, (P, _) = held(curved), starts(curved)
+    forecast = Forecast(loop, states=50)
+    found = forecast.sampled(P, 0.1)
+    x, h = 2 * found.middle - found.end, loop.step
+
+    def value(G: np.ndarray) -> np.ndarray:
+        return np.einsum("ki,ij,kj->k", x + h * G, P, x + h * G) / h
+
+    lost = np.einsum("ki,ij,kj->k", x, P, x) / h - value(found.G)
+    small = 1e-4
+    asked = sum(np.abs(value(found.G + small * e) - value(found.G - small * e)) for e in found.errors.swapaxes(0, 1))
+    assert found.margins(P) == pytest.approx(lost / (asked / (2 * small)), rel=1e-4)
+    assert found.end == pytest.approx(x + h * found.G)
+
+
+def test_it_is_made_of_loops_whose_input_is_held(curved: ClosedLoop) -> None:
+    loop = held(curved)
+    found = [choose_candidate(loop, name).P for name in ("lyapunov", "scaled")]
+    P, unseen = economical_candidate(loop, found, BOXES), Forecast(loop, states=1000, seed=1)
+    assert unseen.boxes(P, 1.0) < 2 * BOXES
+    assert volume(P, unseen.level(P, BOXES)) > 1.5 * max(volume(one, unseen.level(one, BOXES)) for one in found)
+    assert unseen.decrease(P) > 0.1 * slowest_decay(loop.mean_rate(), loop.step)
 
 
 def test_it_is_made_from_another_candidate_where_more_is_forecast_of_it_than_of_all_others(curved: ClosedLoop) -> None:

@@ -226,6 +226,33 @@ def test_a_large_margin_is_tried_where_ranges_leave_next_to_nothing_of_the_large
     assert names == began
 
 
+@pytest.mark.parametrize(
+    ("states", "share", "expected", "settled", "heats"),
+    [
+        (4, 0.11, 1.0, True, 4),  # of the volume by two parts of a heat and two more
+        (4, 0.11, 1e9, False, 2),  # a gain is too far off
+        (4, 0.09, 1.0, False, 4),
+        (3, 0.9, 1.0, False, 0),
+    ],
+)
+def test_in_many_states_the_largest_set_is_gone_on_with_before_others_are_made(
+    states: int, share: float, expected: float, settled: bool, heats: int, tmp_path: Path
+) -> None:
+    loop, options, begun = ClosedLoop(*chain(states, [-1, -4, -6, -4][-states:])), RoaOptions(), list[Slow]()
+    large = trial(loop, solve_lyapunov(loop.linearise()[0], np.eye(states)), "optimised", options)
+
+    def begin(one: Trial, proved: bool) -> Slow:
+        begun.append(Slow(one.task.target, share ** (2 / states) / 4, expected))
+        return begun[-1]
+
+    effort = Effort(UNIT)
+    tools = Tools(tmp_path, Any, effort, Any, {})  # type: ignore[arg-type]
+    run = Race(begin, effort, 0.04 * UNIT, 100)  # type: ignore[arg-type]
+    choice = _Choice(SimpleNamespace(loop=loop, options=options, interruptible=True), tools, effort, run)  # type: ignore[arg-type]
+    assert choice._goes_far(large) is settled
+    assert [one.heats for one in begun] == ([heats] if heats else [])
+
+
 def test_the_candidate_of_a_large_margin_is_smaller_and_decays_at_every_corner(pendulum: System) -> None:
     system = pendulum.with_ranges({"m": (Fraction(14, 100), Fraction(16, 100))})
     loop = ClosedLoop(system, load_policy(SHIPPED).network)

@@ -7,7 +7,7 @@ larger the error could be, so that one of the share r sqrt(m) is proved, and {V 
 m^(-n/2) boxes, which samples estimate. Halvings that overshoot, boxes that stick out of the set, and those that are
 divided themselves multiply that by a factor, which is measured. For fixed states m is a quotient of a linear and of a
 convex function of P, and does not depend on P's scale: each round minimises the forecast over P in a trust region, and
-then takes the level that the boxes reach.
+then takes the level that the boxes reach. Where time goes in steps, the mean rate of V over a step stands for Vdot.
 
 Directions in which V decreases little, or grows, may be too few for samples. So the slowest decrease of the linear
 part, of a V of length 1, is kept above a share of the slowest mode's.
@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 
 from certify.effort import UNLIMITED, Effort
 from certify.loop.closed_loop import ClosedLoop
-from certify.lyapunov import diagonalising_coordinates, domain_limit, volume
+from certify.loop.plants import mean_rate
+from certify.lyapunov import diagonalising_coordinates, domain_limit, increment_matrix, slowest_decay, volume
 from certify.provers.bounds import operations_of_policy, policy_enclosure
 
 Array = NDArray[np.float64]
@@ -34,6 +35,7 @@ NEAREST = 0.1  # distance from the origin, of 1, from which on they are sampled
 OVERHEAD = 8.0  # boxes for each that is forecast, times 2^(n/2)
 LEAST = 1e-2  # m, of where nothing would be proved
 _SHARE = 0.1  # the size of their boxes
+_FLOW = 8  # evaluations of f for a period in which the input is held
 _SLOW = 0.2  # share of the slowest mode's decrease, below which no direction is to fall
 _HARD = 100.0  # the price of a direction without decrease
 _ROUNDS, _TRUST, _MOST_TRUST, _LEAST_TRUST = 12, 0.15, 0.3, 0.01  # of the entries of X, P = L (1 + X) L'
@@ -44,18 +46,20 @@ _BELOW = 1 - 1e-9  # share of the domain's limit
 
 @dataclass(frozen=True)
 class _Sampled:
-    """States, F, and how much F changes with each input's error on their boxes: (N, n), (N, n), (N, m, n)."""
+    """States (N, n), the mean rate G of a step from each (N, n), and how much G changes with each input's error on
+    their boxes (N, m, n). With `middle` halfway through the step and `end` at its end, V changes by 2 middle'P G, and
+    with a change of G by 2 end'P of that."""
 
-    x: Array
-    F: Array
+    G: Array
     errors: Array
+    middle: Array
+    end: Array
 
     def margins(self, P: Array) -> Array:
         """m of each state, (N,)."""
-        along = 2 * self.x @ P
-        asked = np.abs((self.errors * along[:, None]).sum(-1)).sum(-1)
+        asked = np.abs((self.errors * (2 * self.end @ P)[:, None]).sum(-1)).sum(-1)
         with np.errstate(all="ignore"):
-            found = -(along * self.F).sum(-1) / asked
+            found = -(2 * self.middle @ P * self.G).sum(-1) / asked
         return np.asarray(np.where(np.isfinite(found), found, 0.0))
 
 
@@ -64,7 +68,7 @@ class Forecast:
 
     Parameters
     ----------
-    loop : in continuous time, its input follows at once, and nothing is uncertain.
+    loop : nothing in it is uncertain.
     effort : to which the samples are charged.
     states, seed : how many are sampled, and the seed of their directions.
     """
@@ -79,12 +83,13 @@ class Forecast:
         alike = sphere * -math.log(NEAREST) / (2 * _SHARE) ** n  # boxes of this share between the radii
         self.unit = OVERHEAD * 2 ** (n / 2) * alike
         self.A = loop.mean_rate()
-        self.slow = -_SLOW * float(np.linalg.eigvals(self.A).real.max())
+        self.slow = _SLOW * slowest_decay(self.A, loop.step)
 
     def sampled(self, P: Array, level: float) -> _Sampled:
         """The states of {x'Px <= level}, each with the errors on its box."""
-        loop, n = self.loop, self.loop.system.n
-        self.effort.charge(len(self.z) * (operations_of_policy(loop.network) + (loop.system.m + 1) * loop.operations))
+        loop, n, m, h = self.loop, self.loop.system.n, self.loop.system.m, self.loop.step
+        steps = (m + 1) * (_FLOW if loop.system.sample else 1)
+        self.effort.charge(len(self.z) * (operations_of_policy(loop.network) + steps * loop.operations))
         T = diagonalising_coordinates(P, self.A, loop.step)
         T = T / np.sqrt(np.diag(T.T @ P @ T))
         x = math.sqrt(level) * np.linalg.solve(np.linalg.cholesky(P).T, self.z.T).T
@@ -92,9 +97,9 @@ class Forecast:
         boxes = np.concatenate([x.T[:, None], T[:, :, None] * reach], 1)
         wide = self.enclosure(boxes, np.zeros((n, len(self.z))))[2]
         u = loop.policy(x)
-        F = self.f(x, u)
-        moved = [self.f(x, u + wide[j][:, None] * one) - F for j, one in enumerate(np.eye(loop.system.m))]
-        return _Sampled(x, F, np.stack(moved, 1))
+        G = mean_rate(loop.system, self.f, x, u, h)
+        moved = [mean_rate(loop.system, self.f, x, u + wide[j][:, None] * one, h) - G for j, one in enumerate(np.eye(m))]
+        return _Sampled(G, np.stack(moved, 1), x + h / 2 * G, x + h * G)
 
     def boxes(self, P: Array, level: float) -> float:
         """The number of boxes."""
@@ -119,10 +124,10 @@ class Forecast:
         """P (n, n) of the same determinant for which the present states need the fewest boxes, near the present one."""
         n, found, L = len(P), self.sampled(P, level), np.linalg.cholesky(P)
         slow = min(self.slow, 0.999 * self.decrease(P))
-        A = L.T @ self.A @ np.linalg.inv(L.T)
+        A, h = L.T @ self.A @ np.linalg.inv(L.T), self.loop.step
         rows = np.triu_indices(n)
-        z, F, errors = found.x @ L, found.F @ L, found.errors @ L
-        along, asked = _products(z, F), _products(z[:, None], errors)
+        along = _products(found.middle @ L, found.G @ L)
+        asked = _products((found.end @ L)[:, None], found.errors @ L)
         often = np.where(rows[0] == rows[1], 1.0, 2.0)
 
         def forecast(v: Array) -> tuple[float, Array]:
@@ -139,11 +144,11 @@ class Forecast:
             gradient -= np.einsum("ku,kuij->ij", (by * m / size)[:, None] * np.sign(each), asked)
             value = math.log(total) + np.maximum(LEAST - m, 0.0).sum()
             if slow > 0:
-                values, vectors = np.linalg.eigh(-(A.T @ M + M @ A) - 2 * slow * M)
+                values, vectors = np.linalg.eigh(-increment_matrix(M, A, h) - 2 * slow * M)
                 short = _HARD * np.maximum(2 - values / slow, 0.0)
                 value += (short**2).sum() / (2 * _HARD)
                 along_short = (vectors * short) @ vectors.T
-                gradient += (A @ along_short + along_short @ A.T + 2 * slow * along_short) / slow
+                gradient += (increment_matrix(along_short, A.T, h) + 2 * slow * along_short) / slow
             return float(value), gradient[rows] * often
 
         from scipy.optimize import minimize  # which a proof that asks no forecast does not load
@@ -162,15 +167,14 @@ class Forecast:
         return np.asarray(new / np.linalg.det(new) ** (1 / n) * np.linalg.det(P) ** (1 / n))
 
     def decrease(self, P: Array) -> float:
-        """The largest r with `A'P + PA <= -2 r P`."""
-        half = np.linalg.solve(L := np.linalg.cholesky(P), self.A.T @ P + P @ self.A)
+        """The largest r for which V of the linear part falls at least as `exp(-2 r t)` does at first."""
+        half = np.linalg.solve(L := np.linalg.cholesky(P), increment_matrix(P, self.A, self.loop.step))
         return float(-np.linalg.eigvalsh(np.linalg.solve(L, half.T)).max() / 2)
 
 
 def is_forecast(loop: ClosedLoop) -> bool:
     """True for loops that a forecast can be made of."""
-    system = loop.system
-    return system.time == "continuous" and system.sample is None and not system.uncertain
+    return not loop.system.uncertain
 
 
 def economical_candidate(loop: ClosedLoop, starts: Sequence[Array], boxes: float, effort: Effort = UNLIMITED) -> Array:

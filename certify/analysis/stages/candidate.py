@@ -54,6 +54,7 @@ from certify.provers.falsify import Witness
 _HEAT = 0.04  # share of the effort for a candidate's first heat
 _SEARCH = 0.6  # share of the effort that is left for a search that cannot be interrupted
 _AROUND_FIRST = 0.3  # the same in many states, for the first of several, of which the later ones are to be the larger
+_HALF = 0.5  # of the effort left, for the largest candidate in many states before the others are made
 _TO_FIND = 0.5  # share of the effort before an outer set for a candidate, where its one heat gets the rest
 _GRACE, _LEAST = 1.0 * UNIT, 0.05  # operations, or of the whole, for a local level where nothing is proved yet
 _FOR_BALL = 0.2  # of the whole, for a set from a ball around the equilibrium, even if no effort is left
@@ -276,6 +277,8 @@ class _Choice(_Trials):
         most = volume(ellipsoid_in(loop.system), 1.0)
         if state.interruptible and large is not None and race.is_settled_by(large, most):
             return None  # before the others are made, of which `robust` takes longest
+        if state.interruptible and large is not None and self._goes_far(large):
+            return None
         trials = [] if large is None else [large]
         if not self.effort.over or not race.proved:
             with self.tools.timing("candidate"):
@@ -329,6 +332,20 @@ class _Choice(_Trials):
                 between = list(blends(loop, unproved[0].trial, best, self.state.options, self._granted()))
             race.enter(between, None if race.gained else 0.0)  # without a gain their local levels tell
         race.knock_out()
+
+    def _goes_far(self, large: Trial) -> bool:
+        """True if half of the effort proves more than a little of the largest candidate in many states, where a search
+        gains nothing at first, and others take much to be made; it is tried where a gain is expected in that."""
+        entered = None
+        if self.loop.system.n > FEW and not self.loop.system.ranges:
+            entered = self._enter_alone(large, _HEAT)
+        if entered is None:
+            return False
+        self.race.advance(entered, _HALF * self.effort.left, operations_of_box(self.loop))
+        if entered.proved <= _SMALL * large.volume:
+            return False
+        self._improve()
+        return True
 
     def _is_firm(self, large: Trial) -> bool:
         """True if most is proved of the candidate of a large margin, tried where next to nothing is of the largest."""
