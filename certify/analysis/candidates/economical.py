@@ -98,7 +98,9 @@ class Forecast:
         wide = self.enclosure(boxes, np.zeros((n, len(self.z))))[2]
         u = loop.policy(x)
         G = mean_rate(loop.system, self.f, x, u, h)
-        moved = [mean_rate(loop.system, self.f, x, u + wide[j][:, None] * one, h) - G for j, one in enumerate(np.eye(m))]
+        moved = [
+            mean_rate(loop.system, self.f, x, u + wide[j][:, None] * one, h) - G for j, one in enumerate(np.eye(m))
+        ]
         return _Sampled(G, np.stack(moved, 1), x + h / 2 * G, x + h * G)
 
     def boxes(self, P: Array, level: float) -> float:
