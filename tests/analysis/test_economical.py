@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from certify.analysis.candidates.economical import Forecast, economical_candidate, is_forecast
+from certify.analysis.candidates.economical import Forecast, economical_candidate
 from certify.analysis.candidates.trials import economical, economical_from, trial
 from certify.analysis.options import RoaOptions
 from certify.effort import UNLIMITED, Effort
@@ -77,10 +77,16 @@ def test_it_is_asked_for_where_boxes_limit_the_proof_alone(curved: ClosedLoop) -
     assert economical(curved, found, 1e12, options, UNLIMITED) is None
 
 
-def test_no_forecast_is_made_of_loops_whose_boxes_it_does_not_know(curved: ClosedLoop) -> None:
-    assert is_forecast(curved) and is_forecast(held(curved))
-    ranged = curved.system.with_ranges({"m": (Fraction(45, 100), Fraction(5, 10))})
-    assert not is_forecast(ClosedLoop(ranged, curved.network))
+def test_corners_of_ranges_count(curved: ClosedLoop) -> None:
+    """A wider range takes more boxes, and one of no extent none."""
+    (P, _), taken = starts(curved), list[float]()
+    level = Forecast(curved, states=2000).level(P, BOXES)
+    middle = curved.system.parameters["I"]
+    for share in (0, Fraction(1, 10**9), Fraction(1, 4)):
+        ranges = {"I": (middle * (1 - share), middle * (1 + share))} if share else {}
+        loop = ClosedLoop(curved.system.with_ranges(ranges), curved.network)
+        taken.append(Forecast(loop, states=2000).boxes(P, level))
+    assert taken[1] == pytest.approx(taken[0], rel=1e-6) and taken[2] > 1.1 * taken[0]
 
 
 def held(loop: ClosedLoop, period: Fraction = Fraction(1, 50)) -> ClosedLoop:

@@ -68,7 +68,7 @@ class Forecast:
 
     Parameters
     ----------
-    loop : nothing in it is uncertain.
+    loop : with ranges, a forecast takes a corner of them for each sample.
     effort : to which the samples are charged.
     states, seed : how many are sampled, and the seed of their directions.
     """
@@ -78,7 +78,9 @@ class Forecast:
         z = generator.standard_normal((states, n))
         self.radii = np.exp(generator.uniform(math.log(NEAREST), 0.0, states))
         self.z = z / np.linalg.norm(z, axis=1, keepdims=True) * self.radii[:, None]
-        self.enclosure, self.f = policy_enclosure(loop), loop.system.function()
+        ranges = [np.array([float(end) for end in ends]) for _, ends in loop.system.uncertain]
+        values, f = [ends[generator.integers(2, size=states)] for ends in ranges], loop.system.uncertain_function()
+        self.enclosure, self.f = policy_enclosure(loop), lambda x, u: f(x, u, values)
         sphere = 2 * math.pi ** (n / 2) / math.gamma(n / 2)
         alike = sphere * -math.log(NEAREST) / (2 * _SHARE) ** n  # boxes of this share between the radii
         self.unit = OVERHEAD * 2 ** (n / 2) * alike
@@ -174,17 +176,12 @@ class Forecast:
         return float(-np.linalg.eigvalsh(np.linalg.solve(L, half.T)).max() / 2)
 
 
-def is_forecast(loop: ClosedLoop) -> bool:
-    """True for loops that a forecast can be made of."""
-    return not loop.system.uncertain
-
-
 def economical_candidate(loop: ClosedLoop, starts: Sequence[Array], boxes: float, effort: Effort = UNLIMITED) -> Array:
     """P (n, n), scaled so that about {x'Px <= 1} is proved by this number of boxes, for the largest such set found.
 
     Parameters
     ----------
-    loop : a closed loop of which `is_forecast` is true.
+    loop : a closed loop.
     starts : (n, n) each, of which the best is improved.
     """
     rough, forecast = Forecast(loop, effort, FEW_STATES), Forecast(loop, effort)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from certify.analysis.asked import ellipsoid_in
 from certify.analysis.candidates.converging import is_nearby
-from certify.analysis.candidates.economical import is_forecast
 from certify.analysis.candidates.robust import NoCandidateError
 from certify.analysis.candidates.trials import (
     FOR_PEAK,
@@ -271,9 +270,14 @@ class _Choice(_Trials):
                 trials = solved(loop, found, state.options, self._granted())
             rests = loop.network.is_moved and not loop.system.ranges
             return self._around_its_rest(trials, found) if rests else self._around_a_level(trials)
-        if state.interruptible and self._enters_thrifty(partial(economical, loop, found)):
+        ranged = bool(loop.system.ranges)
+        if state.interruptible and not ranged and self._enters_thrifty(partial(economical, loop, found)):
             return None
         large = self._made(partial(optimised, loop)) if state.options.engine != "dreal" else None
+        if state.interruptible and ranged and large is not None:
+            starts = {**found, large.name: large.P}
+            if self._enters_thrifty(partial(economical, loop, starts, largest=large)):
+                return None
         most = volume(ellipsoid_in(loop.system), 1.0)
         if state.interruptible and large is not None and race.is_settled_by(large, most):
             return None  # before the others are made, of which `robust` takes longest
@@ -363,7 +367,7 @@ class _Choice(_Trials):
     def _enters_thrifty(self, make: Callable[[float, RoaOptions, Effort], Trial | None]) -> bool:
         """Enter a candidate for the boxes that the effort left can bound and check; False if these are not what limits
         it, since nothing is proved, or its samples have missed a violation."""
-        if not (FEW < self.loop.system.n <= MANY and is_forecast(self.loop)) or self.state.options.engine == "dreal":
+        if not FEW < self.loop.system.n <= MANY or self.state.options.engine == "dreal":
             return False
         each = operations_of_box(self.loop) + operations_of_check(self.loop)
         boxes = (self.effort.left - OPTIMISING * self.tools.whole) / each
