@@ -254,6 +254,50 @@ class _Trials:
                 return
             race.enter([again])
 
+    def _largest(self, found: dict[str, Array]) -> tuple[Trial | None, bool]:
+        """The largest candidate, and True if no other is worth its effort beside this one, or beside one for the boxes
+        that there are: before the others are made, of which `robust` takes longest."""
+        loop, ranges = self.loop, self.loop.system.ranges
+        if not ranges and self._enters_thrifty(partial(economical, loop, found)):
+            return None, True
+        large = self._made(partial(optimised, loop))
+        if large is None:
+            return None, False
+        starts = {**found, large.name: large.P}
+        if ranges and self._enters_thrifty(partial(economical, loop, starts, largest=large)):
+            return large, True
+        most = volume(ellipsoid_in(loop.system), 1.0)
+        return large, self.race.is_settled_by(large, most) or self._goes_far(large)
+
+    def _goes_far(self, large: Trial) -> bool:
+        """True if half of the effort proves more than a little of the largest candidate in many states, where a search
+        gains nothing at first, and others take much to be made; it is tried where a gain is expected in that."""
+        entered = None
+        if self.loop.system.n > FEW and not self.loop.system.ranges:
+            entered = self._enter_alone(large, _HEAT)
+        if entered is None:
+            return False
+        self.race.advance(entered, _HALF * self.effort.left, operations_of_box(self.loop))
+        if entered.proved <= _SMALL * large.volume:
+            return False
+        self._improve()
+        return True
+
+    def _enters_thrifty(self, make: Callable[[float, RoaOptions, Effort], Trial | None]) -> bool:
+        """Enter a candidate for the boxes that the effort left can bound and check; False if these are not what limits
+        it, since nothing is proved, or its samples have missed a violation."""
+        if not FEW < self.loop.system.n <= MANY or self.state.options.engine == "dreal":
+            return False
+        each = operations_of_box(self.loop) + operations_of_check(self.loop)
+        boxes = (self.effort.left - OPTIMISING * self.tools.whole) / each
+        cut_short = self.cut_short
+        made = self._made(partial(make, boxes)) if boxes >= 1 else None
+        if made is None:
+            self.cut_short = cut_short
+            return False
+        self.race.enter([made])
+        return self.race.proved and not (self.race.contenders[-1].attempt.done and self._is_left_for_more())
+
 
 @dataclass
 class _Choice(_Trials):
@@ -270,19 +314,12 @@ class _Choice(_Trials):
                 trials = solved(loop, found, state.options, self._granted())
             rests = loop.network.is_moved and not loop.system.ranges
             return self._around_its_rest(trials, found) if rests else self._around_a_level(trials)
-        ranged = bool(loop.system.ranges)
-        if state.interruptible and not ranged and self._enters_thrifty(partial(economical, loop, found)):
-            return None
-        large = self._made(partial(optimised, loop)) if state.options.engine != "dreal" else None
-        if state.interruptible and ranged and large is not None:
-            starts = {**found, large.name: large.P}
-            if self._enters_thrifty(partial(economical, loop, starts, largest=large)):
+        if state.interruptible:
+            large, settled = self._largest(found)
+            if settled:
                 return None
-        most = volume(ellipsoid_in(loop.system), 1.0)
-        if state.interruptible and large is not None and race.is_settled_by(large, most):
-            return None  # before the others are made, of which `robust` takes longest
-        if state.interruptible and large is not None and self._goes_far(large):
-            return None
+        else:
+            large = self._made(partial(optimised, loop)) if state.options.engine != "dreal" else None
         trials = [] if large is None else [large]
         if not self.effort.over or not race.proved:
             with self.tools.timing("candidate"):
@@ -337,20 +374,6 @@ class _Choice(_Trials):
             race.enter(between, None if race.gained else 0.0)  # without a gain their local levels tell
         race.knock_out()
 
-    def _goes_far(self, large: Trial) -> bool:
-        """True if half of the effort proves more than a little of the largest candidate in many states, where a search
-        gains nothing at first, and others take much to be made; it is tried where a gain is expected in that."""
-        entered = None
-        if self.loop.system.n > FEW and not self.loop.system.ranges:
-            entered = self._enter_alone(large, _HEAT)
-        if entered is None:
-            return False
-        self.race.advance(entered, _HALF * self.effort.left, operations_of_box(self.loop))
-        if entered.proved <= _SMALL * large.volume:
-            return False
-        self._improve()
-        return True
-
     def _is_firm(self, large: Trial) -> bool:
         """True if most is proved of the candidate of a large margin, tried where next to nothing is of the largest."""
         race = self.race
@@ -363,21 +386,6 @@ class _Choice(_Trials):
             return False
         race.advance(entered, _SEARCH * self.effort.left, operations_of_box(self.loop))
         return entered.proved > _MOST * entered.trial.volume
-
-    def _enters_thrifty(self, make: Callable[[float, RoaOptions, Effort], Trial | None]) -> bool:
-        """Enter a candidate for the boxes that the effort left can bound and check; False if these are not what limits
-        it, since nothing is proved, or its samples have missed a violation."""
-        if not FEW < self.loop.system.n <= MANY or self.state.options.engine == "dreal":
-            return False
-        each = operations_of_box(self.loop) + operations_of_check(self.loop)
-        boxes = (self.effort.left - OPTIMISING * self.tools.whole) / each
-        cut_short = self.cut_short
-        made = self._made(partial(make, boxes)) if boxes >= 1 else None
-        if made is None:
-            self.cut_short = cut_short
-            return False
-        self.race.enter([made])
-        return self.race.proved and not (self.race.contenders[-1].attempt.done and self._is_left_for_more())
 
     def _around_a_level(self, trials: list[Trial]) -> None:
         """A practical claim in many states, where no tree of boxes can carry what a ball does not: the candidate made
