@@ -352,7 +352,7 @@ def test_what_to_try_next_names_a_policy_that_was_the_first_word(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     status, out, _ = run(
-        capsys, *("roa", SHIPPED, "--max-boxes", "3", "--effort", "0.1"), "--out", tmp_path, "--json", "--quiet"
+        capsys, *("roa", SHIPPED, "--max-boxes", "3", "--effort", "0.02"), "--out", tmp_path, "--json", "--quiet"
     )
     command = json.loads(out)["diagnosis"]["next"]["command"]
     assert status == 0 and command.startswith(f"certify roa {SHIPPED} ") and "--max-boxes 30" in command
@@ -661,7 +661,7 @@ def test_reach_proves_that_a_box_converges(
     tmp_path: Path, spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     box = "p=1.49..1.51", "v=1.38..1.42"
-    status, out, _ = run(capsys, "reach", *spring, "--from", ",".join(box), "--effort", "0.3", "--json")
+    status, out, _ = run(capsys, "reach", *spring, "--from", ",".join(box), "--effort", "0.06", "--json")
     data = json.loads(out)
     assert status == 0 and data["verdict"] == "PROVED" and data["checked"] == "ACCEPTED"
     assert data["reach_from"] == {"p": ["149/100", "151/100"], "v": ["69/50", "71/50"]}
@@ -670,7 +670,7 @@ def test_reach_proves_that_a_box_converges(
     assert run(capsys, "contains", file, *box)[0] == 0
     wider = [round(1.5 + 2 * (-1) ** k * data["tube"]["semi_axes"][0], 6) for k in (1, 0)]
     assert run(capsys, "contains", file, f"p={wider[0]}..{wider[1]}", box[1])[0] != 0
-    status, out, _ = run(capsys, "reach", *spring, "--from", ",".join(box), "--effort", "0.3")
+    status, out, _ = run(capsys, "reach", *spring, "--from", ",".join(box), "--effort", "0.06")
     assert status == 0 and re.search(r"box +p = 1.49..1.51 m, v = 1.38..1.42 m/s", out)
 
 
@@ -853,7 +853,7 @@ def test_a_disturbance_that_always_acts_is_refused_where_it_would_be_left_out(
 def test_a_tube_of_a_plant_with_a_range(
     tmp_path: Path, ranged: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    status, out, _ = run(capsys, "roa", *ranged, "--param", "k=0.9..1.1", "--level", "0.05", "--enlarge")
+    status, out, _ = run(capsys, "roa", *ranged, "--param", "k=0.9..1.1", "--level", "0.05", "--enlarge", "--effort", "0.2")
     assert status == 0 and "PROVED" in out
     claim = json.loads((tmp_path / "o" / "certificate.json").read_text())
     assert claim["claim"]["kind"] == "enlarged" and claim["plant"]["uncertain"][0]["range"] == ["9/10", "11/10"]

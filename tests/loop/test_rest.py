@@ -300,7 +300,7 @@ def test_what_is_asked_of_a_set_is_about_its_own_point(tmp_path: Path, capsys: p
         "--candidate",
         "lqr",
         "--effort",
-        "0.1",
+        "0.02",
         "--out",
         str(tmp_path),
         "--json",

@@ -222,7 +222,7 @@ def without_biases(name: str) -> PolicyNetwork:
 
 @pytest.mark.parametrize("name", slow_after(1, ["elu", "softsign"]))
 def test_a_corner_with_a_tangent_at_the_operating_point_is_proved(name: str, tmp_path: Path) -> None:
-    result = certify_roa(PLANT, without_biases(name), tmp_path, effort=0.3, candidate="ellipsoid")
+    result = certify_roa(PLANT, without_biases(name), tmp_path, effort=0.1, candidate="ellipsoid")
     assert result.verdict is Verdict.PROVED and result.claim == "asymptotic" and result.levels.floor is None
     assert result.volume is not None and result.volume > 10
     programs: tuple[Program, ...] = ("checker", "reference")
@@ -244,7 +244,7 @@ def test_a_corner_of_elu_beside_one_of_relu_has_directions_for_the_relu() -> Non
 
 def test_a_relu_with_its_corner_at_the_operating_point_has_directions(tmp_path: Any) -> None:
     """A kink at the origin, and an unstable loop on one side of it."""
-    result = certify_roa(PLANT, free_of_biases(policy("relu"), 1), out=tmp_path, effort=0.1)
+    result = certify_roa(PLANT, free_of_biases(policy("relu"), 1), tmp_path, effort=0.1, candidate="ellipsoid")
     assert result.verdict is Verdict.PROVED and result.volume is not None and result.volume > 10
     local = json.loads((tmp_path / "certificate.json").read_text("utf-8"))["evidence"]["local"]
     assert len(local["directions"]) == 4

@@ -282,7 +282,7 @@ def test_missing_dreal_is_unknown_when_named_and_a_notice_when_not(
     monkeypatch.setattr(dreal_proof, "find_backend", missing)
     path = tmp_path / "policy.pt"
     save_policy(path, Policy(pendulum_network((8, 8)), "pendulum", {"m": "0.15"}))
-    arguments = ["roa", "--policy", str(path), "--out", str(tmp_path / "o"), "--json"]
+    arguments = ["roa", "--policy", str(path), "--out", str(tmp_path / "o"), "--effort", "0.2", "--json"]
     assert _run([*arguments, "--engine", "dreal"], True) == 3
     assert "libibex.so is missing" in json.loads(capsys.readouterr().out)["reason"]
     monkeypatch.setenv("CERTIFY_ENGINE", "dreal")

@@ -118,7 +118,7 @@ def cycle(tmp_path_factory: pytest.TempPathFactory) -> InvariantResult:
         "cycle", (X, Y), (U,), {}, (Y, (1 - X**2) * Y - X + U), u_eq=(Number(0),), domain=box(3, 4),
         input_bounds=box(1), constraints={"moving": Number(1) / 4 - X**2 - Y**2},
     ).with_sample((Fraction(1, 20), Fraction(1, 20)))  # fmt: skip
-    return proved(system, tmp_path_factory.mktemp("cycle"), (0.0, -0.1), 0.1)
+    return proved(system, tmp_path_factory.mktemp("cycle"), (0.0, -0.1), 0.02)
 
 
 def test_boxes_around_a_limit_cycle_are_accepted(cycle: InvariantResult) -> None:

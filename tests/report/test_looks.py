@@ -60,7 +60,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     for name, (system, network) in loops.items():
         folder = tmp_path_factory.mktemp(name)
         asked = {"p": 1.2, "v": 0.5} if name == "path" else None
-        options = RoaOptions(candidate="lyapunov", enlarge=name == "tube", reach_from=asked, effort=0.1)
+        options = RoaOptions(candidate="lyapunov", enlarge=name == "tube", reach_from=asked, effort=0.02)
         result = certify_roa(system, network, folder, options, provenance={"numpy": "1.2.3"})
         assert result.certificate is not None and result.checker is not None
         data = result.to_dict()
