@@ -756,7 +756,7 @@ class Random:
 
 
 @pytest.mark.parametrize("scattered", [False, True])
-@pytest.mark.parametrize("seed", slow_after(6, range(200)))
+@pytest.mark.parametrize("seed", slow_after(3, range(200)))
 def test_true_functions_are_within_the_least_bound(seed: int, scattered: bool) -> None:
     """The least E that both programs accept holds g - P at drawn points and in cells' middles; the two agree on it."""
     g, lo, hi = Random(seed), Fraction(0), Fraction(10**8)
