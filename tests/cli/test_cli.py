@@ -440,11 +440,11 @@ def test_an_interrupt_leaves_a_search_and_nothing_half_written(
         monkeypatch.setattr(VdotBound, "__call__", interrupt)
     else:
         monkeypatch.setattr("certify.analysis.acceptance.run_checker", interrupt)
-    status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", "--effort", "0.1")
+    status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", "--effort", "0.02")
     assert status == 130 and out == "" and "interrupted" in err and "--resume" in err
     assert [path.name for path in (tmp_path / "o").iterdir()] == ["search.json"]
     monkeypatch.undo()
-    assert run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", "--resume", "--effort", "0.1")[0] == 0
+    assert run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", "--resume", "--effort", "0.02")[0] == 0
     assert sorted(path.name for path in (tmp_path / "o").iterdir()) == ["certificate.json", "report.html"]
     assert run(capsys, "check", tmp_path / "o" / "certificate.json")[0] == 0
 
@@ -549,7 +549,7 @@ def test_practical_stability_from_the_command_line(tmp_path: Path, capsys: pytes
         "--candidate",
         "lqr",
         "--effort",
-        "0.1",
+        "0.02",
         "--out",
         tmp_path,
     )
@@ -853,7 +853,9 @@ def test_a_disturbance_that_always_acts_is_refused_where_it_would_be_left_out(
 def test_a_tube_of_a_plant_with_a_range(
     tmp_path: Path, ranged: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    status, out, _ = run(capsys, "roa", *ranged, "--param", "k=0.9..1.1", "--level", "0.05", "--enlarge", "--effort", "0.2")
+    status, out, _ = run(
+        capsys, "roa", *ranged, "--param", "k=0.9..1.1", "--level", "0.05", "--enlarge", "--effort", "0.2"
+    )
     assert status == 0 and "PROVED" in out
     claim = json.loads((tmp_path / "o" / "certificate.json").read_text())
     assert claim["claim"]["kind"] == "enlarged" and claim["plant"]["uncertain"][0]["range"] == ["9/10", "11/10"]
@@ -880,7 +882,18 @@ def test_a_sample_time_and_a_rate_are_said_everywhere(
     tmp_path: Path, ranged: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Result, JSON, page and checker speak of the same periods and the same rate."""
-    asked = ("--candidate", "lyapunov", "--level", "0.25", "--sample-time", "0.01..0.05", "--rate", "0.25")
+    asked = (
+        "--candidate",
+        "lyapunov",
+        "--level",
+        "0.25",
+        "--sample-time",
+        "0.01..0.05",
+        "--rate",
+        "0.25",
+        "--effort",
+        "0.2",
+    )
     status, out, _ = run(capsys, "roa", *ranged, *asked)
     said = " ".join(out.split())
     assert status == 0 and "is invariant at sampling instants and attracted by the origin" in said

@@ -295,7 +295,11 @@ def require_followed(system: System, options: RoaOptions, changed: Mapping[str, 
     ("more", "option", "better"),
     [
         (["--rate", "1.5", "--effort", "0.1"], "--rate", lambda old, new: new["verdict"] == "PROVED" != old["verdict"]),
-        (["--sample-time", "4", "--effort", "0.2"], "--sample-time", lambda old, new: new["verdict"] == "PROVED" != old["verdict"]),
+        (
+            ["--sample-time", "4", "--effort", "0.2"],
+            "--sample-time",
+            lambda old, new: new["verdict"] == "PROVED" != old["verdict"],
+        ),
         pytest.param(
             ["--sample-time", "0.2", "--candidate", "ellipsoid", "--effort", "0.1"],
             "--ranks",

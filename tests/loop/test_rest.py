@@ -120,7 +120,18 @@ def test_practical_stability_is_claimed_where_the_policy_is_not_centred(tmp_path
 def test_the_command_centres_on_request_and_says_what_that_changes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["roa", "--policy", str(PLAIN), "--candidate", "lqr", "--effort", "0.1", "--out", str(tmp_path), "--json"]
+    command = [
+        "roa",
+        "--policy",
+        str(PLAIN),
+        "--candidate",
+        "lqr",
+        "--effort",
+        "0.02",
+        "--out",
+        str(tmp_path),
+        "--json",
+    ]
     assert _run([*command, "--claim", "practical"], True) == 0
     further = json.loads(capsys.readouterr().out)["diagnosis"]["next"]
     assert further["options"] == {"--centre": "preactivation", "--claim": "auto"}
@@ -355,7 +366,7 @@ def test_a_range_moves_the_fixed_point_of_a_map(tmp_path: Path) -> None:
     folder = Path(__file__).parents[2] / "examples"
     system = load_system(folder / "plants" / "henon.toml").with_ranges({"a": (Fraction(139, 100), Fraction(141, 100))})
     policy = load_policy(folder / "policies" / "henon.pt")
-    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="lyapunov", effort=0.3))
+    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="lyapunov", effort=0.06))
     assert result.verdict is Verdict.PROVED and result.claim == "nearby" and result.certificate is not None
     assert result.levels.floor is not None and result.levels.floor < 1e-2
     certificate = read_certificate(result.certificate)

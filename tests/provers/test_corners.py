@@ -266,7 +266,9 @@ def test_saturated_plants_are_proved(name: str, tmp_path: Path) -> None:
 
 def test_leaves_across_a_corner_are_shown_in_the_order_that_they_were_proved_in_alone(tmp_path: Path) -> None:
     """A series of order 2 does not exist there, and boxes with ranks ask for it: the ring's proof keeps its order."""
-    result = certify_roa(LOOPS["held"][0](), regulator(1.0, 1.73), tmp_path, RoaOptions(candidate="optimised", effort=0.2))
+    result = certify_roa(
+        LOOPS["held"][0](), regulator(1.0, 1.73), tmp_path, RoaOptions(candidate="optimised", effort=0.2)
+    )
     assert result.certificate is not None and result.problem is not None
     read = read_certificate(result.certificate)
     assert isinstance(read.evidence, PartitionTree) and read.evidence.order == 1
