@@ -49,7 +49,7 @@ def test_the_python_interface(environment: dict[str, str], tmp_path: Path) -> No
         " for name, v in zip(('weight', 'bias'), pair)}\n"
         "said = dict(states=('theta', 'theta_dot'), activation='tanh', squash='tanh', normaliser='none',"
         " action_scale=(6,), centre='preactivation')\n"
-        f"found = certify.certify_roa('pendulum', state, importing=said, out={str(tmp_path / 'other')!r}, effort=0.02)\n"
+        f"found = certify.certify_roa('pendulum', state, importing=said, out={str(tmp_path / 'o')!r}, effort=0.02)\n"
         "print(found.verdict.value)\n"
     )
     assert ended(environment, "-c", code).split() == ["PROVED", "True", "PROVED"]

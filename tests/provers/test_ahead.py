@@ -247,7 +247,8 @@ def by_arrival(name: str, patched: pytest.MonkeyPatch) -> None:
 def test_what_hangs_on_arrival_would_show(name: str, case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The order of boxes, the count of effort, and bounds that were made for levels of before."""
     by_arrival(name, monkeypatch)
-    found, _, _ = differences(outwards_of(case), ["two places"])
+    efforts = EFFORTS[2:] if name == "levels" else EFFORTS[:2]  # a level moves late
+    found, _, _ = differences(outwards_of(case), ["two places"], efforts)
     assert found
 
 
