@@ -33,6 +33,7 @@ from tests.support.loops import chain, pendulum_network
 from tests.support.marks import slow_after
 
 SHIPPED = Path(__file__).parent.parent.parent / "examples" / "policies" / "pendulum.pt"
+QUICK = ("--effort", "0.1")
 VAN_DER_POL = Path(__file__).parent.parent.parent / "examples" / "van_der_pol.toml"
 
 
@@ -50,7 +51,9 @@ def policy_file(tmp_path: Path) -> Path:
 def proved(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The certificate of that policy."""
     folder = tmp_path_factory.mktemp("proved")
-    assert _run(["roa", "--policy", str(saved(folder / "policy.pt")), "--out", str(folder), "--quiet"], False) == 0
+    assert (
+        _run(["roa", "--policy", str(saved(folder / "policy.pt")), "--out", str(folder), "--quiet", *QUICK], False) == 0
+    )
     return (folder / "certificate.json").read_bytes()
 
 
@@ -71,7 +74,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int
 
 
 def test_roa_proves_writes_and_reports(tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", "--json")
+    status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", "--json", *QUICK)
     assert status == 0
     data = json.loads(out)
     assert out.count("\n") == 1
@@ -83,7 +86,7 @@ def test_roa_proves_writes_and_reports(tmp_path: Path, policy_file: Path, capsys
 
 
 def test_roa_in_words(tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, _ = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o")
+    status, out, _ = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", *QUICK)
     assert status == 0
     assert "PROVED" in out and "ACCEPTED" in out and str(tmp_path / "o" / "report.html") in out.replace("\n", "")
 
@@ -113,7 +116,7 @@ def test_check_compares_what_a_policy_file_says_beside_its_numbers(
 ) -> None:
     """The box in which an imported policy is that of its file, and the input that beta centres it at."""
     policy, plain, other = load_policy(SHIPPED), tmp_path / "plain.pt", tmp_path / "other.pt"
-    ways = ["--candidate", "ellipsoid", "--effort", "0.2", "--quiet", "--out", tmp_path / "o"]
+    ways = ["--candidate", "ellipsoid", *QUICK, "--quiet", "--out", tmp_path / "o"]
     assert run(capfd, "roa", "--policy", SHIPPED, *ways)[0] == 0
     where = np.array([[-3.15, 3.15], [-np.inf, np.inf]])
     narrow = np.array([[-3.15, 3.0], [-np.inf, np.inf]])
@@ -197,7 +200,7 @@ def test_a_plant_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 def test_a_rounded_beta_is_read_as_the_real_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     network = pendulum_network((8, 8))
     save_policy(tmp_path / "b.pt", Policy(network, "pendulum", beta=np.array([1e-7])))
-    status, _, err = run(capsys, "roa", "--policy", tmp_path / "b.pt", "--out", tmp_path)
+    status, _, err = run(capsys, "roa", "--policy", tmp_path / "b.pt", "--out", tmp_path, *QUICK)
     assert status == 0 and "this shifts u(0) by 6e-07" in err
 
 

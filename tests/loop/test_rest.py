@@ -82,7 +82,9 @@ def test_a_rest_that_is_not_stable_is_not_called_so() -> None:
 def test_a_loop_that_is_not_stable_there_is_told_so(tmp_path: Path, candidate: Literal["auto", "lqr"]) -> None:
     """Nothing is refuted: a floor may hold what leaves the point. A V that somebody gives is tried."""
     loop = scalar(x - x**3 + u, 0.5, 0.25)
-    result = certify_roa(loop.system, loop.network, tmp_path, RoaOptions(candidate=candidate, around="origin"))
+    result = certify_roa(
+        loop.system, loop.network, tmp_path, RoaOptions(candidate=candidate, around="origin", effort=0.2)
+    )
     assert (result.verdict, result.stop, result.P) == (Verdict.UNKNOWN, Stop.UNSTABLE, None)
     assert result.reason == "unstable linearisation: eigenvalues 1.5 where V is to be 0"
     given = RoaOptions(P=np.eye(1), around="origin")
@@ -147,7 +149,7 @@ def test_the_command_centres_on_request_and_says_what_that_changes(
 
 def test_a_loop_that_rests_at_the_origin_gets_the_stronger_claim(tmp_path: Path) -> None:
     loop = scalar(x / 2 + u, -1.0, 0.0)
-    result = certify_roa(loop.system, loop.network, tmp_path, RoaOptions(candidate="lyapunov"))
+    result = certify_roa(loop.system, loop.network, tmp_path, RoaOptions(candidate="lyapunov", effort=0.2))
     assert result.claim == "asymptotic" and result.rest is None and result.notice is None
     assert loop.system.domain == ((Fraction(-3), Fraction(3)),)
 
@@ -205,7 +207,7 @@ def test_a_point_of_rest_that_newton_misses_is_found_along_a_trajectory() -> Non
 def test_the_set_lies_around_where_the_loop_rests(tmp_path: Path, around: Literal["auto", "rest"]) -> None:
     policy = load_policy(PLAIN)
     system = get_system("pendulum").with_parameters(policy.parameters)
-    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="lqr", around=around, effort=0.1))
+    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="lqr", around=around, effort=0.02))
     assert result.verdict is Verdict.PROVED and result.claim == "nearby" and result.certificate is not None
     assert run_checker(result.certificate, "reference")["result"] == "ACCEPTED"
     assert result.rest is not None and result.levels.floor is not None and result.P is not None

@@ -272,7 +272,7 @@ def test_a_relu_network_without_biases_is_proved_where_it_stabilises(share: floa
 
 @pytest.mark.parametrize("name", NEW)
 def test_a_loop_is_proved_and_accepted(name: str, tmp_path: Any) -> None:
-    result = certify_roa(PLANT, policy(name), out=tmp_path, candidate="lyapunov", effort=0.1)
+    result = certify_roa(PLANT, policy(name), out=tmp_path, candidate="lyapunov", effort=0.02)
     assert result.verdict is Verdict.PROVED and result.levels.roa is not None and result.volume is not None
     assert result.volume > 80 and result.raw is not None
     assert result.checker is not None and result.checker["reference"]["result"] == "ACCEPTED"

@@ -298,7 +298,9 @@ def test_missing_dreal_is_unknown_when_named_and_a_notice_when_not(
 
 def test_both_engines_agree_or_say_so(pendulum: System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = answering(monkeypatch, unsat)
-    result = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(engine="both", candidate="lyapunov"))
+    result = certify_roa(
+        pendulum, pendulum_network(), tmp_path, RoaOptions(engine="both", candidate="lyapunov", effort=0.2)
+    )
     assert result.to_dict()["checked"] == "ACCEPTED" and {"local", "ring"} <= set(asked)
     assert result.solver is not None and all(q["answer"] == "unsat" for q in result.solver["queries"])
     assert result.certificate is not None
