@@ -639,12 +639,12 @@ def test_the_command_prints_ranges_and_draws_a_page(tmp_path: Path, capsys: pyte
 
 
 def test_a_contradiction_is_a_finding_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rows = transitions()
-    rows[17, 3] += 0.1
-    assert _run(command(tmp_path, rows=rows), False) == 1
+    rows = wheel()
+    rows[17, 2] += 0.1
+    assert _run(command(tmp_path, rows=rows, text=WHEEL), False) == 1
     shown = capsys.readouterr().out
     assert shown.startswith("REFUTED") and "line 19" in shown and not (tmp_path / "known.toml").exists()
-    assert _run(command(tmp_path, "--json", rows=rows), True) == 1
+    assert _run(command(tmp_path, "--json", rows=rows, text=WHEEL), True) == 1
     found = json.loads(capsys.readouterr().out)
     assert found["verdict"] == "REFUTED" and "line 19" in found["transitions"]
 

@@ -33,7 +33,7 @@ from tests.support.loops import chain, pendulum_network
 from tests.support.marks import slow_after
 
 SHIPPED = Path(__file__).parent.parent.parent / "examples" / "policies" / "pendulum.pt"
-QUICK = ("--effort", "0.1")
+QUICK = ("--candidate", "lyapunov", "--effort", "0.1")
 VAN_DER_POL = Path(__file__).parent.parent.parent / "examples" / "van_der_pol.toml"
 
 
@@ -116,7 +116,7 @@ def test_check_compares_what_a_policy_file_says_beside_its_numbers(
 ) -> None:
     """The box in which an imported policy is that of its file, and the input that beta centres it at."""
     policy, plain, other = load_policy(SHIPPED), tmp_path / "plain.pt", tmp_path / "other.pt"
-    ways = ["--candidate", "ellipsoid", *QUICK, "--quiet", "--out", tmp_path / "o"]
+    ways = ["--candidate", "ellipsoid", "--effort", "0.1", "--quiet", "--out", tmp_path / "o"]
     assert run(capfd, "roa", "--policy", SHIPPED, *ways)[0] == 0
     where = np.array([[-3.15, 3.15], [-np.inf, np.inf]])
     narrow = np.array([[-3.15, 3.0], [-np.inf, np.inf]])
