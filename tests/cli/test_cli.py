@@ -988,16 +988,19 @@ def test_a_command_that_ends_at_once_has_said_everything(
 
 @pytest.mark.parametrize(
     ("command", "both"),
-    [
-        ("certify roa --policy {policy} --out {out}", True),
-        ("certify roa --policy {policy} --out {out}", False),
-        ("certify roa --policy nosuch.pt", False),
-        ("certify prove", True),
-        ("certify roa --help", True),
-        ("controllers evaluate nosuch.pt --json", True),
-        ("controllers train pendulum --no-such", False),
-        ("controllers train --help", True),
-    ],
+    slow_after(
+        5,
+        [
+            ("certify roa --policy {policy} --out {out}", True),
+            ("certify roa --policy nosuch.pt", False),
+            ("certify prove", True),
+            ("certify roa --help", True),
+            ("controllers train pendulum --no-such", False),
+            ("certify roa --policy {policy} --out {out}", False),
+            ("controllers evaluate nosuch.pt --json", True),
+            ("controllers train --help", True),
+        ],
+    ),
 )
 def test_a_closed_pipe_is_no_verdict_whatever_was_to_be_said(command: str, both: bool, tmp_path: Path) -> None:
     """Standard error goes into a pipe that nobody reads, with standard output or without it."""

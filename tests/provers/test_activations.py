@@ -270,7 +270,7 @@ def test_a_relu_network_without_biases_is_proved_where_it_stabilises(share: floa
 # --------------------------------------------------------------------------------------------------------------- proofs
 
 
-@pytest.mark.parametrize("name", NEW)
+@pytest.mark.parametrize("name", slow_after(4, NEW))
 def test_a_loop_is_proved_and_accepted(name: str, tmp_path: Any) -> None:
     result = certify_roa(PLANT, policy(name), out=tmp_path, candidate="lyapunov", effort=0.02)
     assert result.verdict is Verdict.PROVED and result.levels.roa is not None and result.volume is not None
