@@ -712,28 +712,28 @@ def test_scattered_samples_are_a_part_of_the_claim(
     asked: list[str], fitted_box: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Two at the same point, and two that are left out, among them."""
-    Path(asked[1]).write_text(scattered_rows(60) + "\n0,0,0,1e-10\n0,0,0,0\n7,0,0,123\n0,0,-1.001,5\n")
+    Path(asked[1]).write_text(scattered_rows(120) + "\n0,0,0,1e-10\n0,0,0,0\n7,0,0,123\n0,0,-1.001,5\n")
     assert _run(asked, False) == 0
     for name, claim in (("far", "practical"), ("near", "asymptotic")):
         result = proved(fitted_box, name, claim=claim)
         assert result.verdict == "PROVED", result.reason
         assert (result.checker or {})["reference"]["result"] == "ACCEPTED"
-        assert dict(stated(result))["for every"] == "function v′ = g(x, v, u) with which 62 samples are consistent"
+        assert dict(stated(result))["for every"] == "function v′ = g(x, v, u) with which 122 samples are consistent"
         raw = (fitted_box / name / "certificate.json").read_bytes()
         c = parse_certificate(raw, name)
         again = Certificate(c.system, c.network, c.V, c.claim, c.evidence, c.provenance, c.data).document()
         assert {**again, "provenance": {}} == {**json.loads(raw), "provenance": {}}
     paths = [str(fitted_box / name / "certificate.json") for name in ("far", "near")]
     assert _run(["compose", *paths, "--out", str(fitted_box / "both")], False) == 0
-    assert "for every function v′ = g(x, v, u) with which 62 samples are consistent" in capsys.readouterr().out
+    assert "for every function v′ = g(x, v, u) with which 122 samples are consistent" in capsys.readouterr().out
 
 
 def test_the_error_may_count_more_near_the_origin(
     asked: list[str], fitted_box: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The plant's file says so, and the grid is chosen again as it was."""
-    monkeypatch.setattr("certify.analysis.fitting.grid._MOST", 60)
-    Path(asked[1]).write_text(scattered_rows(60))
+    monkeypatch.setattr("certify.analysis.fitting.grid._MOST", 120)
+    Path(asked[1]).write_text(scattered_rows(120))
     constants = []
     for power in ("0", "2"):
         assert _run([*asked, "--near-origin", power], False) == 0

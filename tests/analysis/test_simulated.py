@@ -66,7 +66,7 @@ STEPS = plant(x + RATE / 10, time="discrete")
 
 
 def proved(folder: Path, system: System | None = None, **options: object) -> RoaResult:
-    given: dict[str, object] = {"effort": 0.1} | options
+    given: dict[str, object] = {"effort": 0.07} | options
     result = certify_roa(system or plant(), REST, folder, **given)  # type: ignore[arg-type]
     assert result.verdict is Verdict.PROVED
     return result
@@ -200,7 +200,8 @@ def test_an_ellipsoid_that_is_most_of_it_is_enough(tmp_path: Path) -> None:
     """The certificate is then the very one of the ellipsoid alone, and nothing is learned."""
     network = load_policy(POLICIES / "pendulum.pt").network
     found = [
-        certify_roa(get_system("pendulum"), network, tmp_path / name, candidate=name) for name in ("auto", "ellipsoid")
+        certify_roa(get_system("pendulum"), network, tmp_path / name, candidate=name, effort=0.2)
+        for name in ("auto", "ellipsoid")
     ]
     assert found[0].raw == found[1].raw and found[0].outer is None
     assert all(one.simulated is not None and 0.8 < (one.simulated.share or 0.0) < 0.9 for one in found)
@@ -304,7 +305,7 @@ def test_the_ellipsoid_stays_where_the_checker_refuses_more(
 def test_a_ring_that_is_cut_for_more_is_resumed_without_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All of the effort is kept for what lies beyond, which then is not wanted: the ring takes it after all."""
     network = load_policy(POLICIES / "pendulum.pt").network
-    options = {"candidate": "auto", "effort": 0.2}
+    options = {"candidate": "auto", "effort": 0.1}
     plain = certify_roa(get_system("pendulum"), network, tmp_path / "plain", **options)  # type: ignore[arg-type]
     monkeypatch.setattr(simulation, "_FOR_MORE", 1.0)
     monkeypatch.setattr(simulation, "_FOR_RING", 0.0)
@@ -339,10 +340,10 @@ def test_centring_is_suggested_only_where_it_gains(tmp_path: Path) -> None:
     """From the plain policy's equilibrium as much converges as from the operating point of the centred one, and all of
     it to one equilibrium; under the weaker claim alone centring gains the stronger one."""
     network = load_policy(POLICIES / "without_gain" / "pendulum.pt").network
-    nearby = certify_roa(get_system("pendulum"), network, tmp_path / "nearby", effort=0.1)
+    nearby = certify_roa(get_system("pendulum"), network, tmp_path / "nearby", effort=0.02)
     assert nearby.claim == "nearby" and nearby.diagnosis is not None
     assert "--centre" not in dict(nearby.diagnosis.next.options)
-    folder, options = tmp_path / "practical", {"claim": "practical", "candidate": "lqr", "effort": 0.1}
+    folder, options = tmp_path / "practical", {"claim": "practical", "candidate": "lqr", "effort": 0.02}
     weaker = certify_roa(get_system("pendulum"), network, folder, **options)  # type: ignore[arg-type]
     assert weaker.claim == "practical" and weaker.diagnosis is not None
     assert dict(weaker.diagnosis.next.options) == {"--centre": "preactivation", "--claim": "auto"}
