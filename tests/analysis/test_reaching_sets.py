@@ -217,7 +217,7 @@ def test_a_tube_into_the_set(tmp_path: Path) -> None:
     """In continuous time the set is proved again, with the tube."""
     loop = swinging(None)
     target = known(loop, tmp_path / "set", level=0.05)
-    asked = into_set_of(target, *loop, RoaOptions(reach_from={"theta": 1.0}, effort=0.05))
+    asked = into_set_of(target, *loop, RoaOptions(reach_from={"theta": 1.0}, effort=0.02))
     result = certify_roa(*loop, out=tmp_path / "led", options=asked)
     assert result.verdict == "PROVED" and result.raw is not None
     given, found = parse_certificate(target.read_bytes(), "set"), parse_certificate(result.raw, "led")
