@@ -222,7 +222,7 @@ def without_biases(name: str) -> PolicyNetwork:
 
 @pytest.mark.parametrize("name", slow_after(1, ["elu", "softsign"]))
 def test_a_corner_with_a_tangent_at_the_operating_point_is_proved(name: str, tmp_path: Path) -> None:
-    result = certify_roa(PLANT, without_biases(name), tmp_path, effort=0.1, candidate="ellipsoid")
+    result = certify_roa(PLANT, without_biases(name), tmp_path, effort=0.04, candidate="ellipsoid")
     assert result.verdict is Verdict.PROVED and result.claim == "asymptotic" and result.levels.floor is None
     assert result.volume is not None and result.volume > 10
     programs: tuple[Program, ...] = ("checker", "reference")
@@ -238,7 +238,7 @@ def test_a_corner_of_elu_beside_one_of_relu_has_directions_for_the_relu() -> Non
     net = Network(2, (first, *units, middle, Map((5,), "elu"), end))
     case = case_of(PLANT, PolicyNetwork(net, law.scale, law.offset, law.squash, law.centre))
     assert meets_corner(paths(case.loop))
-    result = certify_roa(PLANT, case.loop.network, effort=0.1, candidate="ellipsoid")
+    result = certify_roa(PLANT, case.loop.network, effort=0.02, candidate="ellipsoid")
     assert result.verdict is Verdict.PROVED and result.claim == "asymptotic"
 
 

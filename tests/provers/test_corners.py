@@ -267,7 +267,7 @@ def test_saturated_plants_are_proved(name: str, tmp_path: Path) -> None:
 def test_leaves_across_a_corner_are_shown_in_the_order_that_they_were_proved_in_alone(tmp_path: Path) -> None:
     """A series of order 2 does not exist there, and boxes with ranks ask for it: the ring's proof keeps its order."""
     result = certify_roa(
-        LOOPS["held"][0](), regulator(1.0, 1.73), tmp_path, RoaOptions(candidate="optimised", effort=0.2)
+        LOOPS["held"][0](), regulator(1.0, 1.73), tmp_path, RoaOptions(candidate="optimised", effort=0.05)
     )
     assert result.certificate is not None and result.problem is not None
     read = read_certificate(result.certificate)
@@ -352,5 +352,5 @@ def test_a_corner_at_rest_that_a_state_may_pass_in_a_period_is_named(tmp_path: P
     assert result.verdict is Verdict.UNKNOWN
     assert result.reason.startswith("local: abs(v) has its corner at the operating point") and "1e-2" in result.reason
     assert result.diagnosis is not None and result.diagnosis.next.options == (("--claim", "practical"),)
-    weaker = certify_roa(system, regulator(0.2, 0.2), tmp_path, RoaOptions(claim="practical", effort=0.1))
+    weaker = certify_roa(system, regulator(0.2, 0.2), tmp_path, RoaOptions(claim="practical", effort=0.03))
     assert weaker.verdict is Verdict.PROVED
