@@ -243,7 +243,7 @@ def test_a_proof_loads_no_more_than_it_needs(arguments: list[str], tmp_path: Pat
         "--out",
         str(tmp_path),
         "--effort",
-        "0.1",
+        "0.02",
         *arguments,
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -37,7 +37,7 @@ README = ROOT / "README.md"
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
 FORMAT = sorted((ROOT / "certify" / "checker").rglob("*.md"))
 READ = [README, *PAGES]
-FIRST = ("README.md", "index.md", "tutorial.md")  # what a newcomer reads
+FIRST = ("README.md", "tutorial.md")  # what a newcomer reads; the commands of index.md are the README's
 _BLOCK = re.compile(r"(?:<!-- (?P<mark>[^\n]*?) -->\n)?^```(?P<language>[^\n]*)\n(?P<code>.*?)^```$", re.M | re.S)
 _OUTSIDE = re.compile(r"""<(?:script|link|img|iframe|source|object)\b[^>]*?(?:src|href|data)=["']?(?:https?:)?//""")
 

@@ -42,14 +42,14 @@ def test_torch_is_blocked(environment: dict[str, str]) -> None:
 def test_the_python_interface(environment: dict[str, str], tmp_path: Path) -> None:
     code = (
         "import certify; from pathlib import Path\n"
-        f"found = certify.certify_roa('pendulum', {str(SHIPPED)!r}, out={str(tmp_path / 'out')!r}, effort=0.1)\n"
+        f"found = certify.certify_roa('pendulum', {str(SHIPPED)!r}, out={str(tmp_path / 'out')!r}, effort=0.02)\n"
         "print(found.verdict.value, found.contains([0.1, 0.1]))\n"
         f"policy = certify.load_policy({str(SHIPPED)!r})\n"
         "state = {f'{2 * k}.{name}': v for k, pair in enumerate(zip(policy.network.weights, policy.network.biases))"
         " for name, v in zip(('weight', 'bias'), pair)}\n"
         "said = dict(states=('theta', 'theta_dot'), activation='tanh', squash='tanh', normaliser='none',"
         " action_scale=(6,), centre='preactivation')\n"
-        f"found = certify.certify_roa('pendulum', state, importing=said, out={str(tmp_path / 'other')!r}, effort=0.1)\n"
+        f"found = certify.certify_roa('pendulum', state, importing=said, out={str(tmp_path / 'o')!r}, effort=0.02)\n"
         "print(found.verdict.value)\n"
     )
     assert ended(environment, "-c", code).split() == ["PROVED", "True", "PROVED"]
@@ -58,7 +58,7 @@ def test_the_python_interface(environment: dict[str, str], tmp_path: Path) -> No
 def test_the_commands(environment: dict[str, str], tmp_path: Path) -> None:
     out = tmp_path / "out"
     certificate = out / "certificate.json"
-    said = ended(environment, "-m", "certify", "roa", str(SHIPPED), "--effort", "0.1", "--out", str(out))
+    said = ended(environment, "-m", "certify", "roa", str(SHIPPED), "--effort", "0.02", "--out", str(out))
     assert said.startswith("PROVED") and "Figures" in (out / "report.html").read_text()
     assert "ACCEPTED" in ended(environment, "-m", "certify", "check", str(certificate), "--policy", str(SHIPPED))
     (out / "report.html").unlink()

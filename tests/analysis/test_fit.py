@@ -132,7 +132,7 @@ def within(truth: Truth, share: float = 1.0, scattered: bool = False) -> tuple[b
 
 
 @pytest.mark.parametrize("scattered", [False, True])
-@pytest.mark.parametrize("seed", slow_after(4, range(60)))
+@pytest.mark.parametrize("seed", slow_after(2, range(60)))
 def test_the_truth_is_within_what_is_found(seed: int, scattered: bool) -> None:
     assert within(Truth(seed), scattered=scattered) == (True, True)
 

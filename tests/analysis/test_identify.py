@@ -94,7 +94,9 @@ def transitions(count: int = 60, noise: float = NOISE, **how: float) -> Array:
     return np.hstack([x + errors[0], u, after + errors[1]])
 
 
-def write(path: Path, rows: Array, header: str = COLUMNS) -> Path:
+def write(path: Path, rows: Array, header: str | None = None) -> Path:
+    """A file of rows, by default of the pendulum's, or of the wheel's if they have three entries."""
+    header = header or (COLUMNS if np.shape(rows)[1] == 5 else "theta_dot,u,theta_dot_next")
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(header.split(","))
@@ -399,23 +401,61 @@ def test_what_the_equations_lack_is_a_residual(tmp_path: Path) -> None:
 
 
 RESIDUAL = STRUCTURE.replace("[u_eq]", '[residual]\ntheta_dot = "{}"\n\n[u_eq]')
+WHEEL = """name = "wheel"
+states = ["theta_dot"]
+inputs = ["u"]
+positive = ["c"]
+
+[parameters]
+b = [1, 4]
+c = [10, 50]
+
+[dynamics]
+theta_dot = "c*u - b*theta_dot"
+
+[u_eq]
+u = 0
+
+[domain]
+theta_dot = [-20, 20]
+
+[input_bounds]
+u = [-6, 6]
+"""
+DRAGGED = WHEEL.replace("[u_eq]", '[residual]\ntheta_dot = "{}"\n\n[u_eq]')
+
+
+def wheel(drag: float = 0.0) -> Array:
+    """Transitions of b = 2 and c = 20, with a drag that the structure lacks, (N, 3)."""
+    draw = np.random.default_rng(5)
+    v, u = draw.uniform(-2, 2, 60), draw.uniform(-6, 6, 60)
+
+    def rate(v: Array) -> Array:
+        return np.asarray(20 * u - 2 * v - drag * v * np.abs(v))
+
+    after = v
+    for _ in range(64):
+        middle = after + 0.02 / 128 * rate(after)
+        after = after + 0.02 / 64 * rate(middle)
+    errors = draw.uniform(-1e-4, 1e-4, (2, 60))
+    return np.stack([v + errors[0], u, after + errors[1]], axis=1)
 
 
 def test_the_least_factor_of_a_residual_is_no_larger_than_the_true_one(tmp_path: Path) -> None:
     """The plant has half the bound that the structure allows; what is refuted is refuted as a bound by itself."""
-    rows = transitions(noise=1e-4, drag=0.2)
-    found = identified(tmp_path, rows, RESIDUAL.format("0.4*theta_dot**2"), noise="1e-4")
+    rows = wheel(0.2)
+    found = identified(tmp_path, rows, DRAGGED.format("0.4*theta_dot**2"), noise="1e-4")
     (least,) = found.least_residual
     assert least.open is not None
     refuted, open_ = least.refuted["theta_dot"], least.open["theta_dot"]
     assert 0.2 < refuted < 0.5 and refuted < open_ < 1.1 * refuted
     with pytest.raises(Contradiction):
-        identified(tmp_path, rows, RESIDUAL.format(f"{0.4 * refuted}*theta_dot**2"), noise="1e-4")
-    identified(tmp_path, rows, RESIDUAL.format(f"{0.4 * open_}*theta_dot**2"), noise="1e-4")
-    none = identified(tmp_path, transitions(noise=1e-4), RESIDUAL.format("0.4*theta_dot**2"), noise="1e-4")
+        identified(tmp_path, rows, DRAGGED.format(f"{0.4 * refuted}*theta_dot**2"), noise="1e-4")
+    identified(tmp_path, rows, DRAGGED.format(f"{0.4 * open_}*theta_dot**2"), noise="1e-4")
+    none = identified(tmp_path, wheel(), DRAGGED.format("0.4*theta_dot**2"), noise="1e-4")
     assert [(one.refuted, one.open) for one in none.least_residual] == [({"theta_dot": 0}, {"theta_dot": 0})]
     assert none.to_dict()["least_residual"] == [{"refuted": {"theta_dot": 0}, "open": {"theta_dot": 0}}]
-    assert identified(tmp_path, transitions()).least_residual == ()
+    assert identified(tmp_path, wheel(), WHEEL, noise="1e-4").least_residual == ()
 
 
 @pytest.mark.slow
@@ -431,18 +471,18 @@ def test_factors_are_of_all_residuals_and_of_each_beside_the_others(tmp_path: Pa
 def test_a_refuted_structure_says_what_its_equations_lack(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The drag is at most 0.2 of the square of a rate of up to 6: less than it is refuted, and what is said to be tried
     is not."""
-    rows = transitions(noise=1e-4, drag=0.2)
-    assert _run(command(tmp_path, "--noise", "1e-4", rows=rows), False) == 1
+    rows = wheel(0.2)
+    assert _run(command(tmp_path, "--noise", "1e-4", rows=rows, text=WHEEL), False) == 1
     shown = capsys.readouterr().out
     advice = re.search(r'try next +in the structure \[residual\] theta_dot = "(\S+)", or bounds', shown)
     assert advice is not None and "in θ̇′ is contradicted as well" in shown and 0.2 < float(advice[1]) < 7.2
-    assert _run(command(tmp_path, "--noise", "1e-4", "--json", rows=rows), True) == 1
+    assert _run(command(tmp_path, "--noise", "1e-4", "--json", rows=rows, text=WHEEL), True) == 1
     found = json.loads(capsys.readouterr().out)
     least = next(one for one in found["least_constants"] if "theta_dot" in one["refuted"])
     refuted = least["refuted"]["theta_dot"]
     assert found["least_residual"] == [] and refuted < least["open"]["theta_dot"] <= float(advice[1]) < 1.2 * refuted
     for size, status in ((refuted, 1), (float(advice[1]), 0)):
-        more = command(tmp_path, "--noise", "1e-4", "--json", rows=rows, text=RESIDUAL.format(size))
+        more = command(tmp_path, "--noise", "1e-4", "--json", rows=rows, text=DRAGGED.format(size))
         assert _run(more, True) == status
     capsys.readouterr()
 
@@ -450,7 +490,7 @@ def test_a_refuted_structure_says_what_its_equations_lack(tmp_path: Path, capsys
 def test_a_residual_that_is_too_small_is_refuted_with_the_factor_that_is_missing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rows, text = transitions(noise=1e-4, drag=0.2), RESIDUAL.format("0.05*theta_dot**2")
+    rows, text = wheel(0.2), DRAGGED.format("0.05*theta_dot**2")
     assert _run(command(tmp_path, "--noise", "1e-4", rows=rows, text=text), False) == 1
     shown = capsys.readouterr().out
     factor = re.search(r"θ̇: (\S+) times the bound is contradicted; (\S+) times is not", shown)
@@ -599,12 +639,12 @@ def test_the_command_prints_ranges_and_draws_a_page(tmp_path: Path, capsys: pyte
 
 
 def test_a_contradiction_is_a_finding_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rows = transitions()
-    rows[17, 3] += 0.1
-    assert _run(command(tmp_path, rows=rows), False) == 1
+    rows = wheel()
+    rows[17, 2] += 0.1
+    assert _run(command(tmp_path, rows=rows, text=WHEEL), False) == 1
     shown = capsys.readouterr().out
     assert shown.startswith("REFUTED") and "line 19" in shown and not (tmp_path / "known.toml").exists()
-    assert _run(command(tmp_path, "--json", rows=rows), True) == 1
+    assert _run(command(tmp_path, "--json", rows=rows, text=WHEEL), True) == 1
     found = json.loads(capsys.readouterr().out)
     assert found["verdict"] == "REFUTED" and "line 19" in found["transitions"]
 

@@ -97,7 +97,7 @@ def test_the_structure_is_a_plant_of_its_own(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["rows", "runs", "arrays", "steps"])
 def test_files_of_every_form_are_read(tmp_path: Path, kind: str) -> None:
     draw = np.random.default_rng(2)
-    x, u = [draw.uniform(-1, 1, (20, 2)) * [0.2, 0.4]], [draw.uniform(-2, 2, (20, 1)) for _ in range(4)]
+    x, u = [draw.uniform(-1, 1, (8, 2)) * [0.2, 0.4]], [draw.uniform(-2, 2, (8, 1)) for _ in range(4)]
     for v in u:
         x.append(simulated(x[-1], v))
     states, inputs = np.stack(x, 1), np.stack(u, 1)
@@ -111,7 +111,7 @@ def test_files_of_every_form_are_read(tmp_path: Path, kind: str) -> None:
         return
     else:
         rows = np.concatenate(
-            [np.column_stack([np.full(5, e), states[e], np.append(inputs[e], inputs[e][-1:], 0)]) for e in range(20)]
+            [np.column_stack([np.full(5, e), states[e], np.append(inputs[e], inputs[e][-1:], 0)]) for e in range(8)]
         )
         rows = rows if kind == "runs" else rows[:5, 1:]
         write(tmp_path / "data.csv", rows, "run,theta,theta_dot,u" if kind == "runs" else "theta,theta_dot,u")

@@ -23,7 +23,7 @@ POLICIES = Path(__file__).parent.parent.parent / "examples" / "policies"
 def largest(quantity: Quantity, out: Path, **options: Any) -> Any:
     policy = load_policy(POLICIES / "pendulum.pt")
     system = get_system("pendulum").with_parameters(policy.parameters)
-    return certify_largest(quantity, system, policy.network, out, RoaOptions(effort=0.02, **options))
+    return certify_largest(quantity, system, policy.network, out, RoaOptions(effort=0.01, **options))
 
 
 def test_a_level_that_is_asked_for_is_the_level_that_is_proved(tmp_path: Path) -> None:
@@ -70,7 +70,7 @@ def test_what_excludes_it_is_refused_before_anything_is_proved(
 
 
 def test_the_command_says_what_it_is_to_type_next(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    asked = ["roa", str(POLICIES / "pendulum.pt"), "--sample-time", "max", "--effort", "0.02", "--json"]
+    asked = ["roa", str(POLICIES / "pendulum.pt"), "--sample-time", "max", "--effort", "0.01", "--json"]
     assert _run([*asked, "--out", str(tmp_path)], as_json=True) == 0
     data = json.loads(capsys.readouterr().out)
     assert data["search"] is None and "--resume" not in data["diagnosis"]["next"].get("command", "")

@@ -59,10 +59,10 @@ def bumpy(half_width: int = 1, ends: float = 1.0) -> tuple[System, PolicyNetwork
 
 def test_the_set_that_converges_is_claimed_where_that_is_asked_for(tmp_path: Path) -> None:
     plant, law = bumpy()
-    large = certify_roa(plant, law, tmp_path / "auto", RoaOptions(candidate="ellipsoid"))
+    large = certify_roa(plant, law, tmp_path / "auto", RoaOptions(candidate="ellipsoid", effort=0.2))
     assert (large.verdict, large.claim) == (Verdict.PROVED, "practical")
     assert large.volume is not None and large.volume > 1.8
-    close = certify_roa(plant, law, tmp_path / "nearby", RoaOptions(candidate="ellipsoid", claim="nearby"))
+    close = certify_roa(plant, law, tmp_path / "nearby", RoaOptions(candidate="ellipsoid", claim="nearby", effort=0.2))
     assert (close.verdict, close.claim) == (Verdict.PROVED, "nearby")
     assert close.volume is not None and 0.15 < close.volume < 0.5
     assert close.notice is not None and "not that all converge to one equilibrium" in close.notice
@@ -70,7 +70,7 @@ def test_the_set_that_converges_is_claimed_where_that_is_asked_for(tmp_path: Pat
 
 def test_next_to_nothing_of_the_domain_counts_for_less_than_convergence(tmp_path: Path) -> None:
     plant, law = bumpy(400)
-    result = certify_roa(plant, law, tmp_path, RoaOptions(candidate="ellipsoid"))
+    result = certify_roa(plant, law, tmp_path, RoaOptions(candidate="ellipsoid", effort=0.2))
     assert (result.verdict, result.claim) == (Verdict.PROVED, "nearby")
     assert result.volume is not None and 0.15 < result.volume < 0.5
 

@@ -27,6 +27,7 @@ from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
 from certify.loop.rigorous import Balls, ball, points, precision, step_on
 from tests.support.corners import plant
+from tests.support.marks import slow_after
 
 TENTH = (Fraction(1, 10), Fraction(1, 10))
 
@@ -334,7 +335,7 @@ def test_a_line_that_meets_the_target_on_the_way_does_not_cross(v: str, crosses:
         assert search._crosses((np.array([-0.1, 1.0]), np.array([0.1, 1.0])), saddle, 8) is crosses
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", slow_after(3, range(6)))
 def test_slopes_of_a_step_with_a_held_input(seed: int) -> None:
     """Beside differences of the step itself; abs is beside its corner."""
     rng = np.random.default_rng(seed)

@@ -117,7 +117,7 @@ def test_full_turns_of_an_angle_do_not_count(tmp_path: Path) -> None:
 def test_a_held_input_with_a_higher_order(tmp_path: Path) -> None:
     """The series in time that the set was proved with is too short for boxes that take many periods."""
     loop = swinging()
-    target = known(loop, tmp_path / "set", level=0.05)
+    target = known(loop, tmp_path / "set", level=0.05, effort=0.02)
     result = led(loop, target, tmp_path / "led", ((Fraction(1), Fraction(11, 10)), (Fraction(0), Fraction(0))))
     given, found = parse_certificate(target.read_bytes(), "set"), accepted_by_both(result)
     assert found.evidence.order > given.evidence.order  # type: ignore[union-attr]
@@ -217,11 +217,11 @@ def test_a_tube_into_the_set(tmp_path: Path) -> None:
     """In continuous time the set is proved again, with the tube."""
     loop = swinging(None)
     target = known(loop, tmp_path / "set", level=0.05)
-    asked = into_set_of(target, *loop, RoaOptions(reach_from={"theta": 1.0}, effort=0.05))
+    asked = into_set_of(target, *loop, RoaOptions(reach_from={"theta": 1.0}, effort=0.02))
     result = certify_roa(*loop, out=tmp_path / "led", options=asked)
     assert result.verdict == "PROVED" and result.raw is not None
     given, found = parse_certificate(target.read_bytes(), "set"), parse_certificate(result.raw, "led")
     assert (found.kind, found.roa, found.P.tolist()) == ("reached", given.roa, given.P.tolist())
-    practical = known(loop, tmp_path / "practical", claim="practical")
+    practical = known(loop, tmp_path / "practical", claim="practical", effort=0.02)
     with pytest.raises(OptionError, match="asymptotic certificate where a tube"):
         into_set_of(practical, *loop, asked)

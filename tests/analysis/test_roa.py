@@ -42,11 +42,13 @@ from tests.support.marks import slow_after
 
 SHIPPED = Path(__file__).parent.parent.parent / "examples" / "policies" / "pendulum.pt"
 
+QUICK = RoaOptions(effort=0.2)
+
 
 @pytest.mark.parametrize("n", slow_after(1, [3, 2, 4, 5, 6]))
 def test_linear_plants_reach_their_domain(tmp_path: Path, n: int) -> None:
     system, network = chain(n, [-1.0 - k for k in range(n)])
-    result = certify_roa(system, network, tmp_path, RoaOptions(candidate="ellipsoid"))
+    result = certify_roa(system, network, tmp_path, RoaOptions(candidate="ellipsoid", effort=0.2))
     assert result.verdict is Verdict.PROVED and result.reason == "domain"
     # The limit in exact rationals, from the binary64 P that was proved.
     assert result.P is not None
@@ -101,7 +103,7 @@ def test_scalar_plant_just_inside_and_just_outside(tmp_path: Path, x: float, ver
 
 
 def test_scalar_plant_largest_level(tmp_path: Path) -> None:
-    result = certify_roa(*scalar_tanh(), tmp_path)
+    result = certify_roa(*scalar_tanh(), tmp_path, QUICK)
     level = result.levels.roa
     assert result.verdict is Verdict.PROVED and result.reason == "witness"
     assert level is not None and 0.99 * 1.915008**2 < level < 1.915009**2
@@ -114,7 +116,7 @@ def test_a_level_outside_the_domain(tmp_path: Path) -> None:
 @pytest.mark.parametrize("centre", slow_after(1, ["preactivation", "output"]))
 def test_a_wrong_raw_equilibrium_is_centred(tmp_path: Path, pendulum: System, centre: str) -> None:
     network = pendulum_network(centre=centre)
-    result = certify_roa(pendulum, network, tmp_path)
+    result = certify_roa(pendulum, network, tmp_path, QUICK)
     assert result.verdict is Verdict.PROVED and result.checker is not None
     assert result.checker["result"] == "ACCEPTED"
 
@@ -131,9 +133,9 @@ def test_uncentred_or_displaced_loops_are_refused(tmp_path: Path, pendulum: Syst
 def test_levels_scale_with_P(tmp_path: Path, pendulum: System) -> None:
     """(P, c) -> (aP, ac) leaves the set as it is."""
     network = pendulum_network((8, 8))
-    base = certify_roa(pendulum, network, tmp_path)
+    base = certify_roa(pendulum, network, tmp_path, QUICK)
     assert base.P is not None and base.levels.roa is not None
-    scaled = certify_roa(pendulum, network, tmp_path, RoaOptions(P=4.0 * base.P))
+    scaled = certify_roa(pendulum, network, tmp_path, RoaOptions(P=4.0 * base.P, effort=0.2))
     assert scaled.levels.roa == pytest.approx(4.0 * base.levels.roa, rel=1e-5)
 
 
@@ -178,7 +180,7 @@ def test_the_largest_level_within_a_budget_is_still_proved(tmp_path: Path, pendu
 def test_the_shipped_policy(tmp_path: Path, pendulum: System) -> None:
     policy = load_policy(SHIPPED)
     assert policy.network.layers == (2, 16, 16, 1)
-    result = certify_roa(pendulum.with_parameters(policy.parameters), policy.network, tmp_path)
+    result = certify_roa(pendulum.with_parameters(policy.parameters), policy.network, tmp_path, QUICK)
     assert result.verdict is Verdict.PROVED
     roa, limit = result.levels.roa, result.levels.domain_limit
     sampled = result.levels.sampled_limit
@@ -195,7 +197,7 @@ def test_the_shipped_policy(tmp_path: Path, pendulum: System) -> None:
 
 def test_equal_runs_write_equal_certificates(tmp_path: Path, pendulum: System) -> None:
     for name in ("a", "b"):
-        certify_roa(pendulum, pendulum_network((8, 8)), tmp_path / name)
+        certify_roa(pendulum, pendulum_network((8, 8)), tmp_path / name, QUICK)
     assert (tmp_path / "a" / "certificate.json").read_bytes() == (tmp_path / "b" / "certificate.json").read_bytes()
 
 
@@ -226,7 +228,7 @@ def test_whatever_the_checker_refuses_a_run_ends_with_what_it_accepts(
         found = honest(self, lo, hi, inner, outer)
         return found._replace(proved=found.bound < trust)
 
-    options = RoaOptions(candidate="lyapunov")
+    options = RoaOptions(candidate="lyapunov", effort=0.2)
     network = pendulum_network()
     true = certify_roa(pendulum, network, tmp_path / "true", options).levels
     monkeypatch.setattr(VdotBound, "__call__", careless)
@@ -254,7 +256,7 @@ def test_what_cannot_be_mended_is_a_soundness_error(tmp_path: Path, monkeypatch:
 def test_a_checker_that_cannot_run_is_a_backend_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.executable", "/bin/false")
     with pytest.raises(BackendError, match="no verdict"):
-        certify_roa(*scalar_tanh(), tmp_path)
+        certify_roa(*scalar_tanh(), tmp_path, QUICK)
 
 
 @pytest.mark.parametrize(
@@ -304,7 +306,7 @@ def test_every_registered_plant_can_be_named() -> None:
 
 def test_two_runs_in_one_folder_do_not_meet(tmp_path: Path) -> None:
     with sole_writer(tmp_path), pytest.raises(InputError, match="another run is writing"):
-        certify_roa(*scalar_tanh(), tmp_path)
+        certify_roa(*scalar_tanh(), tmp_path, QUICK)
     assert certify_roa(*scalar_tanh(), tmp_path, RoaOptions(level=1.0)).verdict is Verdict.PROVED
 
 
@@ -319,7 +321,7 @@ def test_an_answer_about_other_bytes_is_no_proof(tmp_path: Path, monkeypatch: py
 
 
 def test_the_reference_is_asked_where_it_is_quick(tmp_path: Path) -> None:
-    result = certify_roa(*scalar_tanh(), tmp_path)
+    result = certify_roa(*scalar_tanh(), tmp_path, QUICK)
     assert result.checker is not None and result.to_dict()["reference"] == "ACCEPTED"
     assert result.checker["reference"]["certificate_sha256"] == result.checker["certificate_sha256"]
     assert dict(rows_of(result.to_dict(), True))["checker"] == "ACCEPTED BY BOTH"
@@ -339,7 +341,7 @@ def test_what_the_reference_refuses_is_mended_or_left_out(tmp_path: Path, monkey
 
     monkeypatch.setattr("certify.analysis.acceptance.run_checker", refusing)
     with pytest.raises(SoundnessError, match=r"rejects what the engine proved.*reference"):
-        certify_roa(*scalar_tanh(), tmp_path)
+        certify_roa(*scalar_tanh(), tmp_path, QUICK)
     assert len(told) > 3 and told[1] > told[0]  # the first leaf was split
 
 
@@ -353,7 +355,7 @@ def test_a_reference_s_answer_about_something_else_is_no_proof(
 
     monkeypatch.setattr("certify.analysis.acceptance.run_checker", other)
     with pytest.raises(SoundnessError, match="is about other"):
-        certify_roa(*scalar_tanh(), tmp_path)
+        certify_roa(*scalar_tanh(), tmp_path, QUICK)
 
 
 @pytest.mark.parametrize("long", ["by its leaves", "by its bytes", "as it turns out"])
@@ -369,7 +371,7 @@ def test_a_reference_that_needs_long_is_not_waited_for(
     monkeypatch.setattr(acceptance, "run_checker", alone)
     if long != "as it turns out":
         monkeypatch.setattr(acceptance, "_LEAVES" if long == "by its leaves" else "_BYTES", -1)
-    result = certify_roa(*scalar_tanh(), tmp_path)
+    result = certify_roa(*scalar_tanh(), tmp_path, QUICK)
     assert result.verdict is Verdict.PROVED and result.to_dict()["reference"] is None
     assert "ACCEPTED BY BOTH" not in dict(rows_of(result.to_dict(), True))["checker"]
 

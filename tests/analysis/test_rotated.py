@@ -40,32 +40,43 @@ def under_the_policy(count: int = 120, noise: float = 1e-3, seed: int = 0) -> Ar
 
 
 @pytest.fixture(scope="module")
-def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a plant along axes, the same without, and their data."""
-    folder = tmp_path_factory.mktemp("rotated")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("rotated")
+
+
+@pytest.fixture(scope="module")
+def found_in(folder: Path) -> dict[str, certify.IdentifyResult]:
+    """What is found of the data in a folder, along axes and without, by the name of the file that says it."""
     (folder / "structure.toml").write_text(WIDE)
-    data = write(folder / "data.csv", under_the_policy())
-    for name, rotate in (("known", True), ("boxed", False)):
-        certify.identify(
-            data,
-            folder / "structure.toml",
-            noise="1e-3",
-            sample_time="0.02",
-            out=folder / f"{name}.toml",
-            rotate=rotate,
-        )
+    data, structure = write(folder / "data.csv", under_the_policy()), folder / "structure.toml"
+    options = {"noise": "1e-3", "sample_time": "0.02"}
+    return {
+        name: certify.identify(data, structure, out=folder / f"{name}.toml", rotate=rotate, **options)  # type: ignore[arg-type]
+        for name, rotate in (("known", True), ("boxed", False))
+    }
+
+
+@pytest.fixture(scope="module")
+def known(folder: Path, found_in: dict[str, certify.IdentifyResult]) -> Path:
+    """The folder with a plant along axes, the same without, and their data."""
     return folder
 
 
 def proved(folder: Path, name: str) -> certify.RoaResult:
+    data = folder / "data.csv"
     return certify.certify_roa(
-        folder / f"{name}.toml", POLICY, folder / name, data=folder / "data.csv", candidate="lyapunov"
+        folder / f"{name}.toml", POLICY, folder / name, data=data, candidate="lyapunov", effort=0.2
     )
 
 
-def test_axes_prove_what_ranges_do_not(known: Path) -> None:
+@pytest.fixture(scope="module")
+def along_axes(known: Path) -> certify.RoaResult:
+    return proved(known, "known")
+
+
+def test_axes_prove_what_ranges_do_not(known: Path, along_axes: certify.RoaResult) -> None:
     assert proved(known, "boxed").verdict == "UNKNOWN"
-    found = proved(known, "known")
+    found = along_axes
     assert found.verdict == "PROVED" and found.volume is not None and found.volume > 190
     certificate = known / "known" / "certificate.json"
     for program in ("checker", "reference"):
@@ -93,18 +104,19 @@ def test_the_plant_along_axes_is_the_plant(known: Path) -> None:
     assert axes_of(sums_of(data.axes)) == data.axes
 
 
-def test_axes_are_much_closer_than_ranges(tmp_path: Path) -> None:
-    found = identified(tmp_path, under_the_policy(), WIDE, rotate=True)
+def test_axes_are_much_closer_than_ranges(found_in: dict[str, certify.IdentifyResult]) -> None:
+    found, plain = found_in["known"], found_in["boxed"]
     assert found.smaller > 10 and holds(found)
     assert found.to_dict()["axes"]["smaller"] == found.smaller and len(found.to_dict()["axes"]["sums"]) == 3
-    plain = identified(tmp_path, under_the_policy(), WIDE)
     assert plain.smaller == 1 and plain.to_dict()["axes"]["sums"] == {} and plain.system.ranges == plain.known.ranges
     assert plain.ranges == found.ranges
 
 
-def test_axes_that_do_not_hold_all_that_is_left_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_axes_that_do_not_hold_all_that_is_left_go(
+    tmp_path: Path, found_in: dict[str, certify.IdentifyResult], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As where ranges are 1e8 times narrower than their priors, and the axes' ends round inside."""
-    plain = identified(tmp_path, under_the_policy(), WIDE)
+    plain = found_in["boxed"]
     identify, asked = provers_data.identify, list[tuple[Axis, ...]]()
 
     def wider(system: System, measurements: Measurements, **how: Any) -> Any:
@@ -196,10 +208,10 @@ def test_the_command_turns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert _run(["plant", str(tmp_path / "known.toml")], False) == 0
 
 
-def test_pages_and_words_name_the_sums_that_axes_bound(known: Path) -> None:
-    found = certify.identify(
-        known / "data.csv", known / "structure.toml", noise="1e-3", sample_time="0.02", rotate=True
-    )
+def test_pages_and_words_name_the_sums_that_axes_bound(
+    known: Path, found_in: dict[str, certify.IdentifyResult], along_axes: certify.RoaResult
+) -> None:
+    found = found_in["known"]
     said, sums, data = found.to_dict(), sums_along(found.to_dict()), found.measurements
     assert len(sums) == 3 and max(a.shrink for a in sums) > 30
     for along, axis in zip(sums, data.axes, strict=True):
@@ -210,8 +222,8 @@ def test_pages_and_words_name_the_sums_that_axes_bound(known: Path) -> None:
         assert max(map(abs, along.factors.values())) == 1
     text = page(found.residuals(), said)
     assert all(a.text in text and a.ends in text for a in sums) and "axis₁" in text
-    proved(known, "known")
-    certificate = known / "known" / "certificate.json"
+    assert along_axes.certificate is not None
+    certificate = along_axes.certificate
     for program in ("certify.checker", "certify.reference"):
         command = [sys.executable, "-m", program, str(certificate)]
         words = subprocess.run(command, capture_output=True, text=True, check=True).stdout

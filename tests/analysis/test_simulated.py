@@ -66,7 +66,7 @@ STEPS = plant(x + RATE / 10, time="discrete")
 
 
 def proved(folder: Path, system: System | None = None, **options: object) -> RoaResult:
-    given: dict[str, object] = {"effort": 0.4} | options
+    given: dict[str, object] = {"effort": 0.07} | options
     result = certify_roa(system or plant(), REST, folder, **given)  # type: ignore[arg-type]
     assert result.verdict is Verdict.PROVED
     return result
@@ -75,6 +75,11 @@ def proved(folder: Path, system: System | None = None, **options: object) -> Roa
 @pytest.fixture(scope="module")
 def by_default(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
     return proved(tmp_path_factory.mktemp("default"))
+
+
+@pytest.fixture(scope="module")
+def in_steps(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
+    return proved(tmp_path_factory.mktemp("steps"), STEPS, effort=0.04)
 
 
 def test_states_that_converge_are_those_of_the_region(tmp_path: Path) -> None:
@@ -103,13 +108,13 @@ def test_states_from_which_an_input_leaves_its_bounds_do_not_count(period: float
 def test_the_states_that_a_clip_would_add_are_counted(tmp_path: Path) -> None:
     """The policy commands u = x where |u| <= 1 is allowed: states from below -1 converge if it saturates there."""
     follows = PolicyNetwork.of_layers((np.ones((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
-    found = certify_roa(plant(), follows, tmp_path, effort=0.4)
+    found = certify_roa(plant(), follows, tmp_path, effort=0.04, candidate="ellipsoid")
     assert found.simulated is not None and found.diagnosis is not None
     counts, clipped = found.simulated, replace(follows, clip=(-np.ones(1), np.ones(1)))
     assert counts.clipped is not None and counts.clipped > 1.8 * counts.converging
     said = dict(rows_of(found.to_dict(), True))["simulated"]
     assert f"{counts.more:,} more would converge if the policy were clipped at the bounds of its inputs" in said
-    whole = certify_roa(plant(), clipped, tmp_path / "clipped", effort=0.4).simulated
+    whole = certify_roa(plant(), clipped, tmp_path / "clipped", effort=0.04, candidate="ellipsoid").simulated
     assert whole is not None and whole.clipped is None and whole.more == 0
     assert whole.converging / whole.runs == pytest.approx(counts.clipped / counts.runs, abs=0.05)
 
@@ -195,7 +200,8 @@ def test_an_ellipsoid_that_is_most_of_it_is_enough(tmp_path: Path) -> None:
     """The certificate is then the very one of the ellipsoid alone, and nothing is learned."""
     network = load_policy(POLICIES / "pendulum.pt").network
     found = [
-        certify_roa(get_system("pendulum"), network, tmp_path / name, candidate=name) for name in ("auto", "ellipsoid")
+        certify_roa(get_system("pendulum"), network, tmp_path / name, candidate=name, effort=0.2)
+        for name in ("auto", "ellipsoid")
     ]
     assert found[0].raw == found[1].raw and found[0].outer is None
     assert all(one.simulated is not None and 0.8 < (one.simulated.share or 0.0) < 0.9 for one in found)
@@ -230,9 +236,9 @@ def test_what_a_proof_finds_wrong_is_taught_again(tmp_path: Path, monkeypatch: p
     learn, functions, corrected = Learner.learn, list[Learned](), list[float]()
 
     def wrong_at_first(learner: Learner, effort: Effort) -> Learned:
-        functions.append(learn(learner, effort))
         rises = Polynomial(np.array([[1], [2]]), np.array([2.0, 0.5]))  # least at -2, where the state goes on to 0
-        return functions[-1] if len(functions) > 1 else replace(functions[-1], function=rises)
+        functions.append(learn(learner, effort) if functions else Learned(rises, 1.0, 0.9, ()))
+        return functions[-1]
 
     correct = Learner.correct
     monkeypatch.setattr(Learner, "learn", wrong_at_first)
@@ -250,14 +256,18 @@ def test_what_a_proof_finds_wrong_is_taught_again(tmp_path: Path, monkeypatch: p
 def test_candidates_whose_heats_are_whole_proofs_leave_half_of_more_effort_than_a_proof_takes(
     claim: str, effort: float, share: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    extend, granted = Candidate.extend, list[float]()
+    granted = list[float]()
+
+    class Enough(Exception):
+        pass
 
     def told(stage: Candidate, state: State, effort: Effort) -> State:
         granted.append(effort.left / stage.tools.whole)
-        return extend(stage, state, effort)
+        raise Enough
 
     monkeypatch.setattr(Candidate, "extend", told)
-    proved(tmp_path, claim=claim, effort=effort)
+    with pytest.raises(Enough):
+        proved(tmp_path, claim=claim, effort=effort)
     assert granted == [pytest.approx(share, abs=0.02)]
 
 
@@ -295,7 +305,7 @@ def test_the_ellipsoid_stays_where_the_checker_refuses_more(
 def test_a_ring_that_is_cut_for_more_is_resumed_without_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All of the effort is kept for what lies beyond, which then is not wanted: the ring takes it after all."""
     network = load_policy(POLICIES / "pendulum.pt").network
-    options = {"candidate": "auto", "effort": 0.2}
+    options = {"candidate": "auto", "effort": 0.1}
     plain = certify_roa(get_system("pendulum"), network, tmp_path / "plain", **options)  # type: ignore[arg-type]
     monkeypatch.setattr(simulation, "_FOR_MORE", 1.0)
     monkeypatch.setattr(simulation, "_FOR_RING", 0.0)
@@ -303,8 +313,8 @@ def test_a_ring_that_is_cut_for_more_is_resumed_without_it(tmp_path: Path, monke
     assert cut.verdict is Verdict.PROVED and cut.volume == plain.volume
 
 
-def test_boxes_get_ranks_until_nearly_all_is_proved(tmp_path: Path) -> None:
-    result = proved(tmp_path / "default", STEPS, effort=0.04)
+def test_boxes_get_ranks_until_nearly_all_is_proved(in_steps: RoaResult, tmp_path: Path) -> None:
+    result = in_steps
     every = proved(tmp_path / "all", STEPS, candidate="ellipsoid", ranks=True, effort=0.04)
     assert result.ranks is not None and result.simulated is not None and every.ranks is not None
     assert (result.simulated.share or 0.0) > 0.9 and result.contains([-2.5])
@@ -330,10 +340,11 @@ def test_centring_is_suggested_only_where_it_gains(tmp_path: Path) -> None:
     """From the plain policy's equilibrium as much converges as from the operating point of the centred one, and all of
     it to one equilibrium; under the weaker claim alone centring gains the stronger one."""
     network = load_policy(POLICIES / "without_gain" / "pendulum.pt").network
-    nearby = certify_roa(get_system("pendulum"), network, tmp_path / "nearby")
+    nearby = certify_roa(get_system("pendulum"), network, tmp_path / "nearby", effort=0.02)
     assert nearby.claim == "nearby" and nearby.diagnosis is not None
     assert "--centre" not in dict(nearby.diagnosis.next.options)
-    weaker = certify_roa(get_system("pendulum"), network, tmp_path / "practical", claim="practical", candidate="lqr")
+    folder, options = tmp_path / "practical", {"claim": "practical", "candidate": "lqr", "effort": 0.02}
+    weaker = certify_roa(get_system("pendulum"), network, folder, **options)  # type: ignore[arg-type]
     assert weaker.claim == "practical" and weaker.diagnosis is not None
     assert dict(weaker.diagnosis.next.options) == {"--centre": "preactivation", "--claim": "auto"}
 
@@ -356,9 +367,9 @@ def test_the_page_says_the_share_where_there_is_no_grid(by_default: RoaResult) -
     assert drawn_of(None) == drawn_of({"simulated": None}) == ""
 
 
-def test_more_effort_comes_before_a_wider_domain_where_little_is_proved(tmp_path: Path) -> None:
+def test_more_effort_comes_before_a_wider_domain_where_little_is_proved(in_steps: RoaResult) -> None:
     """As long as boxes with ranks still grow; where nothing is left for them to gain, a wider domain is looked at."""
-    result, options = proved(tmp_path, STEPS), RoaOptions(effort=0.4)
+    result, options = in_steps, RoaOptions(effort=0.4)
     assert result.ranks is not None and result.simulated is not None
 
     def step(done: bool, covered: int) -> Step | None:
@@ -375,10 +386,10 @@ def test_more_effort_comes_before_a_wider_domain_where_little_is_proved(tmp_path
 
 @pytest.mark.parametrize("periods", [None, ("1/50", "1/20")])
 def test_no_effort_is_suggested_where_images_meet_too_many_boxes(
-    periods: tuple[str, str] | None, tmp_path: Path
+    periods: tuple[str, str] | None, in_steps: RoaResult
 ) -> None:
     """The search ended for its size, so that more effort finds the same."""
-    result = proved(tmp_path, STEPS)
+    result = in_steps
     assert result.ranks is not None
     ranks = replace(result.ranks, done=True, full=True)
     system = result.system if periods is None else plant().with_sample((Fraction(periods[0]), Fraction(periods[1])))

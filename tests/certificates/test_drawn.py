@@ -38,7 +38,7 @@ def test_a_tube_is_asked_about_where_it_starts():
 
 
 def test_a_result_its_file_and_its_page_say_the_same(tmp_path):
-    result = certify_roa("pendulum", PENDULUM, tmp_path)
+    result = certify_roa("pendulum", PENDULUM, tmp_path, effort=0.1)
     found = nonlinearity_of(parse_certificate(result.raw, "x"))
     assert found == result.nonlinearity and result.to_dict()["nonlinearity"] == found.to_dict()
     assert 0.005 < found.rms < found.largest < 0.1 and found.states == 1000 and not found.fitted
@@ -51,7 +51,7 @@ def test_a_result_its_file_and_its_page_say_the_same(tmp_path):
 
 def test_an_ellipsoid_that_is_none_has_no_states(tmp_path):
     """A rejected file need not make sense: its page then has no row on this."""
-    result = certify_roa("pendulum", PENDULUM, tmp_path)
+    result = certify_roa("pendulum", PENDULUM, tmp_path, effort=0.1)
     certificate = parse_certificate(result.raw, "x")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "region_of", lambda _: Region((sublevel_set(-P, 1.0),)))

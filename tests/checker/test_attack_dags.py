@@ -36,7 +36,7 @@ from tests.support.models import linear as linear_in
 
 Array = Any
 BITS = 300
-SEEDS = slow_after(24, range(240))
+SEEDS = slow_after(12, range(240))
 
 
 @pytest.fixture(autouse=True)

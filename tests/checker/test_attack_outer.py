@@ -118,7 +118,7 @@ def spread(row: list[Fraction], box: list[tuple[Fraction, Fraction]]) -> list[Fr
     return [sum(map(of, pairs), Fraction(0)) for of in (min, max)]
 
 
-@sizes(120, 6000)
+@sizes(60, 6000)
 def test_what_is_known_of_a_box_is_so_exactly(count: int) -> None:
     """That it lies outside of the domain, that V < c2 on it, the forms of x, and V - c2 as a model."""
     met: Counter[str] = Counter()
@@ -270,7 +270,7 @@ def value_of_model(model: Taylor, d: Sequence[arb], row: int | None = None) -> a
     return value
 
 
-@sizes(100, 10000)
+@sizes(50, 10000)
 def test_networks_of_any_size_lie_in_their_models(count: int) -> None:
     """Every layer, N's least value by lines, and N'F for an F whose symbols are more than those of the box."""
     met: Counter[str] = Counter()

@@ -361,10 +361,7 @@ def test_no_pair_parts_over_a_period_of_a_random_plant(seed: int) -> None:
 
 
 def test_some_random_plants_are_accepted() -> None:
-    found = seed = 0
-    while found < 4 and seed < 16:
+    for seed in (1, 6, 11, 12):
         data = with_P(random_plant(seed))
         P = square(data["lyapunov"]["P"])
-        found += any(passes_the_checker(on_ball(data, P, 2.0**-12, share)) for share in SHARES)
-        seed += 1
-    assert found >= 4, found
+        assert any(passes_the_checker(on_ball(data, P, 2.0**-12, share)) for share in SHARES), seed

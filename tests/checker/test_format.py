@@ -267,8 +267,14 @@ VALUES = [None, False, 0, 3, "", "a text", [], [[]], {}, {"a": []}, [1, 2, 3], "
 
 
 @pytest.mark.parametrize("path", ["", *TYPED])
-@pytest.mark.parametrize("value", VALUES, ids=repr)
-def test_a_value_of_another_type_is_rejected(path: str, value: Any, tmp_path: Path) -> None:
+def test_a_value_of_another_type_is_rejected(path: str, tmp_path: Path) -> None:
+    for value in VALUES:
+        one = of_another_type(path, value)
+        assert_format(edited(good(), path, one) if path else one, tmp_path)
+
+
+def of_another_type(path: str, value: Any) -> Any:
+    """The value, or one like it where it would do."""
     if path == "provenance" and isinstance(value, dict):
         value = list(value)  # any object would do there
     if path == "policy.clip" and value is None:
@@ -277,7 +283,7 @@ def test_a_value_of_another_type_is_rejected(path: str, value: Any, tmp_path: Pa
         value = "null"
     if path in EMPTY and value == []:
         value = [None]
-    assert_format(edited(good(), path, value) if path else value, tmp_path)
+    return value
 
 
 SHAPES = [

@@ -172,7 +172,7 @@ def verdicts(data: Document) -> tuple[str, str]:
 COUNT = 40
 
 
-@pytest.mark.parametrize("k", slow_after(12, range(COUNT)))
+@pytest.mark.parametrize("k", slow_after(6, range(COUNT)))
 def test_a_ball_is_accepted_up_to_the_edge_and_refused_beyond(k: int) -> None:
     plant, inner, outer = plants(COUNT)[k]
     assert verdicts(plant.document(inner * (1 - 1e-6))) == ("ACCEPTED", "ACCEPTED")

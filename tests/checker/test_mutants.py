@@ -128,7 +128,7 @@ def test_the_originals_are_accepted(name: str, tmp_path: Path) -> None:
     assert judge(base(name)) is None
 
 
-@pytest.mark.parametrize("share", slow_after(1, [12, 1]), ids=["a twelfth", "all"])
+@pytest.mark.parametrize("share", slow_after(1, [24, 1]), ids=["a twenty-fourth", "all"])
 @pytest.mark.parametrize("name", FAMILIES)
 def test_mutants_that_count_are_refused_by_the_expected_rule(name: str, share: int, tmp_path: Path) -> None:
     least, met = CAMPAIGN[name]

@@ -163,7 +163,7 @@ LOST = looked_at([([[1.0]], [0.0]), ([[3.0]], [0.0])], [2.0**-53], squash="ident
 ROUNDS = looked_at([([[0.1, 0.7, 1 / 3]], [0.0])], [0.1, 0.3, 1e15], squash="identity")
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(policies(), BOXES)
 @example(CANCELS, (0.0, 2.0**-1074, 0))
 @example(LOST, (0.0, 2.0**-1074, 0))
@@ -183,7 +183,7 @@ def test_the_checker_encloses_a_moved_policy_on_boxes(data: Document, box: tuple
                 assert not known or within(u, arb(float(m)), [arb(float(v)) for v in s], arb(float(e)), d)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(policies(), BOXES)
 @example(CANCELS, (0.0, 2.0**-1074, 0))
 @example(LOST, (0.0, 2.0**-1074, 0))
@@ -215,7 +215,7 @@ def certainly_outside(u: arb, mid: arb, slopes: Sequence[arb], error: arb, d: Se
     return bool(abs(u - line) > error)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(policies(clips=False), st.sampled_from([2.0**-60, 2.0**-20, 0.125, 1.0]), st.integers(0, 99))
 @example(CANCELS, 2.0**-60, 0)
 @example(LOST, 2.0**-60, 0)

@@ -682,7 +682,7 @@ def levels_and_vdots(name: str, c: Certificate, z: Array) -> list[tuple[arb, arb
     return result
 
 
-@sizes((100, 6), (1000, 50))
+@sizes((50, 6), (1000, 50))
 def test_vdot_on_boxes(first: int, second: int, report: Report) -> None:
     """The checker's bounds of Vdot, all the way from boxes in z; `first` rings, `second` boxes each.
 

@@ -666,7 +666,7 @@ def test_a_bump_between_two_samples_is_what_is_allowed(M: Fraction, step: Fracti
     assert not is_shown(one(M, step, noise, top, off=TINY)) and not is_shown(one(M, step, noise, top, off=-TINY))
 
 
-@pytest.mark.parametrize("seed", range(200))
+@pytest.mark.parametrize("seed", slow_after(60, range(200)))
 def test_any_weights_bound_a_consistent_function(seed: int) -> None:
     """At the point that they give, exactly: of a quadratic function whose second derivatives are M or -M, sampled with
     all of the noise, which is the function at an end where weights are positive and it bends most along each axis."""
@@ -756,7 +756,7 @@ class Random:
 
 
 @pytest.mark.parametrize("scattered", [False, True])
-@pytest.mark.parametrize("seed", slow_after(6, range(200)))
+@pytest.mark.parametrize("seed", slow_after(3, range(200)))
 def test_true_functions_are_within_the_least_bound(seed: int, scattered: bool) -> None:
     """The least E that both programs accept holds g - P at drawn points and in cells' middles; the two agree on it."""
     g, lo, hi = Random(seed), Fraction(0), Fraction(10**8)

@@ -33,6 +33,7 @@ from tests.support.loops import chain, pendulum_network
 from tests.support.marks import slow_after
 
 SHIPPED = Path(__file__).parent.parent.parent / "examples" / "policies" / "pendulum.pt"
+QUICK = ("--candidate", "lyapunov", "--effort", "0.1")
 VAN_DER_POL = Path(__file__).parent.parent.parent / "examples" / "van_der_pol.toml"
 
 
@@ -50,7 +51,9 @@ def policy_file(tmp_path: Path) -> Path:
 def proved(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The certificate of that policy."""
     folder = tmp_path_factory.mktemp("proved")
-    assert _run(["roa", "--policy", str(saved(folder / "policy.pt")), "--out", str(folder), "--quiet"], False) == 0
+    assert (
+        _run(["roa", "--policy", str(saved(folder / "policy.pt")), "--out", str(folder), "--quiet", *QUICK], False) == 0
+    )
     return (folder / "certificate.json").read_bytes()
 
 
@@ -71,7 +74,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int
 
 
 def test_roa_proves_writes_and_reports(tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", "--json")
+    status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", "--json", *QUICK)
     assert status == 0
     data = json.loads(out)
     assert out.count("\n") == 1
@@ -83,7 +86,7 @@ def test_roa_proves_writes_and_reports(tmp_path: Path, policy_file: Path, capsys
 
 
 def test_roa_in_words(tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, _ = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o")
+    status, out, _ = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", *QUICK)
     assert status == 0
     assert "PROVED" in out and "ACCEPTED" in out and str(tmp_path / "o" / "report.html") in out.replace("\n", "")
 
@@ -113,7 +116,7 @@ def test_check_compares_what_a_policy_file_says_beside_its_numbers(
 ) -> None:
     """The box in which an imported policy is that of its file, and the input that beta centres it at."""
     policy, plain, other = load_policy(SHIPPED), tmp_path / "plain.pt", tmp_path / "other.pt"
-    ways = ["--candidate", "ellipsoid", "--effort", "0.2", "--quiet", "--out", tmp_path / "o"]
+    ways = ["--candidate", "ellipsoid", "--effort", "0.1", "--quiet", "--out", tmp_path / "o"]
     assert run(capfd, "roa", "--policy", SHIPPED, *ways)[0] == 0
     where = np.array([[-3.15, 3.15], [-np.inf, np.inf]])
     narrow = np.array([[-3.15, 3.0], [-np.inf, np.inf]])
@@ -197,7 +200,7 @@ def test_a_plant_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 def test_a_rounded_beta_is_read_as_the_real_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     network = pendulum_network((8, 8))
     save_policy(tmp_path / "b.pt", Policy(network, "pendulum", beta=np.array([1e-7])))
-    status, _, err = run(capsys, "roa", "--policy", tmp_path / "b.pt", "--out", tmp_path)
+    status, _, err = run(capsys, "roa", "--policy", tmp_path / "b.pt", "--out", tmp_path, *QUICK)
     assert status == 0 and "this shifts u(0) by 6e-07" in err
 
 
@@ -352,7 +355,7 @@ def test_what_to_try_next_names_a_policy_that_was_the_first_word(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     status, out, _ = run(
-        capsys, *("roa", SHIPPED, "--max-boxes", "3", "--effort", "0.1"), "--out", tmp_path, "--json", "--quiet"
+        capsys, *("roa", SHIPPED, "--max-boxes", "3", "--effort", "0.02"), "--out", tmp_path, "--json", "--quiet"
     )
     command = json.loads(out)["diagnosis"]["next"]["command"]
     assert status == 0 and command.startswith(f"certify roa {SHIPPED} ") and "--max-boxes 30" in command
@@ -440,11 +443,11 @@ def test_an_interrupt_leaves_a_search_and_nothing_half_written(
         monkeypatch.setattr(VdotBound, "__call__", interrupt)
     else:
         monkeypatch.setattr("certify.analysis.acceptance.run_checker", interrupt)
-    status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", "--effort", "0.1")
+    status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", "--effort", "0.02")
     assert status == 130 and out == "" and "interrupted" in err and "--resume" in err
     assert [path.name for path in (tmp_path / "o").iterdir()] == ["search.json"]
     monkeypatch.undo()
-    assert run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", "--resume", "--effort", "0.1")[0] == 0
+    assert run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", "--resume", "--effort", "0.02")[0] == 0
     assert sorted(path.name for path in (tmp_path / "o").iterdir()) == ["certificate.json", "report.html"]
     assert run(capsys, "check", tmp_path / "o" / "certificate.json")[0] == 0
 
@@ -549,7 +552,7 @@ def test_practical_stability_from_the_command_line(tmp_path: Path, capsys: pytes
         "--candidate",
         "lqr",
         "--effort",
-        "0.1",
+        "0.02",
         "--out",
         tmp_path,
     )
@@ -661,7 +664,7 @@ def test_reach_proves_that_a_box_converges(
     tmp_path: Path, spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     box = "p=1.49..1.51", "v=1.38..1.42"
-    status, out, _ = run(capsys, "reach", *spring, "--from", ",".join(box), "--effort", "0.3", "--json")
+    status, out, _ = run(capsys, "reach", *spring, "--from", ",".join(box), "--effort", "0.06", "--json")
     data = json.loads(out)
     assert status == 0 and data["verdict"] == "PROVED" and data["checked"] == "ACCEPTED"
     assert data["reach_from"] == {"p": ["149/100", "151/100"], "v": ["69/50", "71/50"]}
@@ -670,7 +673,7 @@ def test_reach_proves_that_a_box_converges(
     assert run(capsys, "contains", file, *box)[0] == 0
     wider = [round(1.5 + 2 * (-1) ** k * data["tube"]["semi_axes"][0], 6) for k in (1, 0)]
     assert run(capsys, "contains", file, f"p={wider[0]}..{wider[1]}", box[1])[0] != 0
-    status, out, _ = run(capsys, "reach", *spring, "--from", ",".join(box), "--effort", "0.3")
+    status, out, _ = run(capsys, "reach", *spring, "--from", ",".join(box), "--effort", "0.06")
     assert status == 0 and re.search(r"box +p = 1.49..1.51 m, v = 1.38..1.42 m/s", out)
 
 
@@ -853,7 +856,9 @@ def test_a_disturbance_that_always_acts_is_refused_where_it_would_be_left_out(
 def test_a_tube_of_a_plant_with_a_range(
     tmp_path: Path, ranged: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    status, out, _ = run(capsys, "roa", *ranged, "--param", "k=0.9..1.1", "--level", "0.05", "--enlarge")
+    status, out, _ = run(
+        capsys, "roa", *ranged, "--param", "k=0.9..1.1", "--level", "0.05", "--enlarge", "--effort", "0.2"
+    )
     assert status == 0 and "PROVED" in out
     claim = json.loads((tmp_path / "o" / "certificate.json").read_text())
     assert claim["claim"]["kind"] == "enlarged" and claim["plant"]["uncertain"][0]["range"] == ["9/10", "11/10"]
@@ -880,7 +885,18 @@ def test_a_sample_time_and_a_rate_are_said_everywhere(
     tmp_path: Path, ranged: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Result, JSON, page and checker speak of the same periods and the same rate."""
-    asked = ("--candidate", "lyapunov", "--level", "0.25", "--sample-time", "0.01..0.05", "--rate", "0.25")
+    asked = (
+        "--candidate",
+        "lyapunov",
+        "--level",
+        "0.25",
+        "--sample-time",
+        "0.01..0.05",
+        "--rate",
+        "0.25",
+        "--effort",
+        "0.2",
+    )
     status, out, _ = run(capsys, "roa", *ranged, *asked)
     said = " ".join(out.split())
     assert status == 0 and "is invariant at sampling instants and attracted by the origin" in said
@@ -972,16 +988,19 @@ def test_a_command_that_ends_at_once_has_said_everything(
 
 @pytest.mark.parametrize(
     ("command", "both"),
-    [
-        ("certify roa --policy {policy} --out {out}", True),
-        ("certify roa --policy {policy} --out {out}", False),
-        ("certify roa --policy nosuch.pt", False),
-        ("certify prove", True),
-        ("certify roa --help", True),
-        ("controllers evaluate nosuch.pt --json", True),
-        ("controllers train pendulum --no-such", False),
-        ("controllers train --help", True),
-    ],
+    slow_after(
+        5,
+        [
+            ("certify roa --policy {policy} --out {out}", True),
+            ("certify roa --policy nosuch.pt", False),
+            ("certify prove", True),
+            ("certify roa --help", True),
+            ("controllers train pendulum --no-such", False),
+            ("certify roa --policy {policy} --out {out}", False),
+            ("controllers evaluate nosuch.pt --json", True),
+            ("controllers train --help", True),
+        ],
+    ),
 )
 def test_a_closed_pipe_is_no_verdict_whatever_was_to_be_said(command: str, both: bool, tmp_path: Path) -> None:
     """Standard error goes into a pipe that nobody reads, with standard output or without it."""

@@ -83,7 +83,13 @@ def test_a_box_that_gets_there(asked: list[str], tmp_path: Path, capsys: pytest.
 
 def test_into_a_certified_set(asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     loop, known = asked[1:5], str(tmp_path / "known")
-    assert _run(["roa", *loop, "--quiet", "--level", "0.05", "--out", known, "--keep", "v >= -2.9"], False) == 0
+    assert (
+        _run(
+            ["roa", *loop, "--quiet", "--level", "0.05", "--effort", "0.2", "--out", known, "--keep", "v >= -2.9"],
+            False,
+        )
+        == 0
+    )
     led = ["reach", *loop, "--quiet", "--target", f"{known}/certificate.json", *asked[-4:], "--keep", "v >= -2.9"]
     status, data = said(capsys, led)
     assert status == 0 and (data["checked"], data["reference"]) == ("ACCEPTED", "ACCEPTED")

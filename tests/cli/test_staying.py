@@ -74,7 +74,7 @@ def test_boxes_are_proved_with_a_held_input(
     assert _run([*held, "--effort", "0.01"], False) == 0
     told = capsys.readouterr().out
     assert "circle: boxes that are never left" in told and "steps is proved" in told
-    status, data = said(capsys, [*held, "--effort", "0.03", "--contains", "x=0.9..1.1,y=-0.1..0.1"])
+    status, data = said(capsys, [*held, "--effort", "0.012", "--contains", "x=0.9..1.1,y=-0.1..0.1"])
     assert status == 0 and (data["verdict"], data["checked"]) == ("PROVED", "ACCEPTED")
     assert (
         data["claim"] == {"kind": "remains", "sample": ["1/20", "1/20"]} and data["contains"]["result"] == "contained"

@@ -313,7 +313,7 @@ def test_a_plant_of_each_function_is_proved_up_to_its_edge(name: str, tmp_path: 
 
 def test_a_plant_of_all_functions(tmp_path: Path) -> None:
     system, network = valve()
-    result = certify_roa(system, network, tmp_path, RoaOptions(candidate="ellipsoid"))
+    result = certify_roa(system, network, tmp_path, RoaOptions(candidate="ellipsoid", effort=0.2))
     assert result.verdict is Verdict.PROVED
     path = tmp_path / "certificate.json"
     assert run_checker(path)["result"] == "ACCEPTED" and reference_rules.judge(path.read_bytes()).result == "ACCEPTED"

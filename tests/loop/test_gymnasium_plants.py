@@ -145,7 +145,7 @@ def test_the_pendulum_goes_to_one_point(policy: Policy, tmp_path: Path) -> None:
     system = plant("pendulum")
     rest = find_rest(ClosedLoop(system, policy.network))
     assert rest is not None and rest.stable and -1e-3 < float(rest.x[0]) < -1e-5 and float(rest.x[1]) == 0
-    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="optimised", effort=0.1))
+    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="optimised", effort=0.02))
     assert result.verdict is Verdict.PROVED and result.claim == "nearby" and result.certificate is not None
     assert result.network.is_moved and result.to_dict()["volume"] > 9
     assert judge_bytes(Path(result.certificate).read_bytes()) is None

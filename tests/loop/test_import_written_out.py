@@ -373,7 +373,7 @@ PROVED = {
 @pytest.mark.parametrize("name", PROVED)
 def test_a_small_policy_is_proved(name: str, tmp_path: Path) -> None:
     said: dict[str, Any] = {"states": ("theta", "theta_dot"), "normaliser": "none", "action_scale": (6,)}
-    options = RoaOptions(candidate="lyapunov", effort=0.05)
+    options = RoaOptions(candidate="lyapunov", effort=0.01)
     given = PROVED[name]
     if name == "layer norm":
         said |= {"norm": "layer-before", "norm_epsilon": 1e-5, "activation": "tanh", "squash": "tanh"}

@@ -56,7 +56,7 @@ def test_what_was_proved_with_an_earlier_floor_is_accepted_with_the_last(
 
 
 def test_progress_survives_a_level_that_falls_below_zero(tmp_path: Path) -> None:
-    options = RoaOptions(claim="practical", effort=0.1)
+    options = RoaOptions(claim="practical", effort=0.02)
     system = plant({"x": "-x + u + tan(x)/100"}, half=3, bound=10)
     certify_roa(system, gain(-1.0), tmp_path, options, progress=lambda stage, state: None)
 

@@ -82,7 +82,9 @@ def test_a_rest_that_is_not_stable_is_not_called_so() -> None:
 def test_a_loop_that_is_not_stable_there_is_told_so(tmp_path: Path, candidate: Literal["auto", "lqr"]) -> None:
     """Nothing is refuted: a floor may hold what leaves the point. A V that somebody gives is tried."""
     loop = scalar(x - x**3 + u, 0.5, 0.25)
-    result = certify_roa(loop.system, loop.network, tmp_path, RoaOptions(candidate=candidate, around="origin"))
+    result = certify_roa(
+        loop.system, loop.network, tmp_path, RoaOptions(candidate=candidate, around="origin", effort=0.2)
+    )
     assert (result.verdict, result.stop, result.P) == (Verdict.UNKNOWN, Stop.UNSTABLE, None)
     assert result.reason == "unstable linearisation: eigenvalues 1.5 where V is to be 0"
     given = RoaOptions(P=np.eye(1), around="origin")
@@ -120,7 +122,18 @@ def test_practical_stability_is_claimed_where_the_policy_is_not_centred(tmp_path
 def test_the_command_centres_on_request_and_says_what_that_changes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["roa", "--policy", str(PLAIN), "--candidate", "lqr", "--effort", "0.1", "--out", str(tmp_path), "--json"]
+    command = [
+        "roa",
+        "--policy",
+        str(PLAIN),
+        "--candidate",
+        "lqr",
+        "--effort",
+        "0.02",
+        "--out",
+        str(tmp_path),
+        "--json",
+    ]
     assert _run([*command, "--claim", "practical"], True) == 0
     further = json.loads(capsys.readouterr().out)["diagnosis"]["next"]
     assert further["options"] == {"--centre": "preactivation", "--claim": "auto"}
@@ -136,7 +149,7 @@ def test_the_command_centres_on_request_and_says_what_that_changes(
 
 def test_a_loop_that_rests_at_the_origin_gets_the_stronger_claim(tmp_path: Path) -> None:
     loop = scalar(x / 2 + u, -1.0, 0.0)
-    result = certify_roa(loop.system, loop.network, tmp_path, RoaOptions(candidate="lyapunov"))
+    result = certify_roa(loop.system, loop.network, tmp_path, RoaOptions(candidate="lyapunov", effort=0.2))
     assert result.claim == "asymptotic" and result.rest is None and result.notice is None
     assert loop.system.domain == ((Fraction(-3), Fraction(3)),)
 
@@ -194,7 +207,7 @@ def test_a_point_of_rest_that_newton_misses_is_found_along_a_trajectory() -> Non
 def test_the_set_lies_around_where_the_loop_rests(tmp_path: Path, around: Literal["auto", "rest"]) -> None:
     policy = load_policy(PLAIN)
     system = get_system("pendulum").with_parameters(policy.parameters)
-    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="lqr", around=around, effort=0.1))
+    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="lqr", around=around, effort=0.02))
     assert result.verdict is Verdict.PROVED and result.claim == "nearby" and result.certificate is not None
     assert run_checker(result.certificate, "reference")["result"] == "ACCEPTED"
     assert result.rest is not None and result.levels.floor is not None and result.P is not None
@@ -300,7 +313,7 @@ def test_what_is_asked_of_a_set_is_about_its_own_point(tmp_path: Path, capsys: p
         "--candidate",
         "lqr",
         "--effort",
-        "0.1",
+        "0.02",
         "--out",
         str(tmp_path),
         "--json",
@@ -355,7 +368,7 @@ def test_a_range_moves_the_fixed_point_of_a_map(tmp_path: Path) -> None:
     folder = Path(__file__).parents[2] / "examples"
     system = load_system(folder / "plants" / "henon.toml").with_ranges({"a": (Fraction(139, 100), Fraction(141, 100))})
     policy = load_policy(folder / "policies" / "henon.pt")
-    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="lyapunov", effort=0.3))
+    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="lyapunov", effort=0.06))
     assert result.verdict is Verdict.PROVED and result.claim == "nearby" and result.certificate is not None
     assert result.levels.floor is not None and result.levels.floor < 1e-2
     certificate = read_certificate(result.certificate)

@@ -51,11 +51,11 @@ def test_the_optimised_candidate_falls_back_with_a_notice(
         raise BackendError("cvxpy is not installed.")
 
     monkeypatch.setattr(choice, "optimise_repeatedly", fail)
-    result = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(candidate="optimised"))
+    result = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(candidate="optimised", effort=0.2))
     assert result.verdict.value == "PROVED" and result.candidate == "lyapunov"
     assert result.notice is not None and "cvxpy is not installed" in result.notice
     assert result.to_dict()["lyapunov"]["candidate"] == "lyapunov"
-    plain = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(candidate="lyapunov"))
+    plain = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(candidate="lyapunov", effort=0.2))
     assert plain.P is not None and result.P is not None and np.array_equal(plain.P, result.P)
 
 
@@ -138,6 +138,12 @@ def test_the_command_says_what_to_try_next(tmp_path: Path, capsys: pytest.Captur
 def test_quiet_says_nothing_but_the_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "policy.pt"
     save_policy(path, Policy(pendulum_network((8, 8)), "pendulum", {"m": "0.15"}))
-    assert _run(["roa", "--policy", str(path), "--out", str(tmp_path), "--candidate", "lqr", "--quiet"], False) == 0
+    assert (
+        _run(
+            ["roa", "--policy", str(path), "--out", str(tmp_path), "--candidate", "lqr", "--effort", "0.2", "--quiet"],
+            False,
+        )
+        == 0
+    )
     captured = capsys.readouterr()
     assert captured.err == "" and "PROVED" in captured.out

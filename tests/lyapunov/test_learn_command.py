@@ -32,7 +32,7 @@ def test_what_is_learned_is_written_and_proved(tmp_path: Path, capsys: pytest.Ca
     assert data["lyapunov"] == str(out) and 0 < data["sampled_cover"] <= 1 and "verdict" not in data
     stored = load_lyapunov(out)
     assert stored.system == "pendulum" and stored.training["learned"]["seed"] == 0
-    given = ("--lyapunov", out, "--out", tmp_path / "o", "--effort", "1", "--quiet", "--json")
+    given = ("--lyapunov", out, "--out", tmp_path / "o", "--effort", "0.2", "--quiet", "--json")
     status, text, _ = run(capsys, "roa", *asked, *given)
     proved = json.loads(text)
     assert status == 0 and proved["checked"] == "ACCEPTED"

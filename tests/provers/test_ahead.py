@@ -47,7 +47,7 @@ DEEP = 10**6
 WIDE = dataclasses.replace(get_system("pendulum"), domain=box(7, 30))  # whose level ends at a violation
 CASES: dict[str, tuple[Callable[[], Any], float, float]] = {
     "two states": (lambda: case_of(get_system("pendulum"), pendulum_network()), 1e-6, 3.0),
-    "four states": (cartpole_case, 2.5e-4, 1e-3),
+    "four states": (cartpole_case, 2.5e-4, 7e-4),
     "uncertain": (lambda: case_of(uncertain_pendulum(), pendulum_network()), 0.02, 0.5),
     "sampled": (lambda: stepped(swung(sample=held("1/50")), pendulum_network()), 0.02, 0.5),
     "violated": (lambda: case_of(WIDE, pendulum_network()), 1e-6, 30.0),
@@ -247,7 +247,8 @@ def by_arrival(name: str, patched: pytest.MonkeyPatch) -> None:
 def test_what_hangs_on_arrival_would_show(name: str, case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The order of boxes, the count of effort, and bounds that were made for levels of before."""
     by_arrival(name, monkeypatch)
-    found, _, _ = differences(outwards_of(case), ["two places"])
+    efforts = EFFORTS[2:] if name == "levels" else EFFORTS[:2]  # a level moves late
+    found, _, _ = differences(outwards_of(case), ["two places"], efforts)
     assert found
 
 

@@ -144,7 +144,7 @@ def test_what_is_no_address_is_refused(address: str) -> None:
     "address", ["tcp://127.0.0.1:1", "nothing://127.0.0.1:1", "tls://127.0.0.1:1", "tcp://nowhere.invalid:1"]
 )
 def test_where_nobody_answers_is_said_in_one_sentence(address: str, capfd: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(BackendError, match=f"no scheduler answers at {address}"), connect(address, patience=1.0):
+    with pytest.raises(BackendError, match=f"no scheduler answers at {address}"), connect(address, patience=0.3):
         pass
     assert capfd.readouterr() == ("", "")
 

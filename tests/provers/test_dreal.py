@@ -282,7 +282,7 @@ def test_missing_dreal_is_unknown_when_named_and_a_notice_when_not(
     monkeypatch.setattr(dreal_proof, "find_backend", missing)
     path = tmp_path / "policy.pt"
     save_policy(path, Policy(pendulum_network((8, 8)), "pendulum", {"m": "0.15"}))
-    arguments = ["roa", "--policy", str(path), "--out", str(tmp_path / "o"), "--json"]
+    arguments = ["roa", "--policy", str(path), "--out", str(tmp_path / "o"), "--effort", "0.2", "--json"]
     assert _run([*arguments, "--engine", "dreal"], True) == 3
     assert "libibex.so is missing" in json.loads(capsys.readouterr().out)["reason"]
     monkeypatch.setenv("CERTIFY_ENGINE", "dreal")
@@ -298,7 +298,9 @@ def test_missing_dreal_is_unknown_when_named_and_a_notice_when_not(
 
 def test_both_engines_agree_or_say_so(pendulum: System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = answering(monkeypatch, unsat)
-    result = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(engine="both", candidate="lyapunov"))
+    result = certify_roa(
+        pendulum, pendulum_network(), tmp_path, RoaOptions(engine="both", candidate="lyapunov", effort=0.2)
+    )
     assert result.to_dict()["checked"] == "ACCEPTED" and {"local", "ring"} <= set(asked)
     assert result.solver is not None and all(q["answer"] == "unsat" for q in result.solver["queries"])
     assert result.certificate is not None

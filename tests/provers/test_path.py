@@ -187,7 +187,7 @@ def test_after_is_the_flow() -> None:
 
 
 def run(out: Path, plant: tuple[System, PolicyNetwork], state: dict[str, Any], **change: Any) -> RoaResult:
-    options = {"candidate": "lqr", "max_boxes": 1, "effort": 0.16} | change
+    options = {"candidate": "lqr", "max_boxes": 1, "effort": 0.04} | change
     return certify_roa(*plant, out, RoaOptions(reach_from=state, **options))
 
 

@@ -38,7 +38,7 @@ from tests.support.loops import box, pendulum_network, scalar_tanh
 from tests.support.marks import slow_after
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
-PRACTICAL = RoaOptions(claim="practical", effort=0.1)
+PRACTICAL = RoaOptions(claim="practical", effort=0.02)
 
 
 def prove(case: Case, budget: Budget | None = None, exactly: float | None = None) -> Proof:
@@ -125,7 +125,7 @@ def test_the_shipped_pendulum_without_its_centring(claim: str, tmp_path: Path) -
 
 def test_a_policy_trained_without_the_gain(tmp_path: Path) -> None:
     policy = load_policy(POLICIES / "without_gain" / "pendulum.pt")
-    options = RoaOptions(claim="practical", candidate="lqr", around="origin", effort=0.1)
+    options = RoaOptions(claim="practical", candidate="lqr", around="origin", effort=0.02)
     result = certify_roa(get_system("pendulum").with_parameters(policy.parameters), policy.network, tmp_path, options)
     assert result.verdict is Verdict.PROVED and result.problem is not None and result.certificate is not None
     rest = np.array([-0.084302068, 0.0])  # where it comes to rest in simulation

@@ -22,7 +22,7 @@ from tests.support.ways import Way, bounded
 
 POLICIES = Path(__file__).parent.parent.parent / "examples" / "policies"
 RUNS = {
-    "pendulum": RoaOptions(effort=0.1),
+    "pendulum": RoaOptions(effort=0.02),
     "cartpole": RoaOptions(candidate="lqr"),
     "quadrotor2d": RoaOptions(candidate="lqr", max_boxes=3000),
 }

@@ -317,7 +317,7 @@ def test_the_ball_contains_its_level_set() -> None:
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
     """A pendulum whose ring is not given enough boxes to reach far, so that a tube is worth its while."""
-    options = RoaOptions(candidate="lqr", enlarge=True, max_boxes=1, effort=0.6)
+    options = RoaOptions(candidate="lqr", enlarge=True, max_boxes=1, effort=0.12)
     policy = load_policy(POLICIES / "pendulum.pt")
     return certify_roa(get_system("pendulum"), policy.network, tmp_path_factory.mktemp("tube"), options)
 

@@ -193,7 +193,7 @@ u = [-6, 6]
 
 def test_more_quantities_than_have_corners_are_proved(tmp_path: Path) -> None:
     (tmp_path / "nine.toml").write_text(NINE)
-    policy, options = load_policy(POLICIES / "pendulum.pt").network, RoaOptions(candidate="optimised", effort=0.1)
+    policy, options = load_policy(POLICIES / "pendulum.pt").network, RoaOptions(candidate="optimised", effort=0.05)
     result = certify_roa(load_system(tmp_path / "nine.toml"), policy, tmp_path / "out", options)
     assert result.verdict is Verdict.PROVED, result.detail
     assert result.levels is not None and result.levels.local is not None and result.levels.local > 0.1

@@ -545,7 +545,7 @@ def test_the_checker_has_the_same_limits() -> None:
 def test_the_checker_says_the_same_in_small_batches(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A leaf may then have more images than a batch has places, and all leaves must keep their own."""
     chance = random.Random(11)
-    every = [in_pieces(chance)[0] for _ in range(60)]
+    every = [in_pieces(chance)[0] for _ in range(30)]
     every += [document([GROWS], [-4.0], [4.0], 4, [3] * 16, [1, 2, 3, 1] * 4), *(d for _, d in within(HAIR))]
     for first in (12, 11, 10):
         left = [k if i < first else 0 for i, k in enumerate([1, 2, 3, 1] * 4)]

@@ -259,7 +259,7 @@ def test_the_least_range_of_a_slope_is_accepted_and_a_little_less_is_not(j: int,
 EACH = [(p, side, k) for p in range(15) for side in (0, 1) for k in range(4)]
 
 
-@pytest.mark.parametrize(("p", "side", "k"), EACH)
+@pytest.mark.parametrize(("p", "side", "k"), slow_after(40, EACH))
 def test_weights_have_exact_sums(p: int, side: int, k: int) -> None:
     """Also where the error in the equation would be large enough for any interval."""
     data = edited(far(), "plant.dynamics.0", far_equation(Fraction(9)))

@@ -113,7 +113,7 @@ def test_pictures_of_four_states_are_zoomed_to_the_set() -> None:
 
 def test_a_local_set_that_is_the_whole_set_is_not_zero_of_one_leaves(tmp_path: Path) -> None:
     system, network = chain(4, [-1.0, -2.0, -3.0, -4.0])
-    result = certify_roa(system, network, tmp_path, RoaOptions(candidate="lyapunov"))
+    result = certify_roa(system, network, tmp_path, RoaOptions(candidate="lyapunov", effort=0.2))
     assert result.levels.local == result.levels.roa and result.certificate is not None and result.checker is not None
     from certify.certificates import read_certificate
 
@@ -138,7 +138,9 @@ def proved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Certificate, dict[
     from certify.certificates import read_certificate
 
     folder = tmp_path_factory.mktemp("proved")
-    result = certify_roa(get_system("pendulum"), pendulum_network(), folder, RoaOptions(candidate="lyapunov"))
+    result = certify_roa(
+        get_system("pendulum"), pendulum_network(), folder, RoaOptions(candidate="lyapunov", effort=0.2)
+    )
     assert result.certificate is not None and result.checker is not None
     return read_certificate(result.certificate), dict(result.checker), result.to_dict(), result.certificate
 

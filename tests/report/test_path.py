@@ -191,7 +191,7 @@ def test_a_state_that_is_missed_is_said_to_be_first(missed: RoaResult) -> None:
 
 
 def test_values_and_deviations_are_told_apart(tmp_path: Path) -> None:
-    options = RoaOptions(candidate="lyapunov", reach_from={"p": Fraction(17, 10), "v": Fraction(1, 2)}, effort=0.1)
+    options = RoaOptions(candidate="lyapunov", reach_from={"p": Fraction(17, 10), "v": Fraction(1, 2)}, effort=0.02)
     result = certify_roa(*shifted_spring(), tmp_path, options)
     assert result.verdict is Verdict.PROVED and claim_of(certificate_of(result)).centre == (1.2, 0.5)
     text = page_of(result).text

@@ -85,7 +85,9 @@ class Case:
 
 
 def certified(system: System, network: PolicyNetwork, folder: Path) -> Case:
-    result = certify_roa(system, network, folder, RoaOptions(candidate="lyapunov"), provenance={"numpy": "1.2.3-test"})
+    result = certify_roa(
+        system, network, folder, RoaOptions(candidate="lyapunov", effort=0.2), provenance={"numpy": "1.2.3-test"}
+    )
     assert result.certificate is not None and result.checker is not None
     return Case(read_certificate(result.certificate), dict(result.checker), result.to_dict(), result.certificate)
 

@@ -130,12 +130,12 @@ def test_flattening_is_suggested_where_bounds_see_bends_and_little_is_proved(
     monkeypatch.setattr("certify.analysis.diagnosis._TELLING", 0)
     path, out = tmp_path / "bent.pt", tmp_path / "o"
     save_policy(path, bent())
-    status = _run(["roa", str(path), "--max-boxes", "3", "--effort", "0.16", "--out", str(out), "--json"], True)
+    status = _run(["roa", str(path), "--max-boxes", "3", "--effort", "0.04", "--out", str(out), "--json"], True)
     following = json.loads(capsys.readouterr().out)["diagnosis"]["next"]
     flat = tmp_path / "bent_flat.pt"
     assert status in (0, 3) and following["flatten"] and following["options"] == {}
     assert following["command"] == (
-        f"controllers flatten {path} --out {flat} && certify roa {flat} --effort 0.16 --max-boxes 3 --out {out} --json"
+        f"controllers flatten {path} --out {flat} && certify roa {flat} --effort 0.04 --max-boxes 3 --out {out} --json"
     )
     assert "a flatter policy that does the same" in following["why"]
 
@@ -172,7 +172,7 @@ def test_a_policy_of_another_program_is_imported_before_it_is_flattened(
     torch.save(state, path)
     said = ["--system", "pendulum", "--states", "theta,theta_dot", "--activation", "tanh", "--squash", "identity"]
     said += ["--normaliser", "none", "--action-scale", "1", "--centre", "output"]
-    more = ["--max-boxes", "3", "--effort", "0.16", "--out", str(out), "--json"]
+    more = ["--max-boxes", "3", "--effort", "0.04", "--out", str(out), "--json"]
     _run(["roa", str(path), *said, *more], True)
     printed_out = capsys.readouterr().out
     following = json.loads(printed_out)["diagnosis"]["next"]

@@ -80,7 +80,7 @@ def test_it_costs_no_more_and_takes_fewer_boxes(result):
     size, _ = before.log_boxes(_student(curved()), torch.Generator().manual_seed(0), 500)
     assert result.after.settled == result.before.settled == 20 and result.after.cost <= result.before.cost
     assert result.boxes < 0.5 * np.exp(size.item())
-    assert result.steps == 20 and result.gain_change < 0.1
+    assert result.steps == QUICK.steps // 4 and result.gain_change < 0.1
     record = result.policy.training["flattened"]
     P = np.array(record["P"])
     assert volume(P, 1.0) == pytest.approx(20.0, rel=1e-5) and record["boxes"] == result.boxes

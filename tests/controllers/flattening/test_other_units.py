@@ -25,7 +25,7 @@ PENDULUM = get_system("pendulum")
 ORIGIN = PENDULUM.exact_u_eq()
 OTHERS = [name for name in ACTIVATIONS if name != "tanh"]
 GAIN = np.array([[0.9, 0.35]])  # of net, before 6 tanh(.): a stable loop
-QUICK = FlattenOptions(steps=80, batch=64, states=20)
+QUICK = FlattenOptions(steps=40, batch=64, states=20)
 BOX = np.array([1.5, 2.0])
 
 
