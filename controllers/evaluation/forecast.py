@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from certify.analysis.candidates.economical import FEW_STATES, Forecast, is_forecast
+from certify.analysis.candidates.economical import FEW_STATES, Forecast
 from certify.analysis.stages.acceptance import operations_of_check
 from certify.effort import WHOLE
 from certify.errors import InputError
@@ -30,7 +30,7 @@ class Forecasted:
 
 
 def forecast_of(network: PolicyNetwork, system: System, box: Sequence[float]) -> Forecasted | None:
-    """The forecast for the best P that solves a Lyapunov equation; None of a loop of which none can be made.
+    """The forecast for the best P that solves a Lyapunov equation; None in more than six states, or if it is not stable.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def forecast_of(network: PolicyNetwork, system: System, box: Sequence[float]) ->
     Only the policy's curvature is forecast: where it bends little, the plant decides, and less may be proved.
     """
     loop, n = ClosedLoop(system, network), system.n
-    if not is_forecast(loop) or n > _MANY:
+    if n > _MANY:
         return None
     forecast = Forecast(loop, states=FEW_STATES)
     boxes = (1 - _LOST) * WHOLE / (operations_of_box(loop) + operations_of_check(loop))

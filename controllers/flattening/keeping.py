@@ -19,7 +19,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from certify.analysis.candidates.economical import is_forecast
 from certify.errors import OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.policies import PolicyNetwork
@@ -72,7 +71,7 @@ def require_forecast(task: Task) -> None:
         at the origin.
     """
     centred = task.old.centre != "none" or task.exactly_centred
-    if not is_forecast(ClosedLoop(task.system, task.old)) or not centred:
+    if task.system.in_steps or task.system.uncertain or not centred:
         raise OptionError(
             "`curvature` kept needs a plant in continuous time whose input follows at once, nothing uncertain, and a "
             "policy that is centred: the boxes of a proof can be forecast there only. Use `curvature` removed."
