@@ -30,7 +30,7 @@ class Forecasted:
 
 
 def forecast_of(network: PolicyNetwork, system: System, box: Sequence[float]) -> Forecasted | None:
-    """The forecast for the best P that solves a Lyapunov equation; None in more than six states, or if it is not stable.
+    """The forecast for the best P that solves a Lyapunov equation; None in over six states, or if it is not stable.
 
     Parameters
     ----------
