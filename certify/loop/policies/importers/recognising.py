@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
@@ -16,7 +17,7 @@ from certify.loop.policies.importers.onnx_graph import read_onnx
 from certify.loop.policies.importers.options import ImportOptions
 from certify.loop.policies.importers.reading import Reading
 from certify.loop.policies.importers.sb3 import read_sb3
-from certify.loop.policies.importers.state_dict import is_two_stage, read_state_dict, read_two_stage
+from certify.loop.policies.importers.state_dict import is_two_stage, parameters_of, read_state_dict, read_two_stage
 from certify.loop.policies.importers.tensors import is_npz, load_npz, load_safetensors, load_tensors
 from certify.loop.policies.importers.torchscript import is_torchscript, read_torchscript
 
@@ -81,19 +82,21 @@ def read_kind(
     folder: Path | None,
     beside: str | None,
 ) -> Reading:
+    parameters = parameters_of(options.activation or "")
     readers: dict[Content, Callable[[], Reading]] = {
         "sb3": lambda: read_sb3(Archive(raw, name), name, options.ignore),
         "torchscript": lambda: read_torchscript(TorchFile(raw, name), n, options.output),
         "onnx": lambda: read_onnx(raw, name, options.output, folder),
         "safetensors": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m, beside),
         "two-stage": lambda: read_two_stage(tensors_in(kind, raw, name), options),
-        "state-dict": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m, beside),
+        "state-dict": lambda: read_state_dict(tensors_in(kind, raw, name, parameters), options, n, m, beside),
     }
     return readers[kind]()
 
 
-def tensors_in(kind: Content, raw: bytes, name: str) -> dict[str, Numbers]:
-    """The tensors of a state_dict or two-stage file, of safetensors or npz, by their names."""
+def tensors_in(kind: Content, raw: bytes, name: str, also: re.Pattern[str] | None = None) -> dict[str, Numbers]:
+    """The tensors of a state_dict or two-stage file, of safetensors or npz, by their names; `also` as in
+    `load_tensors`."""
     if raw.startswith(b"PK") and is_npz(Archive(raw, name)):
         return load_npz(raw, name)
-    return load_safetensors(raw, name) if kind == "safetensors" else load_tensors(raw, name)
+    return load_safetensors(raw, name) if kind == "safetensors" else load_tensors(raw, name, also=also)

@@ -7,7 +7,7 @@ after the last one, nor the treatment of observations and actions: each is asked
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from fractions import Fraction
 
 import numpy as np
@@ -26,9 +26,27 @@ from certify.loop.policies.importers.reading import (
     perceptron,
     widths,
 )
-from certify.loop.policies.importers.steps import Affine, Clip, Step, Tanh, linear
-from certify.loop.policies.importers.unread import unread
+from certify.loop.policies.importers.steps import (
+    PARAMETERS,
+    Affine,
+    Clip,
+    Step,
+    Tanh,
+    in_words,
+    linear,
+    parted,
+    plainly,
+)
+from certify.loop.policies.importers.unread import known_by_name, named_by, unread
 
+_LEAF = r"(.*\.)?(?!log)(.*_)?"
+_PARAMETERS = {
+    "leaky_relu": re.compile(_LEAF + r"(slope|alpha|leak|leakiness|leaky_?relu)", re.IGNORECASE),
+    "elu": re.compile(_LEAF + r"alpha", re.IGNORECASE),
+    "celu": re.compile(_LEAF + r"alpha", re.IGNORECASE),
+    "softplus": re.compile(_LEAF + r"beta", re.IGNORECASE),
+}
+"""The names that a file may give to the number of an activation."""
 _KEY = re.compile(r"(?:(?P<prefix>.*)\.)?(?P<number>[0-9]{1,4})\.(?P<rest>.*)", re.DOTALL)
 MEAN = "mean"
 """The `--output` of a network whose last layer gives the mean of the actions and behind it their spread."""
@@ -125,10 +143,12 @@ def read_state_dict(
     if (at := normaliser_root(tensors)) is not None:
         read |= {f"{at}_mean", f"{at}_std"}
         known |= dict.fromkeys((f"{at}_var", f"{at}count"), "of the normaliser that is read")
+    known |= _stated(tensors, read, prefix, m, options)
     if beside is not None:
         known |= dict.fromkeys(_own(tensors, beside), "the Lyapunov network that is imported beside it")
     activation, placed = options.activation or "tanh", dict(norms.values())
-    assumed = f"{activation} between the layers is what --activation says, {squash} behind them what --squash says"
+    assumed = f"{in_words(activation)} between the layers is what --activation says"
+    assumed += f", {squash} behind them what --squash says"
     if options.output == MEAN:
         assumed += f", of whose {2 * m} numbers the first {m} are the mean, as --output says"
     if options.norm is not None:
@@ -143,6 +163,36 @@ def read_state_dict(
         assumed=assumed,
         unread=unread(tensors, read, prefix, m, options.ignore, known),
     )
+
+
+def parameters_of(activation: str) -> re.Pattern[str] | None:
+    """The names that a file may give to the number of an activation; None if it has none, or it is said."""
+    return _PARAMETERS.get(activation)
+
+
+def _stated(
+    tensors: Mapping[str, Numbers], read: Collection[str], prefix: str, m: int, options: ImportOptions
+) -> dict[str, str]:
+    """The reason why the number of the activation is not read from the file, by the names that it may have there.
+
+    Raises
+    ------
+    InputError : the file has such a number, and `--activation` says none.
+    """
+    name, said = parted(options.activation or "tanh")
+    names = _PARAMETERS.get(name)
+    left = [key for key, t in tensors.items() if names is not None and t.size == 1 and names.fullmatch(key)]
+    left = [key for key in left if key not in read and not named_by(options.ignore, key)]
+    found = {key: tensors[key].item() for key in left if known_by_name(key, tensors, prefix, m) is None}
+    if found and not said:
+        word, usual = PARAMETERS[name]
+        key, value = next(iter(found.items()))
+        raise InputError(
+            f"the file says {', '.join(f'{k} = {plainly(v)}' for k, v in found.items())}, which may be the {word} of "
+            f"{name}. Say which is right: --activation {name}:{plainly(value)}, or --activation "
+            f"{name}:{plainly(usual)} if {key} is another number."
+        )
+    return {key: f"the {PARAMETERS[name][0]} that --activation says" for key, v in found.items() if v == said[0]}
 
 
 def read_lyapunov(tensors: Mapping[str, Numbers], prefix: str | None, options: ImportOptions) -> Reading:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from certify.errors import InputError
 from certify.loop.files.archives import Archive
-from certify.loop.files.arrays import Numbers, array_of, is_array
+from certify.loop.files.arrays import Numbers, array_of, is_array, is_number
 from certify.loop.files.pickles import Call
 from certify.loop.files.torchfile import TorchFile, is_tensor
 
@@ -20,8 +21,14 @@ _SAFE = {
 }  # fmt: skip
 
 
-def load_tensors(raw: bytes, what: str, file: TorchFile | None = None) -> dict[str, Numbers]:
+def load_tensors(
+    raw: bytes, what: str, file: TorchFile | None = None, also: re.Pattern[str] | None = None
+) -> dict[str, Numbers]:
     """The tensors and arrays of a file of torch.save: the keys on the way to one are joined by dots.
+
+    Parameters
+    ----------
+    also : keys of single numbers that are taken for tensors; None for none.
 
     Raises
     ------
@@ -33,7 +40,8 @@ def load_tensors(raw: bytes, what: str, file: TorchFile | None = None) -> dict[s
     waiting, seen = [("", file.pickle("data.pkl"))], set[int]()
     while waiting:
         prefix, node = waiting.pop()
-        if is_tensor(node) or is_array(node):
+        named = also is not None and is_number(node) and also.fullmatch(prefix)
+        if is_tensor(node) or is_array(node) or named:
             if prefix.startswith(("_modules.", "_parameters.")):
                 raise InputError(
                     f"{what} is a module that was pickled whole, and what its forward does with {prefix} is not in the "

@@ -22,7 +22,8 @@ from certify.errors import InputError
 from certify.loop.files.arrays import Numbers
 
 _STATE = re.compile(
-    r"(.*\.)?state\.[0-9]+\.(step|exp_avg|exp_avg_sq|max_exp_avg_sq|exp_inf|momentum_buffer|square_avg|grad_avg|acc_delta|sum)"
+    r"(.*\.)?(param_groups\.[0-9]+\..*|state\.[0-9]+\."
+    r"(step|exp_avg|exp_avg_sq|max_exp_avg_sq|exp_inf|momentum_buffer|square_avg|grad_avg|acc_delta|sum))"
 )
 _SPREAD = re.compile(r"(.*_)?log_?(std|sigma|alpha|ent_coef|temperature)s?(_.*)?|sigma_param", re.IGNORECASE)
 _COUNTS = {"step", "steps", "global_step", "total_steps", "num_timesteps", "iteration", "epoch", "count"}
@@ -69,10 +70,10 @@ def unread(
     could = []
     left = sorted(set(tensors) - set(read))
     for name in left:
-        if any(fnmatchcase(name, pattern) for pattern in ignored or ()):
+        if named_by(ignored, name):
             found[name] = "--ignore names it"
             continue
-        why = known.get(name) or _known(name, tensors, prefix, outputs, of_policy)
+        why = known.get(name) or known_by_name(name, tensors, prefix, outputs, of_policy=of_policy)
         if why is None:
             could.append(name)
         else:
@@ -99,7 +100,14 @@ def unread(
     return found
 
 
-def _known(name: str, tensors: Mapping[str, Numbers], prefix: str, outputs: int, of_policy: bool) -> str | None:
+def named_by(ignored: tuple[str, ...] | None, name: str) -> bool:
+    """True if a pattern of `--ignore` names a tensor."""
+    return any(fnmatchcase(name, pattern) for pattern in ignored or ())
+
+
+def known_by_name(
+    name: str, tensors: Mapping[str, Numbers], prefix: str, outputs: int, *, of_policy: bool = True
+) -> str | None:
     """The reason why no output depends on a tensor of this name; None if the name shows none."""
     *parts, leaf = name.split(".")
     if any(_SPREAD.fullmatch(part) for part in (leaf, *parts)):
