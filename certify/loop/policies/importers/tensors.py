@@ -12,7 +12,7 @@ import numpy as np
 from certify.errors import InputError
 from certify.loop.files.archives import Archive
 from certify.loop.files.arrays import Numbers, array_of, is_array, is_number
-from certify.loop.files.pickles import Call
+from certify.loop.files.pickles import Call, Name
 from certify.loop.files.torchfile import TorchFile, is_tensor
 
 _SAFE = {
@@ -54,7 +54,7 @@ def load_tensors(
         elif isinstance(node, dict | list | tuple | Call) and id(node) not in seen:
             seen.add(id(node))
             waiting += [
-                (f"{prefix}.{k}" if prefix else str(k), v) for k, v in _inside(node) if isinstance(k, str | int)
+                (f"{prefix}.{k}" if prefix else str(k), v) for k, v in _inside(node) if isinstance(k, str | int | Name)
             ]
     return found
 
