@@ -19,6 +19,7 @@ import numpy as np
 
 from certify.errors import InputError
 from certify.loop.files.archives import MAX_BYTES
+from certify.loop.files.foreign import folder_described
 from certify.loop.networks import Affine, Network
 from certify.loop.policies.exact import require_centred
 from certify.loop.policies.file import Policy
@@ -111,6 +112,8 @@ def read_bytes(path: Path) -> bytes:
     InputError : it cannot be read, or is larger than any policy.
     """
     try:
+        if path.is_dir():
+            raise InputError(f"policy file {path} must be a file; it is {folder_described(path)}")
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"policy file {path} must have at most {MAX_BYTES >> 20} MiB; it has more.")
         return path.read_bytes()

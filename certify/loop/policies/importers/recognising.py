@@ -10,6 +10,7 @@ from typing import Literal
 from certify.errors import InputError
 from certify.loop.files.archives import Archive
 from certify.loop.files.arrays import Numbers
+from certify.loop.files.foreign import described
 from certify.loop.files.legacy import BEGINNING
 from certify.loop.files.torchfile import TorchFile
 from certify.loop.policies.file import is_text
@@ -22,13 +23,21 @@ from certify.loop.policies.importers.tensors import is_npz, load_npz, load_safet
 from certify.loop.policies.importers.torchscript import is_torchscript, read_torchscript
 
 Content = Literal["state-dict", "torchscript", "onnx", "sb3", "safetensors", "two-stage", "policy"]
+_WANTED = "it must be a file of torch.save, TorchScript, stable-baselines3, ONNX, safetensors or npz"
 _OWN, _LYAPUNOV = "certify-policy/", "certify-lyapunov/"
 
 
 def content_of(raw: bytes, name: str) -> Content | None:
-    """Recognise a file's kind by its bytes and, for ONNX, by its name; None if no reader takes it."""
+    """Recognise a file's kind by its bytes and, for ONNX, by its name; None if no reader takes it.
+
+    Raises
+    ------
+    InputError : it is damaged, or of a kind that is known and not read.
+    """
+    archive = Archive(raw, name) if raw.startswith(b"PK") else None
+    if (known := described(raw, name, archive.names if archive is not None else ())) is not None:
+        raise InputError(f"{_WANTED}; it is {known}")
     if raw.startswith((b"PK", BEGINNING)):
-        archive = Archive(raw, name) if raw.startswith(b"PK") else None
         if archive is not None and "policy.pth" in archive and "data" in archive:
             return "sb3"
         if archive is not None and is_npz(archive):
@@ -59,12 +68,11 @@ def kind_of(raw: bytes, name: str, options: ImportOptions) -> Content:
     """
     kind = options.kind if options.kind in ("onnx", "safetensors") else content_of(raw, name)
     if kind is None:
-        wanted = "it must be a file of torch.save, TorchScript, stable-baselines3, ONNX, safetensors or npz"
         if raw[:1] in (b"\x80", b"("):
             raise InputError(
-                f"{wanted}; it is a bare pickle. If you trust it, load it and write it again with torch.save."
+                f"{_WANTED}; it is a bare pickle. If you trust it, load it and write it again with torch.save."
             )
-        raise InputError(f"{wanted}; it is none of these{', but text' if is_text(raw) else ''}.")
+        raise InputError(f"{_WANTED}; it is none of these{', but text' if is_text(raw) else ''}.")
     if kind == "policy":
         raise InputError("it is a policy file of this program already: use it with certify roa --policy.")
     if options.kind not in ("auto", kind) and (options.kind, kind) != ("state-dict", "two-stage"):
