@@ -112,7 +112,7 @@ REFUSED = {
     "integers": ({**STATE, "2.weight": torch.ones(5, 7, dtype=torch.int64)}, LAYERS, "floating-point"),
     "two policies": ({f"{p}.{k}": v for p in ("a", "b") for k, v in STATE.items()}, LAYERS, "--prefix"),
     "only a critic": ({f"critic.{k}": v for k, v in STATE.items()}, LAYERS, "holds 0"),
-    "nothing": ({"x": torch.ones(2)}, LAYERS, "none .layers must be called"),
+    "nothing": ({"x": torch.ones(2)}, LAYERS, r"none in x \(2,\) \(layers must be called"),
     "a wrong prefix": (
         STATE,
         replace(LAYERS, prefix="actor"),
@@ -881,7 +881,7 @@ def test_the_weights_of_keras_are_read_as_the_next_step_writes_them(tmp_path: Pa
     arrays = {
         f"{names[key[0]]}/{'kernel' if v.ndim == 2 else 'bias'}": v.numpy().T for key, v in module.state_dict().items()
     }
-    np.savez(tmp_path / "policy.npz", **arrays)  # type: ignore[arg-type]
+    np.savez(tmp_path / "policy.npz", **arrays)
     found = import_policy(tmp_path / "policy.npz", plant(), replace(LAYERS, prefix="dense,dense_1"))
     assert gap(found, values(module, X)) < TIGHT
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping, Sequence
 from fractions import Fraction
+from itertools import islice
 
 import numpy as np
 
@@ -51,6 +52,7 @@ _KEY = re.compile(r"(?:(?P<prefix>.*)\.)?(?P<number>[0-9]{1,4})\.(?P<rest>.*)", 
 MEAN = "mean"
 """The `--output` of a network whose last layer gives the mean of the actions and behind it their spread."""
 _COMPUTED = re.compile(r"(^|\.)(weight_(g|v|orig)|parametrizations\.weight\.original[01]?)$")
+_MOST_LISTED = 12
 _PARTS = ("controller.x_equilibrium", "controller.layers.0.weight", "controller.b")
 _OTHERS = ("critic", "value", "vf", "v_net", "q_net", "qf", "q1", "q2", "lyapunov", "target")
 _ENDS: dict[Output, tuple[Step, ...]] = {
@@ -161,7 +163,7 @@ def read_state_dict(
         normaliser=rsl_normaliser(tensors, options.epsilon),
         double=_is_double(tensors, prefix),
         assumed=assumed,
-        unread=unread(tensors, read, prefix, m, options.ignore, known),
+        unread=unread(tensors, read, prefix, m, options.ignore, known, observed=n),
     )
 
 
@@ -288,16 +290,16 @@ def _numbered(tensors: Mapping[str, Numbers], names: Sequence[str]) -> dict[str,
     if wrong or len(set(names)) != len(names):
         raise InputError(
             f"--prefix with commas must name each layer once, in their order; found {','.join(names)}. "
-            f"Layers are {', '.join(_weights(tensors)) or 'none'}.{_without_norm(tensors)}"
+            f"Layers are {', '.join(_weights(tensors).values()) or 'none'}.{_without_norm(tensors)}"
         )
     parts = {f"{name}.{part}": f"{_LISTED}.{k}.{part}" for k, name in enumerate(names) for part in ("weight", "bias")}
     return {parts.get(name, name): tensor for name, tensor in tensors.items()}
 
 
-def _weights(tensors: Mapping[str, Numbers]) -> list[str]:
-    """The names of layers, each with its sizes."""
-    found = {name.removesuffix(".weight"): tensors[name] for name in tensors if name.endswith(".weight")}
-    return [f"{name} ({w.shape[1]} to {w.shape[0]})" for name, w in sorted(found.items()) if w.ndim == 2]
+def _weights(tensors: Mapping[str, Numbers]) -> dict[str, str]:
+    """The layers with their sizes, by their names, in the file's order."""
+    found = {name.removesuffix(".weight"): w for name, w in tensors.items() if name.endswith(".weight")}
+    return {name: f"{name} ({w.shape[1]} to {w.shape[0]})" for name, w in found.items() if w.ndim == 2}
 
 
 def _groups(tensors: Mapping[str, Numbers]) -> list[str]:
@@ -318,23 +320,32 @@ def _only(tensors: Mapping[str, Numbers], n: int, m: int) -> str:
         numbers = _numbers(tensors, prefix)
         first, last = tensors[f"{_dot(prefix)}{numbers[0]}.weight"], tensors[f"{_dot(prefix)}{numbers[-1]}.weight"]
         described.append(f"{prefix or 'no prefix'}: {first.shape[-1]} to {last.shape[0] if last.ndim else 0}")
-        other = any(part.startswith(_OTHERS) for part in prefix.split("."))
-        if first.shape[-1:] == (n,) and last.shape[:1] == (m,) and not other:
+        if first.shape[-1:] == (n,) and last.shape[:1] == (m,) and not _of_another(prefix):
             fitting.append(prefix)
     if len(fitting) == 1:
         return fitting[0]
     listed = "; ".join(described)
     if not described:
-        named = ", ".join(_weights(tensors))
-        listed = f"layers without a number, {named}: name them in their order, as in --prefix fc1,fc2,fc3"
-        needed = "PREFIX.NUMBER.weight and PREFIX.NUMBER.bias; a gain K, u = -K x, is one layer, 0.weight = -K"
-        listed = listed if named else f"none (layers must be called {needed})"
+        layers = _weights(tensors)
+        named, order = ", ".join(layers.values()), ",".join(name for name in layers if not _of_another(name))
+        listed = f"layers without a number, {named}: name them in their order, as in --prefix {order}"
+        needed = (
+            "PREFIX.NUMBER.weight (out, in) and PREFIX.NUMBER.bias, or of numpy kernel (in, out) instead of weight; a "
+            "gain K, u = -K x, is one layer, 0.weight = -K"
+        )
+        shapes = ", ".join(f"{name} {tensor.shape}" for name, tensor in islice(tensors.items(), _MOST_LISTED))
+        listed = listed if named else f"none in {shapes or 'no tensors'} (layers must be called {needed})"
     raise InputError(
         f"a file must hold one policy from {n} states to {m} inputs; it holds {len(fitting)}. "
         f"Name its keys up to their numbers with --prefix, and its states with --states. Found {listed}. "
         "If the policy is more than layers one behind the other, export it as TorchScript or ONNX."
         f"{_without_norm(tensors)}"
     )
+
+
+def _of_another(name: str) -> bool:
+    """True if a part of a name says that it is a critic's or the like."""
+    return any(part.startswith(_OTHERS) for part in name.split("."))
 
 
 def _without_norm(tensors: Mapping[str, Numbers]) -> str:

@@ -53,9 +53,8 @@ def load_tensors(
             found[prefix] = file.tensor(node, prefix) if is_tensor(node) else array_of(node, prefix)
         elif isinstance(node, dict | list | tuple | Call) and id(node) not in seen:
             seen.add(id(node))
-            waiting += [
-                (f"{prefix}.{k}" if prefix else str(k), v) for k, v in _inside(node) if isinstance(k, str | int | Name)
-            ]
+            inside = [(k, v) for k, v in _inside(node) if isinstance(k, str | int | Name)]
+            waiting += [(f"{prefix}.{k}" if prefix else str(k), v) for k, v in reversed(inside)]
     return found
 
 

@@ -49,6 +49,7 @@ def unread(
     known: Mapping[str, str],
     *,
     of_policy: bool = True,
+    observed: int = 0,
 ) -> dict[str, str]:
     """The reason why each unread tensor is left out, by its name.
 
@@ -61,6 +62,7 @@ def unread(
     ignored : names to leave out, `*` and `?` in them as in names of files.
     known : reasons why others are left out, from a reader that knows the format.
     of_policy : True if the network is a policy, False for a Lyapunov network.
+    observed : how many numbers it observes, if they may be normalised; else 0.
 
     Raises
     ------
@@ -90,12 +92,20 @@ def unread(
         whole = "policy" if of_policy else "Lyapunov function"
         listed = ", ".join(f"{name} {tensors[name].shape}" for name in could[:8])
         more = f" and {len(could) - 8} more" if len(could) > 8 else ""
-        options = " ".join(f"--ignore {_quoted(name)}" for name in _patterns(could, set(tensors) - set(could)))
+        normaliser = _normaliser(could, tensors, observed)
+        rest = [name for name in could if name not in normaliser]
+        options = " ".join(f"--ignore {_quoted(name)}" for name in _patterns(rest, set(tensors) - set(rest)))
+        advice = f"If the layers are all of it, say so: {options}. " if rest else ""
+        if normaliser:
+            advice = (
+                f"{' and '.join(normaliser)} have a number for each observation: if they normalise it, write them "
+                f"again as obs._mean and obs._std, and add --epsilon 0 for (o - mean) / std. {advice}"
+            )
         layers = prefix if " " in prefix else f"layers {_dot(prefix)}NUMBER"  # those listed have no common prefix
         raise InputError(
             f"the {layers} must be all of the {whole}, and the file holds what could belong to it: "
-            f"{listed}{more}. If the layers are all of it, say so: {options}. "
-            f"If they are not, export the {whole} as TorchScript or ONNX, which say what becomes of each number."
+            f"{listed}{more}. {advice}If they are not, export the {whole} as TorchScript or ONNX, which say what "
+            "becomes of each number."
         )
     return found
 
@@ -140,6 +150,15 @@ def _names_another(part: str, words: set[str], leaf: str) -> bool:
     if words & {"target", "targ"}:  # which a state to be reached is called too
         return bool(words & _NETWORKS) or leaf in ("weight", "bias")
     return part not in ("q", "v") and bool(words & {"q", "v"}) and words <= _OF  # positions and velocities are q and v
+
+
+def _normaliser(names: Collection[str], tensors: Mapping[str, Numbers], observed: int) -> tuple[str, ...]:
+    """A mean and a standard deviation among these names that have a number for each observation."""
+    for name in names:
+        for std in (name.removesuffix("mean") + end for end in ("std", "stddev")):
+            if name.endswith("mean") and std in names and tensors[name].size == tensors[std].size == observed:
+                return name, std
+    return ()
 
 
 def _has_mean(tensors: Mapping[str, Numbers], parts: list[str]) -> bool:
