@@ -316,8 +316,8 @@ def lines(imported: Imported) -> list[str]:
     ]
     if "--action-scale" not in record["options"] and not record.get("scores"):
         said.append(
-            "action   its space is the plant's input bounds, so the output is taken as u; if the environment scales it, "
-            "say --action-scale"
+            "action   its space is the plant's input bounds, so the output is taken as u; if the environment scales "
+            "it, say --action-scale"
         )
     if policy.valid is not None:
         said.append(f"valid    where no observation is clipped: {_box(found)}")

@@ -104,6 +104,7 @@ KNOWN: dict[str, tuple[dict[str, Any], str]] = {
         {f"ac_targ.net.{k}": v for k, v in CRITIC.items()},
         "another network",
     ),
+    "an old policy": ({f"actor_old.{k}": v for k, v in mlp(seed=1).state_dict().items()}, "another network"),
     "a Lyapunov network": ({f"lyapunov.layers.{k}": v for k, v in CRITIC.items()}, "another network"),
     "Adam": ({"opt": {"state": {0: {"step": torch.tensor(1.0), "exp_avg": torch.ones(7, 2)}}}}, "optimiser"),
     "an optimiser": ({"optimizer": {"moments": torch.ones(3)}}, "optimiser"),
@@ -122,6 +123,13 @@ def test_what_is_known_not_to_belong_is_named_with_its_reason(name: str, tmp_pat
     assert imported.policy.training["imported"]["not_read"] == imported.not_read
     said = "\n".join(lines(imported))
     assert f"not read {braced(imported.not_read)}: " in said
+
+
+def test_an_old_policy_beside_the_policy_is_not_asked_about(tmp_path: Path) -> None:
+    """As tianshou has them."""
+    path = saved(tmp_path, ACTOR | KNOWN["an old policy"][0])
+    imported = import_policy(path, plant(), LAYERS)
+    assert imported.words.startswith("state_dict actor ") and "actor_old.0.weight" in imported.not_read
 
 
 def test_ignore_names_what_is_no_part_of_the_policy(tmp_path: Path) -> None:

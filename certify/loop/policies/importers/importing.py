@@ -316,7 +316,14 @@ def _normaliser(reading: Reading, options: ImportOptions, n: int) -> tuple[Step,
         if options.epsilon is not None:
             raise InputError("--epsilon must go with a normaliser of rsl_rl; there is none.")
         return ()
-    spread(found.mean if isinstance(found, Normalise) else found.offset, n)
+    size = len(found.mean if isinstance(found, Normalise) else found.offset)
+    if size not in (1, n):
+        held = reading.normaliser is not None
+        raise InputError(
+            f"the normaliser {'that the file holds' if held else options.normaliser} must be of the {n} numbers that "
+            f"the policy reads; it is of {size}. "
+            f"{'Name what it reads with --states' if held else 'Name the one that was saved with this policy'}."
+        )
     return (found,)
 
 

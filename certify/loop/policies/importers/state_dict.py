@@ -344,8 +344,8 @@ def _only(tensors: Mapping[str, Numbers], n: int, m: int) -> str:
 
 
 def _of_another(name: str) -> bool:
-    """True if a part of a name says that it is a critic's or the like."""
-    return any(part.startswith(_OTHERS) for part in name.split("."))
+    """True if a part of a name says that it is a critic's, or a policy's of before, as tianshou has it."""
+    return any(part.startswith(_OTHERS) or part.endswith("_old") for part in name.split("."))
 
 
 def _without_norm(tensors: Mapping[str, Numbers]) -> str:

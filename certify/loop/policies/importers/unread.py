@@ -6,7 +6,7 @@ that no action depends on it:
 - the state of an optimiser, of a schedule of learning rates or of the run (steps, random numbers, last observations);
 - the spread of the actions that training draws, and weights of losses: `log_std`, `log_alpha`, `log_sigma_...`, or
   `std` with a number for each output and no mean beside it;
-- another network: it lies in a part called critic, value, Q, Lyapunov or target.
+- another network: it lies in a part called critic, value, Q, Lyapunov, target or old.
 
 Every other one could belong to the network, as the K of `u = -K x + net(x)` does, and a file with such a tensor is
 refused unless `--ignore` names it.
@@ -37,7 +37,7 @@ _POLICY = {"actor", "policy", "pi", "controller"}
 _OPTIMISER_WORDS = "the state of an optimiser or of a schedule"
 _SPREAD_WORDS = "the spread of actions in training, or a weight of a loss"
 _RUN_WORDS = "the state of the run"
-_OTHER_WORDS = "another network: a critic, a value, a Lyapunov or a target network"
+_OTHER_WORDS = "another network: a critic, a value, a Lyapunov, a target or an old network"
 
 
 def unread(
@@ -144,10 +144,10 @@ def known_by_name(
 
 
 def _names_another(part: str, words: set[str], leaf: str) -> bool:
-    """True if a part of a name says that it is a critic, a value, a Lyapunov or a target network."""
+    """True if a part of a name says that it is a critic, a value, a Lyapunov, a target or an old network."""
     if words & _OTHER:
         return True
-    if words & {"target", "targ"}:  # which a state to be reached is called too
+    if words & {"target", "targ", "old"}:  # which a state to be reached is called too
         return bool(words & _NETWORKS) or leaf in ("weight", "bias")
     return part not in ("q", "v") and bool(words & {"q", "v"}) and words <= _OF  # positions and velocities are q and v
 
