@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections import defaultdict
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
@@ -140,6 +141,7 @@ SAYS_A_NUMBER: dict[str, tuple[dict[str, Any], str, str]] = {
     "beside": (SLOPE, "leaky_relu", "negative_slope = 0.1, .* --activation leaky_relu:0.1, or .* leaky_relu:0.01 if"),
     "deep": ({"config": {"nets": [SLOPE]}}, "leaky_relu", "config.nets.0.negative_slope = 0.1, "),
     "an attribute": ({"args": Namespace(relu_slope=0.1)}, "leaky_relu", "args.relu_slope = 0.1, "),
+    "in a dictionary of another class": ({"config": defaultdict(int, SLOPE)}, "leaky_relu", "config.negative_slope = "),
     "of numpy": ({"negative_slope": np.float64(0.1)}, "leaky_relu", "negative_slope = 0.1, "),
     "a tensor": ({"negative_slope": torch.tensor(0.5)}, "leaky_relu", "negative_slope = 0.5, "),
     "elu": ({"elu_alpha": 2}, "elu", "elu_alpha = 2, .* --activation elu:2, or --activation elu:1 if"),

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import shlex
 import warnings
+from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -40,6 +41,24 @@ class Statistics:
     rate: float = 0.5
 
 
+class Config(dict[str, Any]):
+    """A dictionary as programs keep their options in."""
+
+
+class Pair(NamedTuple):
+    """Two numbers or tensors."""
+
+    K: Any
+    b: Any
+
+
+@dataclass(slots=True)
+class Slotted:
+    """An object without a dictionary."""
+
+    K: Any
+
+
 def traced(path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -62,6 +81,11 @@ COULD: dict[str, tuple[dict[str, Any], str]] = {
     "a gain in a list": ({"gains": [torch.ones(1, 2)]}, r"gains\.0"),
     "a gain in a tuple": ({"gains": (1, torch.ones(1, 2))}, r"gains\.1"),
     "an object": ({"obs_rms": Statistics(np.ones(2))}, r"obs_rms\.mean"),
+    "a dictionary of another class": ({"more": Config(K=torch.ones(1, 2))}, r"more\.K"),
+    "a dictionary with a default": ({"more": defaultdict(list, K=torch.ones(1, 2))}, r"more\.K"),
+    "a named tuple": ({"more": Pair(torch.ones(1, 2), 1)}, r"more\.0"),
+    "a list of another class": ({"more": deque([torch.ones(1, 2)])}, r"more\.0"),
+    "an object with slots": ({"more": Slotted(torch.ones(1, 2))}, r"more\.K"),
     "many": ({f"a{i}": torch.ones(1) for i in range(12)}, r"and 4 more.*--ignore (agent\.)?a0 --ignore .*a9\. "),
 }
 

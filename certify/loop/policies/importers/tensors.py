@@ -59,12 +59,19 @@ def load_tensors(
 
 
 def _inside(node: dict[Any, Any] | list[Any] | tuple[Any, ...] | Call) -> Iterable[tuple[Any, Any]]:
-    """Items of a container, or of an object that the pickle would have made, by key, number or attribute."""
+    """Items of a container, or of an object that the pickle would have made, by key, number or attribute; what it would
+    have been made of counts too, as of a named tuple."""
     if isinstance(node, dict):
         return node.items()
     if not isinstance(node, Call):
         return enumerate(node)
-    return [pair for state in node.states if isinstance(state, dict) for pair in state.items()]
+    held = [node.arguments, node.items, *(part for state in node.states for part in _parts(state))]
+    return [*node.pairs, *(pair for each in held if isinstance(each, dict | list | tuple) for pair in _inside(each))]
+
+
+def _parts(state: Any) -> tuple[Any, ...]:
+    """The attributes of an object: a dictionary, or with slots two of them."""
+    return state if isinstance(state, tuple) else (state,)
 
 
 def is_npz(archive: Archive) -> bool:
