@@ -40,7 +40,7 @@ from certify.loop.policies.importers.steps import (
 )
 from certify.loop.policies.importers.unread import known_by_name, named_by, unread
 
-_LEAF = r"(.*\.)?(?!log)(.*_)?"
+_LEAF = r"(.*[._])?"
 _PARAMETERS = {
     "leaky_relu": re.compile(_LEAF + r"(slope|alpha|leak|leakiness|leaky_?relu)", re.IGNORECASE),
     "elu": re.compile(_LEAF + r"alpha", re.IGNORECASE),
@@ -328,7 +328,7 @@ def _only(tensors: Mapping[str, Numbers], n: int, m: int) -> str:
     if not described:
         layers = _weights(tensors)
         named, order = ", ".join(layers.values()), ",".join(name for name in layers if not _of_another(name))
-        listed = f"layers without a number, {named}: name them in their order, as in --prefix {order}"
+        listed = f"layers without a number, {named}: name them in their order, as in --prefix {order or 'fc1,fc2'}"
         needed = (
             "PREFIX.NUMBER.weight (out, in) and PREFIX.NUMBER.bias, or of numpy kernel (in, out) instead of weight; a "
             "gain K, u = -K x, is one layer, 0.weight = -K"
