@@ -304,16 +304,21 @@ def is_own(path: Path, importing: ImportOptions) -> bool:
 
 def lines(imported: Imported) -> list[str]:
     """The findings of an import, for people."""
-    found, policy = imported, imported.policy
+    found, policy, record = imported, imported.policy, imported.policy.training["imported"]
     target = _row(found.u_eq)
     origin = f"u_eq = {target}, exactly" if _centres_itself(found) else f"{_row(found.at_origin)}; u_eq {target}"
     said = [
-        f"read     {found.words}; sha256 {policy.training['imported']['sha256']}",
-        f"policy   {found.formula}; o = ({policy.training['imported']['states']})",
+        f"read     {found.words}; sha256 {record['sha256']}",
+        f"policy   {found.formula}; o = ({record['states']})",
         *checked(found.difference, found.compared_with, found.assumed, found.not_read),
         f"pi(0)    {origin}",
         f"centring {_centring(found)}",
     ]
+    if "--action-scale" not in record["options"] and not record.get("scores"):
+        said.append(
+            "action   its space is the plant's input bounds, so the output is taken as u; if the environment scales "
+            "it, say --action-scale"
+        )
     if policy.valid is not None:
         said.append(f"valid    where no observation is clipped: {_box(found)}")
     said.append(

@@ -24,7 +24,7 @@ _HELP = {
     "kind": _KINDS,
     "states": "What the network reads, in its order: states, or expressions as in 'cos(theta),sin(theta),theta_dot'.",
     "prefix": "Keys of a state_dict's layers up to their numbers, as in actor.pi_net.fcs.",
-    "activation": "Between the layers of a state_dict: tanh, relu, elu, silu, gelu and others; docs/import.md has all.",
+    "activation": "Between the layers of a state_dict: tanh, relu, leaky_relu:0.1 and others; docs/import.md has all.",
     "norm": "Layer normalisation between the layers of a state_dict: layer-before or layer-after the activation.",
     "norm_epsilon": "What it adds to the variance; 1e-5 if nothing is said.",
     "squash": "After the last layer of a state_dict: identity, tanh or relu-tanh.",

@@ -124,6 +124,24 @@ def test_wrong_options_end_with_status_2_and_one_sentence(run: Run, arguments: l
         assert status == 2 and message in (json.loads(out)["error"] if last else err)
 
 
+def test_an_action_space_that_is_the_input_bounds_is_said_to_be_u(run: Run, tmp_path: Path) -> None:
+    sb3("PPO", tmp_path)
+    given = (
+        "PPO.zip",
+        "--system",
+        "plant.toml",
+        "--states",
+        "x0,x1",
+        "--normaliser",
+        "normaliser.pkl",
+        "--out",
+        "p.pt",
+    )
+    status, out, _ = run("import", *given)
+    assert status == 0 and "action   its space is the plant's input bounds, so the output is taken as u; if" in out
+    assert "the output is taken as u" not in run("import", *given, "--action-scale", 1)[1]
+
+
 @pytest.mark.slow
 def test_roa_reads_another_programs_file_and_keeps_to_where_no_observation_is_clipped(run: Run, tmp_path: Path) -> None:
     sb3("PPO", tmp_path)

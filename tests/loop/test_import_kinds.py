@@ -369,7 +369,7 @@ def test_files_of_numbers(tmp_path: Path) -> None:
     with zipfile.ZipFile(beside, "a") as archive:  # as _extra_files of torch.jit.save puts them there
         archive.writestr(f"{archive.namelist()[0].split('/')[0]}/extra/models/model.json", "{}")
     agree(import_policy(beside, PLANT, replace(LAYERS, activation=None, squash=None)).policy, net)
-    with pytest.raises(InputError, match=r"fc1 \(2 to 6\), mean \(6 to 1\).*--prefix fc1,fc2,fc3"):
+    with pytest.raises(InputError, match=r"fc1 \(2 to 6\), mean \(6 to 1\).*--prefix fc1,mean\. "):
         import_policy(tmp_path / "plain.pt", PLANT, LAYERS)
     with pytest.raises(InputError, match=r"name each layer once.*fc1 \(2 to 6\)"):
         import_policy(tmp_path / "plain.pt", PLANT, replace(LAYERS, prefix="fc1,fc2"))
@@ -381,6 +381,31 @@ def test_files_of_numbers(tmp_path: Path) -> None:
         np.savez(tmp_path / "odd.npz", **arrays)
         with pytest.raises(InputError, match=r"0\.bias.* must hold real numbers of at most 64 bits"):
             import_policy(tmp_path / "odd.npz", PLANT, LAYERS)
+
+
+def test_arrays_that_do_not_say_which_way_they_go_are_listed(tmp_path: Path) -> None:
+    arrays = {"fc1_w": np.ones((2, 2)), "fc1_b": np.ones(2), "mean": np.ones(2), "stddev": np.ones(2)}
+    np.savez(tmp_path / "p.npz", **arrays)
+    with pytest.raises(InputError, match=r"none in fc1_w \(2, 2\), fc1_b \(2,\), .*kernel \(in, out\)"):
+        import_policy(tmp_path / "p.npz", PLANT, LAYERS)
+
+
+def test_a_normaliser_under_other_names_is_not_ignored(tmp_path: Path) -> None:
+    arrays = {"0.weight": np.ones((1, 2)), "0.bias": np.ones(1), "mean": np.ones(2), "stddev": 2 * np.ones(2)}
+    np.savez(tmp_path / "p.npz", **arrays)
+    with pytest.raises(
+        InputError, match=r"mean and stddev .* obs\._mean and obs\._std, and add --epsilon 0"
+    ) as refused:
+        import_policy(tmp_path / "p.npz", PLANT, LAYERS)
+    assert "--ignore" not in str(refused.value)
+    names = {"mean": "obs._mean", "stddev": "obs._std"}
+    np.savez(tmp_path / "p.npz", **{names.get(k, k): v for k, v in arrays.items()})
+    options = replace(LAYERS, normaliser=None, epsilon=Fraction(0))
+    found = import_policy(tmp_path / "p.npz", PLANT, options).policy
+    assert np.array_equal(found.network(np.array([[3.0, 5.0]]), (Fraction(0),)), [[(3 - 1) / 2 + (5 - 1) / 2 + 1]])
+    with pytest.raises(InputError, match=r"K \(1,\), mean .*say so: --ignore K\. "):
+        np.savez(tmp_path / "p.npz", **arrays, K=np.ones(1))
+        import_policy(tmp_path / "p.npz", PLANT, LAYERS)
 
 
 class Shared(nn.Module):  # type: ignore[misc]

@@ -112,7 +112,7 @@ REFUSED = {
     "integers": ({**STATE, "2.weight": torch.ones(5, 7, dtype=torch.int64)}, LAYERS, "floating-point"),
     "two policies": ({f"{p}.{k}": v for p in ("a", "b") for k, v in STATE.items()}, LAYERS, "--prefix"),
     "only a critic": ({f"critic.{k}": v for k, v in STATE.items()}, LAYERS, "holds 0"),
-    "nothing": ({"x": torch.ones(2)}, LAYERS, "none .layers must be called"),
+    "nothing": ({"x": torch.ones(2)}, LAYERS, r"none in x \(2,\) \(layers must be called"),
     "a wrong prefix": (
         STATE,
         replace(LAYERS, prefix="actor"),
@@ -381,7 +381,7 @@ def test_a_normaliser_of_another_size_or_kind_is_refused(tmp_path: Path) -> None
         "list.pkl": (pickle.dumps([1, 2]), "must be a pickle of VecNormalize"),
         "noise.pkl": (b"noise", "no pickle"),
         "weights.pt": (path.read_bytes(), "must hold _mean and _std"),
-        "rsl.pt": (None, "must match|one number or 3"),
+        "rsl.pt": (None, r"normaliser .*rsl\.pt must be of the 3 numbers .*; it is of 2\. Name the one"),
     }
     for name, (raw, message) in files.items():
         file = tmp_path / name if raw is not None else rsl(tmp_path)
@@ -827,6 +827,63 @@ def test_what_a_file_is_follows_from_its_bytes(tmp_path: Path) -> None:
         import_policy(saved(tmp_path, STATE), plant(), replace(LAYERS, kind="sb3"))
     with pytest.raises(InputError, match="cannot be read"):
         import_policy(tmp_path / "missing.pt", plant(), LAYERS)
+
+
+def members(*names: str) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name in names:
+            archive.writestr(name, b"")
+    return buffer.getvalue()
+
+
+HDF5 = b"\x89HDF\r\n\x1a\n" + bytes(64)
+NOT_READ = {
+    "policy.keras": (members("metadata.json", "config.json", "model.weights.h5"), "model of Keras.*export.*tf2onnx"),
+    "policy.h5": (HDF5, "HDF5, as Keras.*tf2onnx.*numpy.savez.*dense/kernel"),
+    "sb2.zip": (members("data", "parameter_list", "parameters"), "stable-baselines 2, .*numpy.load.*numpy.savez"),
+    "policy.mat": (b"MATLAB 5.0 MAT-file, Platform" + bytes(200), "MAT-file.*exportONNXNetwork.*loadmat.*0.weight"),
+    "new.mat": (b"MATLAB 7.3 MAT-file, Platform".ljust(512) + HDF5, "MAT-file of MATLAB"),
+    "params.msgpack": (b"\x81\xa6params\x80{", "msgpack, as flax.*numpy.savez"),
+    "ACASXU.nnet": (b"// Neural Network File Format\n1,2,1,2,\n", "NNet.*0.weight.*obs._mean"),
+    "saved_model.pb": (b"\x08\x01", "SavedModel.*tf2onnx.convert --saved-model FOLDER"),
+}
+
+
+@pytest.mark.parametrize("name", NOT_READ)
+def test_what_is_known_and_not_read_has_a_next_step(name: str, tmp_path: Path) -> None:
+    raw, message = NOT_READ[name]
+    (tmp_path / name).write_bytes(raw)
+    with pytest.raises(InputError, match=message):
+        import_policy(tmp_path / name, plant(), LAYERS)
+    with pytest.raises(InputError, match=message):
+        load_policy(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("inside", "message"),
+    [
+        ("saved_model.pb", "SavedModel.*--saved-model .*folder --output policy.onnx"),
+        ("_METADATA", "orbax.*numpy.savez"),
+        ("a", "a folder. Name the file"),
+    ],
+)
+def test_a_folder_has_a_next_step(inside: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / inside).write_bytes(b"")
+    with pytest.raises(InputError, match=message):
+        import_policy(tmp_path / "folder", plant(), LAYERS)
+
+
+def test_the_weights_of_keras_are_read_as_the_next_step_writes_them(tmp_path: Path) -> None:
+    module = mlp((2, 5, 1))
+    names = {"0": "dense", "2": "dense_1"}
+    arrays = {
+        f"{names[key[0]]}/{'kernel' if v.ndim == 2 else 'bias'}": v.numpy().T for key, v in module.state_dict().items()
+    }
+    np.savez(tmp_path / "policy.npz", **arrays)
+    found = import_policy(tmp_path / "policy.npz", plant(), replace(LAYERS, prefix="dense,dense_1"))
+    assert gap(found, values(module, X)) < TIGHT
 
 
 # ------------------------------------------------------------------------------------------------- other people's files

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
+from collections import defaultdict
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
@@ -16,7 +18,7 @@ from certify.loop.networks import Affine, Clip, Concat, Map, Network, Observe, S
 from certify.loop.networks.written import as_written
 from certify.loop.plants import System, get_system, load_system
 from certify.loop.policies import load_policy, save_policy
-from certify.loop.policies.importers import ImportOptions, import_state_dict
+from certify.loop.policies.importers import ImportOptions, import_policy, import_state_dict
 from certify.loop.policies.importers.memory import import_module
 from certify.loop.policies.importers.steps import COMPOSED, IMPORTED, Normalise, activated
 from certify.loop.rigorous import evaluate_policy
@@ -84,6 +86,16 @@ def test_modules_with_branches(name: str, kind: str, tmp_path: Path) -> None:
     assert np.array_equal(again(STATES, u_eq), found.network(STATES, u_eq))
 
 
+@pytest.mark.parametrize("function", [nn.ELU(), nn.ELU(0.5), nn.CELU(2), nn.SELU()])
+def test_the_exponential_less_one_cancels_near_0(function: nn.Module) -> None:
+    module = nn.Sequential(nn.Linear(2, 1), function, nn.Linear(1, 1)).double()
+    with torch.no_grad():
+        for layer in (module[0], module[2]):
+            layer.weight.copy_(torch.eye(2)[:1, : layer.in_features])
+            layer.bias.zero_()
+    assert import_module(module, PLANT, SAID).difference.in_double < 1e-15
+
+
 @pytest.mark.parametrize("name", IMPORTED)
 def test_state_dicts_of_every_activation(name: str) -> None:
     generator = np.random.default_rng(1)
@@ -100,6 +112,77 @@ def test_state_dicts_of_every_activation(name: str) -> None:
     for k in (0, 2, 4):
         h = nn.functional.linear(phi(h) if k else h, *(torch.tensor(tensors[f"{k}.{p}"]) for p in ("weight", "bias")))
     assert np.allclose(found.policy.network(STATES, (Fraction(0),)), h.numpy(), atol=1e-12)
+
+
+NUMBERED = {
+    "leaky_relu:0.1": nn.LeakyReLU(0.1),
+    "leaky_relu:0.01": nn.LeakyReLU(),
+    "elu:0.5": nn.ELU(0.5),
+    "elu:1": nn.ELU(),
+    "celu:2": nn.CELU(2),
+    "softplus:3": nn.Softplus(3),
+}
+
+
+@pytest.mark.parametrize("name", NUMBERED)
+def test_the_number_of_an_activation_is_that_of_the_option(name: str) -> None:
+    module = nn.Sequential(nn.Linear(2, 5), NUMBERED[name], nn.Linear(5, 1)).double()
+    options = replace(SAID, activation=name, squash="identity")
+    found = import_state_dict(module.state_dict(), PLANT, options)
+    with torch.no_grad():
+        assert np.allclose(found.policy.network(STATES, (Fraction(0),)), module(torch.tensor(STATES)), atol=1e-13)
+    function, number = name.split(":")
+    assert f"{function} (" in found.assumed and f" {number})" in found.assumed
+    assert found.policy.training["imported"]["options"]["--activation"] == name
+
+
+SLOPE = {"negative_slope": 0.1}
+SAYS_A_NUMBER: dict[str, tuple[dict[str, Any], str, str]] = {
+    "beside": (SLOPE, "leaky_relu", "negative_slope = 0.1, .* --activation leaky_relu:0.1, or .* leaky_relu:0.01 if"),
+    "deep": ({"config": {"nets": [SLOPE]}}, "leaky_relu", "config.nets.0.negative_slope = 0.1, "),
+    "an attribute": ({"args": Namespace(relu_slope=0.1)}, "leaky_relu", "args.relu_slope = 0.1, "),
+    "in a dictionary of another class": ({"config": defaultdict(int, SLOPE)}, "leaky_relu", "config.negative_slope = "),
+    "of numpy": ({"negative_slope": np.float64(0.1)}, "leaky_relu", "negative_slope = 0.1, "),
+    "a tensor": ({"negative_slope": torch.tensor(0.5)}, "leaky_relu", "negative_slope = 0.5, "),
+    "elu": ({"elu_alpha": 2}, "elu", "elu_alpha = 2, .* --activation elu:2, or --activation elu:1 if"),
+    "celu": ({"alpha": 0.5}, "celu", "--activation celu:0.5"),
+    "softplus": (
+        {"beta": 3.0, "softplus_beta": 1},
+        "softplus",
+        "softplus_beta = 1.*beta = 3|beta = 3.*softplus_beta = 1",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SAYS_A_NUMBER)
+def test_a_number_that_the_file_says_is_not_passed_over(name: str, tmp_path: Path) -> None:
+    more, function, message = SAYS_A_NUMBER[name]
+    weights = dict(nn.Sequential(nn.Linear(2, 5), nn.ReLU(), nn.Linear(5, 1)).state_dict())
+    torch.save({"state_dict": weights} | more, tmp_path / "p.pt")
+    options = replace(SAID, activation=function, squash="identity")
+    with pytest.raises(InputError, match=message) as refused:
+        import_policy(tmp_path / "p.pt", PLANT, options)
+    typed = str(refused.value).split("--activation ")[1].partition(",")[0]
+    found = import_policy(tmp_path / "p.pt", PLANT, replace(options, activation=typed))
+    assert typed.partition(":")[2] in found.assumed
+    import_policy(
+        tmp_path / "p.pt",
+        PLANT,
+        replace(options, activation="relu", ignore=("*negative_slope",) if name == "a tensor" else None),
+    )
+
+
+def test_other_numbers_of_the_run_say_nothing_of_the_activation(tmp_path: Path) -> None:
+    weights = dict(nn.Sequential(nn.Linear(2, 5), nn.ReLU(), nn.Linear(5, 1)).state_dict())
+    rest = {"opt": {"param_groups": [{"alpha": 0.99}]}, "log_alpha": 0.2, "critic": SLOPE, "lr": 1e-3}
+    torch.save({"state_dict": weights} | rest, tmp_path / "p.pt")
+    import_policy(tmp_path / "p.pt", PLANT, replace(SAID, activation="leaky_relu", squash="identity"))
+
+
+@pytest.mark.parametrize("said", ["celu:0", "softplus:-1", "tanh:1", "leaky_relu:x", "elu:nan", "elu:inf", "elu:"])
+def test_a_number_that_no_activation_takes_is_refused(said: str) -> None:
+    with pytest.raises(InputError, match=r"number|must be positive"):
+        replace(SAID, activation=said)
 
 
 @pytest.mark.parametrize(

@@ -112,6 +112,29 @@ def test_an_observation_that_is_clipped_in_the_graph(tmp_path: Path) -> None:
     np.testing.assert_allclose(imported.policy.valid, np.stack([mean - std, mean + 1.5 * std], 1), rtol=1e-15)
 
 
+@pytest.mark.parametrize("axes", [1, 2])
+def test_operands_are_broadcast_before_opset_7_as_numpy_does_it(axes: int, tmp_path: Path) -> None:
+    """As MATLAB writes them: the numbers of a row, or a row."""
+    said = {"broadcast": 1} if axes == 1 else {"broadcast": 0}
+    operations = (
+        *(("Sub", "*", "mean", said), ("Div", "*", "std", said), ("Gemm", "*", "W1", "B1", said), ("Tanh", "*")),
+        *(("MatMul", "*", "W2"), ("Add", "*", "B2", said), ("Mul", "*", "three", {"broadcast": 1})),
+    )
+    rows = {name: CONSTANTS[name].reshape((1, -1)[2 - axes :]) for name in ("mean", "std", "B1", "B2")}
+    made = model(chain(*operations), CONSTANTS | rows)
+    made.opset_import[0].version = 6
+    imported = import_policy(written(tmp_path, made), plant(), SAID)
+    expected = 3 * net(NORMALISED)
+    assert np.max(np.abs(imported.policy.network(X, (Fraction(0),)) - expected)) < 1e-12
+    made.graph.node[0].attribute.append(helper.make_attribute("axis", 0))
+    with pytest.raises(InputError, match=r"Sub .* has axis, broadcast, which is not read"):
+        import_policy(written(tmp_path, made), plant(), SAID)
+    del made.graph.node[0].attribute[1]
+    made.opset_import[0].version = 7
+    with pytest.raises(InputError, match=r"Sub .* has broadcast, which is not read"):
+        import_policy(written(tmp_path, made), plant(), SAID)
+
+
 def other_file(made: Any) -> Any:
     tensor = made.graph.initializer[0]
     tensor.ClearField("raw_data")

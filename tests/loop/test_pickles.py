@@ -117,6 +117,20 @@ def test_damaged_and_hostile_pickles_are_refused(program: bytes, message: str) -
         read_pickle(program, "p")
 
 
+def test_a_class_may_be_a_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Lightning has its callbacks; what lies under it is named like all else."""
+    program = b"}cposix\nsystem\nI1\ns."
+    monkeypatch.chdir(tmp_path)
+    assert read_pickle(program, "p") == {Name("posix", "system"): 1}
+    saved = io.BytesIO()
+    torch.save({"callbacks": {Asks: {"best": torch.ones(1)}}, "w": torch.ones(2, 2)}, saved)
+    assert set(load_tensors(saved.getvalue(), "f")) == {"w", f"callbacks.{Asks.__module__}.Asks.best"}
+    # a call in a key is none
+    with pytest.raises(InputError, match="a key must be"):
+        read_pickle(b"}cposix\nsystem\n(S'touch executed'\ntRI1\ns.", "p")
+    assert not Path("executed").exists()
+
+
 def test_a_key_whose_hash_would_take_for_ever_is_refused() -> None:
     doubling = b")" + b"2\x86" * 60  # t = (t, t), sixty times
     with pytest.raises(InputError, match="a key must be"):

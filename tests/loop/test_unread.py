@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import shlex
 import warnings
+from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -40,6 +41,24 @@ class Statistics:
     rate: float = 0.5
 
 
+class Config(dict[str, Any]):
+    """A dictionary as programs keep their options in."""
+
+
+class Pair(NamedTuple):
+    """Two numbers or tensors."""
+
+    K: Any
+    b: Any
+
+
+@dataclass(slots=True)
+class Slotted:
+    """An object without a dictionary."""
+
+    K: Any
+
+
 def traced(path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -62,6 +81,11 @@ COULD: dict[str, tuple[dict[str, Any], str]] = {
     "a gain in a list": ({"gains": [torch.ones(1, 2)]}, r"gains\.0"),
     "a gain in a tuple": ({"gains": (1, torch.ones(1, 2))}, r"gains\.1"),
     "an object": ({"obs_rms": Statistics(np.ones(2))}, r"obs_rms\.mean"),
+    "a dictionary of another class": ({"more": Config(K=torch.ones(1, 2))}, r"more\.K"),
+    "a dictionary with a default": ({"more": defaultdict(list, K=torch.ones(1, 2))}, r"more\.K"),
+    "a named tuple": ({"more": Pair(torch.ones(1, 2), 1)}, r"more\.0"),
+    "a list of another class": ({"more": deque([torch.ones(1, 2)])}, r"more\.0"),
+    "an object with slots": ({"more": Slotted(torch.ones(1, 2))}, r"more\.K"),
     "many": ({f"a{i}": torch.ones(1) for i in range(12)}, r"and 4 more.*--ignore (agent\.)?a0 --ignore .*a9\. "),
 }
 
@@ -104,6 +128,7 @@ KNOWN: dict[str, tuple[dict[str, Any], str]] = {
         {f"ac_targ.net.{k}": v for k, v in CRITIC.items()},
         "another network",
     ),
+    "an old policy": ({f"actor_old.{k}": v for k, v in mlp(seed=1).state_dict().items()}, "another network"),
     "a Lyapunov network": ({f"lyapunov.layers.{k}": v for k, v in CRITIC.items()}, "another network"),
     "Adam": ({"opt": {"state": {0: {"step": torch.tensor(1.0), "exp_avg": torch.ones(7, 2)}}}}, "optimiser"),
     "an optimiser": ({"optimizer": {"moments": torch.ones(3)}}, "optimiser"),
@@ -122,6 +147,13 @@ def test_what_is_known_not_to_belong_is_named_with_its_reason(name: str, tmp_pat
     assert imported.policy.training["imported"]["not_read"] == imported.not_read
     said = "\n".join(lines(imported))
     assert f"not read {braced(imported.not_read)}: " in said
+
+
+def test_an_old_policy_beside_the_policy_is_not_asked_about(tmp_path: Path) -> None:
+    """As tianshou has them."""
+    path = saved(tmp_path, ACTOR | KNOWN["an old policy"][0])
+    imported = import_policy(path, plant(), LAYERS)
+    assert imported.words.startswith("state_dict actor ") and "actor_old.0.weight" in imported.not_read
 
 
 def test_ignore_names_what_is_no_part_of_the_policy(tmp_path: Path) -> None:

@@ -55,6 +55,13 @@ def is_array(node: Any) -> bool:
     return rebuilt or (module in [f"{part}.numeric" for part in _NUMPY_PARTS] and name == "_frombuffer")
 
 
+def is_number(node: Any) -> bool:
+    """True if a node of a pickle describes a single number, of Python or of numpy."""
+    if isinstance(node, Call) and isinstance(node.function, Name):
+        return node.function in [Name(f"{part}.multiarray", "scalar") for part in _NUMPY_PARTS]
+    return isinstance(node, float) or (type(node) is int and abs(node) < 2**53)
+
+
 def product(shape: Any, what: str) -> int:
     """The number of entries of a shape.
 

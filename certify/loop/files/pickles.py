@@ -22,7 +22,6 @@ _SCALARS = {
     "BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8",
 }  # fmt: skip
 _WORDS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
-_KEY = (str, bytes, int, float, bool, type(None))
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +33,9 @@ class Name:
 
     def __str__(self) -> str:
         return f"{self.module}.{self.name}"
+
+
+_KEY = (str, bytes, int, float, bool, type(None), Name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,7 +263,7 @@ def _key(value: Any) -> Any:
     flat = value if isinstance(value, tuple) else (value,)
     if all(isinstance(part, _KEY) for part in flat):
         return value
-    raise InputError(f"a key must be text or a number; found {brief(value)}.")
+    raise InputError(f"a key must be text, a number or a name; found {brief(value)}.")
 
 
 def brief(value: Any) -> str:

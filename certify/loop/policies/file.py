@@ -22,6 +22,7 @@ from certify.errors import CertificateFormatError, InputError
 from certify.loop.activations import ACTIVATIONS
 from certify.loop.expressions import Symbol, from_tree, to_tree
 from certify.loop.files.arrays import Numbers
+from certify.loop.files.foreign import described
 from certify.loop.files.plain import array_in, layers_in, origin_in, read_plain, require_keys, tensors, write_plain
 from certify.loop.networks import Affine, Clip, Concat, Map, Network, Observe, Product, Step, Sum
 from certify.loop.policies.network import Array, Centre, PolicyNetwork, Squash
@@ -219,6 +220,8 @@ def _other(path: Path) -> str | None:
             names = set(zipfile.ZipFile(file).namelist()) if raw.startswith(b"PK") else set()
     except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError):
         return None
+    if (known := described(raw, path.name, names)) is not None:
+        return f"{_WHAT} {path} must hold a policy; it is {known}"
     if {"data", "policy.pth"} <= names:
         return _to_import(path, "a zip file of stable-baselines3")
     if any("/code/" in name for name in names):

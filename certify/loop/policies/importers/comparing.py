@@ -181,6 +181,8 @@ def _run(steps: Sequence[Step], x: Array, error: Array, unit: float) -> tuple[Ar
                 e = phi.steepest * e + _TANH_UNITS * unit * (np.abs(h) + np.abs(value))
                 if step.function == "softplus":
                     e = np.where(h > _STRAIGHT - e, e + np.exp(-_STRAIGHT), e)
+                if step.function == "elu":  # exp(h) - 1 cancels
+                    e = e + 2 * unit * (h < 0)
                 if step.function == "gelu":  # the onnx package's own has constants of single precision
                     e = e + _SINGLE * np.abs(h)
                 h = value

@@ -19,6 +19,7 @@ import numpy as np
 
 from certify.errors import InputError
 from certify.loop.files.archives import MAX_BYTES
+from certify.loop.files.foreign import folder_described
 from certify.loop.networks import Affine, Network
 from certify.loop.policies.exact import require_centred
 from certify.loop.policies.file import Policy
@@ -111,6 +112,8 @@ def read_bytes(path: Path) -> bytes:
     InputError : it cannot be read, or is larger than any policy.
     """
     try:
+        if path.is_dir():
+            raise InputError(f"policy file {path} must be a file; it is {folder_described(path)}")
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"policy file {path} must have at most {MAX_BYTES >> 20} MiB; it has more.")
         return path.read_bytes()
@@ -313,7 +316,14 @@ def _normaliser(reading: Reading, options: ImportOptions, n: int) -> tuple[Step,
         if options.epsilon is not None:
             raise InputError("--epsilon must go with a normaliser of rsl_rl; there is none.")
         return ()
-    spread(found.mean if isinstance(found, Normalise) else found.offset, n)
+    size = len(found.mean if isinstance(found, Normalise) else found.offset)
+    if size not in (1, n):
+        held = reading.normaliser is not None
+        raise InputError(
+            f"the normaliser {'that the file holds' if held else options.normaliser} must be of the {n} numbers that "
+            f"the policy reads; it is of {size}. "
+            f"{'Name what it reads with --states' if held else 'Name the one that was saved with this policy'}."
+        )
     return (found,)
 
 

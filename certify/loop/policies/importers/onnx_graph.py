@@ -113,8 +113,11 @@ def read_onnx(raw: bytes, what: str, wanted: str | None = None, folder: Path | N
     name, output = _ends(model.graph, wanted, what)
     unread = _prune(model, output, what)
     beside = load_weights(model.graph, folder, what)
+    gemms = _as_numpy_broadcasts(model)
     shape = _given_shape(model.graph, name, what)
     steps = _walk(model.graph, name, output, shape, what)
+    for node in gemms:
+        node.attribute.append(onnx.helper.make_attribute("broadcast", 1))  # without it onnx's evaluator takes one row
     double = any(t.data_type == onnx.TensorProto.DOUBLE for t in model.graph.initializer)
     try:
         evaluators = {False: ReferenceEvaluator(model), True: ReferenceEvaluator(_doubled(model))}
@@ -137,6 +140,23 @@ def read_onnx(raw: bytes, what: str, wanted: str | None = None, folder: Path | N
         unread=dict.fromkeys(unread, f"{output} does not depend on it"),
         beside=beside,
     )
+
+
+def _as_numpy_broadcasts(model: Any) -> list[Any]:
+    """Take the attribute `broadcast` away where it is without an axis, and return the nodes of Gemm before opset 7.
+
+    Before opset 7 the shapes of two operands must be equal; with `broadcast` the second may be one number, or have the
+    last axes of the first. So it is in numpy, which also takes shapes that those operators do not.
+    """
+    if all(opset.version >= 7 for opset in model.opset_import if opset.domain in _STANDARD):
+        return []
+    nodes = [node for node in model.graph.node if node.op_type in ("Gemm", "Add", "Sub", "Mul", "Div")]
+    for node in nodes:
+        said = {a.name: a.i for a in node.attribute}
+        if said.get("broadcast") in (0, 1) and "axis" not in said:
+            for k in reversed([k for k, a in enumerate(node.attribute) if a.name == "broadcast"]):
+                del node.attribute[k]
+    return [node for node in nodes if node.op_type == "Gemm"]
 
 
 def _prune(model: Any, output: str, what: str) -> list[str]:

@@ -347,7 +347,7 @@ def _activated(chain: Chain, kind: str, flags: dict[str, Any], at: str) -> Chain
     if kind in _ALPHAS:
         alpha = float(flags["alpha"].f) if "alpha" in flags else _ALPHAS[kind]
         name = "leaky_relu" if kind == "LeakyRelu" else kind.lower()
-        return graph.mapped(chain, name, *([] if alpha == 1 and kind == "Elu" else [alpha]))
+        return graph.mapped(chain, name, alpha)
     if kind == "Selu":
         return graph.mapped(chain, "selu", *(float(flags[k].f) if k in flags else v for k, v in _SELU.items()))
     approximate = flags["approximate"].s if "approximate" in flags else b"none"

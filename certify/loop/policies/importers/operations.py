@@ -322,8 +322,8 @@ def _step(name: str, place: int, count: int, chain: Chain, given: tuple[Any, ...
         case "prelu", 0, 2:
             return graph.leaked(chain, given[0], at)
         case "softplus", 0, 3 if given[0] > 0 and given[1] == 20:
-            return graph.mapped(chain, "softplus", *([] if given[0] == 1 else [given[0]]))
-        case "elu", 0, 2 | 3 | 4 if given[1:] == (1.0, 1.0)[: len(given) - 1] and given[0] != 1:
+            return graph.mapped(chain, "softplus", given[0])
+        case "elu", 0, 2 | 3 | 4 if given[1:] == (1.0, 1.0)[: len(given) - 1]:
             return graph.mapped(chain, name, given[0])
         case _, 0, _ if name in _ACTIVATIONS and given == _ACTIVATIONS[name][: len(given)]:
             return graph.mapped(chain, name.replace("log_s", "logs"))

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from certify.errors import InputError
-from certify.loop.policies.importers.steps import IMPORTED, Clip
+from certify.loop.policies.importers.steps import IMPORTED, Clip, parted
 from certify.loop.policies.network import Centre
 
 Kind = Literal["auto", "state-dict", "torchscript", "onnx", "sb3", "safetensors", "two-stage"]
@@ -45,7 +45,8 @@ class ImportOptions:
     prefix : in a state_dict, the keys of the policy's layers up to their numbers, such as `actor.pi_net.fcs`.
     activation : between the layers of a state_dict, by its name: tanh, relu, elu (alpha 1), sigmoid, silu, gelu (the
         exact one), gelu-tanh (its tanh form), softplus (beta 1), mish, softsign, leaky_relu (slope 0.01), selu, celu
-        (alpha 1), hardtanh, relu6, hardsigmoid, hardswish or logsigmoid.
+        (alpha 1), hardtanh, relu6, hardsigmoid, hardswish or logsigmoid; another number than that in brackets, a
+        binary64, is said as in `leaky_relu:0.1`.
     norm : the layer normalisation between the layers of a state_dict, `layer-before` or `layer-after` the activation;
         None if there is none.
     norm_epsilon : the number that it adds to the variance; 1e-5 by default.
@@ -96,11 +97,13 @@ class ImportOptions:
                 raise InputError(f"{option} must be one of {', '.join(known)}; found {value!r}.")
         if self.activation is not None:
             named = {_plain(name): name for name in IMPORTED}
-            if _plain(self.activation) not in named:
+            typed, colon, number = self.activation.partition(":")
+            if _plain(typed) not in named:
                 raise InputError(
                     f"--activation must be one of {', '.join(IMPORTED)}; found {self.activation!r}. {_WITH_ANOTHER}"
                 )
-            object.__setattr__(self, "activation", named[_plain(self.activation)])
+            object.__setattr__(self, "activation", f"{named[_plain(typed)]}{colon}{number}")
+            parted(self.activation)
         for name in ("action_scale", "action_offset"):
             if isinstance(value := getattr(self, name), int | float | Fraction):
                 object.__setattr__(self, name, (Fraction(value),))

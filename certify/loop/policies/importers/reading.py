@@ -22,6 +22,7 @@ from certify.loop.policies.importers.steps import (
     activated,
     exactly,
     layer_normalised,
+    parted,
 )
 from certify.loop.policies.network import Array
 
@@ -109,10 +110,12 @@ def gives(steps: Sequence[Step], width: int) -> int:
     return width
 
 
-_FORMULAS: Mapping[str, Callable[[Values], Values]] = {
-    "leaky_relu": lambda v: np.where(v > 0, v, 0.01 * v),
-    "selu": lambda v: 1.0507009873554805 * np.where(v > 0, v, 1.6732632423543772 * np.expm1(np.minimum(v, 0))),
-    "celu": lambda v: np.where(v > 0, v, np.expm1(np.minimum(v, 0))),
+_FORMULAS: Mapping[str, Callable[..., Values]] = {
+    "leaky_relu": lambda v, slope=0.01: np.where(v > 0, v, slope * v),
+    "elu": lambda v, alpha=1.0: np.where(v > 0, v, alpha * ACTIVATIONS["elu"](v)),
+    "softplus": lambda v, beta=1.0: ACTIVATIONS["softplus"](beta * v) / beta,
+    "selu": lambda v: 1.0507009873554805 * np.where(v > 0, v, 1.6732632423543772 * ACTIVATIONS["elu"](v)),
+    "celu": lambda v, alpha=1.0: np.where(v > 0, v, alpha * ACTIVATIONS["elu"](v / alpha)),
     "hardtanh": lambda v: np.clip(v, -1, 1),
     "relu6": lambda v: np.clip(v, 0, 6),
     "hardsigmoid": lambda v: np.clip(v + 3, 0, 6) / 6,
@@ -120,7 +123,7 @@ _FORMULAS: Mapping[str, Callable[[Values], Values]] = {
     "logsigmoid": lambda v: -np.logaddexp(0, -v),
     "gelu-tanh": lambda v: 0.5 * v * (1 + np.tanh(0.7978845608028654 * (v + 0.044715 * v * v * v))),
 }
-"""The activations that are made of others, as they are written elsewhere."""
+"""The activations that are made of others, or have a number, as they are written elsewhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +161,11 @@ def perceptron(
     norms: Norms | None = None,
 ) -> Evaluate:
     """The layers with an activation, and maybe a normalisation, between them, and `squash` behind them, in numpy."""
-    phi = _FORMULAS[activation] if activation in _FORMULAS else ACTIVATIONS[activation]
+    name, numbers = parted(activation)
+
+    def phi(v: Values) -> Values:
+        return _FORMULAS[name](v, *numbers) if name in _FORMULAS else ACTIVATIONS[name](v)
+
     ends: dict[Output, Callable[[Values], Values]] = {
         "identity": lambda y: y,
         "tanh": np.tanh,
@@ -185,7 +192,8 @@ def _between(k: int, phi: Callable[[Values], Values], norms: Norms | None) -> tu
 
 def between(layers: Sequence[Affine], activation: str = "tanh", norms: Norms | None = None) -> tuple[Step, ...]:
     """The layers as steps, with an activation, and maybe a normalisation, between them."""
-    function, steps = activated(activation), list[Step]()
+    name, numbers = parted(activation)
+    function, steps = activated(name, *map(Fraction, numbers)), list[Step]()
     for k, layer in enumerate(layers):
         norm = (norms or {}).get(k)
         if k:

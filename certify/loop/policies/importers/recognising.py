@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
@@ -9,6 +10,7 @@ from typing import Literal
 from certify.errors import InputError
 from certify.loop.files.archives import Archive
 from certify.loop.files.arrays import Numbers
+from certify.loop.files.foreign import described
 from certify.loop.files.legacy import BEGINNING
 from certify.loop.files.torchfile import TorchFile
 from certify.loop.policies.file import is_text
@@ -16,18 +18,26 @@ from certify.loop.policies.importers.onnx_graph import read_onnx
 from certify.loop.policies.importers.options import ImportOptions
 from certify.loop.policies.importers.reading import Reading
 from certify.loop.policies.importers.sb3 import read_sb3
-from certify.loop.policies.importers.state_dict import is_two_stage, read_state_dict, read_two_stage
+from certify.loop.policies.importers.state_dict import is_two_stage, parameters_of, read_state_dict, read_two_stage
 from certify.loop.policies.importers.tensors import is_npz, load_npz, load_safetensors, load_tensors
 from certify.loop.policies.importers.torchscript import is_torchscript, read_torchscript
 
 Content = Literal["state-dict", "torchscript", "onnx", "sb3", "safetensors", "two-stage", "policy"]
+_WANTED = "it must be a file of torch.save, TorchScript, stable-baselines3, ONNX, safetensors or npz"
 _OWN, _LYAPUNOV = "certify-policy/", "certify-lyapunov/"
 
 
 def content_of(raw: bytes, name: str) -> Content | None:
-    """Recognise a file's kind by its bytes and, for ONNX, by its name; None if no reader takes it."""
+    """Recognise a file's kind by its bytes and, for ONNX, by its name; None if no reader takes it.
+
+    Raises
+    ------
+    InputError : it is damaged, or of a kind that is known and not read.
+    """
+    archive = Archive(raw, name) if raw.startswith(b"PK") else None
+    if (known := described(raw, name, archive.names if archive is not None else ())) is not None:
+        raise InputError(f"{_WANTED}; it is {known}")
     if raw.startswith((b"PK", BEGINNING)):
-        archive = Archive(raw, name) if raw.startswith(b"PK") else None
         if archive is not None and "policy.pth" in archive and "data" in archive:
             return "sb3"
         if archive is not None and is_npz(archive):
@@ -58,12 +68,11 @@ def kind_of(raw: bytes, name: str, options: ImportOptions) -> Content:
     """
     kind = options.kind if options.kind in ("onnx", "safetensors") else content_of(raw, name)
     if kind is None:
-        wanted = "it must be a file of torch.save, TorchScript, stable-baselines3, ONNX, safetensors or npz"
         if raw[:1] in (b"\x80", b"("):
             raise InputError(
-                f"{wanted}; it is a bare pickle. If you trust it, load it and write it again with torch.save."
+                f"{_WANTED}; it is a bare pickle. If you trust it, load it and write it again with torch.save."
             )
-        raise InputError(f"{wanted}; it is none of these{', but text' if is_text(raw) else ''}.")
+        raise InputError(f"{_WANTED}; it is none of these{', but text' if is_text(raw) else ''}.")
     if kind == "policy":
         raise InputError("it is a policy file of this program already: use it with certify roa --policy.")
     if options.kind not in ("auto", kind) and (options.kind, kind) != ("state-dict", "two-stage"):
@@ -81,19 +90,21 @@ def read_kind(
     folder: Path | None,
     beside: str | None,
 ) -> Reading:
+    parameters = parameters_of(options.activation or "")
     readers: dict[Content, Callable[[], Reading]] = {
         "sb3": lambda: read_sb3(Archive(raw, name), name, options.ignore),
         "torchscript": lambda: read_torchscript(TorchFile(raw, name), n, options.output),
         "onnx": lambda: read_onnx(raw, name, options.output, folder),
         "safetensors": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m, beside),
         "two-stage": lambda: read_two_stage(tensors_in(kind, raw, name), options),
-        "state-dict": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m, beside),
+        "state-dict": lambda: read_state_dict(tensors_in(kind, raw, name, parameters), options, n, m, beside),
     }
     return readers[kind]()
 
 
-def tensors_in(kind: Content, raw: bytes, name: str) -> dict[str, Numbers]:
-    """The tensors of a state_dict or two-stage file, of safetensors or npz, by their names."""
+def tensors_in(kind: Content, raw: bytes, name: str, also: re.Pattern[str] | None = None) -> dict[str, Numbers]:
+    """The tensors of a state_dict or two-stage file, of safetensors or npz, by their names; `also` as in
+    `load_tensors`."""
     if raw.startswith(b"PK") and is_npz(Archive(raw, name)):
         return load_npz(raw, name)
-    return load_safetensors(raw, name) if kind == "safetensors" else load_tensors(raw, name)
+    return load_safetensors(raw, name) if kind == "safetensors" else load_tensors(raw, name, also=also)

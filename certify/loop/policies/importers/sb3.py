@@ -32,7 +32,7 @@ from certify.loop.files.pickles import Name, brief, read_pickle
 from certify.loop.policies.importers.options import WITH_TANH
 from certify.loop.policies.importers.reading import Evaluate, Observations, Reading, Values, between, perceptron, widths
 from certify.loop.policies.importers.sb3_spaces import spaces_of
-from certify.loop.policies.importers.steps import Affine, Clip, Diagonal, Step, Tanh, exactly, linear
+from certify.loop.policies.importers.steps import Affine, Clip, Diagonal, Step, Tanh, exactly, in_words, linear
 from certify.loop.policies.importers.tensors import load_tensors
 from certify.loop.policies.importers.unread import braced, unread
 
@@ -170,7 +170,8 @@ def read_sb3(archive: Archive, what: str, ignored: tuple[str, ...] | None = None
     who = "what its policy_kwargs say" if "activation_fn" in given else "the default of its kind"
     reading = partial(
         Reading,
-        assumed=f"{activation} between the layers is {who}, the rest is how stable-baselines3 documents its policies",
+        assumed=f"{in_words(activation)} between the layers is {who}, the rest is how stable-baselines3 documents its "
+        "policies",
         unread=left | _elsewhere(archive),
     )
     steps = between(layers, activation)

@@ -7,8 +7,9 @@ after the last one, nor the treatment of observations and actions: each is asked
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from fractions import Fraction
+from itertools import islice
 
 import numpy as np
 
@@ -26,13 +27,32 @@ from certify.loop.policies.importers.reading import (
     perceptron,
     widths,
 )
-from certify.loop.policies.importers.steps import Affine, Clip, Step, Tanh, linear
-from certify.loop.policies.importers.unread import unread
+from certify.loop.policies.importers.steps import (
+    PARAMETERS,
+    Affine,
+    Clip,
+    Step,
+    Tanh,
+    in_words,
+    linear,
+    parted,
+    plainly,
+)
+from certify.loop.policies.importers.unread import known_by_name, named_by, unread
 
+_LEAF = r"(.*[._])?"
+_PARAMETERS = {
+    "leaky_relu": re.compile(_LEAF + r"(slope|alpha|leak|leakiness|leaky_?relu)", re.IGNORECASE),
+    "elu": re.compile(_LEAF + r"alpha", re.IGNORECASE),
+    "celu": re.compile(_LEAF + r"alpha", re.IGNORECASE),
+    "softplus": re.compile(_LEAF + r"beta", re.IGNORECASE),
+}
+"""The names that a file may give to the number of an activation."""
 _KEY = re.compile(r"(?:(?P<prefix>.*)\.)?(?P<number>[0-9]{1,4})\.(?P<rest>.*)", re.DOTALL)
 MEAN = "mean"
 """The `--output` of a network whose last layer gives the mean of the actions and behind it their spread."""
 _COMPUTED = re.compile(r"(^|\.)(weight_(g|v|orig)|parametrizations\.weight\.original[01]?)$")
+_MOST_LISTED = 12
 _PARTS = ("controller.x_equilibrium", "controller.layers.0.weight", "controller.b")
 _OTHERS = ("critic", "value", "vf", "v_net", "q_net", "qf", "q1", "q2", "lyapunov", "target")
 _ENDS: dict[Output, tuple[Step, ...]] = {
@@ -125,10 +145,12 @@ def read_state_dict(
     if (at := normaliser_root(tensors)) is not None:
         read |= {f"{at}_mean", f"{at}_std"}
         known |= dict.fromkeys((f"{at}_var", f"{at}count"), "of the normaliser that is read")
+    known |= _stated(tensors, read, prefix, m, options)
     if beside is not None:
         known |= dict.fromkeys(_own(tensors, beside), "the Lyapunov network that is imported beside it")
     activation, placed = options.activation or "tanh", dict(norms.values())
-    assumed = f"{activation} between the layers is what --activation says, {squash} behind them what --squash says"
+    assumed = f"{in_words(activation)} between the layers is what --activation says"
+    assumed += f", {squash} behind them what --squash says"
     if options.output == MEAN:
         assumed += f", of whose {2 * m} numbers the first {m} are the mean, as --output says"
     if options.norm is not None:
@@ -141,8 +163,38 @@ def read_state_dict(
         normaliser=rsl_normaliser(tensors, options.epsilon),
         double=_is_double(tensors, prefix),
         assumed=assumed,
-        unread=unread(tensors, read, prefix, m, options.ignore, known),
+        unread=unread(tensors, read, prefix, m, options.ignore, known, observed=n),
     )
+
+
+def parameters_of(activation: str) -> re.Pattern[str] | None:
+    """The names that a file may give to the number of an activation; None if it has none, or it is said."""
+    return _PARAMETERS.get(activation)
+
+
+def _stated(
+    tensors: Mapping[str, Numbers], read: Collection[str], prefix: str, m: int, options: ImportOptions
+) -> dict[str, str]:
+    """The reason why the number of the activation is not read from the file, by the names that it may have there.
+
+    Raises
+    ------
+    InputError : the file has such a number, and `--activation` says none.
+    """
+    name, said = parted(options.activation or "tanh")
+    names = _PARAMETERS.get(name)
+    left = [key for key, t in tensors.items() if names is not None and t.size == 1 and names.fullmatch(key)]
+    left = [key for key in left if key not in read and not named_by(options.ignore, key)]
+    found = {key: tensors[key].item() for key in left if known_by_name(key, tensors, prefix, m) is None}
+    if found and not said:
+        word, usual = PARAMETERS[name]
+        key, value = next(iter(found.items()))
+        raise InputError(
+            f"the file says {', '.join(f'{k} = {plainly(v)}' for k, v in found.items())}, which may be the {word} of "
+            f"{name}. Say which is right: --activation {name}:{plainly(value)}, or --activation "
+            f"{name}:{plainly(usual)} if {key} is another number."
+        )
+    return {key: f"the {PARAMETERS[name][0]} that --activation says" for key, v in found.items() if v == said[0]}
 
 
 def read_lyapunov(tensors: Mapping[str, Numbers], prefix: str | None, options: ImportOptions) -> Reading:
@@ -238,16 +290,16 @@ def _numbered(tensors: Mapping[str, Numbers], names: Sequence[str]) -> dict[str,
     if wrong or len(set(names)) != len(names):
         raise InputError(
             f"--prefix with commas must name each layer once, in their order; found {','.join(names)}. "
-            f"Layers are {', '.join(_weights(tensors)) or 'none'}.{_without_norm(tensors)}"
+            f"Layers are {', '.join(_weights(tensors).values()) or 'none'}.{_without_norm(tensors)}"
         )
     parts = {f"{name}.{part}": f"{_LISTED}.{k}.{part}" for k, name in enumerate(names) for part in ("weight", "bias")}
     return {parts.get(name, name): tensor for name, tensor in tensors.items()}
 
 
-def _weights(tensors: Mapping[str, Numbers]) -> list[str]:
-    """The names of layers, each with its sizes."""
-    found = {name.removesuffix(".weight"): tensors[name] for name in tensors if name.endswith(".weight")}
-    return [f"{name} ({w.shape[1]} to {w.shape[0]})" for name, w in sorted(found.items()) if w.ndim == 2]
+def _weights(tensors: Mapping[str, Numbers]) -> dict[str, str]:
+    """The layers with their sizes, by their names, in the file's order."""
+    found = {name.removesuffix(".weight"): w for name, w in tensors.items() if name.endswith(".weight")}
+    return {name: f"{name} ({w.shape[1]} to {w.shape[0]})" for name, w in found.items() if w.ndim == 2}
 
 
 def _groups(tensors: Mapping[str, Numbers]) -> list[str]:
@@ -268,23 +320,32 @@ def _only(tensors: Mapping[str, Numbers], n: int, m: int) -> str:
         numbers = _numbers(tensors, prefix)
         first, last = tensors[f"{_dot(prefix)}{numbers[0]}.weight"], tensors[f"{_dot(prefix)}{numbers[-1]}.weight"]
         described.append(f"{prefix or 'no prefix'}: {first.shape[-1]} to {last.shape[0] if last.ndim else 0}")
-        other = any(part.startswith(_OTHERS) for part in prefix.split("."))
-        if first.shape[-1:] == (n,) and last.shape[:1] == (m,) and not other:
+        if first.shape[-1:] == (n,) and last.shape[:1] == (m,) and not _of_another(prefix):
             fitting.append(prefix)
     if len(fitting) == 1:
         return fitting[0]
     listed = "; ".join(described)
     if not described:
-        named = ", ".join(_weights(tensors))
-        listed = f"layers without a number, {named}: name them in their order, as in --prefix fc1,fc2,fc3"
-        needed = "PREFIX.NUMBER.weight and PREFIX.NUMBER.bias; a gain K, u = -K x, is one layer, 0.weight = -K"
-        listed = listed if named else f"none (layers must be called {needed})"
+        layers = _weights(tensors)
+        named, order = ", ".join(layers.values()), ",".join(name for name in layers if not _of_another(name))
+        listed = f"layers without a number, {named}: name them in their order, as in --prefix {order or 'fc1,fc2'}"
+        needed = (
+            "PREFIX.NUMBER.weight (out, in) and PREFIX.NUMBER.bias, or of numpy kernel (in, out) instead of weight; a "
+            "gain K, u = -K x, is one layer, 0.weight = -K"
+        )
+        shapes = ", ".join(f"{name} {tensor.shape}" for name, tensor in islice(tensors.items(), _MOST_LISTED))
+        listed = listed if named else f"none in {shapes or 'no tensors'} (layers must be called {needed})"
     raise InputError(
         f"a file must hold one policy from {n} states to {m} inputs; it holds {len(fitting)}. "
         f"Name its keys up to their numbers with --prefix, and its states with --states. Found {listed}. "
         "If the policy is more than layers one behind the other, export it as TorchScript or ONNX."
         f"{_without_norm(tensors)}"
     )
+
+
+def _of_another(name: str) -> bool:
+    """True if a part of a name says that it is a critic's, or a policy's of before, as tianshou has it."""
+    return any(part.startswith(_OTHERS) or part.endswith("_old") for part in name.split("."))
 
 
 def _without_norm(tensors: Mapping[str, Numbers]) -> str:

@@ -147,10 +147,12 @@ def activated(function: str, *numbers: Fraction) -> tuple[Step, ...]:
     match function, numbers:
         case "tanh", ():
             return (Tanh(),)
-        case _, () if function in ACTIVATIONS:
+        case "celu" | "softplus", (number,) if number <= 0:
+            raise InputError(f"the {PARAMETERS[function][0]} of {function} must be positive; found {float(number)}.")
+        case ("elu" | "softplus", (1,)) | (_, ()) if function in ACTIVATIONS:
             return (Activate(function),)
         case "leaky_relu", _:
-            slope = numbers[0] if numbers else Fraction(0.01)
+            slope = numbers[0] if numbers else Fraction(PARAMETERS[function][1])
             return (_sum((_scaled(slope),), (Activate("relu"), _scaled(1 - slope))),)
         case "elu", (alpha,):
             return (_sum((Activate("elu"), _scaled(alpha)), (Activate("relu"), _scaled(1 - alpha))),)
@@ -183,6 +185,45 @@ COMPOSED = ("leaky_relu", "selu", "celu", "hardtanh", "relu6", "hardsigmoid", "h
 """Activations that are made of others."""
 IMPORTED = (*ACTIVATIONS, *COMPOSED)
 """The names of all activations that are read."""
+PARAMETERS = {"leaky_relu": ("slope", 0.01), "elu": ("alpha", 1.0), "celu": ("alpha", 1.0), "softplus": ("beta", 1.0)}
+"""The number of an activation that has one: its name, and its value where nothing is said."""
+
+
+def parted(activation: str) -> tuple[str, tuple[float, ...]]:
+    """The name of an activation and the number that is said with it, as in `leaky_relu:0.1`.
+
+    Raises
+    ------
+    InputError : it takes no number, or what is said is none.
+    """
+    name, colon, text = activation.partition(":")
+    try:
+        numbers = (float(text),) if colon else ()
+        exact = tuple(map(Fraction, numbers))
+    except (ValueError, OverflowError) as error:
+        raise InputError(f"a number goes with an activation as in leaky_relu:0.1; found {activation!r}.") from error
+    if numbers and name not in PARAMETERS:
+        raise InputError(f"a number goes with {', '.join(PARAMETERS)} only; found {activation!r}.")
+    activated(name, *exact)
+    return name, numbers
+
+
+def in_words(activation: str) -> str:
+    """An activation with its number, for people.
+
+    >>> in_words("leaky_relu"), in_words("elu:2"), in_words("tanh")
+    ('leaky_relu (slope 0.01)', 'elu (alpha 2)', 'tanh')
+    """
+    name, numbers = parted(activation)
+    if name not in PARAMETERS:
+        return name
+    word, usual = PARAMETERS[name]
+    return f"{name} ({word} {plainly((*numbers, usual)[0])})"
+
+
+def plainly(number: float) -> str:
+    """A number as it is typed."""
+    return str(number).removesuffix(".0")
 
 
 def mean_of(width: int) -> tuple[Step, ...]:

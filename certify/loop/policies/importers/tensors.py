@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -10,8 +11,8 @@ import numpy as np
 
 from certify.errors import InputError
 from certify.loop.files.archives import Archive
-from certify.loop.files.arrays import Numbers, array_of, is_array
-from certify.loop.files.pickles import Call
+from certify.loop.files.arrays import Numbers, array_of, is_array, is_number
+from certify.loop.files.pickles import Call, Name
 from certify.loop.files.torchfile import TorchFile, is_tensor
 
 _SAFE = {
@@ -20,8 +21,14 @@ _SAFE = {
 }  # fmt: skip
 
 
-def load_tensors(raw: bytes, what: str, file: TorchFile | None = None) -> dict[str, Numbers]:
+def load_tensors(
+    raw: bytes, what: str, file: TorchFile | None = None, also: re.Pattern[str] | None = None
+) -> dict[str, Numbers]:
     """The tensors and arrays of a file of torch.save: the keys on the way to one are joined by dots.
+
+    Parameters
+    ----------
+    also : keys of single numbers that are taken for tensors; None for none.
 
     Raises
     ------
@@ -33,7 +40,8 @@ def load_tensors(raw: bytes, what: str, file: TorchFile | None = None) -> dict[s
     waiting, seen = [("", file.pickle("data.pkl"))], set[int]()
     while waiting:
         prefix, node = waiting.pop()
-        if is_tensor(node) or is_array(node):
+        named = also is not None and is_number(node) and also.fullmatch(prefix)
+        if is_tensor(node) or is_array(node) or named:
             if prefix.startswith(("_modules.", "_parameters.")):
                 raise InputError(
                     f"{what} is a module that was pickled whole, and what its forward does with {prefix} is not in the "
@@ -45,19 +53,25 @@ def load_tensors(raw: bytes, what: str, file: TorchFile | None = None) -> dict[s
             found[prefix] = file.tensor(node, prefix) if is_tensor(node) else array_of(node, prefix)
         elif isinstance(node, dict | list | tuple | Call) and id(node) not in seen:
             seen.add(id(node))
-            waiting += [
-                (f"{prefix}.{k}" if prefix else str(k), v) for k, v in _inside(node) if isinstance(k, str | int)
-            ]
+            inside = [(k, v) for k, v in _inside(node) if isinstance(k, str | int | Name)]
+            waiting += [(f"{prefix}.{k}" if prefix else str(k), v) for k, v in reversed(inside)]
     return found
 
 
 def _inside(node: dict[Any, Any] | list[Any] | tuple[Any, ...] | Call) -> Iterable[tuple[Any, Any]]:
-    """Items of a container, or of an object that the pickle would have made, by key, number or attribute."""
+    """Items of a container, or of an object that the pickle would have made, by key, number or attribute; what it would
+    have been made of counts too, as of a named tuple."""
     if isinstance(node, dict):
         return node.items()
     if not isinstance(node, Call):
         return enumerate(node)
-    return [pair for state in node.states if isinstance(state, dict) for pair in state.items()]
+    held = [node.arguments, node.items, *(part for state in node.states for part in _parts(state))]
+    return [*node.pairs, *(pair for each in held if isinstance(each, dict | list | tuple) for pair in _inside(each))]
+
+
+def _parts(state: Any) -> tuple[Any, ...]:
+    """The attributes of an object: a dictionary, or with slots two of them."""
+    return state if isinstance(state, tuple) else (state,)
 
 
 def is_npz(archive: Archive) -> bool:

@@ -6,7 +6,7 @@ that no action depends on it:
 - the state of an optimiser, of a schedule of learning rates or of the run (steps, random numbers, last observations);
 - the spread of the actions that training draws, and weights of losses: `log_std`, `log_alpha`, `log_sigma_...`, or
   `std` with a number for each output and no mean beside it;
-- another network: it lies in a part called critic, value, Q, Lyapunov or target.
+- another network: it lies in a part called critic, value, Q, Lyapunov, target or old.
 
 Every other one could belong to the network, as the K of `u = -K x + net(x)` does, and a file with such a tensor is
 refused unless `--ignore` names it.
@@ -22,7 +22,8 @@ from certify.errors import InputError
 from certify.loop.files.arrays import Numbers
 
 _STATE = re.compile(
-    r"(.*\.)?state\.[0-9]+\.(step|exp_avg|exp_avg_sq|max_exp_avg_sq|exp_inf|momentum_buffer|square_avg|grad_avg|acc_delta|sum)"
+    r"(.*\.)?(param_groups\.[0-9]+\..*|state\.[0-9]+\."
+    r"(step|exp_avg|exp_avg_sq|max_exp_avg_sq|exp_inf|momentum_buffer|square_avg|grad_avg|acc_delta|sum))"
 )
 _SPREAD = re.compile(r"(.*_)?log_?(std|sigma|alpha|ent_coef|temperature)s?(_.*)?|sigma_param", re.IGNORECASE)
 _COUNTS = {"step", "steps", "global_step", "total_steps", "num_timesteps", "iteration", "epoch", "count"}
@@ -36,7 +37,7 @@ _POLICY = {"actor", "policy", "pi", "controller"}
 _OPTIMISER_WORDS = "the state of an optimiser or of a schedule"
 _SPREAD_WORDS = "the spread of actions in training, or a weight of a loss"
 _RUN_WORDS = "the state of the run"
-_OTHER_WORDS = "another network: a critic, a value, a Lyapunov or a target network"
+_OTHER_WORDS = "another network: a critic, a value, a Lyapunov, a target or an old network"
 
 
 def unread(
@@ -48,6 +49,7 @@ def unread(
     known: Mapping[str, str],
     *,
     of_policy: bool = True,
+    observed: int = 0,
 ) -> dict[str, str]:
     """The reason why each unread tensor is left out, by its name.
 
@@ -60,6 +62,7 @@ def unread(
     ignored : names to leave out, `*` and `?` in them as in names of files.
     known : reasons why others are left out, from a reader that knows the format.
     of_policy : True if the network is a policy, False for a Lyapunov network.
+    observed : how many numbers it observes, if they may be normalised; else 0.
 
     Raises
     ------
@@ -69,10 +72,10 @@ def unread(
     could = []
     left = sorted(set(tensors) - set(read))
     for name in left:
-        if any(fnmatchcase(name, pattern) for pattern in ignored or ()):
+        if named_by(ignored, name):
             found[name] = "--ignore names it"
             continue
-        why = known.get(name) or _known(name, tensors, prefix, outputs, of_policy)
+        why = known.get(name) or known_by_name(name, tensors, prefix, outputs, of_policy=of_policy)
         if why is None:
             could.append(name)
         else:
@@ -89,17 +92,32 @@ def unread(
         whole = "policy" if of_policy else "Lyapunov function"
         listed = ", ".join(f"{name} {tensors[name].shape}" for name in could[:8])
         more = f" and {len(could) - 8} more" if len(could) > 8 else ""
-        options = " ".join(f"--ignore {_quoted(name)}" for name in _patterns(could, set(tensors) - set(could)))
+        normaliser = _normaliser(could, tensors, observed)
+        rest = [name for name in could if name not in normaliser]
+        options = " ".join(f"--ignore {_quoted(name)}" for name in _patterns(rest, set(tensors) - set(rest)))
+        advice = f"If the layers are all of it, say so: {options}. " if rest else ""
+        if normaliser:
+            advice = (
+                f"{' and '.join(normaliser)} have a number for each observation: if they normalise it, write them "
+                f"again as obs._mean and obs._std, and add --epsilon 0 for (o - mean) / std. {advice}"
+            )
         layers = prefix if " " in prefix else f"layers {_dot(prefix)}NUMBER"  # those listed have no common prefix
         raise InputError(
             f"the {layers} must be all of the {whole}, and the file holds what could belong to it: "
-            f"{listed}{more}. If the layers are all of it, say so: {options}. "
-            f"If they are not, export the {whole} as TorchScript or ONNX, which say what becomes of each number."
+            f"{listed}{more}. {advice}If they are not, export the {whole} as TorchScript or ONNX, which say what "
+            "becomes of each number."
         )
     return found
 
 
-def _known(name: str, tensors: Mapping[str, Numbers], prefix: str, outputs: int, of_policy: bool) -> str | None:
+def named_by(ignored: tuple[str, ...] | None, name: str) -> bool:
+    """True if a pattern of `--ignore` names a tensor."""
+    return any(fnmatchcase(name, pattern) for pattern in ignored or ())
+
+
+def known_by_name(
+    name: str, tensors: Mapping[str, Numbers], prefix: str, outputs: int, *, of_policy: bool = True
+) -> str | None:
     """The reason why no output depends on a tensor of this name; None if the name shows none."""
     *parts, leaf = name.split(".")
     if any(_SPREAD.fullmatch(part) for part in (leaf, *parts)):
@@ -126,12 +144,21 @@ def _known(name: str, tensors: Mapping[str, Numbers], prefix: str, outputs: int,
 
 
 def _names_another(part: str, words: set[str], leaf: str) -> bool:
-    """True if a part of a name says that it is a critic, a value, a Lyapunov or a target network."""
+    """True if a part of a name says that it is a critic, a value, a Lyapunov, a target or an old network."""
     if words & _OTHER:
         return True
-    if words & {"target", "targ"}:  # which a state to be reached is called too
+    if words & {"target", "targ", "old"}:  # which a state to be reached is called too
         return bool(words & _NETWORKS) or leaf in ("weight", "bias")
     return part not in ("q", "v") and bool(words & {"q", "v"}) and words <= _OF  # positions and velocities are q and v
+
+
+def _normaliser(names: Collection[str], tensors: Mapping[str, Numbers], observed: int) -> tuple[str, ...]:
+    """A mean and a standard deviation among these names that have a number for each observation."""
+    for name in names:
+        for std in (name.removesuffix("mean") + end for end in ("std", "stddev")):
+            if name.endswith("mean") and std in names and tensors[name].size == tensors[std].size == observed:
+                return name, std
+    return ()
 
 
 def _has_mean(tensors: Mapping[str, Numbers], parts: list[str]) -> bool:
