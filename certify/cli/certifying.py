@@ -148,9 +148,15 @@ def _with_next_command(data: dict[str, Any], context: typer.Context, policy: Pat
     following = {} if data["diagnosis"] is None else data["diagnosis"]["next"]
     if following.get("flatten"):
         following["command"] = _flattened(context, policy)
-    elif following.get("options") and following["options"].keys() <= set(options_of(context.command).values()):
-        following["command"] = _command(context, following["options"])
+    else:
+        add_command(following, context)
     return data
+
+
+def add_command(following: dict[str, Any], context: typer.Context) -> None:
+    """Say in a next step what to type, if the command has the step's options."""
+    if following.get("options") and following["options"].keys() <= set(options_of(context.command).values()):
+        following["command"] = _command(context, following["options"])
 
 
 def where_of(result: RoaResult | ResultWithoutV, asked: str) -> tuple[dict[str, Any], str]:
