@@ -103,8 +103,10 @@ def finished(
     asked : a state or a box, as people write it; the result says if the proved set contains it.
     """
     if result.certificate is not None and result.raw is not None:
-        answer = None if result.checker is None else dict(result.checker)
+        answer, begin = None if result.checker is None else dict(result.checker), time.perf_counter()
         write(folder / "report.html", page_of(result.raw, result.certificate, answer, data))
+        spent, total = time.perf_counter() - begin, data["seconds"].pop("total")
+        data["seconds"] |= {"report": spent, "total": total + spent}
     where = None if asked is None else where_of(result, asked)
     if where is not None:
         data["contains"] = where[0]

@@ -53,6 +53,7 @@ STAGES = (
     "ranks",
     "write",
     "check",
+    "report",
 )
 _LONG = 200  # characters of an expression, beyond which it is not shown
 
