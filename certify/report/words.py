@@ -32,6 +32,7 @@ _SHORT, _LONGEST = 10, 24  # characters of an exact number that is written as it
 _A_GAIN = ((0.05, ": a gain does nearly the same"), (0.2, ""))
 _NO_GAIN = ": its own gain does not do the same"
 """Conclusions for a reader, by the rms."""
+_MOST = 2.0  # of it that is said as a share
 
 
 def symbol(name: str) -> str:
@@ -266,7 +267,7 @@ does not do the same; sampled at 1,000 states, no part of the proof'
     rms, bend, saturated = (_percent(found[name]) for name in ("rms", "bend", "saturated"))
     part = "the nearest saturated linear feedback" if found["fitted"] else "its saturated linear part"
     sampled = f"; sampled at {found['states']:,} states, no part of the proof"
-    if found["rms"] is None or found["rms"] > 1:  # a share of next to nothing says nothing
+    if found["rms"] is None or found["rms"] > _MOST:  # a share of next to nothing says nothing
         return f"the policy departs from {part} by more than that varies on the set{_NO_GAIN}{sampled}"
     does = next((words for most, words in _A_GAIN if found["rms"] <= most), _NO_GAIN)
     near = f"the policy is within {_at_most(found['largest'])} of {part} on the set"
