@@ -70,6 +70,10 @@ class Step:
     why: str
     flattens: bool = False
 
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"options": dict(self.options), "why": self.why, "flatten": self.flattens}
+
 
 @dataclass(frozen=True, slots=True)
 class TubeFacts:
@@ -244,6 +248,4 @@ class Diagnosis:
     def to_dict(self) -> dict[str, Any]:
         """For JSON: the fields, and `stiffness`; `hurts` by state."""
         stated = asdict(self)
-        stated |= {"stiffness": self.stiffness, "hurts": dict(self.hurts)}
-        stated["next"] = {"options": dict(self.next.options), "why": self.next.why, "flatten": self.next.flattens}
-        return stated
+        return stated | {"stiffness": self.stiffness, "hurts": dict(self.hurts), "next": self.next.to_dict()}

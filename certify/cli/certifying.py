@@ -103,8 +103,10 @@ def finished(
     asked : a state or a box, as people write it; the result says if the proved set contains it.
     """
     if result.certificate is not None and result.raw is not None:
-        answer = None if result.checker is None else dict(result.checker)
+        answer, begin = None if result.checker is None else dict(result.checker), time.perf_counter()
         write(folder / "report.html", page_of(result.raw, result.certificate, answer, data))
+        spent, total = time.perf_counter() - begin, data["seconds"].pop("total")
+        data["seconds"] |= {"report": spent, "total": total + spent}
     where = None if asked is None else where_of(result, asked)
     if where is not None:
         data["contains"] = where[0]
@@ -148,9 +150,15 @@ def _with_next_command(data: dict[str, Any], context: typer.Context, policy: Pat
     following = {} if data["diagnosis"] is None else data["diagnosis"]["next"]
     if following.get("flatten"):
         following["command"] = _flattened(context, policy)
-    elif following.get("options") and following["options"].keys() <= set(options_of(context.command).values()):
-        following["command"] = _command(context, following["options"])
+    else:
+        add_command(following, context)
     return data
+
+
+def add_command(following: dict[str, Any], context: typer.Context) -> None:
+    """Say in a next step what to type, if the command has the step's options."""
+    if following.get("options") and following["options"].keys() <= set(options_of(context.command).values()):
+        following["command"] = _command(context, following["options"])
 
 
 def where_of(result: RoaResult | ResultWithoutV, asked: str) -> tuple[dict[str, Any], str]:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
     from certify.loop.plants import Controllability, Matrix, Measurements, System
 
+_WITHOUT_REST = "certify reach --target and certify roa --claim invariant need no equilibrium."
+
 
 @takes(changes=changes_of_a_plant("parameters"))
 def plant(
@@ -30,10 +32,10 @@ def plant(
 ) -> None:
     """Show a plant: equations, operating point, linearisation, controllability, disturbances, bounds and units.
 
-    The exit status is 2 if the operating point is no equilibrium.
+    The exit status is 2 if the operating point is no equilibrium, unless that is for a clock alone.
     """
     from certify.loop.composition import with_results_as_inputs
-    from certify.loop.plants import chosen_system, controllability, linearise, require_equilibrium
+    from certify.loop.plants import chosen_system, clocks, controllability, linearise, require_equilibrium
 
     found = with_results_as_inputs(changes.of(chosen_system(system)))
     A, B = linearise(found)
@@ -43,9 +45,9 @@ def plant(
     else:
         show(_page(found, A, B, eigenvalues, reach))
     try:
-        require_equilibrium(found, rounded=True)
+        require_equilibrium(found, rounded=True, but=clocks(found))
     except InputError as error:
-        tell(f"certify: {error}")
+        tell(f"certify: {error} {_WITHOUT_REST}")
         raise typer.Exit(2) from None
 
 
@@ -54,7 +56,7 @@ def _data(s: System, A: Matrix, B: Matrix, eigenvalues: Sequence[complex], reach
 
     return {
         **describe(s),
-        "residual": {name: str(r) for name, r in residuals(s).items() if r != 0},
+        "residual": {name: str(r) for name, r in residuals(s).items() if r != 0 or isinstance(r, float)},
         "A": _floats(A),
         "B": _floats(B),
         "eigenvalues": [[e.real, e.imag] for e in eigenvalues],
@@ -130,19 +132,21 @@ def _facts(s: System, eigenvalues: Sequence[complex], reach: Controllability) ->
 
 def _rest(s: System) -> str:
     """The value of f at the operating point, or its distance from an equilibrium, in words."""
-    from certify.loop.plants import residuals, rests_where
+    from certify.loop.plants import clocks, residuals, rests_where
 
-    moves = {name: r for name, r in residuals(s).items() if r != 0}
-    where = f"f(x_eq, u_eq) = {rests_where(s)}"
-    if not moves:
-        return where
-    if all(abs(float(r)) <= 1e-12 for r in moves.values()):
-        exactly = any(isinstance(r, Fraction) for r in moves.values())
-        rounding = "" if exactly else ", within rounding"
-        return f"{where} but for {max(abs(float(r)) for r in moves.values()):.2g}{rounding}"
     verb = " moves by" if s.time == "discrete" else "' ="
-    off = (f"{name}{verb} {float(r):.6g}" for name, r in moves.items())
-    return f"no equilibrium: {', '.join(off)} at (x_eq, u_eq)"
+    running, moves = clocks(s), residuals(s)
+    off = {name: float(r) for name, r in moves.items() if name not in running}
+    ever = ", ".join(f"{name}{verb} {float(r):.6g}" for name, r in running.items())
+    told = f"; but {ever} whatever states and inputs are: {_WITHOUT_REST}" if running else ""
+    where = f"f(x_eq, u_eq) = {rests_where(s)}"
+    if all(isinstance(moves[name], Fraction) and r == 0 for name, r in off.items()):
+        return f"{where}{told}"
+    if all(abs(r) <= 1e-12 for r in off.values()):
+        largest = max(map(abs, off.values()))
+        return f"{where} within rounding, not exactly: the largest residual is {largest:.2g} in floats{told}"
+    found = (f"{name}{verb} {r:.6g}" for name, r in off.items() if r != 0)
+    return f"no equilibrium: {', '.join(found)} at (x_eq, u_eq){told}"
 
 
 def _measured(s: System, data: Measurements) -> list[tuple[str, str]]:

@@ -87,7 +87,7 @@ def reach(
         within=None if within is None else steps_within(within, plant),
         **{name: read_option(name, text) for name, text in typed.items()},
     )
-    concluded(certify_reach, summary, path, stored, plant, towards, out, start, quiet, as_json)
+    concluded(context, certify_reach, summary, path, stored, plant, towards, out, start, quiet, as_json)
 
 
 def _require_one(target: list[str] | None, within: str | None, typed: dict[str, Any], by_tube: bool) -> None:

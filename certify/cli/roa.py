@@ -72,7 +72,9 @@ def roa(
         from certify.analysis.staying import certify_invariant
         from certify.report.stayed import summary
 
-        concluded(certify_invariant, summary, path, stored, plant, options, out, start, quiet, as_json, contains)
+        concluded(
+            context, certify_invariant, summary, path, stored, plant, options, out, start, quiet, as_json, contains
+        )
     certified(context, path, stored, plant, options, out, start, quiet, as_json, contains, largest)
 
 

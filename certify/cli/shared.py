@@ -92,9 +92,11 @@ def given_words(
 
 def page_of(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[str, Any] | None) -> str:
     """The report on a certificate's bytes, with the checker's answer and the run's data where they exist."""
+    from certify.provers.execution.threads import one_thread
     from certify.report import drawn
 
-    return drawn.page_of(raw, path, answer, data)
+    with one_thread():
+        return drawn.page_of(raw, path, answer, data)
 
 
 def describe(s: System) -> dict[str, Any]:

@@ -7,11 +7,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from certify.cli.certifying import finished
+from certify.cli.certifying import add_command, finished
 from certify.cli.shared import noting, page_of
 from certify.cli.terminal import ProgressLine
 
 if TYPE_CHECKING:
+    import typer
+
     from certify.analysis.options import RoaOptions
     from certify.analysis.reaching import ReachOptions
     from certify.analysis.without_v import ResultWithoutV
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
 
 
 def concluded(
+    context: typer.Context,
     run: Callable[..., ResultWithoutV],
     summary: Callable[[Mapping[str, Any]], Any],
     policy: Path,
@@ -64,7 +67,10 @@ def concluded(
             note(line)
     if result.notice is not None:
         note(result.notice)
-    finished(result, result.to_dict(), _page_of, folder, summary, as_json, asked)
+    data = result.to_dict()
+    if isinstance(data["next"], dict):
+        add_command(data["next"], context)
+    finished(result, data, _page_of, folder, summary, as_json, asked)
 
 
 def _page_of(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[str, Any] | None) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import Expression, Operation, Symbol, constant_of
+from certify.loop.expressions import Expression, Operation, Symbol, constant_of, symbols_of
 from certify.loop.plants import System, corners, kept_constraints
 from certify.loop.plants.floating_point import function_of
 from certify.loop.rigorous import ball, evaluate_arb, evaluate_policy, points, precision
@@ -46,6 +46,7 @@ class Constraints:
         self.g = function_of(system, tuple(found.values()), [s for s, _ in system.uncertain], "numpy")
         planes = [_plane(system, g) for g in found.values()]
         self.planes, self.is_plane = [p for p in planes if p is not None], [p is not None for p in planes]
+        self.reads_inputs = any(symbols_of(g) & set(system.inputs) for g in found.values())
         self.values = [[float(q) for q in corner.values()] for corner in corners(system)]
 
     def operations(self, n: int, start: int, steps: int = _STEPS) -> float:
@@ -58,6 +59,12 @@ class Constraints:
         """The worst value of each g at states and inputs, over the corners of the ranges: (B, K)."""
         found = np.stack([self.g(x, u, values) for values in self.values]).max(0)
         return np.asarray(np.where(np.isnan(found), np.inf, found))
+
+    @np.errstate(all="ignore")
+    def worst(self, x: Array) -> Array:
+        """The largest g (...) at states (..., n); the policy is asked for its inputs only if some g reads one."""
+        u = self.loop.policy(x) if self.reads_inputs else np.zeros((*x.shape[:-1], self.loop.system.m))
+        return np.asarray(self.at(x, u).max(-1))
 
     @np.errstate(all="ignore")
     def touching(self, T: Array, limit: float, start: Array, steps: int = _STEPS) -> Array:
@@ -98,7 +105,7 @@ def keeping(loop: ClosedLoop) -> Callable[[Array], NDArray[np.bool_]] | None:
     if not loop.system.constraints:
         return None
     constraints = Constraints(loop)
-    return lambda x: np.asarray(constraints.at(x, loop.policy(x)).max(-1) < 0)
+    return lambda x: np.asarray(constraints.worst(x) < 0)
 
 
 def _plane(system: System, g: Expression) -> tuple[Array, float] | None:

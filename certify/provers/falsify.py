@@ -352,7 +352,7 @@ class _Search:
             return None
         z = self.constraints.touching(self.T, limit, start)
         x = z @ self.T.T
-        z = z[self.constraints.at(x, self.loop.policy(x)).max(-1) > 0] if len(z) else z
+        z = z[self.constraints.worst(x) > 0] if len(z) else z
         for point in self._lowest_few(z, 32):
             x = self.T @ point
             every = self._witnesses(x, float(self.problem.V(x)))

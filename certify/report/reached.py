@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
+from certify.report.rows import try_next
 from certify.report.summary import in_a_line
 from certify.report.words import below, nonlinearity_in_words, pretty_unit
 
@@ -64,7 +65,9 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
 
 def _rows(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     ranks, simulated = result["ranks"], result["simulated"]
-    if result["reason"] not in ("requested", "done"):
+    if result["reason"] == "effort":
+        yield "limited by", "the effort"
+    elif result["reason"] not in ("requested", "done"):
         yield "reason", result["reason"]
     if result["levels"]:
         yield "V of", result["target"][0]
@@ -88,6 +91,8 @@ def _rows(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if result["checked"] is not None:
         both = ", and by the reference" if result["reference"] == "ACCEPTED" else ""
         yield "checked", f"{result['checked']}{both}"
+    if result["next"] is not None:
+        yield try_next(result["next"])
     yield "seconds", ", ".join(f"{name} {value:.2g}" for name, value in result["seconds"].items())
 
 

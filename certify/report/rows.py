@@ -53,6 +53,7 @@ STAGES = (
     "ranks",
     "write",
     "check",
+    "report",
 )
 _LONG = 200  # characters of an expression, beyond which it is not shown
 
@@ -314,8 +315,12 @@ def _diagnosis_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     step = found["next"]
     if not step.get("command") and step["why"] == result.get("reason"):  # which is said already
         return rows
-    command = f"{step['command']}  ({step['why']})" if step.get("command") else step["why"]
-    return [*rows, ("try next", command)]
+    return [*rows, try_next(step)]
+
+
+def try_next(step: Mapping[str, Any]) -> tuple[str, str]:
+    """The row of a next step: the command to type, if there is one, and why."""
+    return "try next", f"{step['command']}  ({step['why']})" if step.get("command") else step["why"]
 
 
 def _level(value: float | None) -> str:

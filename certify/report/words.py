@@ -32,6 +32,7 @@ _SHORT, _LONGEST = 10, 24  # characters of an exact number that is written as it
 _A_GAIN = ((0.05, ": a gain does nearly the same"), (0.2, ""))
 _NO_GAIN = ": its own gain does not do the same"
 """Conclusions for a reader, by the rms."""
+_MOST = 2.0  # of it that is said as a share
 
 
 def symbol(name: str) -> str:
@@ -257,17 +258,20 @@ def nonlinearity_in_words(found: Mapping[str, Any]) -> str:
     ... )
     'the policy is within 13 % of its saturated linear part on the set, 3.1 % rms (bend 20 %, saturated at 0 %): \
 a gain does nearly the same; sampled at 1,000 states, no part of the proof'
+    >>> nonlinearity_in_words(
+    ...     {"rms": 60.0, "largest": 81.0, "bend": 60.0, "saturated": 0.0, "states": 1000, "fitted": True}
+    ... )
+    'the policy departs from the nearest saturated linear feedback by more than that varies on the set: its own gain \
+does not do the same; sampled at 1,000 states, no part of the proof'
     """
     rms, bend, saturated = (_percent(found[name]) for name in ("rms", "bend", "saturated"))
-    largest = _at_most(found["largest"])
     part = "the nearest saturated linear feedback" if found["fitted"] else "its saturated linear part"
-    does = ""
-    if found["rms"] is not None:
-        does = next((words for most, words in _A_GAIN if found["rms"] <= most), _NO_GAIN)
-    return (
-        f"the policy is within {largest} of {part} on the set, {rms} rms (bend {bend}, saturated at {saturated}){does}"
-        f"; sampled at {found['states']:,} states, no part of the proof"
-    )
+    sampled = f"; sampled at {found['states']:,} states, no part of the proof"
+    if found["rms"] is None or found["rms"] > _MOST:  # a share of next to nothing says nothing
+        return f"the policy departs from {part} by more than that varies on the set{_NO_GAIN}{sampled}"
+    does = next((words for most, words in _A_GAIN if found["rms"] <= most), _NO_GAIN)
+    near = f"the policy is within {_at_most(found['largest'])} of {part} on the set"
+    return f"{near}, {rms} rms (bend {bend}, saturated at {saturated}){does}{sampled}"
 
 
 def _percent(share: float | None) -> str:
@@ -281,14 +285,12 @@ def _percent(share: float | None) -> str:
     return f"{100 * share:.2g} %" if share < _ROUNDS_TO_ALL else percent(share)
 
 
-def _at_most(share: float | None) -> str:
+def _at_most(share: float) -> str:
     """The same rounded up, as the words `is within` ask for.
 
     >>> _at_most(0.0374), _at_most(0.121), _at_most(0.9987), _at_most(1.124)
     ('3.8 %', '13 %', '99.9 %', '113 %')
     """
-    if share is None:
-        return _percent(share)
     return f"{math.ceil(100 * share)} %" if share >= 1 else f"{above(100 * share, 2 + (share > 0.99))} %"
 
 

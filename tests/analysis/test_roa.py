@@ -190,7 +190,7 @@ def test_the_shipped_policy(tmp_path: Path, pendulum: System) -> None:
     assert data["checked"] == "ACCEPTED" and data["levels"]["roa"] == roa
     assert set(data["seconds"]) == {
         "load", "data", "candidate", "local", "ring", "tube",
-        "simulate", "learn", "outer", "ranks", "write", "check", "total",
+        "simulate", "learn", "outer", "ranks", "write", "check", "report", "total",
     }  # fmt: skip
     assert run_checker(tmp_path / "certificate.json")["policy_sha256"] == policy.network.sha256()
 

@@ -926,22 +926,79 @@ def test_a_plant_in_discrete_time_is_listed_by_its_steps(
 
 
 @pytest.mark.parametrize(
-    ("u_eq", "said"),
+    ("rate", "u_eq", "said"),
     [
-        ('"1/3"', "f(x_eq, u_eq) = 0 "),
-        ("0.3333333333333", "f(x_eq, u_eq) = 0 but for 3.3e-14 "),
-        ("0.33", "no equilibrium: x' = -0.00333333 at (x_eq, u_eq)"),
+        ("u - 1/3", '"1/3"', "f(x_eq, u_eq) = 0 open loop"),
+        (
+            "u - 1/3",
+            "0.3333333333333",
+            "f(x_eq, u_eq) = 0 within rounding, not exactly: the largest residual is 3.3e-14",
+        ),
+        (
+            "6*tan(u) - 1",
+            "0.16514867741462683",
+            "= 0 within rounding, not exactly: the largest residual is 0 in floats",
+        ),
+        ("u - 1/3", "0.33", "no equilibrium: x' = -0.00333333 at (x_eq, u_eq) open loop"),
     ],
 )
 def test_plant_says_how_far_it_is_from_rest(
-    u_eq: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    rate: str, u_eq: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plant = tmp_path / "s.toml"
     plant.write_text(
-        f'name = "s"\nstates = ["x"]\ninputs = ["u"]\n[dynamics]\nx = "u - 1/3"\n[u_eq]\nu = {u_eq}\n'
+        f'name = "s"\nstates = ["x"]\ninputs = ["u"]\n[dynamics]\nx = "{rate}"\n[u_eq]\nu = {u_eq}\n'
         "[domain]\nx = [-1, 1]\n[input_bounds]\nu = [-2, 2]\n"
     )
-    assert said in run(capsys, "plant", plant)[1]
+    assert said in " ".join(run(capsys, "plant", plant)[1].split())
+
+
+CLOCKED = """
+name = "clocked"
+time = "continuous"
+states = ["x", "t"]
+inputs = ["u"]
+[dynamics]
+x = "u - sin(x)"
+t = "1/10"
+[u_eq]
+u = 0
+[domain]
+x = [-1, 1]
+t = [-0.1, 2]
+[input_bounds]
+u = [-2, 2]
+"""
+
+
+@pytest.mark.parametrize(
+    ("changed", "status", "said"),
+    [
+        (
+            {},
+            0,
+            "f(x_eq, u_eq) = 0; but t' = 0.1 whatever states and inputs are: certify reach --target and certify roa",
+        ),
+        (
+            {"continuous": "discrete", '"1/10"': '"t + 1/10"', "u - sin": "x + u - sin"},
+            0,
+            "but t moves by 0.1 whatever",
+        ),
+        ({"u = 0\n": "u = 0.1\n"}, 2, "no equilibrium: x' = 0.1 at (x_eq, u_eq); but t' = 0.1 whatever states"),
+        ({'"1/10"': '"1/10 + x"'}, 2, "no equilibrium: t' = 0.1 at (x_eq, u_eq) open loop"),
+        ({"[u_eq]": "[x_eq]\nx = 0\nt = 1\n[u_eq]"}, 0, "= 0; but t' = 0.1 whatever"),
+    ],
+)
+def test_a_plant_with_a_clock_never_rests(
+    changed: dict[str, str], status: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text, plant = CLOCKED, tmp_path / "clocked.toml"
+    for old, new in changed.items():
+        text = text.replace(old, new)
+    plant.write_text(text)
+    found, out, err = run(capsys, "plant", plant)
+    assert found == status and said in " ".join(out.split())
+    assert ("reach --target and certify roa --claim invariant need no equilibrium" in err) is bool(status)
 
 
 def test_plants_list_disturbances_and_ranges(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -68,6 +68,8 @@ def test_a_box_that_gets_there(asked: list[str], tmp_path: Path, capsys: pytest.
     assert data["from"] == {"p": ["5/2", "3"], "v": ["0", "0"]} and data["claim"] == {"kind": "reaches"}
     assert data["simulated"]["longest"] <= data["steps"] <= data["ranks"]["steps"]
     assert {"verdict", "reason", "ranks", "seconds", "certificate", "checked"} <= data.keys()
+    *stages, total = data["seconds"].items()
+    assert total[0] == "total" and 0 < dict(stages)["report"] <= sum(dict(stages).values()) <= total[1]
     file = data["certificate"]
     page = (tmp_path / "out" / "report.html").read_text()
     assert "PROVED · ACCEPTED" in page and "p = 2.5..3" in page and f"<b>{data['steps']} steps</b>" in page

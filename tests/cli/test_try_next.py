@@ -4,6 +4,7 @@ that the question has not, or changes nothing."""
 from __future__ import annotations
 
 import ast
+import io
 import itertools
 import json
 import shlex
@@ -15,12 +16,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from certify.analysis import diagnosis, suggested
 from certify.analysis.asked import require_one_that_knows
 from certify.analysis.diagnosis import diagnose
 from certify.analysis.facts import Diagnosis, SimulatedFacts, Step, Tried
 from certify.analysis.options import RoaOptions
+from certify.analysis.reaching import following
 from certify.analysis.results import RoaResult
 from certify.analysis.run import certify_roa
 from certify.certificates.verdict import Stop, Verdict
@@ -29,6 +32,7 @@ from certify.effort import Effort
 from certify.errors import InputError, OptionError
 from certify.loop.plants import System
 from certify.loop.policies import Policy, PolicyNetwork, save_policy
+from certify.report.reached import summary
 from tests.support.loops import chain
 from tests.support.marks import slow_after
 
@@ -54,6 +58,7 @@ F = [-20, 20]
 """
 ADVICE = {
     "--effort": "4",
+    "--from": "p=1.2..1.4,v=0",
     "--candidate": "auto",
     "--domain": "p=-2..5.5",
     "--enlarge": "",
@@ -126,7 +131,7 @@ def follow(printed: Any, words: list[str], *options: str) -> tuple[Asked, Asked,
 def names_in_steps() -> set[str]:
     """Names of options that stand in steps of the source."""
     found = set[str]()
-    for module in (diagnosis, suggested):
+    for module in (diagnosis, following, suggested):
         for node in ast.walk(ast.parse(Path(str(module.__file__)).read_text())):
             if isinstance(node, ast.Tuple) and node.elts and isinstance(node.elts[0], ast.Constant):
                 first = node.elts[0].value
@@ -193,7 +198,7 @@ def test_a_command_that_has_no_such_option_is_not_printed(printed: Any, loop_wor
     before, command = printed(words, step)
     if command is None:
         assert name in ("--candidate", "--enlarge", "--ranks", "--rate", "--max-boxes", "--claim")
-    elif name != "--sample-time":  # a tube is one of continuous time
+    elif name not in ("--from", "--sample-time"):  # a tube is one of continuous time
         after, _ = printed(shlex.split(command)[1:], step)
         assert after.options.reach_from == before.options.reach_from
 
@@ -330,3 +335,57 @@ def test_who_follows_it_gets_more(
         found.append(json.loads(capsys.readouterr().out))
         command = command if len(found) == 2 else found[0]["diagnosis"]["next"]["command"]
     assert option in command and better(*found), (command, found[1]["verdict"], found[0]["volume"], found[1]["volume"])
+
+
+@pytest.mark.parametrize(
+    ("more", "changed", "proves"),
+    [
+        (["--from", "p=1.6..3,v=0", "--effort", "0.003"], {"--effort": "0.03"}, True),
+        (["--from", "p=1.6..3,v=0", "--effort", "1"], {"--from": "p=1.95..2.65,v=0"}, True),
+        (["--from", "p=1.6..3,v=0", "--effort", "2", "--time-limit", "1e-9"], {"--time-limit": "1e-08"}, False),
+        (["--effort", "1e-7"], {"--effort": "1e-06"}, False),
+    ],
+)
+def test_a_search_whose_effort_ended_says_so_and_what_to_try(
+    loop_words: list[str],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    more: list[str],
+    changed: dict[str, str],
+    proves: bool,
+) -> None:
+    """`certify reach --target`, run for run as typed: what it prints is the same command but for one option."""
+    words = ["reach", *loop_words, "--sample-time", "0.1", "--target", "p <= 1.5", *more]
+    short = float(more[-1]) >= 1
+    with monkeypatch.context() as patch:
+        if short:  # the search of an effort of 1 takes a minute
+            patch.setattr("certify.analysis.reaching.run._FOR_SEARCH", 1e-9)
+        status, before, said = told(capsys, words)
+    assert status == 3 and before["reason"].endswith("proved to lead into the target: the effort is over")
+    assert before["next"]["options"] == changed and "try next" in said
+    assert f"nothing was proved yet when the {'time' if '--time-limit' in changed else 'effort'} ended" in said
+    typed = shlex.split(before["next"]["command"])[1:]
+    assert set(typed) - set(words) == {"--json", *changed.values()}
+    if proves:
+        status, after, _ = told(capsys, typed)
+        assert status == 0 and after["verdict"] == "PROVED"
+
+
+def test_a_search_that_proves_boxes_says_where_more_effort_finds_more(
+    loop_words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["reach", *loop_words, "--sample-time", "0.1", "--target", "p <= 1.5", "--effort", "0.01"]
+    status, before, said = told(capsys, words)
+    assert status == 0 and before["next"]["options"] == {"--effort": "0.04"} and "limited by" in said
+    _, after, _ = told(capsys, shlex.split(before["next"]["command"])[1:])
+    assert after["ranks"]["volume"] > before["ranks"]["volume"]
+
+
+def told(capsys: pytest.CaptureFixture[str], words: list[str]) -> tuple[int, dict[str, Any], str]:
+    """The status of a command, its JSON object, and its summary in one line."""
+    capsys.readouterr()
+    status = _run([*words, *([] if "--json" in words else ["--json"])], True)
+    data = json.loads(capsys.readouterr().out)
+    console = Console(file=io.StringIO(), width=1000)
+    console.print(summary(data))
+    return status, data, console.file.getvalue()  # type: ignore[attr-defined]

@@ -63,7 +63,34 @@ def test_a_policy_without_a_gain_has_no_ratio():
     )
     assert math.isinf(found.rms) and found.to_dict()["rms"] is None
     json.dumps(found.to_dict(), allow_nan=False)
-    assert "any share" in nonlinearity_in_words(found.to_dict())
+    assert "departs from its saturated linear part by more than" in nonlinearity_in_words(found.to_dict())
+
+
+def test_no_share_of_a_linear_part_that_is_nearly_0_is_said():
+    """tanh(50 x) - 49.9 x: a gain of 0.1 at 0, and values of some 100 away from it."""
+    one = np.ones((1, 1))
+    network = PolicyNetwork.of_layers(
+        [np.array([[50.0], [1e-3]]), np.array([[1.0, -49.9e3]])], [np.zeros(2), np.zeros(1)], one[0], 0 * one[0],
+        squash="identity", centre="none",
+    )  # fmt: skip
+    entry = nonlinearity(network, ZERO, 0.1 * X).to_dict()
+    words = nonlinearity_in_words(entry)
+    assert entry["rms"] > 1 and "departs from its saturated linear part by more than that varies" in words
+    assert "%" not in words
+
+
+@pytest.mark.parametrize("x", [0.0, 0.3, 1.7, 3.0])
+def test_on_a_set_of_one_point_a_gain_does_the_same(x: float) -> None:
+    """All differences are roundings there: their ratio was any number of per cent."""
+    generator = np.random.default_rng(7)
+    weights = [generator.normal(size=shape) for shape in ((32, 2), (32, 32), (1, 32))]
+    network = PolicyNetwork.of_layers(
+        weights, [generator.normal(size=len(W)) for W in weights], [1.0], [0.0], squash="identity", centre="none"
+    )
+    found = nonlinearity(network, ZERO, np.full((1000, 2), [x, 0.2]), fitted=True)
+    assert (found.rms, found.largest, found.bend) == (0.0, 0.0, 0.0) and "within 0 %" in nonlinearity_in_words(
+        found.to_dict()
+    )
 
 
 def test_a_fit_is_taken_where_the_tangent_at_0_says_nothing():

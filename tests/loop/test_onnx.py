@@ -91,6 +91,15 @@ def test_graphs(name: str, tmp_path: Path) -> None:
     assert imported.difference.in_double < 1e-12 and imported.difference.largest < 1e-4
 
 
+@pytest.mark.parametrize("kind", ["Elu", "Selu", "Celu"])
+def test_the_branch_that_an_elu_does_not_take_may_overflow(tmp_path: Path, kind: str) -> None:
+    """Without a word: numpy warned of it in the user's terminal, and a warning is an error in tests."""
+    steep = CONSTANTS | {"W1": np.float32(1e4) * W1}
+    operations = (("Gemm", "*", "W1", "B1"), (kind, "*"), ("Gemm", "*", "W2", "B2"))
+    imported = import_policy(written(tmp_path, model(chain(*operations), steep)), plant(), SAID)
+    assert np.all(np.isfinite(imported.policy.network(X, (Fraction(0),))))
+
+
 def test_double_precision_and_constants_in_nodes(tmp_path: Path) -> None:
     doubles = {k: v.astype(np.float64) / 3 for k, v in CONSTANTS.items()}
     doubles["B1"] = doubles["B1"].astype(np.float16).astype(np.float64)

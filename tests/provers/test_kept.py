@@ -68,6 +68,18 @@ def worst(case: Stepped, x: np.ndarray, generator: np.random.Generator) -> np.nd
     return found
 
 
+@pytest.mark.parametrize(("keep", "reads"), [("x <= 0.7", False), ("abs(u) <= 0.3", True)])
+def test_the_policy_is_asked_only_where_a_constraint_reads_an_input(
+    monkeypatch: pytest.MonkeyPatch, keep: str, reads: bool
+) -> None:
+    system, network = alone("x/2 - tanh(x)")
+    constraints = Constraints(ClosedLoop(with_constraints(system, [keep], []), network))
+    x = np.linspace(-1, 1, 24).reshape(4, 6, 1)
+    expected, asked = constraints.at(x, constraints.loop.policy(x)).max(-1), list[object]()
+    monkeypatch.setattr(ClosedLoop, "policy", lambda loop, y: asked.append(y) or loop.folded(y, loop.u_eq))
+    assert np.array_equal(constraints.worst(x), expected) and bool(asked) is reads
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_proved_on_boxes_is_so(name: str) -> None:
     case, generator = CASES[name](), np.random.default_rng(0)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from certify.analysis.facts import RankFacts
+from certify.analysis.facts import RankFacts, Step
 from certify.analysis.reaching.never import Stay
 from certify.analysis.reaching.options import ReachOptions, in_words
 from certify.analysis.reaching.runs import Run, Runs
@@ -29,6 +29,7 @@ class ReachResult(ResultWithoutV):
     runs : simulated, from that box.
     stay : a start in it that never arrives, if one is shown.
     given : the certificate whose set is the target; None for a region.
+    following : what to try next, where the search ended before it was done.
     """
 
     options: ReachOptions
@@ -37,6 +38,7 @@ class ReachResult(ResultWithoutV):
     runs: Runs | None = None
     stay: Stay | None = None
     given: Certificate | None = None
+    following: Step | None = None
 
     @property
     def begin(self) -> dict[str, tuple[Fraction, Fraction]] | None:
@@ -71,6 +73,7 @@ class ReachResult(ResultWithoutV):
             "constraints": dict(self.constraints),
             "simulated": None if self.runs is None else self._simulated(self.runs),
             "never": None if self.stay is None else self._stay(self.stay),
+            "next": None if self.following is None else self.following.to_dict(),
             **self.about_the_run(),
         }
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from certify.analysis.acceptance import Clerk
 from certify.analysis.beyond import constraints_in_words, rank_facts
+from certify.analysis.reaching.following import with_following
 from certify.analysis.reaching.goals import Goal, Stated, goal_of, leaves_of, with_ranks
 from certify.analysis.reaching.never import Search
 from certify.analysis.reaching.options import ReachOptions
@@ -193,7 +194,8 @@ def _never(result: ReachResult, goal: Goal, near: Array, tools: Tools) -> ReachR
         stay = Search(goal.loop, goal.expressions, begin, simulation, Effort(_RUNS)).found(states)
     if stay is None:
         return result
-    return replace(result, verdict=Verdict.REFUTED, stay=stay, reason=f"{result.reason}; {result.told_of(stay)}")
+    reason = f"{result.reason}; {result.told_of(stay)}"
+    return replace(result, verdict=Verdict.REFUTED, stay=stay, reason=reason, following=None)
 
 
 def _proved(
@@ -220,7 +222,9 @@ def _proved(
         found = _searched(question, options, arrivals, search, runner, tools)
     evidence = None if found is None else _within(found.evidence, options.within)
     if found is None or evidence is None:
-        result = replace(result, reason="no box of the domain is proved to lead into the target")
+        why = ": the effort is over" if search.over else ""
+        result = replace(result, reason=f"no box of the domain is proved to lead into the target{why}")
+        result = with_following(result, effort) if search.over else result
         return _never(result, goal, begins(options.begin or whole)[:1], tools)
     ranks = Ranks(found.ranks.angles, max(1, evidence.most))
     certificate = goal.certificate(question, evidence, ranks, provenance)
@@ -228,8 +232,9 @@ def _proved(
     facts, kept = rank_facts(certificate, found), constraints_in_words(certificate)
     result = replace(result, ranks=facts, boxes=found.boxes, constraints=kept)
     result = replace(result, certificate=path, raw=raw, checker=answer)
+    further = result if found.done or found.full else with_following(result, effort)
     if options.begin is None:
-        return replace(result, verdict=Verdict.PROVED, reason="effort" if effort.over or not found.done else "done")
+        return replace(further, verdict=Verdict.PROVED, reason="effort" if effort.over or not found.done else "done")
     turned = tuple(i for i, s in enumerate(system.states) if s.name in found.ranks.angles)
     steps = steps_from(Ranked(leaves_of(certificate), goal.ellipsoid, turned), options.begin)
     if steps is None:
@@ -237,7 +242,7 @@ def _proved(
         over = many if found.full else "the effort is over"
         why = over if not found.done else "no leaf is left whose halves could gain anything"
         part, states = _part(result, goal, leaves_of(certificate))
-        return _never(replace(result, reason=f"{part}: {why}"), goal, states, tools)
+        return _never(replace(further, reason=f"{part}: {why}"), goal, states, tools)
     return replace(result, verdict=Verdict.PROVED, reason="requested", steps=steps)
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from fractions import Fraction
 
 import numpy as np
 
 from certify.errors import InputError
-from certify.loop.expressions import Symbol, differentiate, evaluate_exactly, numerical
+from certify.loop.expressions import Symbol, constant_of, differentiate, evaluate_exactly, numerical, symbols_of
 from certify.loop.plants.system import System
 
 _ROUNDED = 1e-12  # of a residual with functions at other points than 0, which rationals do not decide
@@ -36,18 +36,34 @@ def rests_where(system: System) -> str:
     return "0" if system.time == "continuous" else "x_eq"
 
 
+def clocks(system: System) -> dict[str, Fraction | float]:
+    """States that move at one pace whatever states and inputs are, and that pace: such a plant has no equilibrium."""
+    moves = {name: r for name, r in residuals(system).items() if r != 0}
+    each = {s: e for s, e in zip(system.states, system.exact_dynamics(), strict=True) if s.name in moves}
+    if system.time == "continuous":
+        return {s.name: moves[s.name] for s, e in each.items() if not symbols_of(e)}
+    own = {s: e for s, e in each.items() if symbols_of(e) == {s}}
+    return {s.name: moves[s.name] for s, e in own.items() if constant_of(differentiate(e, s)) == 1}
+
+
 def require_equilibrium(
-    system: System, refuse: Callable[[str], InputError] = InputError, *, rounded: bool = False
+    system: System,
+    refuse: Callable[[str], InputError] = InputError,
+    *,
+    rounded: bool = False,
+    but: Collection[str] = (),
 ) -> None:
     """Reject a plant whose operating point is no equilibrium; `refuse` makes the error of a message.
 
-    With `rounded` an exact residual of 1e-12 is 0 as well, as where u_eq is a rounded number.
+    With `rounded` an exact residual of 1e-12 is 0 as well, as where u_eq is a rounded number. States named in `but` may
+    move.
 
     Raises
     ------
     InputError : f(x_eq, u_eq) is not 0; the message has the residual of each state by its name.
     """
-    off = {name: r for name, r in residuals(system).items() if _is_off(float(r) if rounded else r)}
+    moves = {name: r for name, r in residuals(system).items() if name not in but}
+    off = {name: r for name, r in moves.items() if _is_off(float(r) if rounded else r)}
     if off:
         shown = ", ".join(_residual(system, name, r) for name, r in off.items())
         raise refuse(

@@ -27,7 +27,7 @@ from certify.loop.plants.axes import along_axes
 from certify.loop.plants.calls import Call, Named
 from certify.loop.plants.deviations import in_deviations
 from certify.loop.plants.equations import nearest, parse_constraint, parse_expression
-from certify.loop.plants.operating_point import require_equilibrium
+from certify.loop.plants.operating_point import clocks, require_equilibrium
 from certify.loop.plants.source import PlantFile, interval_at, number_at, read_plant_file
 from certify.loop.plants.system import Interval, System, Time
 from certify.loop.plants.unknown import measurements_in, parameter, residual_ranges, samples_in, with_residuals
@@ -124,7 +124,7 @@ def build_system(file: PlantFile) -> System:
         raise file.refuse(str(error)) from error
     system = along_axes(system)
     if "x_eq" in file.data:
-        require_equilibrium(system, lambda message: file.refuse(message, "x_eq"))
+        require_equilibrium(system, lambda message: file.refuse(message, "x_eq"), but=clocks(system))
     return system
 
 

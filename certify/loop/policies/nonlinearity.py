@@ -21,6 +21,7 @@ from certify.loop.policies.network import PolicyNetwork
 
 Array = NDArray[np.float64]
 _END = 0.01  # of the width of an input's range: nearer to an end it counts as saturated
+_ROUNDING = 1e-12  # of a value, or of 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +31,7 @@ class Nonlinearity:
     Parameters
     ----------
     rms, largest : root mean square and maximum of the difference between the two, each relative to that of the linear
-        feedback's own deviation from its value at 0; inputs count in units of their scale.
+        feedback's own deviation from its value at 0; inputs count in units of their scale, roundings as 0.
     bend : root mean square of net(x) - net(0) - J x relative to that of J x, before the squash.
     saturated : share of the states at which some input of the policy is within 1 % of an end of its range.
     states : their number.
@@ -59,15 +60,22 @@ def nonlinearity(network: PolicyNetwork, u_eq: Sequence[Fraction], states: Array
     policy = network.folded(u_eq)
     y, line = policy.net(states), _line(policy, states, fitted)
     u, v, v0 = (policy.clipped(policy.scale * policy.squashed(each) + policy.offset) for each in (y, *line))
-    difference, linear = np.abs((u - v) / policy.scale), np.abs((v - v0) / policy.scale)
+    difference, linear = (_beyond_rounding(each / policy.scale, u / policy.scale) for each in (u - v, v - v0))
+    bend, straight = (_beyond_rounding(each, y) for each in (y - line[0], line[0] - line[1]))
     return Nonlinearity(
         _ratio(_rms(difference), _rms(linear)),
         _ratio(float(difference.max()), float(linear.max())),
-        _ratio(_rms(y - line[0]), _rms(line[0] - line[1])),
+        _ratio(_rms(bend), _rms(straight)),
         float(_saturated(policy, u).mean()),
         len(states),
         fitted,
     )
+
+
+def _beyond_rounding(difference: Array, of: Array) -> Array:
+    """The size of a difference of values like these; 0 where it is a rounding, as all are on a set of one point."""
+    size = np.abs(difference)
+    return np.where(size < _ROUNDING * np.maximum(1.0, np.abs(of)), 0.0, size)
 
 
 def _line(policy: PolicyNetwork, states: Array, fitted: bool) -> tuple[Array, Array]:

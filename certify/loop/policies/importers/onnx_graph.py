@@ -127,7 +127,8 @@ def read_onnx(raw: bytes, what: str, wanted: str | None = None, folder: Path | N
     def evaluate(x: Observations, double: bool) -> Values:
         given = x.reshape(len(x), *shape[1:]) if len(shape) > 2 else x
         given = given.astype(np.float64 if double else np.float32)
-        values: Values = np.asarray(evaluators[double].run([output], {name: given})[0])
+        with np.errstate(all="ignore"):  # of the branch that Elu does not take; what is not finite is refused later
+            values: Values = np.asarray(evaluators[double].run([output], {name: given})[0])
         return values.reshape(len(x), -1) if len(shape) > 2 else values
 
     kinds = [node.op_type for node in model.graph.node if node.op_type != "Constant"]
