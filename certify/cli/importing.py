@@ -37,7 +37,7 @@ _HELP = {
     "observes": "Whether the network reads absolute states or their deviation from the operating point.",
     "ignore": "Tensor that is no part of the policy, * and ? as in names of files; repeatable.",
     "output": "Output that is the action, where there are several: for ONNX its name, else its place, 0 for the first; "
-    "for a state_dict mean, if the last layer gives the mean of the actions and then their spread.",
+    "for a state_dict mean, if its last layer gives the actions' mean and then their spread, or places as in 0,2.",
 }
 
 

@@ -492,9 +492,25 @@ def test_the_mean_of_what_gives_the_spread_as_well(tmp_path: Path) -> None:
         brax(path, outputs)
         with pytest.raises(InputError, match=f"2 numbers for 1 inputs; it gives {outputs}"):
             import_policy(path, PLANT, replace(BRAX, output="mean"))
-    brax(path, 1)
-    with pytest.raises(InputError, match="--output must be left out"):
-        import_policy(path, PLANT, replace(BRAX, output="0"))
+
+
+def test_the_places_of_the_actions_in_what_the_last_layer_gives(tmp_path: Path) -> None:
+    """RLlib has the spread of each action of a tuple behind it."""
+    torch.manual_seed(8)
+    path = tmp_path / "p.npz"
+    module = brax(path, 4)
+    for place in (0, 2, 3):
+        found = import_policy(path, PLANT, replace(BRAX, output=str(place)))
+        assert f"numbers {place}, counted from 0, are the actions" in found.assumed
+        agree(found.policy, module, lambda y, k=place: torch.tanh(y[:, k : k + 1]))
+    torch.save(module.state_dict(), tmp_path / "p.pt")  # found by its sizes
+    found = import_policy(tmp_path / "p.pt", PLANT, replace(BRAX, output="2", prefix=None))
+    agree(found.policy, module.float(), lambda y: torch.tanh(y[:, 2:3]))
+    with pytest.raises(InputError, match=r"--output 4 takes the numbers 4 of .*; it gives 4"):
+        import_policy(path, PLANT, replace(BRAX, output="4"))
+    for said in ("", "-1", "0,2", "0,0", "0,00", "1.0", "first", "\u0662"):
+        with pytest.raises(InputError, match="must be mean, or the place of each of 1 actions"):
+            import_policy(path, PLANT, replace(BRAX, output=said))
 
 
 @pytest.mark.parametrize("prefix", [None, "first,last"])

@@ -38,7 +38,6 @@ from certify.loop.policies.importers.observing import (
 from certify.loop.policies.importers.options import ImportOptions
 from certify.loop.policies.importers.reading import Evaluate, Observations, Reading, Values
 from certify.loop.policies.importers.recognising import Content, kind_of, read_kind
-from certify.loop.policies.importers.state_dict import MEAN
 from certify.loop.policies.importers.steps import Clip, Diagonal, Normalise, Step, spread
 from certify.loop.policies.network import Array, Centre, PolicyNetwork
 
@@ -261,7 +260,7 @@ def _require_answers(kind: Content, reading: Reading, options: ImportOptions, pl
         ("--normaliser", options.normaliser, kind != "two-stage"),
         ("--centre", options.centre, kind != "two-stage" or options.centre == "preactivation"),
         ("--ignore", options.ignore, kind not in ("torchscript", "onnx")),
-        ("--output", options.output, kind in ("onnx", "torchscript") or (layers_only and options.output == MEAN)),
+        ("--output", options.output, kind in ("onnx", "torchscript") or layers_only),
     ):
         if value is not None and not belongs:
             raise InputError(f"{option} must be left out: a file of {kind} says it itself.")

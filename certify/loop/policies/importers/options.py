@@ -61,7 +61,7 @@ class ImportOptions:
     ignore : names of tensors that are no part of the policy, with `*` and `?` as in names of files.
     output : which output of a program is the action, where it has several: a name for ONNX, for TorchScript and modules
         the place, counted from 0. Of a state_dict: `mean`, if its last layer gives the mean of the actions and then
-        their spread.
+        their spread, or the places of the actions in what that gives, as in 0,2.
 
     Raises
     ------

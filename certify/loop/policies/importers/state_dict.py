@@ -132,9 +132,9 @@ def read_state_dict(
     if options.prefix is not None and "," in options.prefix:
         tensors, prefix = _numbered(tensors, options.prefix.split(",")), _LISTED
     else:
-        prefix = options.prefix if options.prefix is not None else _only(tensors, n, _given(m, options))
+        prefix = options.prefix if options.prefix is not None else _only(tensors, n, m, options)
     norms = {} if options.norm is None else _norms(tensors, prefix, options)
-    layers = _mean_of(_layers(tensors, prefix, list(norms)), m, options)
+    layers = _to_actions(_layers(tensors, prefix, list(norms)), m, options)
     if (layers[0].weight.shape[1], layers[-1].weight.shape[0]) != (n, m):
         raise InputError(
             f"the policy must read {n} states and command {m} inputs; {prefix} is {widths(layers)}. "
@@ -153,6 +153,8 @@ def read_state_dict(
     assumed += f", {squash} behind them what --squash says"
     if options.output == MEAN:
         assumed += f", of whose {2 * m} numbers the first {m} are the mean, as --output says"
+    elif options.output is not None:
+        assumed += f", of whose numbers {options.output}, counted from 0, are the actions, as --output says"
     if options.norm is not None:
         epsilon = float(options.norm_epsilon or _EPSILON)
         assumed += f", layer normalisation {options.norm[6:]} the activation, with epsilon {epsilon}, what --norm says"
@@ -250,31 +252,55 @@ def read_lyapunov(tensors: Mapping[str, Numbers], prefix: str | None, options: I
     )
 
 
-def _given(m: int, options: ImportOptions) -> int:
-    """The numbers that the last layer gives for m actions."""
-    return 2 * m if options.output == MEAN else m
-
-
-def _mean_of(layers: Layers, m: int, options: ImportOptions) -> Layers:
-    """The layers up to the mean of the actions, where the last one gives their spread behind it.
+def _places(m: int, options: ImportOptions) -> list[int]:
+    """The places of the actions in what the last layer gives, from 0.
 
     Raises
     ------
-    InputError : `--output` says so, and the last layer does not give two numbers for each input; or the contrary.
+    InputError : `--output` says others than one for each input.
+    """
+    if options.output in (None, MEAN):
+        return list(range(m))
+    said = (options.output or "").split(",")
+    found = {int(place): None for place in said if re.fullmatch("[0-9]{1,4}", place, re.ASCII)}
+    if not len(found) == len(said) == m:
+        raise InputError(
+            f"--output must be mean, or the place of each of {m} actions in what the last layer gives, counted from 0, "
+            f"as in {','.join(str(2 * k) for k in range(m))}; found {options.output}."
+        )
+    return list(found)
+
+
+def _gives(count: int, m: int, options: ImportOptions) -> bool:
+    """True if a last layer of so many numbers may give m actions."""
+    if options.output in (None, MEAN):
+        return count == (m if options.output is None else 2 * m)
+    return count > max(_places(m, options))
+
+
+def _to_actions(layers: Layers, m: int, options: ImportOptions) -> Layers:
+    """The layers up to the actions alone, where the last one gives more: their spread.
+
+    Raises
+    ------
+    InputError : `--output` says so, and the last layer does not give these; or the contrary.
     """
     last = layers[-1]
     given = len(last.bias)
-    if options.output == MEAN:
-        if given != 2 * m:
+    if options.output is not None:
+        if not _gives(given, m, options):
+            wanted = f"the first half of what the last layer gives, {2 * m} numbers for {m} inputs"
+            places = f"the numbers {options.output} of what the last layer gives, counted from 0"
             raise InputError(
-                f"--output mean takes the first half of what the last layer gives, {2 * m} numbers for {m} inputs; it "
-                f"gives {given}."
+                f"--output {options.output} takes {wanted if options.output == MEAN else places}; it gives {given}."
             )
-        return [*layers[:-1], Affine(last.weight[:m], last.bias[:m])]
+        places_of = _places(m, options)
+        return [*layers[:-1], Affine(last.weight[places_of], last.bias[places_of])]
     if given == 2 * m:
         raise InputError(
             f"the last layer must give {m} numbers, one for each input; it gives {given}. If these are the mean of the "
-            "actions and then their spread, as Brax has them, say so with --output mean."
+            "actions and then their spread, as Brax has them, say so with --output mean; if each action's spread is "
+            f"behind it, as RLlib has those of a tuple, with --output {','.join(str(2 * k) for k in range(m))}."
         )
     return layers
 
@@ -312,7 +338,7 @@ def _groups(tensors: Mapping[str, Numbers]) -> list[str]:
     return list(found)
 
 
-def _only(tensors: Mapping[str, Numbers], n: int, m: int) -> str:
+def _only(tensors: Mapping[str, Numbers], n: int, m: int, options: ImportOptions) -> str:
     """The one prefix whose layers lead from n to m and that no name calls a critic."""
     described = []
     fitting = []
@@ -320,7 +346,8 @@ def _only(tensors: Mapping[str, Numbers], n: int, m: int) -> str:
         numbers = _numbers(tensors, prefix)
         first, last = tensors[f"{_dot(prefix)}{numbers[0]}.weight"], tensors[f"{_dot(prefix)}{numbers[-1]}.weight"]
         described.append(f"{prefix or 'no prefix'}: {first.shape[-1]} to {last.shape[0] if last.ndim else 0}")
-        if first.shape[-1:] == (n,) and last.shape[:1] == (m,) and not _of_another(prefix):
+        fits = first.shape[-1:] == (n,) and last.ndim > 0 and _gives(last.shape[0], m, options)
+        if fits and not _of_another(prefix):
             fitting.append(prefix)
     if len(fitting) == 1:
         return fitting[0]
