@@ -42,7 +42,7 @@ ROOT = Path(__file__).parents[2]
 PAGE = Path(__file__).parent
 OUT = ROOT / "out" / "paper"
 PLANTS = ("pendulum", "cartpole", "quadrotor2d", "quadrotor3d")
-EFFORT = {"pendulum": 1.2, "cartpole": 2.4, "quadrotor2d": 3.0, "quadrotor3d": 4.8}
+EFFORT = {"pendulum": 1.2, "cartpole": 2.4, "quadrotor2d": 3.0, "quadrotor3d": 2.4}
 KINDS: tuple[Run, ...] = ("ours", "sac", "sb3-ppo")
 IN_WORDS = {
     "asymptotic": "converges to the origin",
