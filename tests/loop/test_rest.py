@@ -35,6 +35,7 @@ from controllers.evaluation.proved_set import count_covered, require_same_loop, 
 from tests.support.loops import box
 
 PLAIN = Path(__file__).parent.parent.parent / "examples" / "policies" / "without_gain" / "pendulum.pt"
+LITTLE = ["roa", "--policy", str(PLAIN), "--candidate", "lqr", "--effort", "0.02"]
 
 
 def scalar(f: Expression, weight: float, bias: float, clip: tuple[float, float] | None = None) -> ClosedLoop:
@@ -122,18 +123,7 @@ def test_practical_stability_is_claimed_where_the_policy_is_not_centred(tmp_path
 def test_the_command_centres_on_request_and_says_what_that_changes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = [
-        "roa",
-        "--policy",
-        str(PLAIN),
-        "--candidate",
-        "lqr",
-        "--effort",
-        "0.02",
-        "--out",
-        str(tmp_path),
-        "--json",
-    ]
+    command = [*LITTLE, "--out", str(tmp_path), "--json"]
     assert _run([*command, "--claim", "practical"], True) == 0
     further = json.loads(capsys.readouterr().out)["diagnosis"]["next"]
     assert further["options"] == {"--centre": "preactivation", "--claim": "auto"}
@@ -306,19 +296,7 @@ def test_a_set_around_the_rest_is_told_from_one_around_another_point(tmp_path: P
 
 def test_what_is_asked_of_a_set_is_about_its_own_point(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """`--contains` names values: 2.8 lies outside, and would lie inside if it were a deviation; -2.9 the other way."""
-    command = [
-        "roa",
-        "--policy",
-        str(PLAIN),
-        "--candidate",
-        "lqr",
-        "--effort",
-        "0.02",
-        "--out",
-        str(tmp_path),
-        "--json",
-        "--contains",
-    ]
+    command = [*LITTLE, "--out", str(tmp_path), "--json", "--contains"]
     for states, inside in (("theta=2.8", False), ("theta=-2.9", True)):
         assert _run([*command, states], True) == 0
         said = json.loads(capsys.readouterr().out)["contains"]

@@ -46,9 +46,9 @@ _BELOW = 1 - 1e-9  # share of the domain's limit
 
 @dataclass(frozen=True)
 class _Sampled:
-    """States (N, n), the mean rate G of a step from each (N, n), and how much G changes with each input's error on
-    their boxes (N, m, n). With `middle` halfway through the step and `end` at its end, V changes by 2 middle'P G, and
-    with a change of G by 2 end'P of that."""
+    """The mean rate G of a step from each state, (N, n), and how much G changes with each input's error on its box,
+    (N, m, n). V changes by 2 middle'P G, `middle` being halfway to the step's `end`, (N, n) each; a small change of G
+    changes that by 2 end'P times it."""
 
     G: Array
     errors: Array
