@@ -307,7 +307,4 @@ class OnBall(Algebra[Rows]):
 
 def wider(X: Vector, columns: int) -> Vector:
     """X with columns of zeros, up to so many."""
-    more = columns - X.value.shape[1]
-    if more == 0:
-        return X
-    return Vector(np.concatenate([X.value, np.zeros((len(X.value), more))], 1), X.error.beside(Above(np.zeros(more))))
+    return X.beside(np.zeros((len(X.value), columns - X.value.shape[1])))
