@@ -14,8 +14,8 @@ from flint import fmpq, fmpq_mat
 from . import ball
 from .ball import Ball
 from .case import Case, Failures, given
-from .decrease import Models, are_finite, diagonal, rational, vectors
-from .exact import exactly, is_definite, quotient, root_above
+from .decrease import Models, are_finite, vectors
+from .exact import diagonal, exactly, is_definite, quotient, rational, root_above
 from .jets import unpacked
 from .local import is_large_enough
 from .near import Above, Array, Tensor, size

@@ -17,7 +17,7 @@ import numpy as np
 from flint import fmpq, fmpq_mat
 
 from .document import Multipliers
-from .exact import exactly, is_definite, root_above
+from .exact import diagonal, exactly, is_definite, rational, root_above
 from .jets import Jet, unpacked
 from .near import Array, Near, Tensor, Vector, mixed, symmetrised
 from .pairs import bound_of_pairs, in_binary64
@@ -215,13 +215,3 @@ def of_units(models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:
 def vectors(rows: Near) -> Vector:
     """Rows of numbers with an error each, (N, k), as vectors (k, N)."""
     return Vector(rows.value.T, rows.error.norm(1))
-
-
-def diagonal(entries: Sequence[fmpq]) -> fmpq_mat:
-    n = len(entries)
-    return fmpq_mat([[entries[i] if i == j else fmpq(0) for j in range(n)] for i in range(n)])
-
-
-def rational(value: float) -> fmpq:
-    """A finite binary64 number as it is."""
-    return fmpq(*float(value).as_integer_ratio())

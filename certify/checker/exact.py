@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import reduce
@@ -21,9 +22,19 @@ MAX_MATRIX_BITS = 2**16  # of a number in a matrix, times the matrix's size: bey
 _MOST_BITS = 2**14  # the same where all of an inverse is wanted
 
 
+def rational(value: float) -> fmpq:
+    """A finite binary64 number as it is."""
+    return fmpq(*float(value).as_integer_ratio())
+
+
 def exactly(array: NDArray[np.float64]) -> fmpq_mat:
     """A finite binary64 matrix as it is."""
-    return fmpq_mat([[fmpq(*v.as_integer_ratio()) for v in row] for row in array.tolist()])
+    return fmpq_mat([[rational(v) for v in row] for row in array.tolist()])
+
+
+def diagonal(entries: Sequence[fmpq]) -> fmpq_mat:
+    n = len(entries)
+    return fmpq_mat([[entries[i] if i == j else fmpq(0) for j in range(n)] for i in range(n)])
 
 
 def inverse_diagonal(A: fmpq_mat) -> list[Fraction]:
@@ -66,9 +77,7 @@ def is_definite(A: fmpq_mat) -> bool:
 
 def contains_ball(J: fmpq_mat, P: fmpq_mat, level: Fraction) -> bool:
     """True if {x'Px <= level} lies in {J d : ||d|| <= 1}: J'PJ - level I is positive definite."""
-    n, c = J.nrows(), quotient(level)
-    identity = fmpq_mat([[fmpq(int(i == j)) for j in range(n)] for i in range(n)])
-    return is_definite(J.transpose() * P * J - c * identity)
+    return is_definite(J.transpose() * P * J - diagonal([quotient(level)] * J.nrows()))
 
 
 def gershgorin_lower(A: fmpq_mat) -> Fraction:

@@ -20,9 +20,8 @@ from typing import Any
 import numpy as np
 
 from .case import Failures
-from .decrease import rational
 from .document import Certificate, Intervals
-from .exact import fraction, quotient, root_above
+from .exact import fraction, quotient, rational, root_above
 from .expression import Tape, evaluate
 from .jets import Jet
 from .near import Above, Array, Near, near, norm, size

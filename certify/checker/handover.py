@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from flint import fmpq, fmpq_mat
+from flint import fmpq_mat
 
 from .case import Case, Failures, given
 from .document import Certificate
-from .exact import exactly, is_definite
+from .exact import exactly, is_definite, rational
 
 if TYPE_CHECKING:
     from .rules import Tally
@@ -19,7 +19,7 @@ def difference(c: Certificate, then: Certificate) -> fmpq_mat:
 
     For then V'(x) = x'P'x < (c2'/c0) x'Px <= c2' where 0 < V(x) <= c0, and V'(0) = 0.
     """
-    return fmpq(*then.c2.as_integer_ratio()) * exactly(c.P) - fmpq(*c.c0.as_integer_ratio()) * exactly(then.P)
+    return rational(then.c2) * exactly(c.P) - rational(c.c0) * exactly(then.P)
 
 
 def is_same_loop(case: Case) -> Failures:

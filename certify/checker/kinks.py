@@ -18,9 +18,9 @@ from flint import fmpq, fmpq_mat
 from .ball import Ball, OnBall, Rows
 from .boxes import batches, is_whole
 from .case import Failures
-from .decrease import OF_ONE, Models, rational, vectors
+from .decrease import OF_ONE, Models, vectors
 from .elementary import least_share, sqrt
-from .exact import Exact, exactly, fraction, quotient
+from .exact import Exact, exactly, fraction, quotient, rational
 from .expression import evaluate
 from .functions import FUNCTIONS, Undecided
 from .jets import Jet, Units

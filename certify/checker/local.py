@@ -13,9 +13,9 @@ from flint import fmpq_mat
 
 from .ball import Ball
 from .case import Case, Failures
-from .decrease import Inequality, Level, Models, are_finite, are_usable, rational
+from .decrease import Inequality, Level, Models, are_finite, are_usable
 from .document import Intervals, Multipliers
-from .exact import contains_ball, exactly, fraction, is_definite
+from .exact import contains_ball, exactly, fraction, is_definite, rational
 from .jets import Jet
 
 

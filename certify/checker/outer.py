@@ -17,12 +17,12 @@ from operator import add
 from typing import TYPE_CHECKING
 
 import numpy as np
-from flint import fmpq, fmpq_mat
+from flint import fmpq_mat
 
 from .boxes import LEAF, Batch, Boxes, Leaves, batches, in_order, is_whole, keeps_inputs, middle
 from .calls import entries
 from .case import Case, Failures, given, only_where
-from .exact import exactly, inverse, quotient
+from .exact import exactly, inverse, quotient, rational
 from .expression import Call, Tape, evaluate
 from .functions import FUNCTIONS
 from .near import Above, Array, Form, Near, near
@@ -192,7 +192,7 @@ def contains_domain(case: Case) -> Failures:
     sizes = fmpq_mat([[abs(v) for v in row] for row in to_z.tolist()])
     reach = sizes * fmpq_mat([[quotient(x)] for x in far])
     for i, b in enumerate(outer.root.tolist()):
-        if not reach[i, 0] <= fmpq(*b.as_integer_ratio()):
+        if not reach[i, 0] <= rational(b):
             yield f"evidence.outer.root, axis {i}", "the root box must contain the domain"
     return len(far)
 

@@ -14,8 +14,8 @@ import numpy as np
 from flint import fmpq, fmpq_mat
 
 from .case import AT_CORNERS
-from .decrease import OF_ONE, Models, rational
-from .exact import exactly, fraction, root_above
+from .decrease import OF_ONE, Models
+from .exact import exactly, fraction, rational, root_above
 from .functions import FUNCTIONS
 from .jets import Jet, Units, aligned, constant
 from .near import ZERO, Above, Array, Near, Vector, near

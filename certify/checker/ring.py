@@ -6,11 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from flint import fmpq
 
 from .boxes import Batch, Boxes, Leaves, batches, is_whole, middle
 from .case import Case, Failures
-from .exact import fraction, quotient, root_above
+from .exact import fraction, quotient, rational, root_above
 from .near import Array, near
 from .network import enclose_on_boxes
 from .taylor import Taylor, combination, inner_product
@@ -77,7 +76,7 @@ class Ring(Moving):
     def __init__(self, case: Case) -> None:
         lo, hi = case.c.sample or (0, 0)
         super().__init__(case, case.partition.T, case.S, lo < hi)
-        c2, self.order = fmpq(*self.c.c2.as_integer_ratio()), case.partition.order
+        c2, self.order = rational(self.c.c2), case.partition.order
         roots = (root_above(c2 * quotient(p)) for p in case.P_inverse)
         self.widest = [near(fraction(root)).ends[1] for root in roots]
 

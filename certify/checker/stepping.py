@@ -11,9 +11,9 @@ from flint import fmpq, fmpq_mat
 
 from .boxes import multipliers
 from .case import Case
-from .decrease import Inequality, Models, rational
+from .decrease import Inequality, Models
 from .document import Intervals
-from .exact import quotient, root_above
+from .exact import quotient, rational, root_above
 from .local import Local
 from .near import Above, Array, Near, at_least_0, norm, size, triples
 from .ring import Motion, Moving, Ring

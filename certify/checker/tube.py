@@ -19,9 +19,9 @@ from flint import fmpq, fmpq_mat
 from . import ball
 from .ball import Ball
 from .case import Case, Failures, given
-from .decrease import Inequality, Models, are_finite, are_usable, rational
+from .decrease import Inequality, Models, are_finite, are_usable
 from .document import Multipliers
-from .exact import contains_ball, exactly, inverse_diagonal, is_definite, quotient, root_above
+from .exact import contains_ball, exactly, inverse_diagonal, is_definite, quotient, rational, root_above
 from .near import Array
 from .sections import Path, Slab
 
