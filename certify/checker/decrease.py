@@ -11,16 +11,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from flint import fmpq, fmpq_mat
 
-from .document import Multipliers
+from .document import LocalBall
 from .exact import diagonal, exactly, is_definite, rational, root_above
 from .jets import Jet, unpacked
 from .near import Array, Near, Tensor, Vector, mixed, symmetrised
 from .pairs import bound_of_pairs, in_binary64
+
+if TYPE_CHECKING:
+    from .sections import Slab
 
 OF_ONE = 16  # the weight of 1 over that of all of d: any positive number would do
 
@@ -33,6 +36,22 @@ class More(Protocol):
 
     def lengths(self, models: Models, P: fmpq_mat) -> tuple[fmpq, fmpq]:
         """Bounds of its length in the norm of P, of the part with 1, and of the part with d over ||d||."""
+
+
+@dataclass(frozen=True)
+class Multipliers:
+    """alpha, beta and g, n of each, and `weight`, (k, k), from which the others follow."""
+
+    rest: tuple[fmpq, ...]
+    apart: tuple[fmpq, ...]
+    joint: tuple[fmpq, ...]
+    weight: Array
+
+    @staticmethod
+    def of(part: LocalBall | Slab) -> Multipliers:
+        """Those of a part of the evidence."""
+        rest, apart, joint = (tuple(map(rational, row)) for row in part.multipliers.tolist())
+        return Multipliers(rest, apart, joint, part.weight)
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,12 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from flint import fmpq
 
 from .errors import Rejected
 from .expression import Tape, parse
 from .networks import Network, hashed
 from .networks import read as read_networks
-from .schema import Array, Binary64, Matrix, Value, section
+from .schema import Array, Binary64, Matrix, Value, section, shaped
 from .strict import load
 
 if TYPE_CHECKING:
@@ -65,31 +64,11 @@ class Policy:
         return hashed(heading, (*arrays, self.scale, self.offset, *(self.clip or ())), self.network.words())
 
 
-@dataclass(frozen=True)
-class Multipliers:
-    """alpha, beta and g of the inequality `decrease`, n of each, and `weight`, (k, k), from which the others follow."""
-
-    rest: tuple[fmpq, ...]
-    apart: tuple[fmpq, ...]
-    joint: tuple[fmpq, ...]
-    weight: Array
-
-
-def _three(value: Value, sizes: Mapping[str, int]) -> Three:
-    rest, apart, joint = value.array(3, sizes["n"]).tolist()
-    return _rationals(rest), _rationals(apart), _rationals(joint)
-
-
-def _rationals(row: list[float]) -> tuple[fmpq, ...]:
-    return tuple(fmpq(*v.as_integer_ratio()) for v in row)
-
-
 def _trees(value: Value, sizes: Mapping[str, int]) -> tuple[bytes, ...]:
     return value.listed(Value.octets, 2 * sizes["n"] if value.raw else 0)
 
 
-Three = tuple[tuple[fmpq, ...], tuple[fmpq, ...], tuple[fmpq, ...]]
-Rationals = Annotated[Three, _three]  # rest, apart and joint
+ThreeRows = Annotated[Array, shaped(3, "n")]  # alpha, beta and g of the inequality `decrease`
 Order = Annotated[int, lambda value, sizes: value.integer(1, sizes["order"])]
 Directions = Annotated[tuple[bytes, ...] | None, _trees]
 
@@ -100,15 +79,11 @@ class LocalBall:
     time there; with kinks, trees of directions."""
 
     J: Matrix
-    multipliers: Rationals
+    multipliers: ThreeRows
     weight: Matrix
     edge: Binary64
     order: Order
     directions: Directions = None
-
-    @property
-    def by(self) -> Multipliers:
-        return Multipliers(*self.multipliers, self.weight)
 
 
 @dataclass(frozen=True)

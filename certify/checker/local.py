@@ -13,8 +13,8 @@ from flint import fmpq_mat
 
 from .ball import Ball
 from .case import Case, Failures
-from .decrease import Inequality, Level, Models, are_finite, are_usable
-from .document import Intervals, Multipliers
+from .decrease import Inequality, Level, Models, Multipliers, are_finite, are_usable
+from .document import Intervals
 from .exact import contains_ball, exactly, fraction, is_definite, rational
 from .jets import Jet
 
@@ -58,9 +58,9 @@ class Local(Ball):
     @cached_property
     def terms(self) -> tuple[fmpq_mat, fmpq_mat, Multipliers, Level | None]:
         """P, R, the multipliers and the level of the inequality."""
-        P, by, c = exactly(self.case.c.P), self.case.local, self.case.c
-        level = None if self.at_rest else Level(rational(c.c0), rational(by.edge))
-        return P, 2 * rational(c.rate) * P, by.by, level
+        P, part, c = exactly(self.case.c.P), self.case.local, self.case.c
+        level = None if self.at_rest else Level(rational(c.c0), rational(part.edge))
+        return P, 2 * rational(c.rate) * P, Multipliers.of(part), level
 
     def inequality(self, models: Models) -> Inequality:
         return Inequality(models, *self.terms)
@@ -102,7 +102,7 @@ def fits(local: Local) -> Failures:
     """`local`: the ball contains {V <= c1}, and multipliers may be used."""
     c = local.case.c
     yield from is_large_enough(local, "levels.local", "c1", c.c1)
-    if not are_usable(local.case.local.by):
+    if not are_usable(Multipliers.of(local.case.local)):
         yield "evidence.local", "no multiplier may be negative, none of g 0 where some beta is"
     if c.step > 0 and Fraction(local.case.local.edge) * c.step > 1:
         yield "evidence.local.edge", "a step may lead out of {V <= c0}: the edge must be at most 1/h"

@@ -19,10 +19,9 @@ from .document import (
     Certificate,
     Directions,
     Intervals,
-    Multipliers,
     Order,
     Partition,
-    Rationals,
+    ThreeRows,
     certificate,
     quantity,
 )
@@ -108,13 +107,9 @@ class Slab:
     end: Matrix
     duration: Binary64
     J: Matrix
-    multipliers: Rationals
+    multipliers: ThreeRows
     weight: Annotated[Array, shaped("k", "k")]
     path: Annotated[Path | None, _path]
-
-    @property
-    def by(self) -> Multipliers:
-        return Multipliers(*self.multipliers, self.weight)
 
 
 @dataclass(frozen=True)

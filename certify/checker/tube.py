@@ -19,8 +19,7 @@ from flint import fmpq, fmpq_mat
 from . import ball
 from .ball import Ball
 from .case import Case, Failures, given
-from .decrease import Inequality, Models, are_finite, are_usable
-from .document import Multipliers
+from .decrease import Inequality, Models, Multipliers, are_finite, are_usable
 from .exact import contains_ball, exactly, inverse_diagonal, is_definite, quotient, rational, root_above
 from .near import Array
 from .sections import Path, Slab
@@ -122,7 +121,7 @@ def fits(piece: Piece) -> Failures:
         room = 1 / (1 - Fraction(path.share) ** 2)
     if not all(contains_ball(J, P, room) for P in piece.coefficients):
         yield piece.at, "the ball must contain the ellipsoids of start, middle and end"
-    if not are_all_usable(piece.slab.by, path):
+    if not are_all_usable(Multipliers.of(piece.slab), path):
         yield piece.at, "no multiplier may be negative, none of g 0 where some beta is"
     return 0
 
@@ -176,6 +175,7 @@ def padded(A: fmpq_mat, rows: int, columns: int) -> fmpq_mat:
 
 def decreases(piece: Piece) -> Failures:
     """`tube`: x'P(t)x decreases on the ball without its centre; along a path e'P(t)e where it is 1."""
+    by = Multipliers.of(piece.slab)
     for cell in piece.case.cells:
         F = piece.F(cell)
         if not are_finite(F):
@@ -184,7 +184,7 @@ def decreases(piece: Piece) -> Failures:
         models = Models(piece.J, F, piece.slab.path is None, piece.velocity)
         for corner in models.corners(piece.case.c.P):
             for P, rate in zip(piece.coefficients, piece.rates, strict=True):
-                if not inequality(corner, P, rate, piece.slab.by, piece.slab.path).holds:
+                if not inequality(corner, P, rate, by, piece.slab.path).holds:
                     yield piece.at, "the decrease of x'P(t)x is not shown"
     return 1
 

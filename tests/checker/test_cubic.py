@@ -19,8 +19,8 @@ from flint import arb, ctx, fmpq, fmpq_mat
 from certify.checker import decrease, local, tube
 from certify.checker.ball import Ball
 from certify.checker.case import Case
-from certify.checker.decrease import Models
-from certify.checker.document import Certificate, Multipliers
+from certify.checker.decrease import Models, Multipliers
+from certify.checker.document import Certificate
 from certify.checker.exact import exactly
 from certify.checker.jets import Jet as Batch
 from certify.checker.jets import Units, unpacked

@@ -21,8 +21,8 @@ from flint import arb, ctx, fmpq, fmpq_mat
 from certify.checker import tube
 from certify.checker.ball import Ball
 from certify.checker.case import Case
-from certify.checker.decrease import Models, are_finite
-from certify.checker.document import Certificate, Multipliers
+from certify.checker.decrease import Models, Multipliers, are_finite
+from certify.checker.document import Certificate
 from certify.checker.errors import Rejected
 from certify.checker.exact import exactly
 from certify.checker.sections import Path, Slab

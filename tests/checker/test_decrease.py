@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
-from certify.checker.decrease import are_finite, are_usable
-from certify.checker.document import Multipliers
+from certify.checker.decrease import Multipliers, are_finite, are_usable
 from certify.checker.exact import exactly
 from certify.reference import decrease as reference
 from certify.reference.evidence import Ball

@@ -18,8 +18,7 @@ from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 from numpy.random import Generator
 
 from certify.checker.case import Case
-from certify.checker.decrease import Level
-from certify.checker.document import Multipliers
+from certify.checker.decrease import Level, Multipliers
 from certify.checker.exact import exactly
 from certify.checker.flow import Series, enclosed
 from certify.checker.jets import Units

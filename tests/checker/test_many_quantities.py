@@ -14,8 +14,7 @@ from flint import arb, arb_mat, ctx
 from numpy.typing import NDArray
 
 from certify.checker.case import AT_CORNERS
-from certify.checker.decrease import Level, Models
-from certify.checker.document import Multipliers
+from certify.checker.decrease import Level, Models, Multipliers
 from certify.checker.exact import exactly
 from certify.checker.stepping import size_beyond
 from certify.provers.ball.models import AT_CORNERS as PRODUCER_S

@@ -24,8 +24,8 @@ from hypothesis import strategies as st
 
 from certify.checker import clauses, tube
 from certify.checker.case import Case
-from certify.checker.decrease import Models, are_finite
-from certify.checker.document import Certificate, Multipliers
+from certify.checker.decrease import Models, Multipliers, are_finite
+from certify.checker.document import Certificate
 from certify.checker.exact import exactly
 from certify.checker.sections import Path
 from certify.checker.tube import are_all_usable

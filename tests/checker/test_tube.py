@@ -29,8 +29,7 @@ from certify.certificates import checking
 from certify.checker import clauses, tube
 from certify.checker.ball import Ball
 from certify.checker.case import Case
-from certify.checker.decrease import are_finite, are_usable
-from certify.checker.document import Multipliers
+from certify.checker.decrease import Multipliers, are_finite, are_usable
 from certify.checker.errors import Rejected
 from certify.checker.exact import MAX_MATRIX_BITS, exactly, is_definite, root_above
 from certify.reference import rules as second

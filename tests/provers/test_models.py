@@ -16,6 +16,7 @@ from certify.certificates.verdict import Verdict
 from certify.checker.ball import Ball
 from certify.checker.case import Case
 from certify.checker.decrease import Models as TheirModels
+from certify.checker.decrease import Multipliers as TheirMultipliers
 from certify.checker.exact import exactly
 from certify.checker.jets import unpacked
 from certify.effort import UNIT, Effort
@@ -53,7 +54,7 @@ def test_models_and_sides_are_those_of_the_checker(name: str, tmp_path: Path) ->
     assert result.verdict is Verdict.PROVED and result.raw is not None
     c = parse(json.loads(result.raw))
     assert c.evidence.local is not None
-    J, by = c.evidence.local.J, c.evidence.local.by
+    J, by = c.evidence.local.J, TheirMultipliers.of(c.evidence.local)
     mine = paths(case_of(system, network).loop).models(J)
     assert mine.finite and mine.admitted
     with np.errstate(all="ignore"):

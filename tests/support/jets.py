@@ -15,8 +15,7 @@ import numpy as np
 from flint import arb, fmpq, fmpq_mat
 
 from certify.checker import ball, jets, pairs, ranges, tube
-from certify.checker.decrease import Inequality, Level, Models
-from certify.checker.document import Multipliers
+from certify.checker.decrease import Inequality, Level, Models, Multipliers
 from certify.checker.jets import Units
 from certify.checker.near import ZERO, Above, Cubic, Near, Square, Tensor, Vector
 from certify.checker.network import Folded
