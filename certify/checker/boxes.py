@@ -15,9 +15,9 @@ import numpy as np
 from flint import fmpq_mat
 
 from .case import Case, Failures
-from .exact import fraction
+from .exact import near_matrix
 from .expression import evaluate
-from .near import Above, Array, Form, Near, all_near, near, size
+from .near import Above, Array, Form, Near, near, size
 from .network import keep_bounds, prepare
 from .networks import Network
 from .taylor import Taylor, affine, combination, constants, pairs, upper_bound
@@ -61,11 +61,9 @@ class Boxes(ABC):
         self.calls = self.errors + self.m + self.k  # the first symbol of an entry of a call
         self.symbols = self.calls + self.c.dynamics.entries + more
         prepare(*self.networks)
-        rows = [all_near(fraction(v) for v in row) for row in S.tolist()]
-        whole, axes = np.array([row.value for row in rows]), np.eye(self.n, dtype=bool)
-        self.S = np.diag(whole)  # the diagonal
-        wrong = Above(np.array([row.error.v for row in rows]), max(row.error.k for row in rows))
-        self.S_rest = wrong + size(np.where(axes, 0.0, whole))  # bounds what S is beside it
+        whole = near_matrix(S)
+        self.S = np.diag(whole.value)  # the diagonal
+        self.S_rest = whole.error + size(whole.value - np.diag(self.S))  # bounds what S is beside it
 
     @property
     def width(self) -> int:

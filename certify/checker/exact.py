@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from .document import Policy
 from .expression import MAX_BITS
 from .functions import FUNCTIONS, Undecided
+from .near import Near, all_near
 from .networks import Affine, OnNumbers
 
 MAX_MATRIX_BITS = 2**16  # of a number in a matrix, times the matrix's size: beyond, a decision takes minutes
@@ -35,6 +36,12 @@ def exactly(array: NDArray[np.float64]) -> fmpq_mat:
 def diagonal(entries: Sequence[fmpq]) -> fmpq_mat:
     n = len(entries)
     return fmpq_mat([[entries[i] if i == j else fmpq(0) for j in range(n)] for i in range(n)])
+
+
+def near_matrix(A: fmpq_mat) -> Near:
+    """A rational matrix in binary64."""
+    a, shape = all_near(fraction(v) for v in A.entries()), (A.nrows(), A.ncols())
+    return Near(a.value.reshape(shape), a.error.shaped(*shape))
 
 
 def inverse_diagonal(A: fmpq_mat) -> list[Fraction]:

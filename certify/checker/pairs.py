@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from flint import fmpq, fmpq_mat
 
-from .exact import exactly, fraction
-from .near import Array, Near, Square, Tensor, Vector, all_near, gram, near_one
+from .exact import exactly, near_matrix
+from .near import Array, Near, Square, Tensor, Vector, gram, near_one
 
 _FARTHEST = 2.0**100  # of t from 1
 
@@ -33,7 +33,5 @@ def bound_of_pairs(p: Vector, T: Tensor, weight: Array) -> fmpq_mat:
 
 def in_binary64(A: fmpq_mat) -> tuple[Near, int]:
     """(a, e): A is a 2^e, and no entry of a exceeds 1 in magnitude."""
-    entries = [fraction(v) for v in A.entries()]
-    by = max((v.numerator.bit_length() - v.denominator.bit_length() + 1 for v in entries if v), default=0)
-    a = all_near(v / fraction(fmpq(2) ** by) for v in entries)
-    return Near(a.value.reshape(A.nrows(), A.ncols()), a.error.shaped(A.nrows(), A.ncols())), by
+    by = max((v.p.bit_length() - v.q.bit_length() + 1 for v in A.entries() if v), default=0)
+    return near_matrix(A / fmpq(2) ** by), by

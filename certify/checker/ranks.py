@@ -22,9 +22,9 @@ from flint import arb, fmpq_mat
 
 from .boxes import LEAF, Batch, batches, is_whole, middle
 from .case import Case, Failures, given
-from .exact import exactly, fraction, inverse
+from .exact import exactly, inverse, near_matrix
 from .expression import evaluate
-from .near import Above, Array, Form, Near, all_near, near, near_ball
+from .near import Above, Array, Form, Near, near, near_ball
 from .network import enclose_on_boxes
 from .periodic import is_periodic
 from .ring import Motion, Moving
@@ -152,7 +152,7 @@ class Steps(Moving):
         self.widest = [np.inf] * n
         self.order = self.ranks.order
         self.frame = np.eye(n) if self.ranks.frame is None else self.ranks.frame
-        self.back = all_near(fraction(v) for v in given(inverse(exactly(self.frame))).transpose().entries())
+        self.back = near_matrix(given(inverse(exactly(self.frame))).transpose())
         self.rank, self.count = self.ranks.numbers
         self.straight = [i for i in range(n) if i not in self.ranks.angles]  # states that are no angles
 
@@ -286,7 +286,7 @@ class Steps(Moving):
         others = Near(np.stack([v.p[kept:] for v in models]).reshape(n, -1)).through(self.frame)
         others = Near(others.value.reshape(n, -1, batch), others.error.shaped(n, -1, batch))
         more = Above(np.stack([v.r.top + 0 * v.c for v in models])).through(self.frame)
-        back = Near(self.back.value.reshape(n, n, 1), self.back.error.shaped(n, n, 1))
+        back = self.back[:, :, None]
         if self.ranks.moving:
             bound, back = turned(others, more, back)
         else:
