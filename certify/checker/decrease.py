@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import add
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -104,11 +105,11 @@ def are_usable(by: Multipliers) -> bool:
 def are_finite(F: Sequence[Jet]) -> bool:
     """True if every component has a finite model, and the sums of squares in binary64 are finite."""
     parts = [
-        part
-        for f in F
-        for part in (f.c.value, f.error.top, f.a.value, f.slack.top, f.Q.value, f.remainder, f.B.value, f.twist.top)
+        part for f in F for part in (f.c.value, f.error.top, f.a.value, f.slack.top, f.Q.value, f.remainder, f.B.value)
     ]
-    return all(np.all(np.isfinite(part)) for part in (*parts, *(norm.top for norm in F[0].units.norms)))
+    twist = reduce(add, [f.twist for f in F])  # bounds the norms of sums of the K_i, with factors up to 1
+    norms = [(twist * twist).top, *(norm.top for norm in F[0].units.norms)]
+    return all(np.all(np.isfinite(part)) for part in (*parts, *norms))
 
 
 class Inequality:

@@ -263,3 +263,11 @@ def test_what_is_not_finite_is_no_model(bad: float, part: str) -> None:
     spoilt = np.array(parts[part], float)
     spoilt[(-1,) * spoilt.ndim] = bad
     assert not are_finite([jet(**parts).model, jet(**parts | {part: spoilt}).model])
+
+
+def test_third_orders_whose_sum_overflows_are_no_models() -> None:
+    """S_cubic takes the square of the norm of sum_i b_i K_i."""
+    none, steep = np.zeros((2, 2)), np.array([1.2e154, 0.0, 0.0, 0.0])
+    one = plain(np.float64(0), 0.0, np.zeros(2), 0.0, none, none, steep).model
+    with np.errstate(over="ignore"):
+        assert are_finite([one]) and not are_finite([one, one])
