@@ -441,6 +441,7 @@ def wheel(drag: float = 0.0) -> Array:
     return np.stack([v + errors[0], u, after + errors[1]], axis=1)
 
 
+@pytest.mark.slow
 def test_the_least_factor_of_a_residual_is_no_larger_than_the_true_one(tmp_path: Path) -> None:
     """The plant has half the bound that the structure allows; what is refuted is refuted as a bound by itself."""
     rows = wheel(0.2)
@@ -487,6 +488,7 @@ def test_a_refuted_structure_says_what_its_equations_lack(tmp_path: Path, capsys
     capsys.readouterr()
 
 
+@pytest.mark.slow
 def test_a_residual_that_is_too_small_is_refuted_with_the_factor_that_is_missing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

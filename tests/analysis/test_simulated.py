@@ -231,6 +231,7 @@ def test_the_ellipsoid_stays_where_no_level_is_proved(
     assert result.diagnosis is not None and dict(result.diagnosis.next.options) == {"--candidate": "polynomial"}
 
 
+@pytest.mark.slow
 def test_what_a_proof_finds_wrong_is_taught_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A first function of which nothing is proved, as if samples had missed where it rises; the next one counts."""
     learn, functions, corrected = Learner.learn, list[Learned](), list[float]()
@@ -281,7 +282,7 @@ def test_a_plant_that_is_stiff_far_out_has_a_simulated_region(tmp_path: Path) ->
     assert Simulator(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 1e-4).farther == 0
 
 
-@pytest.mark.parametrize("system", [plant(), STEPS], ids=["outer", "ranks"])
+@pytest.mark.parametrize("system", slow_after(1, [plant(), STEPS]), ids=["outer", "ranks"])
 def test_the_ellipsoid_stays_where_the_checker_refuses_more(
     system: System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -324,6 +325,7 @@ def test_boxes_get_ranks_until_nearly_all_is_proved(in_steps: RoaResult, tmp_pat
     assert dict(alone.diagnosis.next.options) == {"--ranks": ""}
 
 
+@pytest.mark.slow
 def test_a_wider_domain_that_is_suggested_gives_what_it_promises(tmp_path: Path) -> None:
     """The domain cuts the region off at -2: beyond it lies a quarter."""
     result = proved(tmp_path, plant(lo=-2))
@@ -336,6 +338,7 @@ def test_a_wider_domain_that_is_suggested_gives_what_it_promises(tmp_path: Path)
     assert wider.outer.volume > 0.9 * promised * result.outer.volume
 
 
+@pytest.mark.slow
 def test_centring_is_suggested_only_where_it_gains(tmp_path: Path) -> None:
     """From the plain policy's equilibrium as much converges as from the operating point of the centred one, and all of
     it to one equilibrium; under the weaker claim alone centring gains the stronger one."""

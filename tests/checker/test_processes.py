@@ -96,7 +96,7 @@ def test_every_refused_leaf_is_named_if_that_is_asked_for(
 
 
 @pytest.mark.parametrize("jobs", slow_after(1, [3, 2, 7]))
-@pytest.mark.parametrize("name", slow_after(8, HONEST))
+@pytest.mark.parametrize("name", slow_after(4, HONEST))
 def test_several_processes_find_what_one_finds(name: str, jobs: int) -> None:
     one, several = (rules.check(parse(honest(name)), count) for count in (1, jobs))
     assert several == one and list(several.rules) == list(one.rules)

@@ -341,7 +341,12 @@ def test_who_follows_it_gets_more(
     ("more", "changed", "proves"),
     [
         (["--from", "p=1.6..3,v=0", "--effort", "0.003"], {"--effort": "0.03"}, True),
-        (["--from", "p=1.6..3,v=0", "--effort", "1"], {"--from": "p=1.95..2.65,v=0"}, True),
+        pytest.param(
+            ["--from", "p=1.6..3,v=0", "--effort", "1"],
+            {"--from": "p=1.95..2.65,v=0"},
+            True,
+            marks=pytest.mark.slow,
+        ),
         (["--from", "p=1.6..3,v=0", "--effort", "2", "--time-limit", "1e-9"], {"--time-limit": "1e-08"}, False),
         (["--effort", "1e-7"], {"--effort": "1e-06"}, False),
     ],
@@ -371,6 +376,7 @@ def test_a_search_whose_effort_ended_says_so_and_what_to_try(
         assert status == 0 and after["verdict"] == "PROVED"
 
 
+@pytest.mark.slow
 def test_a_search_that_proves_boxes_says_where_more_effort_finds_more(
     loop_words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -321,6 +321,7 @@ def test_an_imported_policy_reads_what_its_file_reads(
     assert status == 2 and not out and message in err and "Import its file again" in err
 
 
+@pytest.mark.slow
 def test_a_policy_of_deviations_goes_with_another_operating_point(run: Run) -> None:
     torch.save({"0.weight": torch.tensor([[-1.0, -1.0]]), "0.bias": torch.zeros(1)}, "gain.pt")
     Path("moved.toml").write_text(MOVED)

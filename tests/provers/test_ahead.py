@@ -243,7 +243,9 @@ def by_arrival(name: str, patched: pytest.MonkeyPatch) -> None:
         patched.setattr(Ahead, "_forget", still_known)
 
 
-@pytest.mark.parametrize(("name", "case"), [("order", "two states"), ("count", "sampled"), ("levels", "violated")])
+@pytest.mark.parametrize(
+    ("name", "case"), slow_after(1, [("order", "two states"), ("count", "sampled"), ("levels", "violated")])
+)
 def test_what_hangs_on_arrival_would_show(name: str, case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The order of boxes, the count of effort, and bounds that were made for levels of before."""
     by_arrival(name, monkeypatch)

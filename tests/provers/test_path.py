@@ -151,6 +151,7 @@ def test_the_widest_tube_stays_below_what_is_attracted() -> None:
     assert 1.65 < reach < ATTRACTED
 
 
+@pytest.mark.slow
 def test_a_saddle_beside_the_path_bounds_the_width() -> None:
     """From close to the edge of what is attracted the tube is narrower than the way to the edge."""
     loop, goal = ClosedLoop(*scalar_tanh()), np.array([[1 / 0.3**2]])

@@ -389,6 +389,7 @@ def test_a_tube_that_the_checker_refuses_is_left_out(tmp_path: Path, monkeypatch
     assert result.stop is not Stop.STALLED and "left out with its tube" in (result.notice or "")
 
 
+@pytest.mark.slow
 def test_a_policy_that_is_not_centred_has_no_tube(tmp_path: Path) -> None:
     network = replace(pendulum_network(), centre="none")
     result = certify_roa(get_system("pendulum"), network, tmp_path, RoaOptions(enlarge=True, effort=0.03))

@@ -426,6 +426,7 @@ def test_the_inputs_on_a_slab() -> None:
         assert (verdict.rule, verdict.at) == (place and "inputs", place), verdict.detail
 
 
+@pytest.mark.slow
 def test_a_clip_must_not_act_on_a_slab() -> None:
     """Where the input is far from 0 the clip is seen from there, and not from u_eq."""
     reach = [float((abs(u.v) + u.radius).upper()) for u in inputs_of(swing_of())]

@@ -159,6 +159,7 @@ def test_flattening_is_not_suggested_to_whom_it_cannot_help(tmp_path: Path) -> N
         assert not diagnose(replace(short, network=network), RoaOptions(), None).next.flattens
 
 
+@pytest.mark.slow
 def test_a_policy_of_another_program_is_imported_before_it_is_flattened(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

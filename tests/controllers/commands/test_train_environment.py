@@ -277,6 +277,7 @@ def test_gymnasium_s_own_pendulum(tmp_path):
 REPORT = ["--noise", "1e-9", "--second", "v=0.05*p**2"]
 
 
+@pytest.mark.slow
 def test_a_report_has_guaranteed_ranges_of_what_was_learned(world, tmp_path):
     """They hold the true A and B, and the gain that the true plant would have."""
     out, report = tmp_path / "p.pt", tmp_path / "p.json"

@@ -104,6 +104,7 @@ def test_a_plant_without_initial_states_is_monitored_without_a_simulation(short)
         _settle(trainer.sac.actor.network(), system=system)
 
 
+@pytest.mark.slow
 def test_the_command_shows_and_writes_them_and_a_resumed_run_writes_the_same(tmp_path):
     def run(name, *more):
         path = tmp_path / f"{name}.csv"
