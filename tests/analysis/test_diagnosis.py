@@ -45,6 +45,7 @@ def pendulum_result(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
     return certify_roa(get_system("pendulum"), network, tmp_path_factory.mktemp("pendulum"), LITTLE)
 
 
+@pytest.mark.slow
 def test_a_wider_domain_that_is_suggested_gives_a_larger_set(pendulum_result: RoaResult, tmp_path: Path) -> None:
     """Both sides of the domain bind, so this very V reaches no further: another one does, and the run finds it."""
     assert pendulum_result.diagnosis is not None

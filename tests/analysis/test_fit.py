@@ -449,6 +449,7 @@ def test_scattered_samples(asked: list[str], capsys: pytest.CaptureFixture[str])
     assert f"try next     {len(data['missing'])} more, at points that --json names" in said
 
 
+@pytest.mark.slow
 def test_more_samples_where_they_are_missing_help_as_much_as_is_said(asked: list[str], tmp_path: Path) -> None:
     def found() -> Fitted:
         return fit_plant(Path(asked[1]), Path(asked[3]), lambda _: Fraction(1, 10**9), tmp_path / "out").found[0]
@@ -750,6 +751,7 @@ def test_the_error_may_count_more_near_the_origin(
     assert _run([*asked, "--near-origin", "-1"], False) == 2
 
 
+@pytest.mark.slow
 def test_two_that_are_of_other_plants_are_not_joined_in_words(
     certified: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -762,6 +764,7 @@ def test_two_that_are_of_other_plants_are_not_joined_in_words(
     assert "of every plant that is one of both" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_two_of_other_samples_are_not_joined_in_words(certified: Path) -> None:
     """Both state the same sha256, which nobody compares with the numbers; in the second those are others where no slope
     rests on them. A function near these is far from the samples of the first, and that claims nothing of it."""

@@ -113,6 +113,7 @@ def test_axes_are_much_closer_than_ranges(found_in: dict[str, certify.IdentifyRe
     assert plain.ranges == found.ranges
 
 
+@pytest.mark.slow
 def test_axes_that_do_not_hold_all_that_is_left_go(
     tmp_path: Path, found_in: dict[str, certify.IdentifyResult], monkeypatch: pytest.MonkeyPatch
 ) -> None:

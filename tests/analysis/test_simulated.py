@@ -187,6 +187,7 @@ def test_an_ellipsoid_alone_is_suggested_to_go_on(tmp_path: Path) -> None:
     assert result.diagnosis is not None and dict(result.diagnosis.next.options) == {"--candidate": "auto"}
 
 
+@pytest.mark.slow
 def test_constraints_are_kept_beyond_the_ellipsoid(by_default: RoaResult, tmp_path: Path) -> None:
     """The wall takes states from the set and from the simulated region, by whose share the run went on."""
     result, everything = proved(tmp_path, keep="wall: x <= 0.4"), by_default.simulated
@@ -196,6 +197,7 @@ def test_constraints_are_kept_beyond_the_ellipsoid(by_default: RoaResult, tmp_pa
     assert (result.simulated.share or 0.0) > 0.6
 
 
+@pytest.mark.slow
 def test_an_ellipsoid_that_is_most_of_it_is_enough(tmp_path: Path) -> None:
     """The certificate is then the very one of the ellipsoid alone, and nothing is learned."""
     network = load_policy(POLICIES / "pendulum.pt").network
@@ -303,6 +305,7 @@ def test_the_ellipsoid_stays_where_the_checker_refuses_more(
     assert result.simulated is not None and (result.simulated.share or 0.0) < 0.7
 
 
+@pytest.mark.slow
 def test_a_ring_that_is_cut_for_more_is_resumed_without_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All of the effort is kept for what lies beyond, which then is not wanted: the ring takes it after all."""
     network = load_policy(POLICIES / "pendulum.pt").network

@@ -494,6 +494,7 @@ def test_a_check_without_memory_ends_without_a_verdict(
     assert "more memory than there is" in said.err and "error" in json.loads(said.out)
 
 
+@pytest.mark.slow
 def test_the_reference_ends_after_seconds_without_a_verdict(tmp_path: Path) -> None:
     """A true certificate of 65,536 leaves; all that is asked about, and of one leaf, needs less than a minute."""
     path = write(with_tree(honest("scalar"), uniform([0], 16)), tmp_path)

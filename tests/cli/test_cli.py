@@ -351,6 +351,7 @@ def test_the_policy_may_be_the_first_word(tmp_path: Path, capsys: pytest.Capture
         assert status == 2 and f"a policy file must be named, as in certify {command} policy.pt" in err
 
 
+@pytest.mark.slow
 def test_what_to_try_next_names_a_policy_that_was_the_first_word(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -681,6 +682,7 @@ def test_reach_proves_that_a_box_converges(
     assert status == 0 and re.search(r"box +p = 1.49..1.51 m, v = 1.38..1.42 m/s", out)
 
 
+@pytest.mark.slow
 def test_a_box_that_is_wider_than_every_tube_is_not_shown_to_converge(
     tmp_path: Path, spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:

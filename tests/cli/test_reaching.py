@@ -83,6 +83,7 @@ def test_a_box_that_gets_there(asked: list[str], tmp_path: Path, capsys: pytest.
     assert "steps to the region" in (tmp_path / "set.svg").read_text("utf-8")
 
 
+@pytest.mark.slow
 def test_into_a_certified_set(asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     loop, known = asked[1:5], str(tmp_path / "known")
     assert (
@@ -128,6 +129,7 @@ def test_constraints_are_kept_until_then(asked: list[str], capsys: pytest.Captur
     assert "(kept along every trajectory from there until the region is reached: " in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_pictures_show_where_a_constraint_is_violated(
     asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

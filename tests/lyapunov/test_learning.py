@@ -352,6 +352,7 @@ def test_rounds_are_told_and_end_with_the_effort() -> None:
     assert tuple(told) == found.history and len(found.history) == 1
 
 
+@pytest.mark.slow
 def test_a_set_inside_of_a_narrow_domain_keeps_off_its_faces() -> None:
     loop = disc(0.8)
     found = learn(loop, UNIT, 0.09, (8,))

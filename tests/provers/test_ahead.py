@@ -153,6 +153,7 @@ def test_so_it_is_whoever_comes_and_goes(name: str) -> None:
     assert not found and answered > 30
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["uncertain", pytest.param("sampled", marks=SLOW)])
 def test_so_it_is_on_the_way_inwards(name: str) -> None:
     make, inner, outer = CASES[name]
@@ -166,6 +167,7 @@ def test_so_it_is_on_the_way_inwards(name: str) -> None:
     assert not found and answered > 30 and Stop.EFFORT in stops and len(stops) > 1
 
 
+@pytest.mark.slow
 def test_so_it_is_of_a_set_beyond_the_ellipsoid() -> None:
     """The effort ends on a face, and in the middle of the leaves, with a smaller set."""
     problem, N = planar(), wells([[1.0, 0.0], [-0.5, 0.875], [-0.5, -0.875]], 0.75)

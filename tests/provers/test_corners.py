@@ -331,6 +331,7 @@ def test_drag_of_the_wrong_sign_is_proved_up_to_where_it_turns(time: str, tmp_pa
         assert beyond.verdict is not Verdict.PROVED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("claim", slow_after(1, ["nearby", "asymptotic", "practical"]))
 def test_drag_at_rest_is_proved_with_ranges(claim: str, tmp_path: Path) -> None:
     """The corner moves with w in the last two, so that the loop does not rest at the origin."""
@@ -340,6 +341,7 @@ def test_drag_at_rest_is_proved_with_ranges(claim: str, tmp_path: Path) -> None:
     assert result.verdict is Verdict.PROVED
 
 
+@pytest.mark.slow
 def test_a_corner_of_a_held_input_at_rest_costs_the_ball_nothing(tmp_path: Path) -> None:
     """The input does not change within a period, and so the series in time is known."""
     system = plant("p v", "v", "-p - v + u*abs(u)").with_sample(TENTH)

@@ -143,6 +143,7 @@ def test_a_tube_leads_from_what_is_attracted_and_from_nothing_else(x: float, fou
     assert found or "leaves the domain" in why or "not arrived" in why or "cannot be continued" in why
 
 
+@pytest.mark.slow
 def test_the_widest_tube_stays_below_what_is_attracted() -> None:
     loop, goal = ClosedLoop(*scalar_tanh()), np.array([[1 / 0.3**2]])
     best, _ = surround(loop, np.array([1.5]), goal, {"one": np.eye(1)}, Effort(20 * UNIT))

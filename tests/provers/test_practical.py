@@ -153,6 +153,7 @@ def _check_planted(seed: int) -> bool:
     return inside
 
 
+@pytest.mark.slow
 def test_planted_violations_between_the_levels_are_never_proved() -> None:
     assert sum(_check_planted(seed) for seed in range(2)) >= 1
 

@@ -375,6 +375,7 @@ def test_a_box_must_name_states(tmp_path: Path) -> None:
         certify_roa(get_system("pendulum"), load_policy(POLICIES / "pendulum.pt").network, tmp_path, options)
 
 
+@pytest.mark.slow
 def test_a_tube_that_the_checker_refuses_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A careless producer ends with what is proved without it."""
 

@@ -452,6 +452,7 @@ def test_a_function_that_vanishes_does_so_in_its_box() -> None:
     assert verdicts(edited(data, f"{F}.vanishes", True)) == REFUSED
 
 
+@pytest.mark.slow
 def test_there_are_as_many_samples_as_may_be() -> None:
     c, shown = document.read(dumped(far())), far()["evidence"]["samples"]
 

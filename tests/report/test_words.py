@@ -124,6 +124,7 @@ def test_a_set_that_cannot_be_seen_is_in_no_legend(beside: RoaResult) -> None:
     assert any("inner set" in key.text for key in keys(seen, runs_from(seen, starts(seen)), None, False))
 
 
+@pytest.mark.slow
 def test_flattening_is_suggested_where_bounds_see_bends_and_little_is_proved(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

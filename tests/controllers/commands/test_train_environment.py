@@ -159,6 +159,7 @@ def test_a_policy_and_guaranteed_ranges_without_equations(world, tmp_path):
     assert load_policy(again).network.sha256() == policy.network.sha256()
 
 
+@pytest.mark.slow
 def test_a_plant_that_rests_elsewhere_is_learned_in_deviations(world, tmp_path):
     """The data have the plant's own values, and at rest the policy gives its input there."""
     out, data = tmp_path / "p.pt", tmp_path / "data.csv"

@@ -42,6 +42,7 @@ def _settle(network, options=MONITORING, system=PENDULUM):
     return settle(network, system, chosen.dt, *weights, options)
 
 
+@pytest.mark.slow
 def test_evaluations_come_on_time_and_at_the_end_and_change_nothing(short):
     trainer = Trainer(PENDULUM, short)
     watched = train(trainer, evaluate_every=100)
