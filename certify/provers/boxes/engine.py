@@ -17,7 +17,7 @@ from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
 from certify.provers.ball.local import corners_in_a_period, local_ball, prove_band, prove_local
 from certify.provers.ball.models import meets_corner, paths
-from certify.provers.base import FEW, Attempt, Budget, Engine, Once, Proof, Report, SearchState, Task
+from certify.provers.base import FEW, MANY, Attempt, Budget, Engine, Once, Proof, Report, SearchState, Task
 from certify.provers.boxes.search import Pass, RingProof, empty_ring, outwards, prove_inwards, prove_outwards
 from certify.provers.execution import Runner
 from certify.provers.falsify import Band, Witness, survey
@@ -75,12 +75,13 @@ class BoundsEngine(Engine):
         if found is None:
             return None
         (floor, inner), stop = found, None
-        if inner < task.target:
+        if inner < task.target and (task.exactly or len(self.T) <= MANY):
             grown = outwards(task.problem, self.T, inner, task.target, self.runner)
             stop = grown.advance(budget, report)
             ring = grown.proof(stop)
         else:
             ring = empty_ring(task.problem, self.T, inner)
+            stop = None if inner >= task.target else Stop.EFFORT
         claim = Practical(roa=ring.outer, local=inner, floor=floor, **_beside(task.problem))
         return self.stated(task.problem, ring, claim, {"ring": time.perf_counter() - start})
 
