@@ -383,6 +383,37 @@ def test_files_of_numbers(tmp_path: Path) -> None:
             import_policy(tmp_path / "odd.npz", PLANT, LAYERS)
 
 
+CHAINS: dict[str, tuple[tuple[str, ...], str, tuple[str, ...]]] = {
+    "tianshou": (
+        ("pre.model.0", "pre.model.2", "mu.model.0"),
+        "pre.model,mu.model",
+        ("sigma_param", "critic.0.weight"),
+    ),
+    "a layer behind": (("pi.net.0", "pi.net.2", "pi.mu"), "pi.net,pi.mu", ("pi.log_std.weight", "q1.q.0.weight")),
+    "a layer before": (("first", "net.1", "net.3"), "first,net", ()),
+}
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_a_prefix_may_be_of_several_layers(name: str, tmp_path: Path) -> None:
+    names, prefix, others = CHAINS[name]
+    torch.manual_seed(1)
+    layers = [nn.Linear(2, 6), nn.Linear(6, 5), nn.Linear(5, 1)]
+    net = nn.Sequential(layers[0], nn.ReLU(), layers[1], nn.ReLU(), layers[2])
+    tensors = {
+        f"{k}.{p}": getattr(one, p).detach() for k, one in zip(names, layers, strict=True) for p in ("weight", "bias")
+    }
+    torch.save({name: torch.ones(1, 5) for name in others} | tensors, tmp_path / "p.pt")
+    with pytest.raises(InputError, match=rf"name both: --prefix {prefix}\. If"):
+        import_policy(tmp_path / "p.pt", PLANT, LAYERS)
+    for wrong in (f"{prefix},{names[1]}", f"{prefix},none", f"{names[0]},{names[0]}"):
+        with pytest.raises(InputError, match=r"name each layer once, or the keys of some up to their numbers"):
+            import_policy(tmp_path / "p.pt", PLANT, replace(LAYERS, prefix=wrong))
+    found = import_policy(tmp_path / "p.pt", PLANT, replace(LAYERS, prefix=prefix))
+    agree(found.policy, net)
+    assert set(found.not_read) == set(others)
+
+
 def test_arrays_that_do_not_say_which_way_they_go_are_listed(tmp_path: Path) -> None:
     arrays = {"fc1_w": np.ones((2, 2)), "fc1_b": np.ones(2), "mean": np.ones(2), "stddev": np.ones(2)}
     np.savez(tmp_path / "p.npz", **arrays)
@@ -506,8 +537,9 @@ def test_the_places_of_the_actions_in_what_the_last_layer_gives(tmp_path: Path) 
     torch.save(module.state_dict(), tmp_path / "p.pt")  # found by its sizes
     found = import_policy(tmp_path / "p.pt", PLANT, replace(BRAX, output="2", prefix=None))
     agree(found.policy, module.float(), lambda y: torch.tanh(y[:, 2:3]))
-    with pytest.raises(InputError, match=r"--output 4 takes the numbers 4 of .*; it gives 4"):
-        import_policy(path, PLANT, replace(BRAX, output="4"))
+    for each, prefix in ((path, BRAX.prefix), (tmp_path / "p.pt", None)):
+        with pytest.raises(InputError, match=r"--output 4 takes the numbers 4 of .*; it gives 4"):
+            import_policy(each, PLANT, replace(BRAX, output="4", prefix=prefix))
     for said in ("", "-1", "0,2", "0,0", "0,00", "1.0", "first", "\u0662"):
         with pytest.raises(InputError, match="must be mean, or the place of each of 1 actions"):
             import_policy(path, PLANT, replace(BRAX, output=said))

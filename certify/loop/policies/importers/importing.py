@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -226,11 +227,15 @@ def _record(
 
 def _read_of(options: ImportOptions, plant: System, words: str) -> dict[str, Any]:
     """The plant's facts that are in the policy's numbers: its operating point where the network reads the states'
-    values, and its observations where it reads these. Used with a plant that has others, it is another policy."""
+    values, its observations where it reads these, and its parameters that `--states` names. Used with a plant that has
+    others, it is another policy."""
     own = bool(plant.observations) and options.states is None
-    if options.observes == "deviation" and not own:
-        return {}
-    return {"x_eq": [str(q) for q in plant.exact_x_eq()]} | ({"observations": words} if own else {})
+    named = {name for text in options.states or () for name in re.findall(r"[A-Za-z_]\w*", text)}
+    parameters = {name: str(value) for name, value in plant.parameters.items() if name in named}
+    read: dict[str, Any] = {"parameters": parameters} if parameters else {}
+    if options.observes != "deviation" or own:
+        read["x_eq"] = [str(q) for q in plant.exact_x_eq()]
+    return read | ({"observations": words} if own else {})
 
 
 def _require_answers(kind: Content, reading: Reading, options: ImportOptions, plant: System) -> None:

@@ -306,19 +306,25 @@ def _to_actions(layers: Layers, m: int, options: ImportOptions) -> Layers:
 
 
 def _numbered(tensors: Mapping[str, Numbers], names: Sequence[str]) -> dict[str, Numbers]:
-    """The tensors with the layers of these names, in their order, numbered under one prefix.
+    """The tensors with the layers of these names, or of these prefixes of numbered layers, in their order, numbered
+    under one prefix.
 
     Raises
     ------
-    InputError : a name is none of a layer, or stands there twice.
+    InputError : a name is none of layers, or a layer stands there twice.
     """
-    wrong = [name for name in names if f"{name}.weight" not in tensors]
-    if wrong or len(set(names)) != len(names):
+    groups, places, count = _groups(tensors), dict[str, int](), 0
+    for name in names:
+        inside = {f"{name}.{k}": k for k in _numbers(tensors, name)} if name in groups else {name: 0}
+        start, count = max(places.values(), default=-1) + 1, count + len(inside)
+        places |= {layer: start + k for layer, k in inside.items()}
+    if len(places) < count or any(f"{layer}.weight" not in tensors for layer in places):
         raise InputError(
-            f"--prefix with commas must name each layer once, in their order; found {','.join(names)}. "
-            f"Layers are {', '.join(_weights(tensors).values()) or 'none'}.{_without_norm(tensors)}"
+            "--prefix with commas must name each layer once, or the keys of some up to their numbers, in their order; "
+            f"found {','.join(names)}. Layers are {', '.join(_weights(tensors).values()) or 'none'}."
+            f"{_without_norm(tensors)}"
         )
-    parts = {f"{name}.{part}": f"{_LISTED}.{k}.{part}" for k, name in enumerate(names) for part in ("weight", "bias")}
+    parts = {f"{name}.{part}": f"{_LISTED}.{k}.{part}" for name, k in places.items() for part in ("weight", "bias")}
     return {parts.get(name, name): tensor for name, tensor in tensors.items()}
 
 
@@ -339,35 +345,63 @@ def _groups(tensors: Mapping[str, Numbers]) -> list[str]:
 
 
 def _only(tensors: Mapping[str, Numbers], n: int, m: int, options: ImportOptions) -> str:
-    """The one prefix whose layers lead from n to m and that no name calls a critic."""
-    described = []
-    fitting = []
-    for prefix in _groups(tensors):
-        numbers = _numbers(tensors, prefix)
-        first, last = tensors[f"{_dot(prefix)}{numbers[0]}.weight"], tensors[f"{_dot(prefix)}{numbers[-1]}.weight"]
-        described.append(f"{prefix or 'no prefix'}: {first.shape[-1]} to {last.shape[0] if last.ndim else 0}")
-        fits = first.shape[-1:] == (n,) and last.ndim > 0 and _gives(last.shape[0], m, options)
-        if fits and not _of_another(prefix):
-            fitting.append(prefix)
-    if len(fitting) == 1:
-        return fitting[0]
-    listed = "; ".join(described)
-    if not described:
+    """The one prefix whose layers lead from n to m and that no name calls a critic.
+
+    With `--output` it is also one that gives other numbers than that takes, about which there is more to say.
+    """
+    ends = _ends(tensors)
+    own = [prefix for prefix, (reads, _) in ends.items() if reads == n and not _of_another(prefix)]
+    fitting = [prefix for prefix in own if _gives(ends[prefix][1], m, options)]
+    if len(fitting) == 1 or (not fitting and len(own) == 1 and options.output is not None):
+        return (fitting or own)[0]
+    listed = "; ".join(f"{prefix or 'no prefix'}: {reads} to {gives}" for prefix, (reads, gives) in ends.items())
+    if not ends:
         layers = _weights(tensors)
         named, order = ", ".join(layers.values()), ",".join(name for name in layers if not _of_another(name))
         listed = f"layers without a number, {named}: name them in their order, as in --prefix {order or 'fc1,fc2'}"
         needed = (
-            "PREFIX.NUMBER.weight (out, in) and PREFIX.NUMBER.bias, or of numpy kernel (in, out) instead of weight; a "
-            "gain K, u = -K x, is one layer, 0.weight = -K"
+            "PREFIX.NUMBER.weight (out, in) and PREFIX.NUMBER.bias, or of numpy kernel (in, out) instead of weight; "
+            'write others so, numpy.savez("policy.npz", **{"0.weight": W, "0.bias": b}) with every layer, or W.T if W '
+            "is (in, out); a gain K, u = -K x, is one layer, 0.weight = -K"
         )
         shapes = ", ".join(f"{name} {tensor.shape}" for name, tensor in islice(tensors.items(), _MOST_LISTED))
         listed = listed if named else f"none in {shapes or 'no tensors'} (layers must be called {needed})"
+    elif joined := _joined(tensors, n, m, options):
+        listed += f"; if {joined.replace(',', ' leads to ')}, name both: --prefix {joined}"
     raise InputError(
         f"a file must hold one policy from {n} states to {m} inputs; it holds {len(fitting)}. "
         f"Name its keys up to their numbers with --prefix, and its states with --states. Found {listed}. "
         "If the policy is more than layers one behind the other, export it as TorchScript or ONNX."
         f"{_without_norm(tensors)}"
     )
+
+
+def _ends(tensors: Mapping[str, Numbers]) -> dict[str, tuple[int, int]]:
+    """The numbers that the first of some numbered layers reads and the last one gives, by their prefixes."""
+    found = {}
+    for prefix in _groups(tensors):
+        numbers = _numbers(tensors, prefix)
+        first, last = (tensors[f"{_dot(prefix)}{numbers[k]}.weight"].shape for k in (0, -1))
+        found[prefix] = first[-1] if first else 0, last[0] if last else 0
+    return found
+
+
+def _joined(tensors: Mapping[str, Numbers], n: int, m: int, options: ImportOptions) -> str | None:
+    """Two prefixes of numbered layers, or layers without a number, with a comma between them, of which the one leads
+    from n numbers to those that the other takes to m actions; None if there are no such two, or several."""
+    ends = _ends(tensors)
+    numbered = {f"{_dot(prefix)}{k}" for prefix in ends for k in _numbers(tensors, prefix)}
+    weights = {name.removesuffix(".weight"): w for name, w in tensors.items() if name.endswith(".weight")}
+    plain = {name: (w.shape[1], w.shape[0]) for name, w in weights.items() if w.ndim == 2 and name not in numbered}
+    known = {name: pair for name, pair in {**ends, **plain}.items() if name and not _of_another(name)}
+    found = [
+        f"{first},{last}"
+        for first, (reads, between) in known.items()
+        for last, (then, gives) in known.items()
+        if first != last and reads == n and then == between and _gives(gives, m, options)
+        if known_by_name(f"{last}.weight", tensors, first, m) is None
+    ]
+    return found[0] if len(found) == 1 else None
 
 
 def _of_another(name: str) -> bool:
