@@ -179,7 +179,7 @@ def import_bytes(
     return Imported(
         policy=Policy(network, plant.name, _parameters(plant), {"imported": record}, reading.beta, valid),
         words=reading.words,
-        formula=_formula(normaliser, network, folded, reading, own, u_eq),
+        formula=_formula(normaliser, network, folded, reading, own if reading.program is not None else centre, u_eq),
         difference=difference,
         compared_with=reading.program,
         assumed=reading.assumed,
@@ -425,7 +425,7 @@ def _formula(
     centred: Centre,
     u_eq: Sequence[Fraction],
 ) -> str:
-    """The file's policy, which it centres itself so, in the plant's units."""
+    """The file's policy in the plant's units, centred so by itself, or of a file without a program as it is asked."""
     offset = [float(u) for u in u_eq] if centred == "output" else folded.offset
     observation = "o"
     if normaliser:
@@ -435,7 +435,8 @@ def _formula(
     if reading.beta is not None:
         net = "net(x) - net(x_eq) + beta"
     elif centred == "preactivation":
-        net = f"{net} - net(o_eq)"
+        at_0 = any(u != Fraction(float(o)) for u, o in zip(u_eq, folded.offset, strict=True))
+        net = f"{net} - net(o_eq){' + beta' if at_0 else ''}"
     inner = f"tanh({net})" if network.squash == "tanh" else net
     if centred == "output":
         inner += f" - {inner.replace(net, 'net(o_eq)')}"
