@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
 import warnings
 import zipfile
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -341,7 +343,7 @@ def test_constants_are_exact() -> None:
 
 
 def test_files_of_numbers(tmp_path: Path) -> None:
-    """Arrays of numpy, and layers without numbers, are read as a state_dict is, a pickled module is not."""
+    """Arrays of numpy, layers without numbers, and modules that were pickled whole are read as a state_dict is."""
     policy = Policy("", nn.ReLU()).eval()
     net = nn.Sequential(policy.first, nn.ReLU(), policy.last)
     names = {"fc1": policy.first, "mean": policy.last}
@@ -360,8 +362,7 @@ def test_files_of_numbers(tmp_path: Path) -> None:
         ("flax.npz", "params.fc1,params.mean"),
     ):
         agree(import_policy(tmp_path / name, PLANT, replace(LAYERS, prefix=prefix)).policy, net)
-    with pytest.raises(InputError, match=r"is a module that was pickled whole.* traced"):
-        import_policy(tmp_path / "whole.pt", PLANT, LAYERS)
+    agree(import_policy(tmp_path / "whole.pt", PLANT, LAYERS).policy, net)
     torch.export.save(torch.export.export(net.eval(), (torch.zeros(1, 2),)), tmp_path / "program.pt2")
     with pytest.raises(InputError, match=r"is a program of torch\.export.*ONNX"):
         import_policy(tmp_path / "program.pt2", PLANT, LAYERS)
@@ -412,6 +413,84 @@ def test_a_prefix_may_be_of_several_layers(name: str, tmp_path: Path) -> None:
     found = import_policy(tmp_path / "p.pt", PLANT, replace(LAYERS, prefix=prefix))
     agree(found.policy, net)
     assert set(found.not_read) == set(others)
+
+
+def twice(module: Any, inputs: Any, output: Any) -> Any:
+    """A hook."""
+    return 2 * output
+
+
+def hooked() -> Any:
+    net = nn.Sequential(nn.Linear(2, 4), nn.Tanh(), nn.Linear(4, 1))
+    net[2].register_forward_hook(twice)
+    return net
+
+
+def layered(*between: Any, behind: tuple[Any, ...] = ()) -> Any:
+    return nn.Sequential(nn.Linear(2, 4), *between, nn.Linear(4, 1), *behind)
+
+
+TANH = replace(LAYERS, activation="tanh")
+WHOLE: dict[str, tuple[Callable[[], Any], ImportOptions]] = {
+    "plain": (lambda: layered(nn.Tanh(), nn.Dropout(0.2)), TANH),
+    "squashed": (lambda: layered(nn.Tanh(), behind=(nn.Tanh(),)), replace(TANH, squash="tanh")),
+    "the usual slope": (lambda: layered(nn.LeakyReLU()), replace(LAYERS, activation="leaky_relu")),
+    "a slope": (lambda: layered(nn.LeakyReLU(0.2)), replace(LAYERS, activation="leaky_relu:0.2")),
+    "softplus": (lambda: layered(nn.Softplus(3.0)), replace(LAYERS, activation="softplus:3")),
+    "a norm": (lambda: layered(nn.LayerNorm(4), nn.Tanh()), replace(TANH, norm="layer-before")),
+    "a class of its own": (lambda: Policy("", nn.ReLU()), replace(LAYERS, prefix="first,last")),
+}
+OTHERWISE: dict[str, tuple[Callable[[], Any], ImportOptions, str]] = {
+    "another function": (lambda: layered(nn.ReLU()), TANH, "module 1 is relu; --activation says tanh"),
+    "another end": (lambda: layered(nn.Tanh(), behind=(nn.Tanh(),)), LAYERS, "1 is tanh; --activation says relu"),
+    "no function between": (
+        lambda: nn.Sequential(nn.Linear(2, 4), nn.Linear(4, 4), nn.Tanh(), nn.Linear(4, 1)),
+        TANH,
+        "must be layers with tanh between each two",
+    ),
+    "two functions between": (lambda: layered(nn.Tanh(), nn.Tanh()), TANH, "must be layers with tanh between"),
+    "a function before": (lambda: nn.Sequential(nn.Tanh(), nn.Linear(2, 1)), TANH, "must be layers with tanh between"),
+    "an end that is not said": (lambda: layered(nn.Tanh(), behind=(nn.Tanh(),)), TANH, "behind the last nothing or"),
+    "a slope that is not said": (lambda: layered(nn.LeakyReLU(0.2)), replace(LAYERS, activation="leaky_relu"), r"0\.2"),
+    "another slope": (lambda: layered(nn.LeakyReLU(0.2)), replace(LAYERS, activation="leaky_relu:0.1"), r"slope 0\.2"),
+    "a threshold": (lambda: layered(nn.Softplus(1, 2)), replace(LAYERS, activation="softplus:1"), "Softplus, of which"),
+    "a module that is not read": (lambda: layered(nn.Tanh(), behind=(nn.Softmax(-1),)), TANH, "Softmax, of which no"),
+    "a norm without numbers": (
+        lambda: layered(nn.LayerNorm(4, elementwise_affine=False), nn.Tanh()), TANH, "LayerNorm, of which no",
+    ),
+    "another epsilon": (
+        lambda: layered(nn.LayerNorm(4, eps=0.1), nn.Tanh()), replace(TANH, norm="layer-before"), "with --norm-eps",
+    ),
+    "a hook": (hooked, TANH, "must have no hooks"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_modules_that_were_pickled_whole(name: str, tmp_path: Path) -> None:
+    """In each form of torch.save and of pickle, and beside another network in a dictionary."""
+    torch.manual_seed(3)
+    module, path = WHOLE[name][0]().eval(), tmp_path / "p.pt"
+    options = WHOLE[name][1]
+    for k in range(4):
+        if k < 2:
+            torch.save(module, path, _use_new_zipfile_serialization=bool(k))
+        else:
+            path.write_bytes(pickle.dumps(module if k == 2 else {"critic": nn.Sequential(nn.ReLU()), "pi": module}))
+        prefix = options.prefix if k < 3 or options.prefix is None else "pi.first,pi.last"
+        found = import_policy(
+            path, PLANT, replace(options, prefix=prefix, ignore=("*mean", "*var", "*most") if prefix else None)
+        )
+        agree(found.policy, module)
+        assert "forward is not in the file" in found.assumed
+        module.float()
+
+
+@pytest.mark.parametrize("name", OTHERWISE)
+def test_modules_that_are_not_what_is_said_are_refused(name: str, tmp_path: Path) -> None:
+    made, options, message = OTHERWISE[name]
+    torch.save(made(), tmp_path / "p.pt")
+    with pytest.raises(InputError, match=message):
+        import_policy(tmp_path / "p.pt", PLANT, options)
 
 
 def test_arrays_that_do_not_say_which_way_they_go_are_listed(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from certify.loop.files.arrays import Numbers
 from certify.loop.files.barepickle import BEGINNING as BARE
 from certify.loop.files.foreign import described
 from certify.loop.files.legacy import BEGINNING
+from certify.loop.files.pickles import Call
 from certify.loop.files.torchfile import TorchFile
 from certify.loop.policies.file import is_text
 from certify.loop.policies.importers.onnx_graph import read_onnx
@@ -54,7 +55,7 @@ def content_of(raw: bytes, name: str) -> Content | None:
             return "policy"
         if isinstance(said, str) and said.startswith(_LYAPUNOV):
             raise InputError("it must hold a policy; it is a Lyapunov function of this program.")
-        return "two-stage" if is_two_stage(load_tensors(raw, name, file)) else "state-dict"
+        return "two-stage" if is_two_stage(load_tensors(raw, name, file, modules={})) else "state-dict"
     if name.endswith(".onnx"):
         return "onnx"
     if name.endswith(".safetensors") or raw[4:9] == b"\0\0\0\0{":
@@ -91,7 +92,7 @@ def read_kind(
     folder: Path | None,
     beside: str | None,
 ) -> Reading:
-    parameters = parameters_of(options.activation or "")
+    parameters, modules = parameters_of(options.activation or ""), dict[str, Call]()
     readers: dict[Content, Callable[[], Reading]] = {
         "sb3": lambda: read_sb3(Archive(raw, name), name, options.ignore),
         "torchscript": lambda: read_torchscript(TorchFile(raw, name), n, options.output),
@@ -100,7 +101,9 @@ def read_kind(
             read_state_dict(tensors_in(kind, raw, name, parameters), options, n, m, beside), raw
         ),
         "two-stage": lambda: read_two_stage(tensors_in(kind, raw, name), options),
-        "state-dict": lambda: read_state_dict(tensors_in(kind, raw, name, parameters), options, n, m, beside),
+        "state-dict": lambda: read_state_dict(
+            tensors_in(kind, raw, name, parameters, modules), options, n, m, beside, modules
+        ),
     }
     return readers[kind]()
 
@@ -117,9 +120,17 @@ def _with_texts(reading: Reading, raw: bytes) -> Reading:
     return replace(reading, unread={**reading.unread, METADATA: f"texts, from which nothing is taken: {said}"})
 
 
-def tensors_in(kind: Content, raw: bytes, name: str, also: re.Pattern[str] | None = None) -> dict[str, Numbers]:
-    """The tensors of a state_dict or two-stage file, of safetensors or npz, by their names; `also` as in
+def tensors_in(
+    kind: Content,
+    raw: bytes,
+    name: str,
+    also: re.Pattern[str] | None = None,
+    modules: dict[str, Call] | None = None,
+) -> dict[str, Numbers]:
+    """The tensors of a state_dict or two-stage file, of safetensors or npz, by their names; `also` and `modules` as in
     `load_tensors`."""
     if raw.startswith(b"PK") and is_npz(Archive(raw, name)):
         return load_npz(raw, name)
-    return load_safetensors(raw, name, also) if kind == "safetensors" else load_tensors(raw, name, also=also)
+    if kind == "safetensors":
+        return load_safetensors(raw, name, also)
+    return load_tensors(raw, name, also=also, modules=modules)

@@ -15,6 +15,8 @@ import numpy as np
 
 from certify.errors import InputError
 from certify.loop.files.arrays import Numbers
+from certify.loop.files.pickles import Call
+from certify.loop.policies.importers.modules import require_said
 from certify.loop.policies.importers.normalisers import normaliser_root, rsl_normaliser
 from certify.loop.policies.importers.operations import WITHOUT_WEIGHT_NORM
 from certify.loop.policies.importers.options import WITHOUT_NORMALISATION, ImportOptions, Output
@@ -116,21 +118,30 @@ def read_two_stage(tensors: Mapping[str, Numbers], options: ImportOptions) -> Re
 
 
 def read_state_dict(
-    tensors: Mapping[str, Numbers], options: ImportOptions, n: int, m: int, beside: str | None = None
+    tensors: Mapping[str, Numbers],
+    options: ImportOptions,
+    n: int,
+    m: int,
+    beside: str | None = None,
+    modules: Mapping[str, Call] | None = None,
 ) -> Reading:
     """The perceptron from n observations to m actions among the tensors of a file.
 
     Parameters
     ----------
     beside : keys of the layers of the Lyapunov network that is imported with it, if there is one.
+    modules : those that were pickled whole, by their names.
 
     Raises
     ------
     InputError : there is none, there are several and `--prefix` does not say which, a layer is of a kind that is
         not proved, or another tensor could belong to the policy.
     """
+    listed = dict[str, list[int]]()
     if options.prefix is not None and "," in options.prefix:
-        tensors, prefix = _numbered(tensors, options.prefix.split(",")), _LISTED
+        names = options.prefix.split(",")
+        listed = {name: _affine(tensors, name) for name in names if name in _groups(tensors)}
+        tensors, prefix = _numbered(tensors, names), _LISTED
     else:
         prefix = options.prefix if options.prefix is not None else _only(tensors, n, m, options)
     norms = {} if options.norm is None else _norms(tensors, prefix, options)
@@ -141,6 +152,8 @@ def read_state_dict(
             "Name the states that it reads with --states."
         )
     squash: Output = "identity" if options.squash is None else options.squash
+    groups = listed if prefix == _LISTED else {prefix: _affine(tensors, prefix)}
+    require_said(modules or {}, groups, options)
     read, known = set(_own(tensors, prefix)), dict[str, str]()
     if (at := normaliser_root(tensors)) is not None:
         read |= {f"{at}_mean", f"{at}_std"}
@@ -149,8 +162,23 @@ def read_state_dict(
     if beside is not None:
         known |= dict.fromkeys(_own(tensors, beside), "the Lyapunov network that is imported beside it")
     activation, placed = options.activation or "tanh", dict(norms.values())
-    assumed = f"{in_words(activation)} between the layers is what --activation says"
-    assumed += f", {squash} behind them what --squash says"
+    return Reading(
+        words=f"state_dict {prefix} {widths(layers)}{' with layer normalisation' if norms else ''}",
+        steps=(*between(layers, activation, placed), *_ENDS[squash]),
+        evaluate=perceptron(layers, squash, activation, placed),
+        normaliser=rsl_normaliser(tensors, options.epsilon),
+        double=_is_double(tensors, prefix),
+        assumed=_assumed(options, m, bool(modules)),
+        unread=unread(tensors, read, prefix, m, options.ignore, known, observed=n),
+    )
+
+
+def _assumed(options: ImportOptions, m: int, whole: bool) -> str:
+    """The source of the functions between the layers; `whole` says that the file has the modules too."""
+    assumed = f"{in_words(options.activation or 'tanh')} between the layers is what --activation says"
+    assumed += f", {options.squash or 'identity'} behind them what --squash says"
+    if whole:
+        assumed += ", of a module whose forward is not in the file"
     if options.output == MEAN:
         assumed += f", of whose {2 * m} numbers the first {m} are the mean, as --output says"
     elif options.output is not None:
@@ -158,15 +186,7 @@ def read_state_dict(
     if options.norm is not None:
         epsilon = float(options.norm_epsilon or _EPSILON)
         assumed += f", layer normalisation {options.norm[6:]} the activation, with epsilon {epsilon}, what --norm says"
-    return Reading(
-        words=f"state_dict {prefix} {widths(layers)}{' with layer normalisation' if norms else ''}",
-        steps=(*between(layers, activation, placed), *_ENDS[squash]),
-        evaluate=perceptron(layers, squash, activation, placed),
-        normaliser=rsl_normaliser(tensors, options.epsilon),
-        double=_is_double(tensors, prefix),
-        assumed=assumed,
-        unread=unread(tensors, read, prefix, m, options.ignore, known, observed=n),
-    )
+    return assumed
 
 
 def parameters_of(activation: str) -> re.Pattern[str] | None:
@@ -495,6 +515,11 @@ def _numbers(tensors: Mapping[str, Numbers], prefix: str) -> list[int]:
         found = ", ".join(f"--prefix {name}" if name else "layers without a prefix" for name in _groups(tensors))
         raise InputError(f"there must be layers {root}0.weight and so on; found {found or ', '.join(tensors)}.")
     return sorted(numbers)
+
+
+def _affine(tensors: Mapping[str, Numbers], prefix: str) -> list[int]:
+    """The numbers of the layers under a prefix, less those of normalisations."""
+    return [k for k in _numbers(tensors, prefix) if tensors[f"{_dot(prefix)}{k}.weight"].ndim != 1]
 
 
 def _own(tensors: Mapping[str, Numbers], prefix: str) -> list[str]:

@@ -16,19 +16,25 @@ from certify.loop.files.arrays import Numbers, array_of, is_array, is_number
 from certify.loop.files.barepickle import BEGINNING as BARE
 from certify.loop.files.barepickle import BarePickle
 from certify.loop.files.legacy import BEGINNING
-from certify.loop.files.pickles import Call, Name
+from certify.loop.files.pickles import Call, Name, Persistent
 from certify.loop.files.torchfile import TorchFile, is_tensor
+from certify.loop.policies.importers.operations import WITHOUT_WEIGHT_NORM
 
 _SAFE = {
     "F64": "f8", "F32": "f4", "F16": "f2", "BOOL": "b1", "U8": "u1", "U16": "u2", "U32": "u4", "U64": "u8",
     "I8": "i1", "I16": "i2", "I32": "i4", "I64": "i8",
 }  # fmt: skip
+_HELD = ("_parameters", "_buffers", "_modules")
 METADATA = "__metadata__"
 """The entry of a file of safetensors for texts."""
 
 
 def load_tensors(
-    raw: bytes, what: str, file: TorchFile | None = None, also: re.Pattern[str] | None = None
+    raw: bytes,
+    what: str,
+    file: TorchFile | None = None,
+    also: re.Pattern[str] | None = None,
+    modules: dict[str, Call] | None = None,
 ) -> dict[str, Numbers]:
     """The tensors and arrays of a file of torch.save, or of a pickle that stands alone: the keys on the way to one are
     joined by dots. A `kernel` (in, out) of numpy becomes a `weight` (out, in).
@@ -36,11 +42,12 @@ def load_tensors(
     Parameters
     ----------
     also : keys of single numbers that are taken for tensors; None for none.
+    modules : gets the modules of torch that were pickled whole, by their names; None refuses such.
 
     Raises
     ------
     InputError : the file is no archive of torch.save, or a module that was pickled whole, whose `forward` is code that
-        the file does not hold; two tensors have one name, or one cannot be read.
+        the file does not hold, where these are refused; two tensors have one name, or one cannot be read.
     """
     held, root = _opened(raw, what, file)
     found: dict[str, Numbers] = {}
@@ -62,7 +69,11 @@ def load_tensors(
             found[prefix] = array
         elif isinstance(node, dict | list | tuple | Call) and id(node) not in seen:
             seen.add(id(node))
-            inside = [(k, v) for k, v in _inside(node) if isinstance(k, str | int | Name)]
+            module = None if modules is None else _module(node, prefix or what)
+            if module is not None and modules is not None and isinstance(node, Call):
+                modules[prefix] = node
+            within = _inside(node) if module is None else module
+            inside = [(k, v) for k, v in within if isinstance(k, str | int | Name)]
             waiting += [(f"{prefix}.{k}" if prefix else str(k), v) for k, v in reversed(inside)]
     return found
 
@@ -85,6 +96,33 @@ def _inside(node: dict[Any, Any] | list[Any] | tuple[Any, ...] | Call) -> Iterab
         return enumerate(node)
     held = [node.arguments, node.items, *(part for state in node.states for part in _parts(state))]
     return [*node.pairs, *(pair for each in held if isinstance(each, dict | list | tuple) for pair in _inside(each))]
+
+
+def _module(node: Any, what: str) -> list[tuple[Any, Any]] | None:
+    """The content of a module of torch, by the names of a state_dict; None if a node is none.
+
+    Raises
+    ------
+    InputError : it calls other functions before or after its own.
+    """
+    state = node.states[0] if isinstance(node, Call) and len(node.states) == 1 else None
+    if not isinstance(state, dict) or not all(isinstance(state.get(part), dict) for part in _HELD):
+        return None
+    if any(state.get(hooks) for hooks in ("_forward_pre_hooks", "_forward_hooks")):
+        raise InputError(
+            f"the module {what} must have no hooks, which change what it reads or gives. {WITHOUT_WEIGHT_NORM}"
+        )
+    rest = {} if str(class_of(node)).startswith("torch.") else state  # torch's own use no tensor beside these
+    named = [(k, v) for k, v in rest.items() if not (isinstance(k, str) and k.startswith("_"))]
+    return [*(pair for part in _HELD for pair in state[part].items()), *named]
+
+
+def class_of(module: Call) -> Name | None:
+    """The class of a module that was pickled whole; in a file of torch before version 1.6 its source is with it."""
+    found = module.function
+    if isinstance(found, Persistent) and isinstance(found.reference, tuple) and len(found.reference) > 1:
+        found = found.reference[1]
+    return found if isinstance(found, Name) else None
 
 
 def _parts(state: Any) -> tuple[Any, ...]:
