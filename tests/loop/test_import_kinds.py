@@ -395,6 +395,17 @@ CHAINS: dict[str, tuple[tuple[str, ...], str, tuple[str, ...]]] = {
 }
 
 
+def test_a_gain_is_one_layer_without_a_number(tmp_path: Path) -> None:
+    """As in a file of a gain and a Lyapunov network."""
+    others = {"lyapunov.0.weight": torch.ones(4, 2), "lyapunov.2.weight": torch.ones(1, 4)}
+    torch.save({"policy.weight": torch.tensor([[-2.0, 3.0]])} | others, tmp_path / "p.pt")
+    with pytest.raises(InputError, match=r"if the policy is policy, say so: --prefix policy\. If"):
+        import_policy(tmp_path / "p.pt", PLANT, LAYERS)
+    found = import_policy(tmp_path / "p.pt", PLANT, replace(LAYERS, prefix="policy"))
+    assert found.policy.network(np.array([[1.0, 2.0]]), (Fraction(0),)).item() == 4
+    assert set(found.not_read) == set(others)
+
+
 @pytest.mark.parametrize("name", CHAINS)
 def test_a_prefix_may_be_of_several_layers(name: str, tmp_path: Path) -> None:
     names, prefix, others = CHAINS[name]
@@ -405,7 +416,7 @@ def test_a_prefix_may_be_of_several_layers(name: str, tmp_path: Path) -> None:
         f"{k}.{p}": getattr(one, p).detach() for k, one in zip(names, layers, strict=True) for p in ("weight", "bias")
     }
     torch.save({name: torch.ones(1, 5) for name in others} | tensors, tmp_path / "p.pt")
-    with pytest.raises(InputError, match=rf"name both: --prefix {prefix}\. If"):
+    with pytest.raises(InputError, match=rf"say so: --prefix {prefix}\. If"):
         import_policy(tmp_path / "p.pt", PLANT, LAYERS)
     for wrong in (f"{prefix},{names[1]}", f"{prefix},none", f"{names[0]},{names[0]}"):
         with pytest.raises(InputError, match=r"name each layer once, or the keys of some up to their numbers"):

@@ -885,6 +885,7 @@ NOT_READ = {
     "new.mat": (b"MATLAB 7.3 MAT-file, Platform".ljust(512) + HDF5, "MAT-file of MATLAB"),
     "params.msgpack": (b"\x81\xa6params\x80{", "msgpack, as flax.*numpy.savez"),
     "ACASXU.nnet": (b"// Neural Network File Format\n1,2,1,2,\n", "NNet.*0.weight.*obs._mean"),
+    "best.onnx": (b"version https://git-lfs.github.com/spec/v1\noid sha256:1d\nsize 15\n", "Git LFS, .*git lfs pull"),
     "saved_model.pb": (b"\x08\x01", "SavedModel.*tf2onnx.convert --saved-model FOLDER"),
 }
 

@@ -14,6 +14,7 @@ _NUMBERED = 'numpy.savez("policy.npz", **{"0.weight": W, "0.bias": b}) with ever
 _KERAS = (
     f"Write the model as a folder, model.export(FOLDER), and that as ONNX, {_ONNX}; or write its weights, {_NUMPY}."
 )
+_POINTER = b"version https://git-lfs.github.com/spec/"
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
@@ -26,6 +27,8 @@ def described(raw: bytes, name: str, members: Collection[str] = ()) -> str | Non
     members : the names of its members, if it is a zip archive.
     """
     end = name.lower()
+    if raw.startswith(_POINTER):
+        return "a pointer of Git LFS, whose file is not here. Fetch it in the folder of its repository, git lfs pull."
     if "model.weights.h5" in members:
         return f"a model of Keras. {_KERAS}"
     if {"data", "parameter_list", "parameters"} <= set(members):

@@ -138,7 +138,7 @@ def read_state_dict(
         not proved, or another tensor could belong to the policy.
     """
     listed = dict[str, list[int]]()
-    if options.prefix is not None and "," in options.prefix:
+    if options.prefix is not None and ("," in options.prefix or f"{options.prefix}.weight" in tensors):
         names = options.prefix.split(",")
         listed = {name: _affine(tensors, name) for name in names if name in _groups(tensors)}
         tensors, prefix = _numbered(tensors, names), _LISTED
@@ -320,7 +320,8 @@ def _to_actions(layers: Layers, m: int, options: ImportOptions) -> Layers:
         raise InputError(
             f"the last layer must give {m} numbers, one for each input; it gives {given}. If these are the mean of the "
             "actions and then their spread, as Brax has them, say so with --output mean; if each action's spread is "
-            f"behind it, as RLlib has those of a tuple, with --output {','.join(str(2 * k) for k in range(m))}."
+            f"behind it, as RLlib has those of a tuple, with --output {','.join(str(2 * k) for k in range(m))}; or say "
+            "the places of the actions, counted from 0."
         )
     return layers
 
@@ -386,8 +387,8 @@ def _only(tensors: Mapping[str, Numbers], n: int, m: int, options: ImportOptions
         )
         shapes = ", ".join(f"{name} {tensor.shape}" for name, tensor in islice(tensors.items(), _MOST_LISTED))
         listed = listed if named else f"none in {shapes or 'no tensors'} (layers must be called {needed})"
-    elif joined := _joined(tensors, n, m, options):
-        listed += f"; if {joined.replace(',', ' leads to ')}, name both: --prefix {joined}"
+    elif named := _named(tensors, n, m, options):
+        listed += f"; if the policy is {named.replace(',', ' and behind it ')}, say so: --prefix {named}"
     raise InputError(
         f"a file must hold one policy from {n} states to {m} inputs; it holds {len(fitting)}. "
         f"Name its keys up to their numbers with --prefix, and its states with --states. Found {listed}. "
@@ -406,15 +407,18 @@ def _ends(tensors: Mapping[str, Numbers]) -> dict[str, tuple[int, int]]:
     return found
 
 
-def _joined(tensors: Mapping[str, Numbers], n: int, m: int, options: ImportOptions) -> str | None:
-    """Two prefixes of numbered layers, or layers without a number, with a comma between them, of which the one leads
-    from n numbers to those that the other takes to m actions; None if there are no such two, or several."""
+def _named(tensors: Mapping[str, Numbers], n: int, m: int, options: ImportOptions) -> str | None:
+    """The layer without a number that leads from n numbers to m actions; or two, with a comma between them, of which
+    one leads to the numbers that the other takes to them, prefixes of numbered layers or layers without a number. None
+    if there are none, or several."""
     ends = _ends(tensors)
     numbered = {f"{_dot(prefix)}{k}" for prefix in ends for k in _numbers(tensors, prefix)}
     weights = {name.removesuffix(".weight"): w for name, w in tensors.items() if name.endswith(".weight")}
     plain = {name: (w.shape[1], w.shape[0]) for name, w in weights.items() if w.ndim == 2 and name not in numbered}
+    plain = {name: pair for name, pair in plain.items() if known_by_name(f"{name}.weight", tensors, "", m) is None}
     known = {name: pair for name, pair in {**ends, **plain}.items() if name and not _of_another(name)}
-    found = [
+    found = [name for name in plain if name in known and plain[name][0] == n and _gives(plain[name][1], m, options)]
+    found += [
         f"{first},{last}"
         for first, (reads, between) in known.items()
         for last, (then, gives) in known.items()
