@@ -604,9 +604,10 @@ def test_the_mean_of_what_gives_the_spread_as_well(tmp_path: Path) -> None:
     found = import_policy(path, PLANT, replace(BRAX, output="mean"))
     assert "first 1 are the mean" in found.assumed
     agree(found.policy, module, lambda y: torch.tanh(y[:, :1]))
-    with pytest.raises(InputError, match=r"it gives 2\. .* --output mean"):
-        import_policy(path, PLANT, BRAX)
     torch.save(module.state_dict(), tmp_path / "p.pt")  # found by its sizes
+    for each, prefix in ((path, BRAX.prefix), (tmp_path / "p.pt", None)):
+        with pytest.raises(InputError, match=r"it gives 2\. .* --output mean"):
+            import_policy(each, PLANT, replace(BRAX, prefix=prefix))
     found = import_policy(tmp_path / "p.pt", PLANT, replace(BRAX, output="mean", prefix=None))
     agree(found.policy, module.float(), lambda y: torch.tanh(y[:, :1]))
     for outputs in (1, 3, 4):

@@ -368,12 +368,14 @@ def _groups(tensors: Mapping[str, Numbers]) -> list[str]:
 def _only(tensors: Mapping[str, Numbers], n: int, m: int, options: ImportOptions) -> str:
     """The one prefix whose layers lead from n to m and that no name calls a critic.
 
-    With `--output` it is also one that gives other numbers than that takes, about which there is more to say.
+    It is also one that gives other numbers than `--output` takes, or without it two for each action, about which there
+    is more to say.
     """
     ends = _ends(tensors)
     own = [prefix for prefix, (reads, _) in ends.items() if reads == n and not _of_another(prefix)]
     fitting = [prefix for prefix in own if _gives(ends[prefix][1], m, options)]
-    if len(fitting) == 1 or (not fitting and len(own) == 1 and options.output is not None):
+    said = options.output is not None or (len(own) == 1 and ends[own[0]][1] == 2 * m)
+    if len(fitting) == 1 or (not fitting and len(own) == 1 and said):
         return (fitting or own)[0]
     listed = "; ".join(f"{prefix or 'no prefix'}: {reads} to {gives}" for prefix, (reads, gives) in ends.items())
     if not ends:
