@@ -496,6 +496,20 @@ def test_modules_that_were_pickled_whole(name: str, tmp_path: Path) -> None:
         module.float()
 
 
+def test_a_module_with_two_names_has_its_tensors_under_both(tmp_path: Path) -> None:
+    """As in a state_dict: without those of the first layer, the second would be a network of its own."""
+    net = nn.Module()
+    net.first = nn.Linear(2, 2)
+    net.net = nn.Sequential(net.first, nn.Tanh(), nn.Linear(2, 1))
+    torch.save(net, tmp_path / "p.pt")
+    found = import_policy(tmp_path / "p.pt", PLANT, replace(TANH, prefix="net", ignore=("first.*",)))
+    agree(found.policy, net.net)
+    net.own = net
+    (tmp_path / "p.pt").write_bytes(pickle.dumps(net))
+    with pytest.raises(InputError, match="at most 1,000 modules"):
+        import_policy(tmp_path / "p.pt", PLANT, TANH)
+
+
 @pytest.mark.parametrize("name", OTHERWISE)
 def test_modules_that_are_not_what_is_said_are_refused(name: str, tmp_path: Path) -> None:
     made, options, message = OTHERWISE[name]

@@ -17,7 +17,7 @@ from certify.loop.policies.importers.steps import in_words, plainly
 from certify.loop.policies.importers.tensors import class_of
 from certify.loop.policies.importers.unread import known_by_name
 
-_NOTHING = {"Linear", "Sequential", "ModuleList", "ModuleDict", "Identity", "Dropout", "Flatten"}
+_NOTHING = {"Module", "Linear", "Sequential", "ModuleList", "ModuleDict", "Identity", "Dropout", "Flatten"}
 _FUNCTIONS = {
     "Tanh": "tanh", "ReLU": "relu", "ELU": "elu", "LeakyReLU": "leaky_relu", "Sigmoid": "sigmoid", "SiLU": "silu",
     "Mish": "mish", "Softplus": "softplus", "Softsign": "softsign", "CELU": "celu", "SELU": "selu", "ReLU6": "relu6",
@@ -97,4 +97,6 @@ def _function(module: Call, name: str, options: ImportOptions) -> str:
         if state.get("eps") == epsilon:
             return ""
         raise InputError(f"the file's {name} has eps = {state.get('eps')}: say so with --norm-epsilon.")
-    raise InputError(f"the file has a module {name} of {of}, of which no option says what becomes: {_TRACED}")
+    raise InputError(
+        f"the file has a module {name or 'itself'} of {of}, of which no option says what becomes: {_TRACED}"
+    )

@@ -389,8 +389,8 @@ def _only(tensors: Mapping[str, Numbers], n: int, m: int, options: ImportOptions
         )
         shapes = ", ".join(f"{name} {tensor.shape}" for name, tensor in islice(tensors.items(), _MOST_LISTED))
         listed = listed if named else f"none in {shapes or 'no tensors'} (layers must be called {needed})"
-    elif named := _named(tensors, n, m, options):
-        listed += f"; if the policy is {named.replace(',', ' and behind it ')}, say so: --prefix {named}"
+    elif policy := _named(tensors, n, m, options):
+        listed += f"; if the policy is {policy.replace(',', ' and behind it ')}, say so: --prefix {policy}"
     raise InputError(
         f"a file must hold one policy from {n} states to {m} inputs; it holds {len(fitting)}. "
         f"Name its keys up to their numbers with --prefix, and its states with --states. Found {listed}. "

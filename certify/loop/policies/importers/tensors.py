@@ -24,6 +24,7 @@ _SAFE = {
     "F64": "f8", "F32": "f4", "F16": "f2", "BOOL": "b1", "U8": "u1", "U16": "u2", "U32": "u4", "U64": "u8",
     "I8": "i1", "I16": "i2", "I32": "i4", "I64": "i8",
 }  # fmt: skip
+_MOST_MODULES = 1000
 _HELD = ("_parameters", "_buffers", "_modules")
 METADATA = "__metadata__"
 """The entry of a file of safetensors for texts."""
@@ -67,11 +68,15 @@ def load_tensors(
             if prefix in found:
                 raise InputError(f"{what} must name each tensor once; {prefix} stands there twice.")
             found[prefix] = array
-        elif isinstance(node, dict | list | tuple | Call) and id(node) not in seen:
-            seen.add(id(node))
+        elif isinstance(node, dict | list | tuple | Call):
             module = None if modules is None else _module(node, prefix or what)
             if module is not None and modules is not None and isinstance(node, Call):
-                modules[prefix] = node
+                modules[prefix] = node  # under each of its names, as in a state_dict
+                if len(modules) > _MOST_MODULES:
+                    raise InputError(f"{what} must have at most {_MOST_MODULES:,} modules; it has more.")
+            elif id(node) in seen:
+                continue
+            seen.add(id(node))
             within = _inside(node) if module is None else module
             inside = [(k, v) for k, v in within if isinstance(k, str | int | Name)]
             waiting += [(f"{prefix}.{k}" if prefix else str(k), v) for k, v in reversed(inside)]
