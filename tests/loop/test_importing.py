@@ -720,9 +720,16 @@ def test_safetensors(tmp_path: Path) -> None:
     save_file(STATE, path, {"format": "pt", "negative_slope": "0.1", "note": "n" * 99})
     with pytest.raises(InputError, match=r"__metadata__\.negative_slope = 0\.1, .* --activation leaky_relu:0\.1, or"):
         import_policy(path, plant(), replace(LAYERS, activation="leaky_relu"))
-    for said in ("leaky_relu:0.1", "tanh"):
-        texts = import_policy(path, plant(), replace(LAYERS, activation=said)).not_read["__metadata__"]
-        assert "negative_slope = 0.1" in texts and f"note = {'n' * 80} …" in texts and "format" not in texts
+    for said, why in (
+        ("leaky_relu:0.1", "the slope that"),
+        ("leaky_relu:0.3", "it is 0.1, not the slope that"),
+        ("tanh", ""),
+    ):
+        found = import_policy(path, plant(), replace(LAYERS, activation=said)).not_read
+        texts = found["__metadata__"]
+        assert f"note = {'n' * 80} …" in texts and "format" not in texts
+        assert ("negative_slope = 0.1" in texts) is not why.endswith("that")
+        assert not why or found["__metadata__.negative_slope"].startswith(why)
     save_file(STATE, path, {"slope": "steep"})
     with pytest.raises(InputError, match=r"slope in the metadata of .* must be a number; found 'steep'"):
         import_policy(path, plant(), replace(LAYERS, activation="leaky_relu"))

@@ -190,8 +190,8 @@ def _assumed(options: ImportOptions, m: int, whole: bool) -> str:
 
 
 def parameters_of(activation: str) -> re.Pattern[str] | None:
-    """The names that a file may give to the number of an activation; None if it has none, or it is said."""
-    return _PARAMETERS.get(activation)
+    """The names that a file may give to the number of an activation; None if it has none."""
+    return _PARAMETERS.get(activation.partition(":")[0])
 
 
 def _stated(
@@ -216,7 +216,8 @@ def _stated(
             f"{name}. Say which is right: --activation {name}:{plainly(value)}, or --activation "
             f"{name}:{plainly(usual)} if {key} is another number."
         )
-    return {key: f"the {PARAMETERS[name][0]} that --activation says" for key, v in found.items() if v == said[0]}
+    same = f"the {PARAMETERS[name][0]} that --activation says" if found else ""
+    return {key: same if v == said[0] else f"it is {plainly(v)}, not {same}" for key, v in found.items()}
 
 
 def read_lyapunov(tensors: Mapping[str, Numbers], prefix: str | None, options: ImportOptions) -> Reading:
