@@ -308,6 +308,8 @@ def test_order_operating_point_and_normaliser_together(tmp_path: Path) -> None:
     model, environment, path, normaliser = sb3("PPO", tmp_path)
     environment.obs_rms.mean, environment.obs_rms.var = np.array([-2.5, 1.25]), np.array([0.01, 0.09])
     environment.save(str(normaliser))
+    with pytest.raises(InputError, match=r"is a normaliser of observations: name it with --normaliser"):
+        import_policy(normaliser, plant(), SAID)
     options = ImportOptions(states=("x1", "x0"), normaliser=normaliser, observes="absolute")
     policy = import_policy(path, plant(x_eq=(1, -2)), options).policy
     reach = 10 * np.sqrt(environment.obs_rms.var + 1e-8)
@@ -892,6 +894,7 @@ NOT_READ = {
     "new.mat": (b"MATLAB 7.3 MAT-file, Platform".ljust(512) + HDF5, "MAT-file of MATLAB"),
     "params.msgpack": (b"\x81\xa6params\x80{", "msgpack, as flax.*numpy.savez"),
     "ACASXU.nnet": (b"// Neural Network File Format\n1,2,1,2,\n", "NNet.*0.weight.*obs._mean"),
+    "K.npy": (b"\x93NUMPY\x01\x00", "one array of numpy.*a gain K.*0.weight = -K"),
     "best.onnx": (b"version https://git-lfs.github.com/spec/v1\noid sha256:1d\nsize 15\n", "Git LFS, .*git lfs pull"),
     "saved_model.pb": (b"\x08\x01", "SavedModel.*tf2onnx.convert --saved-model FOLDER"),
 }

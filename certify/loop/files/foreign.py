@@ -36,6 +36,8 @@ def described(raw: bytes, name: str, members: Collection[str] = ()) -> str | Non
             "a file of stable-baselines 2, whose weights are arrays of numpy in its member parameters. Read them, "
             f'numpy.load(io.BytesIO(zipfile.ZipFile(FILE).read("parameters"))), and write them again, {_NUMPY}.'
         )
+    if raw.startswith(b"\x93NUMPY"):
+        return f"one array of numpy. Write all arrays, {_NUMBERED}; a gain K, u = -K x, is one layer, 0.weight = -K."
     if raw.startswith(b"MATLAB") and b"MAT-file" in raw[:128]:
         return (
             "a MAT-file of MATLAB. Write the network there as ONNX, exportONNXNetwork(net, 'policy.onnx'); or load the "

@@ -87,6 +87,9 @@ def _opened(raw: bytes, what: str, file: TorchFile | None) -> tuple[TorchFile | 
     """The reader of a file's tensors, and the value of its pickle."""
     if raw.startswith(BARE) and not raw.startswith(BEGINNING):
         bare = BarePickle(raw, what)
+        made = bare.root.function if isinstance(bare.root, Call) else None
+        if isinstance(made, Name) and made.name == "VecNormalize":
+            raise InputError(f"{what} is a normaliser of observations: name it with --normaliser, beside the policy.")
         return bare, bare.root
     file = file if file is not None else TorchFile(raw, what)
     return file, file.pickle("data.pkl")
