@@ -115,7 +115,6 @@ def certify_reach(
         raise OptionError(f"`target` must lie in another folder than `out`, which gets such a file too; found {path}.")
     with tools.timing("target"):
         goal = goal_of(loop, options.target, options.certificate)
-    _require_met(goal)
     options = _seen_from(goal, options)
     _require_inside(goal.loop.system, options)
     effort = effort_of(options.effort, options.time_limit, load_seconds)
@@ -123,6 +122,7 @@ def certify_reach(
         result = ReachResult(Verdict.UNKNOWN, "", goal.loop.system, goal.loop.network, options, given=goal.given)
         with tools.timing("target"):
             _require_periodic(goal, tools.clerk(path, options.jobs, False, options.cluster))
+            _require_met(goal)
         result = _simulated(result, goal, tools)
         if not result.reason:
             result = _proved(result, goal, effort, tools, path, provenance or {})
