@@ -504,6 +504,11 @@ def test_a_module_with_two_names_has_its_tensors_under_both(tmp_path: Path) -> N
     torch.save(net, tmp_path / "p.pt")
     found = import_policy(tmp_path / "p.pt", PLANT, replace(TANH, prefix="net", ignore=("first.*",)))
     agree(found.policy, net.net)
+    actor = Policy("", nn.Tanh())
+    actor.max_action = 2.0
+    torch.save({"actor": actor}, tmp_path / "q.pt")
+    options = replace(TANH, prefix="actor.first,actor.last", ignore=("actor.m*", "actor.var"))
+    assert "nor the part in it of actor.max_action = 2" in import_policy(tmp_path / "q.pt", PLANT, options).assumed
     net.own = net
     (tmp_path / "p.pt").write_bytes(pickle.dumps(net))
     with pytest.raises(InputError, match="at most 1,000 modules"):

@@ -64,6 +64,13 @@ def require_said(modules: Mapping[str, Call], groups: Mapping[str, Collection[in
             )
 
 
+def numbers_in(modules: Mapping[str, Call]) -> list[str]:
+    """The numbers of classes that are not torch's, which their forward may use, in words."""
+    own = {name: module.states[0] for name, module in modules.items() if not str(class_of(module)).startswith("torch.")}
+    pairs = [(f"{name}.{k}" if name else str(k), v) for name, state in own.items() for k, v in state.items()]
+    return [f"{name} = {plainly(v)}" for name, v in pairs if isinstance(v, int | float) and not isinstance(v, bool)]
+
+
 def _in_turn(placed: Mapping[int, str], layers: Sequence[int], wanted: str, ends: list[str]) -> bool:
     """True if of these functions one stands between each two layers, and behind the last none or the ends."""
     parts: list[list[str]] = [[] for _ in range(len(layers) + 1)]

@@ -16,7 +16,7 @@ import numpy as np
 from certify.errors import InputError
 from certify.loop.files.arrays import Numbers
 from certify.loop.files.pickles import Call
-from certify.loop.policies.importers.modules import require_said
+from certify.loop.policies.importers.modules import numbers_in, require_said
 from certify.loop.policies.importers.normalisers import normaliser_root, rsl_normaliser
 from certify.loop.policies.importers.operations import WITHOUT_WEIGHT_NORM
 from certify.loop.policies.importers.options import WITHOUT_NORMALISATION, ImportOptions, Output
@@ -168,17 +168,18 @@ def read_state_dict(
         evaluate=perceptron(layers, squash, activation, placed),
         normaliser=rsl_normaliser(tensors, options.epsilon),
         double=_is_double(tensors, prefix),
-        assumed=_assumed(options, m, bool(modules)),
+        assumed=_assumed(options, m, modules or {}),
         unread=unread(tensors, read, prefix, m, options.ignore, known, observed=n),
     )
 
 
-def _assumed(options: ImportOptions, m: int, whole: bool) -> str:
-    """The source of the functions between the layers; `whole` says that the file has the modules too."""
+def _assumed(options: ImportOptions, m: int, modules: Mapping[str, Call]) -> str:
+    """The source of the functions between the layers, and the numbers of modules that were pickled whole."""
     assumed = f"{in_words(options.activation or 'tanh')} between the layers is what --activation says"
     assumed += f", {options.squash or 'identity'} behind them what --squash says"
-    if whole:
-        assumed += ", of a module whose forward is not in the file"
+    if modules:
+        numbers = ", ".join(numbers_in(modules)[:_MOST_LISTED])
+        assumed += f", of a module whose forward is not in the file{numbers and f', nor the part in it of {numbers}'}"
     if options.output == MEAN:
         assumed += f", of whose {2 * m} numbers the first {m} are the mean, as --output says"
     elif options.output is not None:
