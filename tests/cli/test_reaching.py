@@ -206,6 +206,7 @@ def test_text_for_people(asked: list[str], capsys: pytest.CaptureFixture[str]) -
     ("more", "why"),
     [
         (["--target", "p < 1"], "--target takes a comparison by <= or >="),
+        (["--target", "p >= 5"], "--target must have states of the domain"),
         (["--box", "p=1"], "--box is about a tube"),
         (["--within", "0"], "--within must be 1 to"),
         (["--within", "2.5s"], "which in cart take no time"),
