@@ -84,6 +84,7 @@ def test_a_policy_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ends_with_its_certificate(capsys.readouterr().out, tmp_path)
 
 
+@pytest.mark.slow
 def test_candidates_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """For the bicycle the choice of V is worth a factor of 70 at least; the file named last is the best one's."""
     found = script("candidates").main(tmp_path)

@@ -231,8 +231,15 @@ def _next(
     if result.stop in (Stop.WITNESS, Stop.INPUTS, Stop.SMALL):
         return _another_candidate(result, options)
     if result.stop is Stop.REQUESTED and result.levels.roa is not None:
-        return Step((), "the level that was asked for is proved; leave --level out for the largest")
+        return Step((), f"the level that was asked for is proved; leave --level out for the largest{_whose(options)}")
     return Step((), result.reason)
+
+
+def _whose(options: RoaOptions) -> str:
+    """A remark on the V of a level, where only the level chose it: that of a run without may be another one."""
+    if options.P is not None or replace(options, level=None).only is not None:
+        return ""
+    return "; the level is of the V of --candidate lyapunov, as none is named, which need not be that of such a run"
 
 
 def _around_a_corner(result: RoaResult, options: RoaOptions) -> Step | None:
@@ -297,7 +304,7 @@ def _around_a_constraint(result: RoaResult, options: RoaOptions) -> Step:
     """The step where a constraint ends the set: a V that is shaped around it, if that was not tried."""
     shaped = any(one.candidate.startswith("optimised") for one in result.tried)
     if options.level is not None:
-        return Step((), "leave --level out for the largest level that can be proved")
+        return Step((), f"leave --level out for the largest level that can be proved{_whose(options)}")
     several = options.claim == "asymptotic"  # one of them is shaped so
     given = options.P is not None or options.resume
     if not shaped and not given and (not several or (options.only is not None and _is_free(options))):
@@ -389,7 +396,7 @@ def _correction(result: RoaResult, options: RoaOptions, plant: System) -> Step |
         return slower
     failed = result.verdict is Verdict.REFUTED or (result.witness is not None and result.levels.roa is None)
     if options.level is not None and failed:
-        return Step((), "leave --level out for the largest level that can be proved")
+        return Step((), f"leave --level out for the largest level that can be proved{_whose(options)}")
     if result.levels.roa is None:
         try:
             require_equilibrium(plant, rounded=True)

@@ -161,7 +161,8 @@ def require_same_reading(stored: Policy, plant: System) -> None:
 
     Raises
     ------
-    InputError : the states come in another order, the operating point is another one, or so are the observations.
+    InputError : the states come in another order, the operating point is another one, or so are the observations or the
+    parameters in them.
     """
     from certify.loop.plants.system import observations_of
 
@@ -175,6 +176,10 @@ def require_same_reading(stored: Policy, plant: System) -> None:
     now = [str(q) for q in plant.exact_x_eq()]
     if isinstance(at, list) and at != now:
         raise _other_reading(f"values of states with the operating point {', '.join(map(str, at))}", ", ".join(now))
+    numbers = record.get("parameters")
+    for name, value in numbers.items() if isinstance(numbers, Mapping) else ():
+        if name in plant.parameters and str(plant.parameters[name]) != value:
+            raise _other_reading(f"states with {name} = {value}", f"{name} = {plant.parameters[name]}")
     if isinstance(read, str) and plant.observations:
         shown = ", ".join(map(str, observations_of(plant)))
         if shown != read:
@@ -357,7 +362,8 @@ def _centring(found: Imported) -> str:
         return f"the file's own, {'inside the squash' if centre == 'preactivation' else 'of the output'}"
     changes = [f"{name} changes u by up to {value:.3g}" for name, value in found.centring.items()]
     if centre != "none":
-        return f"{centre}, as asked for, which changes u by up to {found.centring[centre]:.3g}"
+        changed = f"{centre}, as asked for, which changes u by up to {found.centring[centre]:.3g}"
+        return changed if found.compared_with is not None else f"{changed}, unless your code centres so itself"
     return f"none; {', '.join(f'--centre {c}' for c in changes) or 'u_eq is out of reach of any'}"
 
 

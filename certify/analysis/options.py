@@ -57,7 +57,8 @@ class RoaOptions:
         "The centre of V if the origin is no equilibrium: the origin, or rest, the loop's equilibrium, which then is "
         "the operating point. auto: rest if that is a stable point and nothing is given around the origin."))
     level: float | None = option(None, "claim", "number", _POSITIVE, first=True, help=(
-        "Prove exactly V <= LEVEL; a smaller set counts as UNKNOWN. By default the largest level is looked for."))
+        "Prove exactly V <= LEVEL; a smaller set counts as UNKNOWN. By default the largest level is looked for. V is "
+        "that of the candidate, of lyapunov if none is named."))
     rate: float = option(0.0, "claim", "number", _FROM_0, help=(
         "Prove that V falls at least as exp(-2 RATE t), in discrete time by the share 2 RATE at each step. The "
         "condition is strict: of a V that falls exactly so, only smaller rates are proved."),

@@ -23,7 +23,8 @@ _KINDS = "state-dict, torchscript, onnx, sb3, safetensors or two-stage; auto loo
 _HELP = {
     "kind": _KINDS,
     "states": "What the network reads, in its order: states, or expressions as in 'cos(theta),sin(theta),theta_dot'.",
-    "prefix": "Keys of a state_dict's layers up to their numbers, as in actor.pi_net.fcs.",
+    "prefix": "Keys of a state_dict's layers up to their numbers, as in actor.pi_net.fcs; several, or layers, as in "
+    "pi.net,pi.mu.",
     "activation": "Between the layers of a state_dict: tanh, relu, leaky_relu:0.1 and others; docs/import.md has all.",
     "norm": "Layer normalisation between the layers of a state_dict: layer-before or layer-after the activation.",
     "norm_epsilon": "What it adds to the variance; 1e-5 if nothing is said.",
@@ -33,7 +34,8 @@ _HELP = {
     "action_scale": "u = scale * action + offset: one number or one for each input.",
     "action_offset": "See --action-scale.",
     "clip": "Bounds LO..HI of the action before scale and offset, one pair or one for each input.",
-    "centre": "Make pi(0) = u_eq: output or preactivation; nothing is centred unless this asks for it.",
+    "centre": "Make pi(0) = u_eq, as your code may do itself: output or preactivation; nothing is centred unless this "
+    "asks for it.",
     "observes": "Whether the network reads absolute states or their deviation from the operating point.",
     "ignore": "Tensor that is no part of the policy, * and ? as in names of files; repeatable.",
     "output": "Output that is the action, where there are several: for ONNX its name, else its place, 0 for the first; "

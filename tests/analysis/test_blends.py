@@ -37,6 +37,7 @@ def test_a_blend_wins_where_the_largest_candidate_proves_nothing(tmp_path: Path)
     assert found.volume is not None and found.volume > 2 * (proved["peak"] or 0.0) > 0
 
 
+@pytest.mark.slow
 def test_a_blend_does_not_win_by_a_weaker_claim(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """If all converge in the set that is proved first, a larger one in which that is not shown counts for nothing."""
     answers = iter([True])

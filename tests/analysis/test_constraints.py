@@ -22,6 +22,7 @@ from certify.loop.plants import System, constraints_of_values, get_system, kept_
 from certify.loop.policies import PolicyNetwork
 from tests.provers.test_steps import alone
 from tests.support.loops import pendulum_network
+from tests.support.marks import slow_after
 
 ROOT = Path(__file__).parents[2]
 OSCILLATOR = ROOT / "examples" / "plants" / "van_der_pol.toml"
@@ -126,7 +127,7 @@ CHANGED = {
 }
 
 
-@pytest.mark.parametrize("name", CHANGED)
+@pytest.mark.parametrize("name", slow_after(4, CHANGED))
 def test_both_checkers_accept_what_is_proved(name: str, tmp_path: Path) -> None:
     plant, network = oscillator()
     changes, options = CHANGED[name]
@@ -147,7 +148,7 @@ def test_in_discrete_time_too(tmp_path: Path) -> None:
     assert not result.contains([0.7]) and result.contains([-0.69])
 
 
-@pytest.mark.parametrize("which", ["oscillator", "pendulum"])
+@pytest.mark.parametrize("which", slow_after(1, ["oscillator", "pendulum"]))
 def test_a_constraint_that_never_binds_changes_nothing_but_the_claim(which: str, tmp_path: Path) -> None:
     plant, network = oscillator() if which == "oscillator" else (get_system("pendulum"), pendulum_network())
     name = plant.states[0].name

@@ -45,6 +45,7 @@ def pendulum_result(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
     return certify_roa(get_system("pendulum"), network, tmp_path_factory.mktemp("pendulum"), LITTLE)
 
 
+@pytest.mark.slow
 def test_a_wider_domain_that_is_suggested_gives_a_larger_set(pendulum_result: RoaResult, tmp_path: Path) -> None:
     """Both sides of the domain bind, so this very V reaches no further: another one does, and the run finds it."""
     assert pendulum_result.diagnosis is not None
@@ -182,6 +183,11 @@ def test_a_level_that_is_refuted_is_to_be_left_out(pendulum_result: RoaResult, t
     refuted = certify_roa(pendulum_result.system, pendulum_result.network, tmp_path, options)
     assert refuted.verdict is Verdict.REFUTED and refuted.diagnosis is not None
     assert refuted.diagnosis.next.why.startswith("leave --level out")
+    assert "the level is of the V of --candidate lyapunov" in refuted.diagnosis.next.why
+    refuted = certify_roa(
+        pendulum_result.system, pendulum_result.network, tmp_path, replace(options, candidate="scaled")
+    )
+    assert refuted.diagnosis is not None and "candidate" not in refuted.diagnosis.next.why
 
 
 def test_a_policy_that_is_out_of_bounds_at_rest_is_to_be_read_again(tmp_path: Path) -> None:

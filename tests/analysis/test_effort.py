@@ -72,6 +72,7 @@ def test_seconds_follow_the_pace() -> None:
     assert effort.part(1.0).seconds_for(UNIT) < 0.01 and effort.seconds_for(UNIT) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", slow_after(1, [2, 1]))
 def test_a_busy_machine_gives_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jobs: int) -> None:
     """One run on its own; one beside other work, with clocks that jump."""

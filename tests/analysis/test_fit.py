@@ -132,7 +132,7 @@ def within(truth: Truth, share: float = 1.0, scattered: bool = False) -> tuple[b
 
 
 @pytest.mark.parametrize("scattered", [False, True])
-@pytest.mark.parametrize("seed", slow_after(2, range(60)))
+@pytest.mark.parametrize("seed", slow_after(1, range(60)))
 def test_the_truth_is_within_what_is_found(seed: int, scattered: bool) -> None:
     assert within(Truth(seed), scattered=scattered) == (True, True)
 
@@ -433,6 +433,7 @@ def scattered_rows(count: int, off: float = 0.0) -> str:
     return "\n".join(["x,v,u,v_rate", *(",".join(map(repr, row)) for row in np.column_stack([z, y]).tolist())])
 
 
+@pytest.mark.slow
 def test_scattered_samples(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     """What is missing is said in both forms; of samples beyond the domain nothing is assumed, and they are left out."""
     Path(asked[1]).write_text(scattered_rows(60) + "\n7,0,0,123\n0,0,-1.001,5\n")
@@ -448,6 +449,7 @@ def test_scattered_samples(asked: list[str], capsys: pytest.CaptureFixture[str])
     assert f"try next     {len(data['missing'])} more, at points that --json names" in said
 
 
+@pytest.mark.slow
 def test_more_samples_where_they_are_missing_help_as_much_as_is_said(asked: list[str], tmp_path: Path) -> None:
     def found() -> Fitted:
         return fit_plant(Path(asked[1]), Path(asked[3]), lambda _: Fraction(1, 10**9), tmp_path / "out").found[0]
@@ -681,6 +683,7 @@ def test_samples_are_a_part_of_the_claim(
 NAMES = {"slope_v_x": "a", "slope_v_v": "b", "slope_v_u": "c", "residual_v": "r"}
 
 
+@pytest.mark.slow
 def test_pages_show_quantities_of_any_names(certified: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Numbers are as the checkers see them, whatever operating point a file says to people; that a function is 0 at 0
     is a part of the claim, which needs no slopes."""
@@ -708,6 +711,7 @@ def test_pages_show_quantities_of_any_names(certified: Path, capsys: pytest.Capt
     assert "for every function v′ = g(x, v, u) with which 54 samples are consistent" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_scattered_samples_are_a_part_of_the_claim(
     asked: list[str], fitted_box: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -728,6 +732,7 @@ def test_scattered_samples_are_a_part_of_the_claim(
     assert "for every function v′ = g(x, v, u) with which 122 samples are consistent" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_error_may_count_more_near_the_origin(
     asked: list[str], fitted_box: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -746,6 +751,7 @@ def test_the_error_may_count_more_near_the_origin(
     assert _run([*asked, "--near-origin", "-1"], False) == 2
 
 
+@pytest.mark.slow
 def test_two_that_are_of_other_plants_are_not_joined_in_words(
     certified: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -758,6 +764,7 @@ def test_two_that_are_of_other_plants_are_not_joined_in_words(
     assert "of every plant that is one of both" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_two_of_other_samples_are_not_joined_in_words(certified: Path) -> None:
     """Both state the same sha256, which nobody compares with the numbers; in the second those are others where no slope
     rests on them. A function near these is far from the samples of the first, and that claims nothing of it."""

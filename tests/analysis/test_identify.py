@@ -390,6 +390,7 @@ def test_a_structure_that_the_data_contradict_is_refuted(tmp_path: Path, text: s
         identified(tmp_path, transitions(noise=1e-4), text, noise="1e-4")
 
 
+@pytest.mark.slow
 def test_what_the_equations_lack_is_a_residual(tmp_path: Path) -> None:
     """With a drag that they do not have the data refute them; with a bound of it the truth is inside."""
     rows = transitions(noise=1e-4, drag=0.2)
@@ -441,6 +442,7 @@ def wheel(drag: float = 0.0) -> Array:
     return np.stack([v + errors[0], u, after + errors[1]], axis=1)
 
 
+@pytest.mark.slow
 def test_the_least_factor_of_a_residual_is_no_larger_than_the_true_one(tmp_path: Path) -> None:
     """The plant has half the bound that the structure allows; what is refuted is refuted as a bound by itself."""
     rows = wheel(0.2)
@@ -487,6 +489,7 @@ def test_a_refuted_structure_says_what_its_equations_lack(tmp_path: Path, capsys
     capsys.readouterr()
 
 
+@pytest.mark.slow
 def test_a_residual_that_is_too_small_is_refuted_with_the_factor_that_is_missing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -755,6 +758,7 @@ def test_data_become_a_part_of_the_claim(known: Path, capsys: pytest.CaptureFixt
     assert "ranges that measurements bound" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_python_takes_data_as_the_command_does(known: Path) -> None:
     given = {"candidate": "lyapunov", "level": 1e-3, "data": known / "data.csv"}
     found = certify.certify_roa(known / "known.toml", POLICY, **given)  # type: ignore[arg-type]
@@ -799,6 +803,7 @@ def both(data: Any) -> set[str]:
     return {str(answer.get("rule") or answer["result"]), judged.rule or judged.result}
 
 
+@pytest.mark.slow
 def test_what_fails_in_the_ranges_refutes_no_claim_about_data(known: Path) -> None:
     """The middle of the ranges, or a corner, need not be a consistent plant."""
     none = certify.PolicyNetwork.of_layers(

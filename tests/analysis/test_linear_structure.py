@@ -55,6 +55,7 @@ def test_a_residual_that_is_too_small_is_refuted(tmp_path: Path) -> None:
         found(tmp_path, rows, LinearStructure(second={"theta_dot": "0.01*theta**2"}))
 
 
+@pytest.mark.slow
 def test_the_least_share_of_what_is_beyond_the_linear_part(tmp_path: Path) -> None:
     """With two terms, scaled by one factor: the factor that is refuted is refuted as a bound by itself, and a tenth
     more than the one that is open is open by itself, where the series in time may be another."""

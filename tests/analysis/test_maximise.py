@@ -42,6 +42,7 @@ def test_a_level_that_was_not_asked_for_is_not_said_to_be(tmp_path: Path) -> Non
     assert "--level" not in result.diagnosis.next.why and not result.diagnosis.next.options
 
 
+@pytest.mark.slow
 def test_no_search_is_said_to_be_kept(tmp_path: Path) -> None:
     """A run with max has no search that --resume continues, and the folders of its attempts are gone."""
     result = largest("period", tmp_path)

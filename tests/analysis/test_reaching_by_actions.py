@@ -70,6 +70,7 @@ def test_both_of_two_equal_scores_are_followed(tmp_path: Path) -> None:
         assert nonlinearity_of(parse_any(result.raw, "f")) is None
 
 
+@pytest.mark.slow
 def test_a_car_that_may_be_left_alone_is_not_proved(car: System, tmp_path: Path) -> None:
     """At rest all scores are 0, so that it may stay there where nothing moves it; and it stays if that is larger."""
     assert certify_reach(car, along(1.0), tmp_path / "stays", asked("-0.47", "-0.468")).verdict is Verdict.UNKNOWN

@@ -167,7 +167,7 @@ ARRIVE = {
 }
 
 
-@pytest.mark.parametrize("name", ARRIVE)
+@pytest.mark.parametrize("name", slow_after(4, ARRIVE))
 def test_what_arrives_is_not_refuted(name: str) -> None:
     assert searched(*ARRIVE[name]) is None
 

@@ -114,6 +114,7 @@ def test_full_turns_of_an_angle_do_not_count(tmp_path: Path) -> None:
     assert led(loop, target, tmp_path / "soon", begin, within=1).verdict == "UNKNOWN"  # Arb sees no turns
 
 
+@pytest.mark.slow
 def test_a_held_input_with_a_higher_order(tmp_path: Path) -> None:
     """The series in time that the set was proved with is too short for boxes that take many periods."""
     loop = swinging()
@@ -123,6 +124,7 @@ def test_a_held_input_with_a_higher_order(tmp_path: Path) -> None:
     assert found.evidence.order > given.evidence.order  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 def test_ranks_beside_a_set_take_a_higher_order_if_the_ring_is_cheap(tmp_path: Path) -> None:
     loop = swinging()
     alone, ranked = (

@@ -74,6 +74,7 @@ def along_axes(known: Path) -> certify.RoaResult:
     return proved(known, "known")
 
 
+@pytest.mark.slow
 def test_axes_prove_what_ranges_do_not(known: Path, along_axes: certify.RoaResult) -> None:
     assert proved(known, "boxed").verdict == "UNKNOWN"
     found = along_axes
@@ -112,6 +113,7 @@ def test_axes_are_much_closer_than_ranges(found_in: dict[str, certify.IdentifyRe
     assert plain.ranges == found.ranges
 
 
+@pytest.mark.slow
 def test_axes_that_do_not_hold_all_that_is_left_go(
     tmp_path: Path, found_in: dict[str, certify.IdentifyResult], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -137,6 +139,7 @@ def test_one_parameter_has_no_other_axis(tmp_path: Path) -> None:
     assert found.smaller == 1 and list(found.system.ranges) == ["c"]
 
 
+@pytest.mark.slow
 def test_runs_have_axes_too(tmp_path: Path) -> None:
     """Rows in time order, whose errors are shared."""
     draw, network = np.random.default_rng(1), load_policy(POLICY).network

@@ -187,6 +187,7 @@ def test_an_ellipsoid_alone_is_suggested_to_go_on(tmp_path: Path) -> None:
     assert result.diagnosis is not None and dict(result.diagnosis.next.options) == {"--candidate": "auto"}
 
 
+@pytest.mark.slow
 def test_constraints_are_kept_beyond_the_ellipsoid(by_default: RoaResult, tmp_path: Path) -> None:
     """The wall takes states from the set and from the simulated region, by whose share the run went on."""
     result, everything = proved(tmp_path, keep="wall: x <= 0.4"), by_default.simulated
@@ -196,6 +197,7 @@ def test_constraints_are_kept_beyond_the_ellipsoid(by_default: RoaResult, tmp_pa
     assert (result.simulated.share or 0.0) > 0.6
 
 
+@pytest.mark.slow
 def test_an_ellipsoid_that_is_most_of_it_is_enough(tmp_path: Path) -> None:
     """The certificate is then the very one of the ellipsoid alone, and nothing is learned."""
     network = load_policy(POLICIES / "pendulum.pt").network
@@ -231,6 +233,7 @@ def test_the_ellipsoid_stays_where_no_level_is_proved(
     assert result.diagnosis is not None and dict(result.diagnosis.next.options) == {"--candidate": "polynomial"}
 
 
+@pytest.mark.slow
 def test_what_a_proof_finds_wrong_is_taught_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A first function of which nothing is proved, as if samples had missed where it rises; the next one counts."""
     learn, functions, corrected = Learner.learn, list[Learned](), list[float]()
@@ -281,7 +284,7 @@ def test_a_plant_that_is_stiff_far_out_has_a_simulated_region(tmp_path: Path) ->
     assert Simulator(ClosedLoop(plant(), REST), Quadratic(np.eye(1)), 1e-4).farther == 0
 
 
-@pytest.mark.parametrize("system", [plant(), STEPS], ids=["outer", "ranks"])
+@pytest.mark.parametrize("system", slow_after(1, [plant(), STEPS]), ids=["outer", "ranks"])
 def test_the_ellipsoid_stays_where_the_checker_refuses_more(
     system: System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -302,6 +305,7 @@ def test_the_ellipsoid_stays_where_the_checker_refuses_more(
     assert result.simulated is not None and (result.simulated.share or 0.0) < 0.7
 
 
+@pytest.mark.slow
 def test_a_ring_that_is_cut_for_more_is_resumed_without_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All of the effort is kept for what lies beyond, which then is not wanted: the ring takes it after all."""
     network = load_policy(POLICIES / "pendulum.pt").network
@@ -324,6 +328,7 @@ def test_boxes_get_ranks_until_nearly_all_is_proved(in_steps: RoaResult, tmp_pat
     assert dict(alone.diagnosis.next.options) == {"--ranks": ""}
 
 
+@pytest.mark.slow
 def test_a_wider_domain_that_is_suggested_gives_what_it_promises(tmp_path: Path) -> None:
     """The domain cuts the region off at -2: beyond it lies a quarter."""
     result = proved(tmp_path, plant(lo=-2))
@@ -336,6 +341,7 @@ def test_a_wider_domain_that_is_suggested_gives_what_it_promises(tmp_path: Path)
     assert wider.outer.volume > 0.9 * promised * result.outer.volume
 
 
+@pytest.mark.slow
 def test_centring_is_suggested_only_where_it_gains(tmp_path: Path) -> None:
     """From the plain policy's equilibrium as much converges as from the operating point of the centred one, and all of
     it to one equilibrium; under the weaker claim alone centring gains the stronger one."""

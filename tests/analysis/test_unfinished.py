@@ -392,7 +392,7 @@ PLACES = {  # where Ctrl-C comes, and on which call: from the first candidate to
 }
 
 
-@pytest.mark.parametrize("place", slow_after(4, PLACES))
+@pytest.mark.parametrize("place", slow_after(2, PLACES))
 def test_a_run_that_is_interrupted_anywhere_is_resumed_to_its_end(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

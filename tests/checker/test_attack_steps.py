@@ -417,6 +417,7 @@ def test_random_loops_hold_what_is_accepted_last(kind: str, level: bool, seeds: 
     assert max(excess for excess, *_ in cases) < 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "owner", "rule", "broken"),
     [

@@ -627,6 +627,7 @@ def test_an_even_box_serves_where_one_with_other_ends_does_not(program: Any) -> 
         assert (None not in program(field, -one, one, h)) == held
 
 
+@pytest.mark.slow
 def test_the_reference_has_an_a_priori_box_where_the_checker_has_one() -> None:
     """Random cubic fields, about the longest period for which the checker has one."""
     generator, asked = np.random.default_rng(3), 0

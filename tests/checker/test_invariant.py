@@ -130,6 +130,7 @@ def _as_if(level: float, system):  # type: ignore[no-untyped-def]
     return proof(system, policy([0.0, -1.0]), ANNULUS, level)
 
 
+@pytest.mark.slow
 def test_both_say_the_same_of_levels_and_trees() -> None:
     """Of one loop at many levels with many trees; accepted are only levels at which N falls."""
     generator, accepted, system, network = np.random.default_rng(3), 0, ring(), policy([0.0, -1.0])

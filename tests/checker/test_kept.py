@@ -87,6 +87,7 @@ def _leaves(tree: bytes) -> Iterator[int]:
     return (k for k in range(len(tree) - 2) if tree[k] != LEAF and tree[k + 1 : k + 3] == bytes([LEAF, LEAF]))
 
 
+@pytest.mark.slow
 def test_a_leaf_counts_even_where_n_falls_on_it(tmp_path: Path) -> None:
     """x^3 y is at most 0.325 in the set, whose tree is fine there. Where two leaves become one the constraint is no
     longer shown on some, and both checkers name the rule; N falls on all but a few."""
@@ -163,6 +164,7 @@ def test_without_constraints_it_is_the_certificate_of_old(kind: str) -> None:
     assert verdicts(without("claim.keep")(base(kind))) == ("ACCEPTED", None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by", slow_after(1, [1e-6, 1e-3]))
 def test_the_search_ends_below_what_is_planted(by: float, tmp_path: Path) -> None:
     """The level 1 of x^2 + y^2 is asked for, where an obstacle reaches into that disc: it is not PROVED."""
@@ -187,6 +189,7 @@ def test_a_tube_is_shaped_by_what_stands_beside_it(kind: str, tmp_path: Path) ->
     assert verdicts(data) == ("ACCEPTED", None)
 
 
+@pytest.mark.slow
 def test_a_path_into_an_obstacle_says_so(tmp_path: Path) -> None:
     obstacle = number(0.1) ** 2 - ((X - number(0.8)) ** 2 + Y**2)
     result = certified("path", tmp_path, obstacle, RADIUS - 3, U - 2)

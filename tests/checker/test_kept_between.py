@@ -246,7 +246,7 @@ def test_quarters_are_those_of_the_longest_period_in_rationals(
 
 
 @pytest.mark.parametrize("hi", LONGEST)
-@pytest.mark.parametrize("k", range(5))
+@pytest.mark.parametrize("k", slow_after(2, range(5)))
 def test_no_instant_beside_an_end_is_missing(k: int, hi: str) -> None:
     """v is the share of the period that is over, and g is violated within 2^-36 of an end of a quarter, or of a time
     2^-34 before or after it."""

@@ -209,6 +209,7 @@ def test_layers_that_cancel_leave_roundings_alone(width: int) -> None:
 # ----------------------------------------------------------------------------------------------- certificates of chance
 
 
+@pytest.mark.slow
 @sizes(10, 500)
 def test_what_is_accepted_of_chance_is_not_refuted(count: int) -> None:
     """Levels around the limit that a search knows nearly, and functions of which nobody knows anything."""

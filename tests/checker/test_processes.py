@@ -96,7 +96,7 @@ def test_every_refused_leaf_is_named_if_that_is_asked_for(
 
 
 @pytest.mark.parametrize("jobs", slow_after(1, [3, 2, 7]))
-@pytest.mark.parametrize("name", slow_after(8, HONEST))
+@pytest.mark.parametrize("name", slow_after(4, HONEST))
 def test_several_processes_find_what_one_finds(name: str, jobs: int) -> None:
     one, several = (rules.check(parse(honest(name)), count) for count in (1, jobs))
     assert several == one and list(several.rules) == list(one.rules)
@@ -494,6 +494,7 @@ def test_a_check_without_memory_ends_without_a_verdict(
     assert "more memory than there is" in said.err and "error" in json.loads(said.out)
 
 
+@pytest.mark.slow
 def test_the_reference_ends_after_seconds_without_a_verdict(tmp_path: Path) -> None:
     """A true certificate of 65,536 leaves; all that is asked about, and of one leaf, needs less than a minute."""
     path = write(with_tree(honest("scalar"), uniform([0], 16)), tmp_path)

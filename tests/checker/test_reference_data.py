@@ -461,7 +461,7 @@ def test_axes_where_the_claim_has_none() -> None:
     assert verdicts(put(TURN, encode([1.0] + [0.0] * 159))(renamed)) == ("data", "data"), ranges
 
 
-@pytest.mark.parametrize("name", ["axes", "an axis of two parameters", "an axis in steps"])
+@pytest.mark.parametrize("name", slow_after(1, ["axes", "an axis of two parameters", "an axis in steps"]))
 @pytest.mark.parametrize("kind", WEIGHTS)
 def test_no_multipliers_of_axes_exclude_the_truth(name: str, kind: str) -> None:
     """The range of an axis ends just before its true value, and all other ranges are as wide as can be."""

@@ -442,6 +442,7 @@ def test_no_tube_leads_from_beyond_the_region_of_attraction(
     assert verdicts(data) == {"tube"}
 
 
+@pytest.mark.slow
 @given(st.integers(1, 12), st.floats(0.05, 4.0), st.floats(0.2, 1.5), st.floats(0, 1))
 @example(12, 2.0, 1.0, 0.5)
 @example(12, 2.0, 0.9, 0.5)

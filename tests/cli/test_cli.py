@@ -351,6 +351,7 @@ def test_the_policy_may_be_the_first_word(tmp_path: Path, capsys: pytest.Capture
         assert status == 2 and f"a policy file must be named, as in certify {command} policy.pt" in err
 
 
+@pytest.mark.slow
 def test_what_to_try_next_names_a_policy_that_was_the_first_word(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -517,7 +518,9 @@ def test_a_file_whose_name_is_an_option_is_a_file(tmp_path: Path, monkeypatch: p
     assert done.returncode == 1 and "REJECTED rule=format" in done.stdout
 
 
-@pytest.mark.parametrize("arguments", [["systems", "--json"], ["roa", "--policy", str(SHIPPED), "--effort", "0.1"]])
+@pytest.mark.parametrize(
+    "arguments", slow_after(1, [["systems", "--json"], ["roa", "--policy", str(SHIPPED), "--effort", "0.1"]])
+)
 def test_a_reader_that_has_gone_is_not_a_refutation(tmp_path: Path, arguments: list[str]) -> None:
     out = ["--out", str(tmp_path)] if arguments[0] == "roa" else []
     reading, writing = os.pipe()
@@ -539,6 +542,7 @@ def test_a_beta_that_is_not_the_rounded_one_is_refused(
     assert not (tmp_path / "o").exists()
 
 
+@pytest.mark.slow
 def test_practical_stability_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plain = SHIPPED.parent / "without_gain" / "pendulum.pt"
     status, out, err = run(capsys, "roa", "--policy", plain, "--out", tmp_path, "--claim", "asymptotic")
@@ -660,6 +664,7 @@ def test_reach_proves_that_a_state_converges(
     assert status == 0 and out.splitlines()[-1].startswith("ACCEPTED ") and "c = 1.5 1.4" in out
 
 
+@pytest.mark.slow
 def test_reach_proves_that_a_box_converges(
     tmp_path: Path, spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -677,6 +682,7 @@ def test_reach_proves_that_a_box_converges(
     assert status == 0 and re.search(r"box +p = 1.49..1.51 m, v = 1.38..1.42 m/s", out)
 
 
+@pytest.mark.slow
 def test_a_box_that_is_wider_than_every_tube_is_not_shown_to_converge(
     tmp_path: Path, spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -853,6 +859,7 @@ def test_a_disturbance_that_always_acts_is_refused_where_it_would_be_left_out(
     assert not (tmp_path / "o").exists() or not any((tmp_path / "o").glob("*.[js]*"))
 
 
+@pytest.mark.slow
 def test_a_tube_of_a_plant_with_a_range(
     tmp_path: Path, ranged: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -83,6 +83,7 @@ def test_a_box_that_gets_there(asked: list[str], tmp_path: Path, capsys: pytest.
     assert "steps to the region" in (tmp_path / "set.svg").read_text("utf-8")
 
 
+@pytest.mark.slow
 def test_into_a_certified_set(asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     loop, known = asked[1:5], str(tmp_path / "known")
     assert (
@@ -128,6 +129,7 @@ def test_constraints_are_kept_until_then(asked: list[str], capsys: pytest.Captur
     assert "(kept along every trajectory from there until the region is reached: " in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_pictures_show_where_a_constraint_is_violated(
     asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -204,6 +206,7 @@ def test_text_for_people(asked: list[str], capsys: pytest.CaptureFixture[str]) -
     ("more", "why"),
     [
         (["--target", "p < 1"], "--target takes a comparison by <= or >="),
+        (["--target", "p >= 5"], "--target must have states of the domain"),
         (["--box", "p=1"], "--box is about a tube"),
         (["--within", "0"], "--within must be 1 to"),
         (["--within", "2.5s"], "which in cart take no time"),

@@ -67,6 +67,7 @@ def test_an_expression_is_proved(asked: list[str], tmp_path: Path, capsys: pytes
     assert _run(["report", certificate], False) == 0
 
 
+@pytest.mark.slow
 def test_boxes_are_proved_with_a_held_input(
     asked: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -341,7 +341,12 @@ def test_who_follows_it_gets_more(
     ("more", "changed", "proves"),
     [
         (["--from", "p=1.6..3,v=0", "--effort", "0.003"], {"--effort": "0.03"}, True),
-        (["--from", "p=1.6..3,v=0", "--effort", "1"], {"--from": "p=1.95..2.65,v=0"}, True),
+        pytest.param(
+            ["--from", "p=1.6..3,v=0", "--effort", "1"],
+            {"--from": "p=1.95..2.65,v=0"},
+            True,
+            marks=pytest.mark.slow,
+        ),
         (["--from", "p=1.6..3,v=0", "--effort", "2", "--time-limit", "1e-9"], {"--time-limit": "1e-08"}, False),
         (["--effort", "1e-7"], {"--effort": "1e-06"}, False),
     ],
@@ -371,6 +376,34 @@ def test_a_search_whose_effort_ended_says_so_and_what_to_try(
         assert status == 0 and after["verdict"] == "PROVED"
 
 
+@pytest.mark.parametrize(
+    ("more", "options", "why"),
+    [
+        ([], {}, "no box of the domain meets the target or leads there"),
+        (["--from", "p=1.6,v=0"], {}, "a larger target asks for less"),
+        (
+            ["--from", "p=1.6..3,v=0"],
+            {"--from": "p=1.95..2.65,v=0"},
+            "whatever the effort; a smaller one asks for less",
+        ),
+    ],
+)
+def test_a_search_that_ends_without_a_box_says_what_to_try(
+    loop_words: list[str],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    more: list[str],
+    options: dict[str, str],
+    why: str,
+) -> None:
+    monkeypatch.setattr("certify.analysis.reaching.run.prove_ranks", lambda *_: None)
+    words = ["reach", *loop_words, "--sample-time", "0.1", "--target", "p <= 1.5", *more]
+    status, found, said = told(capsys, words)
+    assert status == 3 and found["reason"].endswith("proved to lead into the target")
+    assert found["next"]["options"] == options and why in said
+
+
+@pytest.mark.slow
 def test_a_search_that_proves_boxes_says_where_more_effort_finds_more(
     loop_words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:

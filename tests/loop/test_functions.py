@@ -432,6 +432,7 @@ def test_a_root_inside_of_a_practical_floor_must_be_defined() -> None:
     assert verdict(data) == "ACCEPTED" and judge(data) is None
 
 
+@pytest.mark.slow
 def test_exponentials_that_overflow_are_never_accepted_for_nothing() -> None:
     """What the checker does not know of it refuses; no false claim comes through where numbers overflow."""
     for rate in ("100", "100000", "9" * 300):

@@ -140,6 +140,7 @@ def test_the_policy_belongs_to_its_plant(policy: Policy) -> None:
     assert [W.shape for W in policy.network.weights] == [(8, 2), (1, 8)]
 
 
+@pytest.mark.slow
 def test_the_pendulum_goes_to_one_point(policy: Policy, tmp_path: Path) -> None:
     """As it is the policy holds it beside upright: a fixed point, which each step from {V <= c0} comes closer to."""
     system = plant("pendulum")

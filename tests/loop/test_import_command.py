@@ -6,6 +6,7 @@ import base64
 import json
 import pickle
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -321,6 +322,7 @@ def test_an_imported_policy_reads_what_its_file_reads(
     assert status == 2 and not out and message in err and "Import its file again" in err
 
 
+@pytest.mark.slow
 def test_a_policy_of_deviations_goes_with_another_operating_point(run: Run) -> None:
     torch.save({"0.weight": torch.tensor([[-1.0, -1.0]]), "0.bias": torch.zeros(1)}, "gain.pt")
     Path("moved.toml").write_text(MOVED)
@@ -338,3 +340,26 @@ def test_observations_are_those_of_the_import(run: Run) -> None:
     assert run("import", "gain.pt", "--system", "moved.toml", *SAID[2:], "--out", "p.pt")[0] == 0
     status, _, err = run("roa", "--policy", "p.pt", "--system", "moved.toml", "--param", "k=3", "--effort", "0.2")
     assert status == 2 and "the observations p/2, v; this plant has p/3, v" in err
+
+
+def test_names_and_parameters_in_observations(run: Run) -> None:
+    """Observations may use names of [where] that stand for expressions of states and parameters, --states parameters;
+    a policy with these numbers is not used with others, nor with a range."""
+    torch.save({"0.weight": torch.tensor([[-1.0, -1.0]]), "0.bias": torch.zeros(1)}, "gain.pt")
+    plain = MOVED.replace('[x_eq]\np = "m"\n', "").replace("(p - m)", "p").replace("m = 0.5", "k = 2")
+    where = '[where]\ntip = "p/k + v"\npush = "F/k"\n[observations]\ntip = "tip"\nv = "v"\n'
+    Path("where.toml").write_text(plain + where)
+    Path("plain.toml").write_text(plain)
+    Path("range.toml").write_text(plain.replace("k = 2", "k = [1, 3]"))
+    assert run("import", "gain.pt", "--system", "where.toml", *SAID[2:], "--out", "w.pt")[0] == 0
+    states = ("--states", "p/k + v,v", *SAID[2:])
+    assert run("import", "gain.pt", "--system", "plain.toml", *states, "--out", "p.pt")[0] == 0
+    x = np.array([[0.5, -1.25]])
+    assert [load_policy(f).network(x, (Fraction(0),)).item() for f in ("w.pt", "p.pt")] == [2.25, 2.25]
+    status, _, err = run("roa", "--policy", "p.pt", "--system", "plain.toml", "--param", "k=3", "--effort", "0.2")
+    assert status == 2 and "to read states with k = 2; this plant has k = 3" in err
+    status, _, err = run("import", "gain.pt", "--system", "range.toml", *states, "--out", "p.pt")
+    assert status == 2 and "'k' is no state or parameter" in err
+    Path("where.toml").write_text(plain + where.replace('tip = "tip"', 'tip = "push"'))
+    status, _, err = run("import", "gain.pt", "--system", "where.toml", *SAID[2:], "--out", "w.pt")
+    assert status == 2 and "observations.tip" in err and "'push' is no state, parameter or name of [where]" in err

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
 import warnings
 import zipfile
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -341,7 +343,7 @@ def test_constants_are_exact() -> None:
 
 
 def test_files_of_numbers(tmp_path: Path) -> None:
-    """Arrays of numpy, and layers without numbers, are read as a state_dict is, a pickled module is not."""
+    """Arrays of numpy, layers without numbers, and modules that were pickled whole are read as a state_dict is."""
     policy = Policy("", nn.ReLU()).eval()
     net = nn.Sequential(policy.first, nn.ReLU(), policy.last)
     names = {"fc1": policy.first, "mean": policy.last}
@@ -360,8 +362,7 @@ def test_files_of_numbers(tmp_path: Path) -> None:
         ("flax.npz", "params.fc1,params.mean"),
     ):
         agree(import_policy(tmp_path / name, PLANT, replace(LAYERS, prefix=prefix)).policy, net)
-    with pytest.raises(InputError, match=r"is a module that was pickled whole.* traced"):
-        import_policy(tmp_path / "whole.pt", PLANT, LAYERS)
+    agree(import_policy(tmp_path / "whole.pt", PLANT, LAYERS).policy, net)
     torch.export.save(torch.export.export(net.eval(), (torch.zeros(1, 2),)), tmp_path / "program.pt2")
     with pytest.raises(InputError, match=r"is a program of torch\.export.*ONNX"):
         import_policy(tmp_path / "program.pt2", PLANT, LAYERS)
@@ -381,6 +382,145 @@ def test_files_of_numbers(tmp_path: Path) -> None:
         np.savez(tmp_path / "odd.npz", **arrays)
         with pytest.raises(InputError, match=r"0\.bias.* must hold real numbers of at most 64 bits"):
             import_policy(tmp_path / "odd.npz", PLANT, LAYERS)
+
+
+CHAINS: dict[str, tuple[tuple[str, ...], str, tuple[str, ...]]] = {
+    "tianshou": (
+        ("pre.model.0", "pre.model.2", "mu.model.0"),
+        "pre.model,mu.model",
+        ("sigma_param", "critic.0.weight"),
+    ),
+    "a layer behind": (("pi.net.0", "pi.net.2", "pi.mu"), "pi.net,pi.mu", ("pi.log_std.weight", "q1.q.0.weight")),
+    "a layer before": (("first", "net.1", "net.3"), "first,net", ()),
+}
+
+
+def test_a_gain_is_one_layer_without_a_number(tmp_path: Path) -> None:
+    """As in a file of a gain and a Lyapunov network."""
+    others = {"lyapunov.0.weight": torch.ones(4, 2), "lyapunov.2.weight": torch.ones(1, 4)}
+    torch.save({"policy.weight": torch.tensor([[-2.0, 3.0]])} | others, tmp_path / "p.pt")
+    with pytest.raises(InputError, match=r"if the policy is policy, say so: --prefix policy\. If"):
+        import_policy(tmp_path / "p.pt", PLANT, LAYERS)
+    found = import_policy(tmp_path / "p.pt", PLANT, replace(LAYERS, prefix="policy"))
+    assert found.policy.network(np.array([[1.0, 2.0]]), (Fraction(0),)).item() == 4
+    assert set(found.not_read) == set(others)
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_a_prefix_may_be_of_several_layers(name: str, tmp_path: Path) -> None:
+    names, prefix, others = CHAINS[name]
+    torch.manual_seed(1)
+    layers = [nn.Linear(2, 6), nn.Linear(6, 5), nn.Linear(5, 1)]
+    net = nn.Sequential(layers[0], nn.ReLU(), layers[1], nn.ReLU(), layers[2])
+    tensors = {
+        f"{k}.{p}": getattr(one, p).detach() for k, one in zip(names, layers, strict=True) for p in ("weight", "bias")
+    }
+    torch.save({name: torch.ones(1, 5) for name in others} | tensors, tmp_path / "p.pt")
+    with pytest.raises(InputError, match=rf"say so: --prefix {prefix}\. If"):
+        import_policy(tmp_path / "p.pt", PLANT, LAYERS)
+    for wrong in (f"{prefix},{names[1]}", f"{prefix},none", f"{names[0]},{names[0]}"):
+        with pytest.raises(InputError, match=r"name each layer once, or the keys of some up to their numbers"):
+            import_policy(tmp_path / "p.pt", PLANT, replace(LAYERS, prefix=wrong))
+    found = import_policy(tmp_path / "p.pt", PLANT, replace(LAYERS, prefix=prefix))
+    agree(found.policy, net)
+    assert set(found.not_read) == set(others)
+
+
+def twice(module: Any, inputs: Any, output: Any) -> Any:
+    """A hook."""
+    return 2 * output
+
+
+def hooked() -> Any:
+    net = nn.Sequential(nn.Linear(2, 4), nn.Tanh(), nn.Linear(4, 1))
+    net[2].register_forward_hook(twice)
+    return net
+
+
+def layered(*between: Any, behind: tuple[Any, ...] = ()) -> Any:
+    return nn.Sequential(nn.Linear(2, 4), *between, nn.Linear(4, 1), *behind)
+
+
+TANH = replace(LAYERS, activation="tanh")
+WHOLE: dict[str, tuple[Callable[[], Any], ImportOptions]] = {
+    "plain": (lambda: layered(nn.Tanh(), nn.Dropout(0.2)), TANH),
+    "squashed": (lambda: layered(nn.Tanh(), behind=(nn.Tanh(),)), replace(TANH, squash="tanh")),
+    "the usual slope": (lambda: layered(nn.LeakyReLU()), replace(LAYERS, activation="leaky_relu")),
+    "a slope": (lambda: layered(nn.LeakyReLU(0.2)), replace(LAYERS, activation="leaky_relu:0.2")),
+    "softplus": (lambda: layered(nn.Softplus(3.0)), replace(LAYERS, activation="softplus:3")),
+    "a norm": (lambda: layered(nn.LayerNorm(4), nn.Tanh()), replace(TANH, norm="layer-before")),
+    "a class of its own": (lambda: Policy("", nn.ReLU()), replace(LAYERS, prefix="first,last")),
+}
+OTHERWISE: dict[str, tuple[Callable[[], Any], ImportOptions, str]] = {
+    "another function": (lambda: layered(nn.ReLU()), TANH, "module 1 is relu; --activation says tanh"),
+    "another end": (lambda: layered(nn.Tanh(), behind=(nn.Tanh(),)), LAYERS, "1 is tanh; --activation says relu"),
+    "no function between": (
+        lambda: nn.Sequential(nn.Linear(2, 4), nn.Linear(4, 4), nn.Tanh(), nn.Linear(4, 1)),
+        TANH,
+        "must be layers with tanh between each two",
+    ),
+    "two functions between": (lambda: layered(nn.Tanh(), nn.Tanh()), TANH, "must be layers with tanh between"),
+    "a function before": (lambda: nn.Sequential(nn.Tanh(), nn.Linear(2, 1)), TANH, "must be layers with tanh between"),
+    "an end that is not said": (lambda: layered(nn.Tanh(), behind=(nn.Tanh(),)), TANH, "behind the last nothing or"),
+    "a slope that is not said": (lambda: layered(nn.LeakyReLU(0.2)), replace(LAYERS, activation="leaky_relu"), r"0\.2"),
+    "another slope": (lambda: layered(nn.LeakyReLU(0.2)), replace(LAYERS, activation="leaky_relu:0.1"), r"slope 0\.2"),
+    "a threshold": (lambda: layered(nn.Softplus(1, 2)), replace(LAYERS, activation="softplus:1"), "Softplus, of which"),
+    "a module that is not read": (lambda: layered(nn.Tanh(), behind=(nn.Softmax(-1),)), TANH, "Softmax, of which no"),
+    "a norm without numbers": (
+        lambda: layered(nn.LayerNorm(4, elementwise_affine=False), nn.Tanh()), TANH, "LayerNorm, of which no",
+    ),
+    "another epsilon": (
+        lambda: layered(nn.LayerNorm(4, eps=0.1), nn.Tanh()), replace(TANH, norm="layer-before"), "with --norm-eps",
+    ),
+    "a hook": (hooked, TANH, "must have no hooks"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_modules_that_were_pickled_whole(name: str, tmp_path: Path) -> None:
+    """In each form of torch.save and of pickle, and beside another network in a dictionary."""
+    torch.manual_seed(3)
+    module, path = WHOLE[name][0]().eval(), tmp_path / "p.pt"
+    options = WHOLE[name][1]
+    for k in range(4):
+        if k < 2:
+            torch.save(module, path, _use_new_zipfile_serialization=bool(k))
+        else:
+            path.write_bytes(pickle.dumps(module if k == 2 else {"critic": nn.Sequential(nn.ReLU()), "pi": module}))
+        prefix = options.prefix if k < 3 or options.prefix is None else "pi.first,pi.last"
+        found = import_policy(
+            path, PLANT, replace(options, prefix=prefix, ignore=("*mean", "*var", "*most") if prefix else None)
+        )
+        agree(found.policy, module)
+        assert "forward is not in the file" in found.assumed
+        module.float()
+
+
+def test_a_module_with_two_names_has_its_tensors_under_both(tmp_path: Path) -> None:
+    """As in a state_dict: without those of the first layer, the second would be a network of its own."""
+    net = nn.Module()
+    net.first = nn.Linear(2, 2)
+    net.net = nn.Sequential(net.first, nn.Tanh(), nn.Linear(2, 1))
+    torch.save(net, tmp_path / "p.pt")
+    found = import_policy(tmp_path / "p.pt", PLANT, replace(TANH, prefix="net", ignore=("first.*",)))
+    agree(found.policy, net.net)
+    actor = Policy("", nn.Tanh())
+    actor.max_action = 2.0
+    torch.save({"actor": actor}, tmp_path / "q.pt")
+    options = replace(TANH, prefix="actor.first,actor.last", ignore=("actor.m*", "actor.var"))
+    assert "nor the part in it of actor.max_action = 2" in import_policy(tmp_path / "q.pt", PLANT, options).assumed
+    net.own = net
+    (tmp_path / "p.pt").write_bytes(pickle.dumps(net))
+    with pytest.raises(InputError, match="at most 1,000 modules"):
+        import_policy(tmp_path / "p.pt", PLANT, TANH)
+
+
+@pytest.mark.parametrize("name", OTHERWISE)
+def test_modules_that_are_not_what_is_said_are_refused(name: str, tmp_path: Path) -> None:
+    made, options, message = OTHERWISE[name]
+    torch.save(made(), tmp_path / "p.pt")
+    with pytest.raises(InputError, match=message):
+        import_policy(tmp_path / "p.pt", PLANT, options)
 
 
 def test_arrays_that_do_not_say_which_way_they_go_are_listed(tmp_path: Path) -> None:
@@ -483,9 +623,10 @@ def test_the_mean_of_what_gives_the_spread_as_well(tmp_path: Path) -> None:
     found = import_policy(path, PLANT, replace(BRAX, output="mean"))
     assert "first 1 are the mean" in found.assumed
     agree(found.policy, module, lambda y: torch.tanh(y[:, :1]))
-    with pytest.raises(InputError, match=r"it gives 2\. .* --output mean"):
-        import_policy(path, PLANT, BRAX)
     torch.save(module.state_dict(), tmp_path / "p.pt")  # found by its sizes
+    for each, prefix in ((path, BRAX.prefix), (tmp_path / "p.pt", None)):
+        with pytest.raises(InputError, match=r"it gives 2\. .* --output mean"):
+            import_policy(each, PLANT, replace(BRAX, prefix=prefix))
     found = import_policy(tmp_path / "p.pt", PLANT, replace(BRAX, output="mean", prefix=None))
     agree(found.policy, module.float(), lambda y: torch.tanh(y[:, :1]))
     for outputs in (1, 3, 4):
@@ -506,8 +647,9 @@ def test_the_places_of_the_actions_in_what_the_last_layer_gives(tmp_path: Path) 
     torch.save(module.state_dict(), tmp_path / "p.pt")  # found by its sizes
     found = import_policy(tmp_path / "p.pt", PLANT, replace(BRAX, output="2", prefix=None))
     agree(found.policy, module.float(), lambda y: torch.tanh(y[:, 2:3]))
-    with pytest.raises(InputError, match=r"--output 4 takes the numbers 4 of .*; it gives 4"):
-        import_policy(path, PLANT, replace(BRAX, output="4"))
+    for each, prefix in ((path, BRAX.prefix), (tmp_path / "p.pt", None)):
+        with pytest.raises(InputError, match=r"--output 4 takes the numbers 4 of .*; it gives 4"):
+            import_policy(each, PLANT, replace(BRAX, output="4", prefix=prefix))
     for said in ("", "-1", "0,2", "0,0", "0,00", "1.0", "first", "\u0662"):
         with pytest.raises(InputError, match="must be mean, or the place of each of 1 actions"):
             import_policy(path, PLANT, replace(BRAX, output=said))

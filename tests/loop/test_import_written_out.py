@@ -18,6 +18,7 @@ from certify.loop.policies.importers import Imported, ImportOptions, import_poli
 from certify.loop.policies.importers.memory import import_module, import_state_dict
 from certify.loop.policies.importers.steps import layer_normalised
 from tests.support.foreign import plant
+from tests.support.marks import slow_after
 
 nn: Any = torch.nn
 jit: Any = torch.jit
@@ -370,7 +371,7 @@ PROVED = {
 }
 
 
-@pytest.mark.parametrize("name", PROVED)
+@pytest.mark.parametrize("name", slow_after(1, PROVED))
 def test_a_small_policy_is_proved(name: str, tmp_path: Path) -> None:
     said: dict[str, Any] = {"states": ("theta", "theta_dot"), "normaliser": "none", "action_scale": (6,)}
     options = RoaOptions(candidate="lyapunov", effort=0.01)

@@ -308,6 +308,8 @@ def test_order_operating_point_and_normaliser_together(tmp_path: Path) -> None:
     model, environment, path, normaliser = sb3("PPO", tmp_path)
     environment.obs_rms.mean, environment.obs_rms.var = np.array([-2.5, 1.25]), np.array([0.01, 0.09])
     environment.save(str(normaliser))
+    with pytest.raises(InputError, match=r"is a normaliser of observations: name it with --normaliser"):
+        import_policy(normaliser, plant(), SAID)
     options = ImportOptions(states=("x1", "x0"), normaliser=normaliser, observes="absolute")
     policy = import_policy(path, plant(x_eq=(1, -2)), options).policy
     reach = 10 * np.sqrt(environment.obs_rms.var + 1e-8)
@@ -717,6 +719,22 @@ def test_safetensors(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-3])
     with pytest.raises(InputError, match="damaged"):
         import_policy(path, plant(), LAYERS)
+    save_file(STATE, path, {"format": "pt", "negative_slope": "0.1", "note": "n" * 99})
+    with pytest.raises(InputError, match=r"__metadata__\.negative_slope = 0\.1, .* --activation leaky_relu:0\.1, or"):
+        import_policy(path, plant(), replace(LAYERS, activation="leaky_relu"))
+    for said, why in (
+        ("leaky_relu:0.1", "the slope that"),
+        ("leaky_relu:0.3", "it is 0.1, not the slope that"),
+        ("tanh", ""),
+    ):
+        found = import_policy(path, plant(), replace(LAYERS, activation=said)).not_read
+        texts = found["__metadata__"]
+        assert f"note = {'n' * 80} …" in texts and "format" not in texts
+        assert ("negative_slope = 0.1" in texts) is not why.endswith("that")
+        assert not why or found["__metadata__.negative_slope"].startswith(why)
+    save_file(STATE, path, {"slope": "steep"})
+    with pytest.raises(InputError, match=r"slope in the metadata of .* must be a number; found 'steep'"):
+        import_policy(path, plant(), replace(LAYERS, activation="leaky_relu"))
 
 
 # --------------------------------------------------------------------------------------- centring, records, the file
@@ -811,7 +829,7 @@ def test_what_a_file_is_follows_from_its_bytes(tmp_path: Path) -> None:
     torch.save(STATE, buffer, _use_new_zipfile_serialization=False)
     assert content_of(buffer.getvalue(), "p.pt") == "state-dict"
     for raw, message in (
-        (pickle.dumps(STATE), "a bare pickle"),
+        (pickle.dumps(STATE, protocol=0), "a pickle of protocol 2 or later"),
         (b"noise", "none of these"),
         (b"", "none of these"),
         (b"PK\x03\x04noise", "no zip archive"),
@@ -837,6 +855,36 @@ def members(*names: str) -> bytes:
     return buffer.getvalue()
 
 
+BARE: dict[str, Any] = {
+    "tensors": STATE,
+    "arrays": {"weights": {f"actor.{k}": v.numpy() for k, v in STATE.items()}, "spec": Fraction, "made": Odd()},
+    "kernels": {k.replace("weight", "kernel"): v.numpy().T for k, v in STATE.items()},
+}
+
+
+@pytest.mark.parametrize("name", BARE)
+def test_pickles_that_stand_alone_are_read_as_data(name: str, tmp_path: Path) -> None:
+    for protocol in range(2, pickle.HIGHEST_PROTOCOL + 1):
+        (tmp_path / "p.pkl").write_bytes(pickle.dumps(BARE[name], protocol))
+        assert gap(import_policy(tmp_path / "p.pkl", plant(), LAYERS), values(mlp(), X)) < TIGHT
+    raw = (tmp_path / "p.pkl").read_bytes()
+    (tmp_path / "p.pkl").write_bytes(raw[: len(raw) // 2])
+    with pytest.raises(InputError, match=r"p\.pkl (ends before its pickle does|is no pickle or is damaged)"):
+        import_policy(tmp_path / "p.pkl", plant(), LAYERS)
+
+
+def test_an_archive_that_is_cut_is_not_read_as_the_last_one_inside(tmp_path: Path) -> None:
+    """A file of stable-baselines3 holds files of torch as they are, each with a directory of its own at its end."""
+    raw = saved(tmp_path, STATE).read_bytes()
+    with zipfile.ZipFile(tmp_path / "sb3.zip", "w") as archive:
+        for name, content in (("data", b"{}"), ("policy.pth", raw), ("more", bytes(99))):
+            archive.writestr(name, content)
+    whole = (tmp_path / "sb3.zip").read_bytes()
+    (tmp_path / "sb3.zip").write_bytes(whole[: whole.index(raw) + len(raw) + 50])
+    with pytest.raises(InputError, match=r"The file is cut, or damaged"):
+        import_policy(tmp_path / "sb3.zip", plant(), LAYERS)
+
+
 HDF5 = b"\x89HDF\r\n\x1a\n" + bytes(64)
 NOT_READ = {
     "policy.keras": (members("metadata.json", "config.json", "model.weights.h5"), "model of Keras.*export.*tf2onnx"),
@@ -846,6 +894,8 @@ NOT_READ = {
     "new.mat": (b"MATLAB 7.3 MAT-file, Platform".ljust(512) + HDF5, "MAT-file of MATLAB"),
     "params.msgpack": (b"\x81\xa6params\x80{", "msgpack, as flax.*numpy.savez"),
     "ACASXU.nnet": (b"// Neural Network File Format\n1,2,1,2,\n", "NNet.*0.weight.*obs._mean"),
+    "K.npy": (b"\x93NUMPY\x01\x00", "one array of numpy.*a gain K.*0.weight = -K"),
+    "best.onnx": (b"version https://git-lfs.github.com/spec/v1\noid sha256:1d\nsize 15\n", "Git LFS, .*git lfs pull"),
     "saved_model.pb": (b"\x08\x01", "SavedModel.*tf2onnx.convert --saved-model FOLDER"),
 }
 

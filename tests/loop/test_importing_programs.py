@@ -164,7 +164,9 @@ def test_a_number_that_the_file_says_is_not_passed_over(name: str, tmp_path: Pat
         import_policy(tmp_path / "p.pt", PLANT, options)
     typed = str(refused.value).split("--activation ")[1].partition(",")[0]
     found = import_policy(tmp_path / "p.pt", PLANT, replace(options, activation=typed))
-    assert typed.partition(":")[2] in found.assumed
+    assert typed.partition(":")[2] in found.assumed and "that --activation says" in {*found.not_read.values()}.pop()
+    found = import_policy(tmp_path / "p.pt", PLANT, replace(options, activation=f"{function}:0.75"))
+    assert all(why.startswith("it is ") and ", not the " in why for why in found.not_read.values()) and found.not_read
     import_policy(
         tmp_path / "p.pt",
         PLANT,

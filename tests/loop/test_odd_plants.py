@@ -55,6 +55,7 @@ def test_what_was_proved_with_an_earlier_floor_is_accepted_with_the_last(
     assert result.verdict is Verdict.PROVED
 
 
+@pytest.mark.slow
 def test_progress_survives_a_level_that_falls_below_zero(tmp_path: Path) -> None:
     options = RoaOptions(claim="practical", effort=0.02)
     system = plant({"x": "-x + u + tan(x)/100"}, half=3, bound=10)

@@ -341,6 +341,7 @@ def test_no_rest_is_enclosed_across_a_jump() -> None:
     assert find_rest(ClosedLoop(system, network)) is None
 
 
+@pytest.mark.slow
 def test_a_range_moves_the_fixed_point_of_a_map(tmp_path: Path) -> None:
     """The Henon map whose a has a range: practically stable for any a(k), and for each a with one fixed point."""
     folder = Path(__file__).parents[2] / "examples"

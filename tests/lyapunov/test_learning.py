@@ -308,6 +308,7 @@ def falls(learned: Learned, loop: ClosedLoop, inner: Quadratic, c2: float) -> bo
     return bool(np.all((learned.function.gradient(x) * loop.system.function()(x, loop.policy(x))).sum(-1) < 0))
 
 
+@pytest.mark.slow
 def test_a_network_learns_the_disc(network: Learned) -> None:
     assert isinstance(network.function, Neural) and network.function.widths == (2, 8, 1)
     assert area(network) > 0.9 and network.cover == pytest.approx(area(network), abs=0.05)
@@ -351,6 +352,7 @@ def test_rounds_are_told_and_end_with_the_effort() -> None:
     assert tuple(told) == found.history and len(found.history) == 1
 
 
+@pytest.mark.slow
 def test_a_set_inside_of_a_narrow_domain_keeps_off_its_faces() -> None:
     loop = disc(0.8)
     found = learn(loop, UNIT, 0.09, (8,))

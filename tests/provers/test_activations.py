@@ -220,6 +220,7 @@ def without_biases(name: str) -> PolicyNetwork:
     return replace(law.with_layers(biases=tuple(0 * b for b in law.biases)), centre="none")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_after(1, ["elu", "softsign"]))
 def test_a_corner_with_a_tangent_at_the_operating_point_is_proved(name: str, tmp_path: Path) -> None:
     result = certify_roa(PLANT, without_biases(name), tmp_path, effort=0.04, candidate="ellipsoid")
@@ -242,6 +243,7 @@ def test_a_corner_of_elu_beside_one_of_relu_has_directions_for_the_relu() -> Non
     assert result.verdict is Verdict.PROVED and result.claim == "asymptotic"
 
 
+@pytest.mark.slow
 def test_a_relu_with_its_corner_at_the_operating_point_has_directions(tmp_path: Any) -> None:
     """A kink at the origin, and an unstable loop on one side of it."""
     result = certify_roa(PLANT, free_of_biases(policy("relu"), 1), tmp_path, effort=0.1, candidate="ellipsoid")

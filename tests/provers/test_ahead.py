@@ -153,6 +153,7 @@ def test_so_it_is_whoever_comes_and_goes(name: str) -> None:
     assert not found and answered > 30
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["uncertain", pytest.param("sampled", marks=SLOW)])
 def test_so_it_is_on_the_way_inwards(name: str) -> None:
     make, inner, outer = CASES[name]
@@ -166,6 +167,7 @@ def test_so_it_is_on_the_way_inwards(name: str) -> None:
     assert not found and answered > 30 and Stop.EFFORT in stops and len(stops) > 1
 
 
+@pytest.mark.slow
 def test_so_it_is_of_a_set_beyond_the_ellipsoid() -> None:
     """The effort ends on a face, and in the middle of the leaves, with a smaller set."""
     problem, N = planar(), wells([[1.0, 0.0], [-0.5, 0.875], [-0.5, -0.875]], 0.75)
@@ -243,7 +245,9 @@ def by_arrival(name: str, patched: pytest.MonkeyPatch) -> None:
         patched.setattr(Ahead, "_forget", still_known)
 
 
-@pytest.mark.parametrize(("name", "case"), [("order", "two states"), ("count", "sampled"), ("levels", "violated")])
+@pytest.mark.parametrize(
+    ("name", "case"), slow_after(1, [("order", "two states"), ("count", "sampled"), ("levels", "violated")])
+)
 def test_what_hangs_on_arrival_would_show(name: str, case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The order of boxes, the count of effort, and bounds that were made for levels of before."""
     by_arrival(name, monkeypatch)

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -28,7 +29,7 @@ from certify.provers.base import Budget
 from certify.provers.boxes import ahead
 from certify.provers.boxes.search import outwards, prove_outwards
 from certify.provers.execution import ThreadRunner
-from certify.provers.execution.cluster import ClusterJobs, ClusterRunner, connect
+from certify.provers.execution.cluster import ClusterJobs, ClusterRunner, connect, signals_later
 from tests.provers.test_vdot import cartpole_case
 from tests.support.dask import ROOT, Cluster, cluster, echo
 
@@ -263,17 +264,35 @@ def command(out: Path, address: str, *more: str) -> list[str]:
     return [sys.executable, "-m", "certify", *asked]
 
 
+def test_ctrl_c_waits_until_all_workers_are_there() -> None:
+    """Threads that start meanwhile, and so their processes, do not see it."""
+    before, seen = signal.signal(signal.SIGINT, signal.default_int_handler), list[Any]()
+    try:
+        with pytest.raises(KeyboardInterrupt), signals_later():
+            thread = threading.Thread(target=lambda: seen.append(signal.pthread_sigmask(signal.SIG_BLOCK, [])))
+            thread.start()
+            os.kill(os.getpid(), signal.SIGINT)
+            thread.join()
+            seen.append("the block ends")
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert signal.SIGINT in seen[0] and seen[1] == "the block ends"
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
 @pytest.mark.slow
+@pytest.mark.parametrize("processes", [3, 1], ids=["in the search", "while workers start"])
 @pytest.mark.parametrize("everybody", [True, False], ids=["as a terminal does", "to certify alone"])
-def test_ctrl_c_leaves_no_processes(everybody: bool, tmp_path: Path) -> None:
+def test_ctrl_c_leaves_no_processes(everybody: bool, processes: int, tmp_path: Path) -> None:
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     run = subprocess.Popen(
         command(tmp_path, "local:2", "--effort", "1.2", "--quiet"),
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=ROOT, start_new_session=True,
     )  # fmt: skip
     try:
-        wait_for(lambda: len(descendants(run.pid)) >= 3 or run.poll() is not None, 120)  # scheduler and workers
-        time.sleep(2.0)  # into the search
+        wait_for(lambda: len(descendants(run.pid)) >= processes or run.poll() is not None, 120)
+        time.sleep(2.0 if processes > 1 else 0.2)
         assert run.poll() is None, run.communicate()
         started = descendants(run.pid)
         (os.killpg if everybody else os.kill)(run.pid, signal.SIGINT)
@@ -284,7 +303,7 @@ def test_ctrl_c_leaves_no_processes(everybody: bool, tmp_path: Path) -> None:
             run.wait()
     assert run.returncode == 130 and err.startswith("certify: interrupted; ") and err.count("\n") == 1 and not out
     wait_for(lambda: not any(alive(pid) for pid in started), 15)
-    assert len(started) >= 2  # workers
+    assert len(started) >= min(processes, 2)  # workers
     kept = ["search.json"] if "the search is kept" in err else []
     assert [path.name for path in tmp_path.iterdir()] == kept and (kept or "nothing was left half-written" in err)
 

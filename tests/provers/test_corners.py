@@ -264,6 +264,7 @@ def test_saturated_plants_are_proved(name: str, tmp_path: Path) -> None:
     assert np.abs(x).max() < 1e-2
 
 
+@pytest.mark.slow
 def test_leaves_across_a_corner_are_shown_in_the_order_that_they_were_proved_in_alone(tmp_path: Path) -> None:
     """A series of order 2 does not exist there, and boxes with ranks ask for it: the ring's proof keeps its order."""
     result = certify_roa(
@@ -321,7 +322,7 @@ def test_a_true_claim_beside_it_is_proved(time: str, tmp_path: Path) -> None:
 DRAG = "0*u + (x*abs(x) - x)/8"  # turns at |x| = 1
 
 
-@pytest.mark.parametrize("time", TIMES)
+@pytest.mark.parametrize("time", slow_after(1, TIMES))
 def test_drag_of_the_wrong_sign_is_proved_up_to_where_it_turns(time: str, tmp_path: Path) -> None:
     system, options = timed(DRAG, 2.0, time), RoaOptions(level=1 - 1e-3, P=np.eye(1))
     assert certify_roa(system, regulator(0.5), tmp_path, options).verdict is Verdict.PROVED
@@ -330,6 +331,7 @@ def test_drag_of_the_wrong_sign_is_proved_up_to_where_it_turns(time: str, tmp_pa
         assert beyond.verdict is not Verdict.PROVED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("claim", slow_after(1, ["nearby", "asymptotic", "practical"]))
 def test_drag_at_rest_is_proved_with_ranges(claim: str, tmp_path: Path) -> None:
     """The corner moves with w in the last two, so that the loop does not rest at the origin."""
@@ -339,6 +341,7 @@ def test_drag_at_rest_is_proved_with_ranges(claim: str, tmp_path: Path) -> None:
     assert result.verdict is Verdict.PROVED
 
 
+@pytest.mark.slow
 def test_a_corner_of_a_held_input_at_rest_costs_the_ball_nothing(tmp_path: Path) -> None:
     """The input does not change within a period, and so the series in time is known."""
     system = plant("p v", "v", "-p - v + u*abs(u)").with_sample(TENTH)
@@ -346,6 +349,7 @@ def test_a_corner_of_a_held_input_at_rest_costs_the_ball_nothing(tmp_path: Path)
     assert result.verdict is Verdict.PROVED and result.levels.roa is not None and result.levels.roa > 0.99
 
 
+@pytest.mark.slow
 def test_a_corner_at_rest_that_a_state_may_pass_in_a_period_is_named(tmp_path: Path) -> None:
     system = plant("p v", "v", "-p - v - v*abs(v) + u").with_sample(TENTH)
     result = certify_roa(system, regulator(0.2, 0.2), tmp_path, RoaOptions(effort=0.02))

@@ -102,6 +102,7 @@ def test_what_a_jump_leads_to_is_proved_and_accepted_by_both(tmp_path: Path) -> 
     assert judge_bytes(result.raw) is None
 
 
+@pytest.mark.slow
 def test_a_jump_that_throws_out_is_not_proved(tmp_path: Path) -> None:
     """At x = 1 alone one of the values leads to 11/2, beyond the domain, and floats take the other one."""
     (x,) = symbols("x")

@@ -110,6 +110,7 @@ RUNS: dict[str, tuple[Any, PolicyNetwork, dict[str, Any]]] = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_after(1, ["a rest beside a kink", "discrete", "three states"]))
 def test_a_run_is_proved_and_accepted(name: str, tmp_path: Any) -> None:
     system, law, options = RUNS[name]

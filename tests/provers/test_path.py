@@ -143,6 +143,7 @@ def test_a_tube_leads_from_what_is_attracted_and_from_nothing_else(x: float, fou
     assert found or "leaves the domain" in why or "not arrived" in why or "cannot be continued" in why
 
 
+@pytest.mark.slow
 def test_the_widest_tube_stays_below_what_is_attracted() -> None:
     loop, goal = ClosedLoop(*scalar_tanh()), np.array([[1 / 0.3**2]])
     best, _ = surround(loop, np.array([1.5]), goal, {"one": np.eye(1)}, Effort(20 * UNIT))
@@ -151,6 +152,7 @@ def test_the_widest_tube_stays_below_what_is_attracted() -> None:
     assert 1.65 < reach < ATTRACTED
 
 
+@pytest.mark.slow
 def test_a_saddle_beside_the_path_bounds_the_width() -> None:
     """From close to the edge of what is attracted the tube is narrower than the way to the edge."""
     loop, goal = ClosedLoop(*scalar_tanh()), np.array([[1 / 0.3**2]])

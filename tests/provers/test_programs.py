@@ -164,7 +164,7 @@ def test_rationals_know_what_steps_make_of_0() -> None:
     assert late == (None,)  # sqrt(1.01)
 
 
-@pytest.mark.parametrize("name", slow_after(2, PROGRAMS))
+@pytest.mark.parametrize("name", slow_after(1, PROGRAMS))
 def test_they_prove_loops_that_both_checkers_accept(name: str) -> None:
     result = certify_roa(PLANT, policy(name), effort=0.1, candidate="ellipsoid")
     assert result.verdict is Verdict.PROVED and result.volume is not None and result.volume > 30

@@ -172,6 +172,7 @@ def test_unknown_says_what_to_try(tmp_path: Path) -> None:
     assert not (tmp_path / "certificate.json").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", slow_after(1, range(6)))
 def test_random_loops_never_end_in_an_error(seed: int, tmp_path: Path) -> None:
     """What is proved is accepted by both, and runs from it stay."""

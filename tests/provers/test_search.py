@@ -77,6 +77,7 @@ def test_the_effort_of_the_check_is_left() -> None:
     assert 10 <= ring.proved < 30
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "hopeless"), [("cartpole", False), ("quadrotor2d", False), ("quadrotor3d", True)])
 def test_what_a_search_expects_tells_the_hopeless(name: str, hopeless: bool) -> None:
     """Four and six states have gained within 40,000 boxes; twelve states would need 1e15."""

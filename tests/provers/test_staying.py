@@ -133,6 +133,7 @@ def test_trajectories_stay(given: InvariantResult) -> None:
         assert np.all(N(x) <= given.outer.level)
 
 
+@pytest.mark.slow
 def test_a_polynomial_is_learned(tmp_path: Path) -> None:
     found = run(tmp_path, candidate="polynomial", degree=4, effort=0.2)
     assert found.verdict is Verdict.PROVED and "polynomial of degree 4" in found.learned

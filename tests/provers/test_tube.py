@@ -375,6 +375,7 @@ def test_a_box_must_name_states(tmp_path: Path) -> None:
         certify_roa(get_system("pendulum"), load_policy(POLICIES / "pendulum.pt").network, tmp_path, options)
 
 
+@pytest.mark.slow
 def test_a_tube_that_the_checker_refuses_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A careless producer ends with what is proved without it."""
 
@@ -389,6 +390,7 @@ def test_a_tube_that_the_checker_refuses_is_left_out(tmp_path: Path, monkeypatch
     assert result.stop is not Stop.STALLED and "left out with its tube" in (result.notice or "")
 
 
+@pytest.mark.slow
 def test_a_policy_that_is_not_centred_has_no_tube(tmp_path: Path) -> None:
     network = replace(pendulum_network(), centre="none")
     result = certify_roa(get_system("pendulum"), network, tmp_path, RoaOptions(enlarge=True, effort=0.03))

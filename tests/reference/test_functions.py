@@ -437,7 +437,7 @@ def raw(data: Document) -> bytes:
 
 
 @pytest.mark.parametrize("loop", slow_after(1, [one_state, two_states]))
-@pytest.mark.parametrize("name", [*ACTIVATIONS, "tanh"])
+@pytest.mark.parametrize("name", slow_after(4, [*ACTIVATIONS, "tanh"]))
 def test_a_loop_of_each_activation_is_proved(name: str, loop: Callable[[str], tuple[Document, Any]]) -> None:
     """And is not with the opposite weights, nor with cos or exp, if with that the loop is not stable."""
     data = proved(loop(name)[0])

@@ -541,6 +541,7 @@ def test_the_checker_has_the_same_limits() -> None:
     assert by_checker(on_unit(plus("x", H(["-", ["sin", "x"], "1/2"])), -3.25, 3.25, angles=("x",))) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", slow_after(1, [2, 1, 3]))
 def test_the_checker_says_the_same_in_small_batches(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A leaf may then have more images than a batch has places, and all leaves must keep their own."""

@@ -29,6 +29,7 @@ from certify.reference.model import Model
 from certify.reference.refusal import Refused
 from tests.support.balls import around, centred
 from tests.support.certificates import Document, dump, edited, encode, make, verdict
+from tests.support.marks import slow_after
 from tests.support.models import triples
 from tests.support.network_loops import affine, hashed, joined, mapped
 from tests.support.reference import judge
@@ -479,7 +480,7 @@ def drawn(kind: str, n: int, generator: np.random.Generator) -> Steps:
 
 
 @pytest.mark.parametrize("time", ["continuous", "discrete"])
-@pytest.mark.parametrize("kind", ["relu", "clip", "layers", "product", "tanh", "sum"])
+@pytest.mark.parametrize("kind", slow_after(2, ["relu", "product", "clip", "layers", "tanh", "sum"]))
 def test_V_falls_at_sampled_states_wherever_the_rule_says_so(kind: str, time: str) -> None:
     """At 0.9 of the rate at which it falls at states of the ball, at least, and not at a thousandth above it."""
     generator, accepted = np.random.default_rng(len(kind)), 0

@@ -181,7 +181,7 @@ def loose(v: Vector, rows: Rows, truth: Truth) -> tuple[Fraction, Fraction]:
     return away(v, stays, truth), sum(map(exactly, allowed), Fraction(0))
 
 
-@pytest.mark.parametrize("memory", [1, 3])
+@pytest.mark.parametrize("memory", slow_after(1, [3, 1]))
 @pytest.mark.parametrize("name", LOOPS)
 def test_images_hold_all_that_is_true(name: str, memory: int) -> None:
     """In many directions, of integers, without any tolerance."""
@@ -386,7 +386,7 @@ def test_axes_that_stay_are_refused_where_those_that_move_are_not() -> None:
     assert verdict(loop.document(400, target)) == "ranks"
 
 
-@pytest.mark.parametrize("memory", [None, 2, 4])
+@pytest.mark.parametrize("memory", slow_after(1, [2, None, 4]))
 @pytest.mark.parametrize("name", ["one state is set", "both are alike", "nilpotent", "all is set", "shear"])
 def test_targets_after_steps_that_have_no_inverse_or_flatten(name: str, memory: int | None) -> None:
     """What is lost is at most twice the errors that have no symbols any more."""

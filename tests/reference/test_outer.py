@@ -545,6 +545,7 @@ def test_with_a_clause_disabled_a_forgery_gets_through(monkeypatch: pytest.Monke
 WELL = ["**", ["-", ROUND, "6/25"], 2]  # least just inside {V <= c2}, where it does not fall
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "needed"), [("close to the edge", 0), ("a well", 1)])
 def test_multipliers_pay(name: str, needed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where N'F vanishes beyond n2, or within {V < c2}, it does not fall on all of a leaf."""

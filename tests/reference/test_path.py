@@ -426,6 +426,7 @@ def test_the_inputs_on_a_slab() -> None:
         assert (verdict.rule, verdict.at) == (place and "inputs", place), verdict.detail
 
 
+@pytest.mark.slow
 def test_a_clip_must_not_act_on_a_slab() -> None:
     """Where the input is far from 0 the clip is seen from there, and not from u_eq."""
     reach = [float((abs(u.v) + u.radius).upper()) for u in inputs_of(swing_of())]
@@ -535,6 +536,7 @@ def some(f: float, a: float, w: float, **more: float) -> bool:
     return any(scalar(f, a, w, edge=k, move=q * k * 4, **more) for k in GRID for q in GRID[GRID < 1][::-6])
 
 
+@pytest.mark.slow
 def test_the_edge_in_one_state() -> None:
     """For P = 1 it is negative at z = 1 and z = -1 while |f| + |w|/2 < -a - R/2; f and w apart meet their edge."""
     assert some(0.98, -1.0, 0.0) and not some(1.0, -1.0, 0.0) and some(-0.98, -1.0, 0.0)
@@ -741,6 +743,7 @@ EDGES: list[tuple[str, Callable[[Document, float], Document]]] = [  # how an edi
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_after(1, ["bent", "swing"]))
 @pytest.mark.parametrize(("what", "edit"), slow_after(1, EDGES))
 def test_the_checker_draws_the_same_line(what: str, edit: Callable[[Document, float], Document], name: str) -> None:

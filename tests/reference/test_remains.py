@@ -315,6 +315,7 @@ def test_the_command(tmp_path: Path) -> None:
 # -------------------------------------------------------------------------------------------------------------- chance
 
 
+@pytest.mark.slow
 def test_what_is_accepted_is_never_left() -> None:
     """x+ = -4/5 x + q on 32 leaves with ranks and steps at random: no trajectory is away for longer than its steps."""
     chance = random.Random(3)

@@ -248,7 +248,7 @@ def test_the_least_error_is_accepted_and_a_little_less_is_not() -> None:
 
 
 @pytest.mark.parametrize("j", [0, 1])
-@pytest.mark.parametrize("side", [0, 1])
+@pytest.mark.parametrize("side", slow_after(1, [0, 1]))
 def test_the_least_range_of_a_slope_is_accepted_and_a_little_less_is_not(j: int, side: int) -> None:
     data, path = near(), f"plant.uncertain.{j}.range.{side}"
     assert verdicts(data) == ACCEPTED
@@ -452,6 +452,7 @@ def test_a_function_that_vanishes_does_so_in_its_box() -> None:
     assert verdicts(edited(data, f"{F}.vanishes", True)) == REFUSED
 
 
+@pytest.mark.slow
 def test_there_are_as_many_samples_as_may_be() -> None:
     c, shown = document.read(dumped(far())), far()["evidence"]["samples"]
 

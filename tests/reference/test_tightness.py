@@ -41,6 +41,7 @@ def limit(at: Callable[[float], Document], least: float, most: float, steps: int
     return least, together, alone
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", slow_after(1, [0.8, 0.1, 0.5]))
 @pytest.mark.parametrize("seed", slow_after(1, range(20)))
 def test_balls_of_stiff_loops_with_ranges(seed: int, share: float) -> None:

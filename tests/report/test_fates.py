@@ -89,6 +89,7 @@ def test_fates_exclude_each_other() -> None:
         Runs(np.zeros((2, 2, 2)), 0.1, both, one)
 
 
+@pytest.mark.slow
 def test_nothing_from_a_certified_set_is_drawn_as_leaving() -> None:
     """The slow mode needs 7,000 seconds; the page draws what the steps allow."""
     slow = certificate(plane("-x/1000", "-y*50"), 0.9)
@@ -101,6 +102,7 @@ def test_nothing_from_a_certified_set_is_drawn_as_leaving() -> None:
     assert roa is not None and roa.contradictions == 0 and not roa.left.any() and roa.slow > 0
 
 
+@pytest.mark.slow
 def test_runs_that_are_too_short_tell_no_share() -> None:
     """Of the pages' runs hardly one comes near where the effort ends early: then no share of them is stated."""
     slow = certificate(plane("-x/1000", "-y*50"), 0.9)

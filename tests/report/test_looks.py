@@ -87,7 +87,7 @@ def keep(name: str, content: bytes) -> None:
 
 
 @pytest.mark.parametrize(("width", "dark"), slow_after(2, LOOKS))
-@pytest.mark.parametrize("name", ["pendulum", "chain", "tube", "path"])
+@pytest.mark.parametrize("name", slow_after(1, ["pendulum", "chain", "tube", "path"]))
 def test_a_page_fits_and_can_be_read(
     browser: Browser, pages: dict[str, Path], name: str, width: int, dark: bool
 ) -> None:
@@ -164,6 +164,7 @@ def test_the_table_of_contents_leads_to_every_section(browser: Browser, pages: d
         assert targets == sections and "#," not in sections
 
 
+@pytest.mark.slow
 def test_a_pendulum_prints_on_two_or_three_pages_and_one_more_with_a_tube(
     browser: Browser, pages: dict[str, Path]
 ) -> None:

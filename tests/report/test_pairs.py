@@ -200,6 +200,7 @@ def width_of(pdf: bytes) -> float:
     return (right - left) / 72
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("columns", "inches"), slow_after(1, [(1, 3.4), (2, 7.0)]))
 def test_the_figure_is_as_wide_as_its_columns(proved: Any, columns: Any, inches: float) -> None:
     options = PaperOptions(columns)

@@ -176,6 +176,7 @@ def test_nothing_is_called_proved_unless_it_was_accepted(proved: RoaResult, answ
     assert "claimed tube" in page.text and "claimed start of the tube, around c₀" in page.text
 
 
+@pytest.mark.slow
 def test_a_state_that_is_missed_is_said_to_be_first(missed: RoaResult) -> None:
     page = page_of(missed)
     text = page.text
@@ -190,6 +191,7 @@ def test_a_state_that_is_missed_is_said_to_be_first(missed: RoaResult) -> None:
     assert "UNKNOWN" not in alone.text and "PROVED · ACCEPTED" in alone.text
 
 
+@pytest.mark.slow
 def test_values_and_deviations_are_told_apart(tmp_path: Path) -> None:
     options = RoaOptions(candidate="lyapunov", reach_from={"p": Fraction(17, 10), "v": Fraction(1, 2)}, effort=0.02)
     result = certify_roa(*shifted_spring(), tmp_path, options)

@@ -236,6 +236,7 @@ def test_a_page_of_a_discrete_plant() -> None:
     assert "the loop's own steps." in text and "time (s)" not in "".join(found.drawings())
 
 
+@pytest.mark.slow
 def test_ranges_and_errors_stay_what_they_are_under_a_sample() -> None:
     found = page(claimed(TIMINGS["exact"], practical(), push=True))
     assert "For every w(t) within ±0.1, any measurable function of time" in found.text

@@ -271,6 +271,7 @@ def test_at_most_so_many_states_are_shown() -> None:
 # The planes
 
 
+@pytest.mark.slow
 def test_pictures_are_zoomed_to_the_larger_set_and_tell_the_two_apart() -> None:
     system, network = chain(4, [-1.0, -2.0, -3.0, -4.0])
     start = np.diag([4.0, 1.0, 4.0, 1.0]) / 0.04  # reaches 0.1 and 0.2

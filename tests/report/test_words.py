@@ -124,6 +124,7 @@ def test_a_set_that_cannot_be_seen_is_in_no_legend(beside: RoaResult) -> None:
     assert any("inner set" in key.text for key in keys(seen, runs_from(seen, starts(seen)), None, False))
 
 
+@pytest.mark.slow
 def test_flattening_is_suggested_where_bounds_see_bends_and_little_is_proved(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -159,6 +160,7 @@ def test_flattening_is_not_suggested_to_whom_it_cannot_help(tmp_path: Path) -> N
         assert not diagnose(replace(short, network=network), RoaOptions(), None).next.flattens
 
 
+@pytest.mark.slow
 def test_a_policy_of_another_program_is_imported_before_it_is_flattened(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

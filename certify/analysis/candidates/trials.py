@@ -260,9 +260,9 @@ def economical_from(
 def share_of_robust(loop: ClosedLoop) -> float:
     """Share of the effort that it may take to be made.
 
-    In many states it is twice as much as for others: there no ring can make up for what is left out.
+    In many states it is three times as much as for others: there no ring can make up for what is left out.
     """
-    return OPTIMISING * (2 if loop.system.n > MANY else 1)
+    return OPTIMISING * (3 if loop.system.n > MANY else 1)
 
 
 def peak(loop: ClosedLoop, options: RoaOptions, effort: Effort) -> Trial | None:

@@ -1,4 +1,4 @@
-"""The next step where the effort of a search for boxes ends before it is done."""
+"""The next step where a search for boxes ends: before it is done, or without any."""
 
 from __future__ import annotations
 
@@ -22,6 +22,21 @@ def with_following(result: ReachResult, effort: Effort) -> ReachResult:
     else:
         step = Step((("--effort", f"{(_MUCH if nothing else _MORE) * options.effort:g}"),), f"{why}effort ended")
     return replace(result, following=step)
+
+
+def without_boxes(result: ReachResult) -> ReachResult:
+    """The result with the step after a search that found no box and had effort left."""
+    middle = _middle(result)
+    if result.begin is None:
+        why = (
+            "no box of the domain meets the target or leads there: see what the target says; --domain widens the domain"
+        )
+        return replace(result, following=Step((), why))
+    if middle is None:
+        why = "bounds of the runs from this state are too wide; a larger target asks for less"
+        return replace(result, following=Step((), why))
+    why = "bounds of the runs from this box are too wide, whatever the effort; a smaller one asks for less"
+    return replace(result, following=Step((("--from", middle),), why))
 
 
 def _middle(result: ReachResult) -> str | None:

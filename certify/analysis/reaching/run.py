@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from certify.analysis.acceptance import Clerk
 from certify.analysis.beyond import constraints_in_words, rank_facts
-from certify.analysis.reaching.following import with_following
+from certify.analysis.reaching.following import with_following, without_boxes
 from certify.analysis.reaching.goals import Goal, Stated, goal_of, leaves_of, with_ranks
 from certify.analysis.reaching.never import Search
 from certify.analysis.reaching.options import ReachOptions
@@ -45,6 +45,7 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.composition import composed
 from certify.loop.plants import System
 from certify.loop.policies import PolicyNetwork
+from certify.loop.rigorous import ball, evaluate_arb
 from certify.provers.base import Progress
 from certify.provers.execution import Runner, runner_at
 from certify.provers.ranks import (
@@ -121,6 +122,7 @@ def certify_reach(
         result = ReachResult(Verdict.UNKNOWN, "", goal.loop.system, goal.loop.network, options, given=goal.given)
         with tools.timing("target"):
             _require_periodic(goal, tools.clerk(path, options.jobs, False, options.cluster))
+            _require_met(goal)
         result = _simulated(result, goal, tools)
         if not result.reason:
             result = _proved(result, goal, effort, tools, path, provenance or {})
@@ -151,6 +153,23 @@ def _require_inside(system: System, options: ReachOptions) -> None:
                 f"`reach_from` must lie in the interior of the domain, {s.name} between {float(least + q):g} and "
                 f"{float(most + q):g}; found {float(lo + q):g}..{float(hi + q):g}. --domain widens it."
             )
+
+
+def _require_met(goal: Goal) -> None:
+    """Refuse a region that has no state of the domain, as bounds of its expressions there show.
+
+    Raises
+    ------
+    OptionError : it has none.
+    """
+    loop = goal.loop
+    lo, hi = (list(map(Fraction, corner.tolist())) for corner in root_box(loop))
+    places = {s: ball(a).union(ball(b)) for s, a, b in zip(loop.system.states, lo, hi, strict=True)}
+    if any(bool(evaluate_arb(t, places) > 0) for t in goal.expressions):
+        raise OptionError(
+            "`target` must have states of the domain, beyond which nothing is followed; nowhere in it do all of its "
+            "comparisons hold. `domain` widens it."
+        )
 
 
 def _require_periodic(goal: Goal, clerk: Clerk) -> None:
@@ -224,7 +243,7 @@ def _proved(
     if found is None or evidence is None:
         why = ": the effort is over" if search.over else ""
         result = replace(result, reason=f"no box of the domain is proved to lead into the target{why}")
-        result = with_following(result, effort) if search.over else result
+        result = with_following(result, effort) if search.over else without_boxes(result)
         return _never(result, goal, begins(options.begin or whole)[:1], tools)
     ranks = Ranks(found.ranks.angles, max(1, evidence.most))
     certificate = goal.certificate(question, evidence, ranks, provenance)

@@ -31,6 +31,12 @@ class Archive:
             self._zip = zipfile.ZipFile(io.BytesIO(raw))
         except (zipfile.BadZipFile, ValueError, struct.error, NotImplementedError, OverflowError) as error:
             raise InputError(f"{what} is no zip archive or is damaged: {error}.") from error
+        start = min((member.header_offset for member in self._zip.infolist()), default=0)
+        if start > 0:  # the directory is of a later archive, as of the last one inside of one that is cut
+            raise InputError(
+                f"{what} must begin with the first member of its archive; what its directory says begins {start} bytes "
+                "later. The file is cut, or damaged: fetch it again."
+            )
         self.names = tuple(self._zip.namelist())
         if len(set(self.names)) != len(self.names):
             raise InputError(f"{what} must hold each member once; one of its names stands there twice.")

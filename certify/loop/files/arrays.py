@@ -38,11 +38,11 @@ def array_of(node: Any, what: str) -> Numbers:
             if name == "_reconstruct" and len(node.states) == 1:
                 state = node.states[0]
                 if isinstance(state, tuple) and len(state) == 5:
-                    return _filled(_bytes(state[4], what), state[2], state[1], bool(state[3]), what)
+                    return _filled(bytes_of(state[4], what), state[2], state[1], bool(state[3]), what)
             if name == "scalar" and len(given) == 2:
-                return _filled(_bytes(given[1], what), given[0], (), False, what)
+                return _filled(bytes_of(given[1], what), given[0], (), False, what)
         if module in [f"{part}.numeric" for part in _NUMPY_PARTS] and name == "_frombuffer" and len(given) == 4:
-            return _filled(_bytes(given[0], what), given[1], given[2], given[3] == "F", what)
+            return _filled(bytes_of(given[0], what), given[1], given[2], given[3] == "F", what)
     raise InputError(f"{what} must be a number or an array of numbers; found {brief(node)}.")
 
 
@@ -96,8 +96,13 @@ def _dtype(node: Any, what: str) -> np.dtype[Any]:
     return np.dtype(f"{order}{code}")
 
 
-def _bytes(node: Any, what: str) -> bytes:
-    """Bytes as they are, or as the old protocols write them: text to be encoded as Latin-1."""
+def bytes_of(node: Any, what: str) -> bytes:
+    """Bytes as they are, or as the old protocols write them: text to be encoded as Latin-1.
+
+    Raises
+    ------
+    InputError : it is neither.
+    """
     if isinstance(node, bytes | bytearray):
         return bytes(node)
     if isinstance(node, Call) and node.function in _BYTES and node.arguments == ():

@@ -14,6 +14,7 @@ _NUMBERED = 'numpy.savez("policy.npz", **{"0.weight": W, "0.bias": b}) with ever
 _KERAS = (
     f"Write the model as a folder, model.export(FOLDER), and that as ONNX, {_ONNX}; or write its weights, {_NUMPY}."
 )
+_POINTER = b"version https://git-lfs.github.com/spec/"
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
@@ -26,6 +27,8 @@ def described(raw: bytes, name: str, members: Collection[str] = ()) -> str | Non
     members : the names of its members, if it is a zip archive.
     """
     end = name.lower()
+    if raw.startswith(_POINTER):
+        return "a pointer of Git LFS, whose file is not here. Fetch it in the folder of its repository, git lfs pull."
     if "model.weights.h5" in members:
         return f"a model of Keras. {_KERAS}"
     if {"data", "parameter_list", "parameters"} <= set(members):
@@ -33,6 +36,8 @@ def described(raw: bytes, name: str, members: Collection[str] = ()) -> str | Non
             "a file of stable-baselines 2, whose weights are arrays of numpy in its member parameters. Read them, "
             f'numpy.load(io.BytesIO(zipfile.ZipFile(FILE).read("parameters"))), and write them again, {_NUMPY}.'
         )
+    if raw.startswith(b"\x93NUMPY"):
+        return f"one array of numpy. Write all arrays, {_NUMBERED}; a gain K, u = -K x, is one layer, 0.weight = -K."
     if raw.startswith(b"MATLAB") and b"MAT-file" in raw[:128]:
         return (
             "a MAT-file of MATLAB. Write the network there as ONNX, exportONNXNetwork(net, 'policy.onnx'); or load the "

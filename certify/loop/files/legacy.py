@@ -85,6 +85,8 @@ def _widths(references: list[Persistent], what: str) -> dict[str, int]:
     found: dict[str, int] = {}
     for each in references:
         given: Any = each.reference
+        if isinstance(given, tuple) and len(given) == 4 and given[0] == "module" and isinstance(given[1], Name):
+            continue  # the class of a module, and its source
         # The last one is None, or marks a view of another storage, which torch no longer writes.
         if not isinstance(given, tuple) or len(given) != 6 or given[0] != "storage" or given[5] is not None:
             raise InputError(f"{what} must refer to plain storages only; it refers to something else.")

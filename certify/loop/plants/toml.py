@@ -114,7 +114,7 @@ def build_system(file: PlantFile) -> System:
             rest_of_calls={name: q for network in networks.values() for name, q in network.at_rest().items()},
             angles=_angles(file, states),
             constraints=dict(zip(constraints, in_deviations(list(constraints.values()), *at), strict=True)),
-            observations=tuple(_observations(file, {s: symbol[s] for s in (*states, *parameters)})),
+            observations=tuple(_observations(file, {s: symbol[s] for s in (*states, *parameters)}, shorthand)),
             measurements=measurements_in(file, states, ranges, time),
             samples=samples_in(file, states, inputs, {*ranges, *acting}),
         )
@@ -198,12 +198,15 @@ def _shorthand(file: PlantFile, symbol: Mapping[str, Symbol], networks: Mapping[
     return found
 
 
-def _observations(file: PlantFile, symbol: Mapping[str, Expression]) -> Iterator[Expression]:
+def _observations(
+    file: PlantFile, symbol: Mapping[str, Symbol], shorthand: Mapping[str, Expression]
+) -> Iterator[Expression]:
     """The table `observations`: what a policy reads, in its order, over the states' values."""
+    names = {**symbol, **{k: e for k, e in shorthand.items() if symbols_of(e) <= {*symbol.values()}}}
     for name in file.table("observations"):
         if not name.isidentifier():
             raise file.refuse("must be a name.", "observations", name)
-        yield _equation(file, "observations", name, symbol, "state or parameter")
+        yield _equation(file, "observations", name, names, "state, parameter or name of [where] made of these")
 
 
 def _angles(file: PlantFile, states: list[str]) -> tuple[str, ...]:

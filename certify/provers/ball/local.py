@@ -133,6 +133,7 @@ def prove_band(
     known: Paths | None = None,
     effort: Effort = UNLIMITED,
     above: float = 1.5,
+    beside: float = 0.0,
 ) -> tuple[float, float] | None:
     """(c0, c1) with c0 < c1: V falls where c0 <= V <= c1; None if there are none, or the effort
     ends before.
@@ -141,8 +142,9 @@ def prove_band(
     ----------
     known : the `paths` of the loop, which need not be at rest.
     effort : where it ends, the search ends with what it has.
-    above : a large ball has a large floor: c1, up to `limit`, is about the largest level whose ball shows a floor of at
-        most so many times the least that any ball shows, and c0 is that floor.
+    above, beside : a large ball has a large floor: c1, up to `limit`, is about the largest level whose ball shows a
+        floor of at most `above` times the least that any ball shows, or of at most `beside` times c1, which nothing
+        smaller is worth; c0 is that floor.
 
     Raises
     ------
@@ -151,17 +153,25 @@ def prove_band(
     rule = Rule.anywhere(problem, T, known)
     if rule.cuts is None:
         return None
-    found = _band(lambda level: _alone(rule, level, effort)[1].floor, limit, effort, above)
+    found = _band(lambda level: _alone(rule, level, effort)[1].floor, limit, effort, above, beside)
     if not has_kinks(rule.steps.known.network) or (found is not None and found[1] >= _NEAR * limit):
         return found
     part, least = (effort, 0.0) if found is None else (effort.share(_FOR_KINKS), found[1])
-    return _band(lambda level: _around(rule, level, part)[1].floor, limit, part, above, least) or found
+    return _band(lambda level: _around(rule, level, part)[1].floor, limit, part, above, beside, least) or found
 
 
 def _band(
-    floor_on: Callable[[float], float], limit: float, effort: Effort, above: float, lowest: float = 0.0
+    floor_on: Callable[[float], float],
+    limit: float,
+    effort: Effort,
+    above: float,
+    beside: float = 0.0,
+    lowest: float = 0.0,
 ) -> tuple[float, float] | None:
-    """The same by the least floor on the ball of a level; None also where no level from `lowest` on has a lower one."""
+    """The same by the least floor on the ball of a level; None also where no level from `lowest` on has a lower one.
+
+    A floor that roundings alone make falls with the level, as its root: `beside` ends the search for the least.
+    """
     floors: dict[float, float] = {}
 
     def floor(level: float) -> float:
@@ -175,11 +185,13 @@ def _band(
         if level <= max(1e-30 * limit, lowest) or level < _LEAST or effort.over:
             return None
     least = floor(level)
-    while not effort.over and floor(level * _LOWER) < min(level * _LOWER, (1 - _WORTH) * least):
+    while not effort.over and floor(level) > beside * level:
+        if not floor(level * _LOWER) < min(level * _LOWER, (1 - _WORTH) * least):
+            break
         level, least = level * _LOWER, floor(level * _LOWER)
 
     def good(level: float) -> bool:
-        return floor(level) < level and floor(level) <= above * least
+        return floor(level) < level and floor(level) <= max(above * least, beside * level)
 
     c1 = max(filter(good, floors))
     higher = [level for level in floors if level > c1]

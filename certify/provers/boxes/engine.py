@@ -17,7 +17,7 @@ from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
 from certify.provers.ball.local import corners_in_a_period, local_ball, prove_band, prove_local
 from certify.provers.ball.models import meets_corner, paths
-from certify.provers.base import FEW, Attempt, Budget, Engine, Once, Proof, Report, SearchState, Task
+from certify.provers.base import FEW, MANY, Attempt, Budget, Engine, Once, Proof, Report, SearchState, Task
 from certify.provers.boxes.search import Pass, RingProof, empty_ring, outwards, prove_inwards, prove_outwards
 from certify.provers.execution import Runner
 from certify.provers.falsify import Band, Witness, survey
@@ -28,6 +28,7 @@ _FOR_BALL = 0.5  # share of the effort for a ring from a ball, and of that for t
 _EQUAL = 0.01  # share of a level
 _NOTHING = 1e-9  # share of a level: no smaller floor is looked for
 _ABOVE = (1.5, 1.1)  # factors of the least floor, in few and in many states, where leaves do not lower it any more
+_BESIDE = (0.0, 1e-3)  # shares of the ball's level that a floor may have, in few and in many states
 _TRIES = 4  # inner levels from which c2 is looked for, each with half of the effort that is left
 
 
@@ -68,17 +69,19 @@ class BoundsEngine(Engine):
     def _from_ball(self, task: Task, budget: Budget, report: Report | None) -> Proof | None:
         """A ring that grows from the ball whose floor is about the least; None without such a ball."""
         start = time.perf_counter()
-        above = _ABOVE[len(self.T) > FEW]
-        found = prove_band(task.problem, self.T, task.target, effort=budget.effort.share(_FOR_BALL), above=above)
+        many = len(self.T) > FEW
+        effort, shares = budget.effort.share(_FOR_BALL), {"above": _ABOVE[many], "beside": _BESIDE[many]}
+        found = prove_band(task.problem, self.T, task.target, effort=effort, **shares)
         if found is None:
             return None
         (floor, inner), stop = found, None
-        if inner < task.target:
+        if inner < task.target and (task.exactly or len(self.T) <= MANY):
             grown = outwards(task.problem, self.T, inner, task.target, self.runner)
             stop = grown.advance(budget, report)
             ring = grown.proof(stop)
         else:
             ring = empty_ring(task.problem, self.T, inner)
+            stop = None if inner >= task.target else Stop.EFFORT
         claim = Practical(roa=ring.outer, local=inner, floor=floor, **_beside(task.problem))
         return self.stated(task.problem, ring, claim, {"ring": time.perf_counter() - start})
 

@@ -12,10 +12,13 @@ import logging
 import pickle
 import queue
 import re
+import signal
+import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from functools import partial
+from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
 from certify.errors import BackendError, InputError
@@ -68,15 +71,15 @@ def connect(address: str, patience: float = 30.0) -> Iterator[Client]:
         ) from error
     with _quiet(), ExitStack() as stack:
         if local is not None:
-            count = int(local[1])
-            local_one = LocalCluster(
-                n_workers=count,
-                threads_per_worker=1,
-                dashboard_address="127.0.0.1:0",  # None is Dask's own port, with a warning where that is taken
-                silence_logs=logging.CRITICAL,
-                preload=_NO_INTERRUPTS,
-            )
-            address = stack.enter_context(local_one).scheduler_address
+            with signals_later():  # half a cluster cannot be closed
+                local_one = LocalCluster(
+                    n_workers=int(local[1]),
+                    threads_per_worker=1,
+                    dashboard_address="127.0.0.1:0",  # None is Dask's own port, with a warning where that is taken
+                    silence_logs=logging.CRITICAL,
+                    preload=_NO_INTERRUPTS,
+                )
+                address = stack.enter_context(local_one).scheduler_address
         try:
             client = Client(address, timeout=patience, deserializers=_PLAIN, set_as_default=False)
         except (OSError, ValueError, TypeError, RuntimeError) as error:  # TLS without certificates is a TypeError
@@ -92,6 +95,30 @@ def connect(address: str, patience: float = 30.0) -> Iterator[Client]:
 def _close(client: Client) -> None:
     with suppress(Exception):  # a scheduler that is gone cannot be told
         client.close(timeout=_FAREWELL)
+
+
+@contextmanager
+def signals_later() -> Iterator[None]:
+    """Signals that end a run come when this is over. Threads that start meanwhile, and their processes, leave Ctrl-C to
+    the main thread from their first moment on."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    ending = (signal.SIGINT, signal.SIGTERM)
+    handlers = {one: signal.getsignal(one) for one in ending if callable(signal.getsignal(one))}
+    for one in handlers:
+        signal.signal(one, lambda number, _: came.append(number))
+    resource_tracker.ensure_running()  # which unblocks signals where it starts
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for one, handler in handlers.items():
+            signal.signal(one, handler)
+        if came:
+            signal.raise_signal(came[0])
 
 
 @contextmanager

@@ -124,6 +124,7 @@ def test_a_run_without_a_gain_leaves_no_earlier_policy(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["p.earlier.pt"]
 
 
+@pytest.mark.slow
 def test_a_run_keeps_the_policy_before_it_and_no_older_one(tmp_path):
     out = tmp_path / "p.pt"
     for seed in (1, 2, 3):

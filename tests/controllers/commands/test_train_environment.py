@@ -159,6 +159,7 @@ def test_a_policy_and_guaranteed_ranges_without_equations(world, tmp_path):
     assert load_policy(again).network.sha256() == policy.network.sha256()
 
 
+@pytest.mark.slow
 def test_a_plant_that_rests_elsewhere_is_learned_in_deviations(world, tmp_path):
     """The data have the plant's own values, and at rest the policy gives its input there."""
     out, data = tmp_path / "p.pt", tmp_path / "data.csv"
@@ -277,6 +278,7 @@ def test_gymnasium_s_own_pendulum(tmp_path):
 REPORT = ["--noise", "1e-9", "--second", "v=0.05*p**2"]
 
 
+@pytest.mark.slow
 def test_a_report_has_guaranteed_ranges_of_what_was_learned(world, tmp_path):
     """They hold the true A and B, and the gain that the true plant would have."""
     out, report = tmp_path / "p.pt", tmp_path / "p.json"

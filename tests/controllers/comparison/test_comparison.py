@@ -464,7 +464,7 @@ def test_the_best_policy_of_a_run_that_goes_on_elsewhere_comes_back_with_it(pend
 CHANGED = {"learning_rate": 1e-3, "reward_weights": (1.0, 3.0), "dt": 0.01, "state_weights": (2.0, 0.5), "batch": 9}
 
 
-@pytest.mark.parametrize("run", ["ours", "sac", "sb3-sac", "sb3-ppo"])
+@pytest.mark.parametrize("run", slow_after(2, ["ours", "sac", "sb3-sac", "sb3-ppo"]))
 @pytest.mark.parametrize("name", CHANGED)
 def test_a_run_of_other_options_is_not_used_in_silence(finished, pendulum_system, run, name):
     """As after a change of the preset."""
@@ -484,7 +484,7 @@ def test_options_that_change_nothing_in_a_run_do_not_part_it_from_the_preset(fin
             runs.obtain(run, pendulum_system, replace(TINY, **changes), finished[0])
 
 
-@pytest.mark.parametrize("run", ["ours", "sac", "sb3-sac", "sb3-ppo"])
+@pytest.mark.parametrize("run", slow_after(2, ["ours", "sac", "sb3-sac", "sb3-ppo"]))
 def test_a_run_on_another_pendulum_is_not_used_in_silence(finished, pendulum_system, run):
     heavier = pendulum_system.with_parameters({"m": "0.2"})
     with pytest.raises(InputError, match="must be of pendulum at the same parameters"):

@@ -228,7 +228,7 @@ def test_a_rule_without_the_curve_has_nothing_to_go_by(tmp_path: Path) -> None:
             follow(learner_of("sac", PENDULUM, TINY, LONG), LONG, tmp_path, lambda: Measurement(1.0, 1.0, 0, 1))
 
 
-@pytest.mark.parametrize("run", ["ours", "sac", "sb3-sac", "sb3-ppo"])
+@pytest.mark.parametrize("run", slow_after(2, ["ours", "sac", "sb3-sac", "sb3-ppo"]))
 def test_a_run_that_ends_in_writing_its_first_files_goes_on(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

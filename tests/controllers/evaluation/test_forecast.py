@@ -15,6 +15,7 @@ from controllers.options import get_plant
 ROOT = Path(__file__).parents[3]
 
 
+@pytest.mark.slow
 def test_the_curved_quadrotor_has_less_than_its_box_and_the_flattened_one_more():
     """Proved at effort 1: 0.0088 of the one, 2,983 of the other, with a P that solves no Lyapunov equation."""
     box = get_plant("quadrotor2d").initial_states

@@ -148,6 +148,7 @@ def test_the_figure_of_the_states_shows_every_one_of_them(kept):
         assert title.width <= axes.get_window_extent().width * 1.25, axes.get_title()
 
 
+@pytest.mark.slow
 def test_positions_are_a_column_a_run_with_sampled_actions_below(kept):
     system = get_system("quadrotor2d")
     responses = _responses(system)

@@ -139,6 +139,7 @@ def test_a_small_weight_changes_less():
     assert much.after.departure < little.after.departure < little.before.departure
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("centre", "squash", "scale", "clip"),
     slow_after(
@@ -170,6 +171,7 @@ def test_exact_centring_by_zero_biases_is_kept():
     require_centred(network, PENDULUM.exact_u_eq())
 
 
+@pytest.mark.slow
 def test_a_policy_without_centring_keeps_its_value_at_the_origin():
     *others, last = curved("none").biases
     teacher = curved("none").with_layers(biases=(*others, last - 0.125))  # it rests beside the origin
@@ -225,6 +227,7 @@ def test_without_a_run_that_settles_nothing_is_judged_and_nothing_flattened():
         flatten(Policy(_chattering(), "pendulum", training=_record()), QUICK)
 
 
+@pytest.mark.slow
 def test_runs_settle_towards_where_the_loop_rests():
     """A policy without centring rests beside the origin: there its runs settle, and do after flattening."""
     old = curved("none", bias=0.5)

@@ -75,6 +75,7 @@ def result():
     return flatten(Policy(curved(), "pendulum"), QUICK)
 
 
+@pytest.mark.slow
 def test_it_costs_no_more_and_takes_fewer_boxes(result):
     before = ProvableSet(ClosedLoop(PENDULUM, curved()), 20.0, 0.25)
     size, _ = before.log_boxes(_student(curved()), torch.Generator().manual_seed(0), 500)

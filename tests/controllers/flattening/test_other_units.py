@@ -71,6 +71,7 @@ def test_the_value_at_the_origin_is_set_for_other_units_too():
     np.testing.assert_allclose(with_value_at_origin(_curved("silu"), wanted).net(np.zeros(2)), wanted, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_after(1, ["relu", "elu", "silu"]))
 def test_it_is_easier_to_prove_and_within_its_bounds(name):
     network = _curved(name)

@@ -238,6 +238,7 @@ def told(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_command_draws_what_was_accepted_and_writes_the_table(told, tmp_path):
     out = tmp_path / "new" / "out"
     arguments = ["history", told, "--out", out, "--candidate", "lyapunov", "--effort", 0.4, "--json"]

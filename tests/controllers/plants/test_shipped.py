@@ -72,6 +72,7 @@ def test_every_plant_that_is_trained_has_equations_and_the_order_is_alphabetical
     assert list(available_plants()) == sorted(available_plants())
 
 
+@pytest.mark.slow
 def test_a_new_plant_is_one_file_on_either_side(plant_file, tmp_path):
     plant_file(system_plants, "leak", EQUATIONS)
     plant_file(shipped, "leak", TRAINED)

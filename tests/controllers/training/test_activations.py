@@ -73,7 +73,7 @@ def test_the_jacobian_is_that_of_the_exported_policy(name, centre):
     require_centred(network, ORIGIN)
 
 
-@pytest.mark.parametrize("name", ACTIVATIONS)
+@pytest.mark.parametrize("name", slow_after(4, ACTIVATIONS))
 def test_descending_the_gain_term_moves_the_jacobian_to_minus_K(name):
     actor = _actor(name)
     optimiser = torch.optim.Adam(actor.parameters(), 1e-2 if name == "sigmoid" else 3e-3)

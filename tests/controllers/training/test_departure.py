@@ -163,6 +163,7 @@ def test_its_box_is_where_episodes_start_unless_another_is_given():
     assert _sac(proof_box=(0.5, 2.0)).box.tolist() == [0.5, 2.0]
 
 
+@pytest.mark.slow
 def test_its_weight_lowers_it_and_without_weight_nothing_changes():
     x = torch.linspace(-1, 1, 64).reshape(32, 2)
     batch = (x, x[:, :1], torch.ones(32, 1), x, torch.zeros(32, 1))

@@ -42,6 +42,7 @@ def _settle(network, options=MONITORING, system=PENDULUM):
     return settle(network, system, chosen.dt, *weights, options)
 
 
+@pytest.mark.slow
 def test_evaluations_come_on_time_and_at_the_end_and_change_nothing(short):
     trainer = Trainer(PENDULUM, short)
     watched = train(trainer, evaluate_every=100)
@@ -104,6 +105,7 @@ def test_a_plant_without_initial_states_is_monitored_without_a_simulation(short)
         _settle(trainer.sac.actor.network(), system=system)
 
 
+@pytest.mark.slow
 def test_the_command_shows_and_writes_them_and_a_resumed_run_writes_the_same(tmp_path):
     def run(name, *more):
         path = tmp_path / f"{name}.csv"

@@ -154,6 +154,7 @@ def test_q_learns_the_scaled_reward_and_bootstraps_only_before_a_termination(opt
     assert (q - goal).abs().max().item() < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "learned"), slow_after(1, [(100.0, True), (1.0, False)]))
 def test_returns_of_some_hundreds_are_learned_in_their_own_unit(options, scale, learned):
     """Goals around -500, Adam's steps of 3e-4: in units of one the critic is still far off."""

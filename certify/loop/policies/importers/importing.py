@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -178,7 +179,7 @@ def import_bytes(
     return Imported(
         policy=Policy(network, plant.name, _parameters(plant), {"imported": record}, reading.beta, valid),
         words=reading.words,
-        formula=_formula(normaliser, network, folded, reading, own, u_eq),
+        formula=_formula(normaliser, network, folded, reading, own if reading.program is not None else centre, u_eq),
         difference=difference,
         compared_with=reading.program,
         assumed=reading.assumed,
@@ -226,11 +227,15 @@ def _record(
 
 def _read_of(options: ImportOptions, plant: System, words: str) -> dict[str, Any]:
     """The plant's facts that are in the policy's numbers: its operating point where the network reads the states'
-    values, and its observations where it reads these. Used with a plant that has others, it is another policy."""
+    values, its observations where it reads these, and its parameters that `--states` names. Used with a plant that has
+    others, it is another policy."""
     own = bool(plant.observations) and options.states is None
-    if options.observes == "deviation" and not own:
-        return {}
-    return {"x_eq": [str(q) for q in plant.exact_x_eq()]} | ({"observations": words} if own else {})
+    named = {name for text in options.states or () for name in re.findall(r"[A-Za-z_]\w*", text)}
+    parameters = {name: str(value) for name, value in plant.parameters.items() if name in named}
+    read: dict[str, Any] = {"parameters": parameters} if parameters else {}
+    if options.observes != "deviation" or own:
+        read["x_eq"] = [str(q) for q in plant.exact_x_eq()]
+    return read | ({"observations": words} if own else {})
 
 
 def _require_answers(kind: Content, reading: Reading, options: ImportOptions, plant: System) -> None:
@@ -420,7 +425,7 @@ def _formula(
     centred: Centre,
     u_eq: Sequence[Fraction],
 ) -> str:
-    """The file's policy, which it centres itself so, in the plant's units."""
+    """The file's policy in the plant's units, centred so by itself, or of a file without a program as it is asked."""
     offset = [float(u) for u in u_eq] if centred == "output" else folded.offset
     observation = "o"
     if normaliser:
@@ -430,7 +435,8 @@ def _formula(
     if reading.beta is not None:
         net = "net(x) - net(x_eq) + beta"
     elif centred == "preactivation":
-        net = f"{net} - net(o_eq)"
+        at_0 = any(u != Fraction(float(o)) for u, o in zip(u_eq, folded.offset, strict=True))
+        net = f"{net} - net(o_eq){' + beta' if at_0 else ''}"
     inner = f"tanh({net})" if network.squash == "tanh" else net
     if centred == "output":
         inner += f" - {inner.replace(net, 'net(o_eq)')}"

@@ -16,7 +16,7 @@ import flint
 import numpy as np
 
 from certify.errors import InputError
-from certify.loop.expressions import Expression, evaluate, substitute
+from certify.loop.expressions import Expression, Number, Symbol, evaluate, substitute
 from certify.loop.networks import Observe
 from certify.loop.networks.floats import evaluated
 from certify.loop.plants.equations import parse_expression
@@ -86,11 +86,12 @@ class Observed:
 
 
 def observed(states: tuple[str, ...] | None, plant: System, options: ImportOptions) -> Observed:
-    """The observations that `--states` names; if it names none, those of the plant, or else its states.
+    """The observations that `--states` names; if it names none, those of the plant, or else its states. A parameter in
+    them is its number: the policy's own, whatever the plant's is later.
 
     Raises
     ------
-    InputError : one is no state of the plant and no expression of its states.
+    InputError : one is no state of the plant, and no expression of its states and of parameters without a range.
     """
     known = {s.name: s for s in plant.states}
     if states is None and plant.observations:
@@ -101,6 +102,7 @@ def observed(states: tuple[str, ...] | None, plant: System, options: ImportOptio
             raise InputError(f"--states must name each state once; found {','.join(states)}.")
         return Observed(plant, tuple(list(known).index(name) for name in states), tuple(known[n] for n in states))
     expressions = []
+    fixed = {Symbol(name): Number(q) for name, q in plant.parameters.items() if name not in plant.ranges}
     for text in states:
         if text.isidentifier() and text not in known:
             raise InputError(
@@ -108,7 +110,8 @@ def observed(states: tuple[str, ...] | None, plant: System, options: ImportOptio
                 f"cos({plant.states[0]}); --states names {text!r}."
             )
         try:
-            expressions.append(parse_expression(text, known, f"state of {plant.name}"))
+            found = parse_expression(text, known | {p.name: p for p in fixed}, f"state or parameter of {plant.name}")
+            expressions.append(substitute(found, fixed))
         except InputError as error:
             raise InputError(f"--states must name states of {plant.name}, or expressions of them: {error}") from error
     x_eq = dict(zip(plant.states, plant.exact_x_eq(), strict=True))

@@ -42,7 +42,8 @@ class ImportOptions:
     Parameters
     ----------
     kind : the kind of file, or `auto`.
-    prefix : in a state_dict, the keys of the policy's layers up to their numbers, such as `actor.pi_net.fcs`.
+    prefix : in a state_dict, the keys of the policy's layers up to their numbers, such as `actor.pi_net.fcs`; or
+        several of these, and layers without a number, in their order, as in `pi.net,pi.mu`.
     activation : between the layers of a state_dict, by its name: tanh, relu, elu (alpha 1), sigmoid, silu, gelu (the
         exact one), gelu-tanh (its tanh form), softplus (beta 1), mish, softsign, leaky_relu (slope 0.01), selu, celu
         (alpha 1), hardtanh, relu6, hardsigmoid, hardswish or logsigmoid; another number than that in brackets, a
@@ -51,7 +52,8 @@ class ImportOptions:
         None if there is none.
     norm_epsilon : the number that it adds to the variance; 1e-5 by default.
     squash : what follows the last layer of a state_dict: `identity`, `tanh`, or `relu-tanh` for relu(tanh(.)).
-    states : what the network reads, in its order: states of the plant, or expressions of them such as `cos(theta)`.
+    states : what the network reads, in its order: states of the plant, or expressions of them and of its parameters,
+        such as `cos(theta)`.
     normaliser : a file with the observations' normaliser, or `none`.
     epsilon : the number that rsl_rl's normaliser adds to the standard deviation; 1/100 by default.
     action_scale, action_offset : `u = scale * action + offset` in the plant's units, exact, one number or m.

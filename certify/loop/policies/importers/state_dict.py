@@ -15,6 +15,8 @@ import numpy as np
 
 from certify.errors import InputError
 from certify.loop.files.arrays import Numbers
+from certify.loop.files.pickles import Call
+from certify.loop.policies.importers.modules import numbers_in, require_said
 from certify.loop.policies.importers.normalisers import normaliser_root, rsl_normaliser
 from certify.loop.policies.importers.operations import WITHOUT_WEIGHT_NORM
 from certify.loop.policies.importers.options import WITHOUT_NORMALISATION, ImportOptions, Output
@@ -116,21 +118,30 @@ def read_two_stage(tensors: Mapping[str, Numbers], options: ImportOptions) -> Re
 
 
 def read_state_dict(
-    tensors: Mapping[str, Numbers], options: ImportOptions, n: int, m: int, beside: str | None = None
+    tensors: Mapping[str, Numbers],
+    options: ImportOptions,
+    n: int,
+    m: int,
+    beside: str | None = None,
+    modules: Mapping[str, Call] | None = None,
 ) -> Reading:
     """The perceptron from n observations to m actions among the tensors of a file.
 
     Parameters
     ----------
     beside : keys of the layers of the Lyapunov network that is imported with it, if there is one.
+    modules : those that were pickled whole, by their names.
 
     Raises
     ------
     InputError : there is none, there are several and `--prefix` does not say which, a layer is of a kind that is
         not proved, or another tensor could belong to the policy.
     """
-    if options.prefix is not None and "," in options.prefix:
-        tensors, prefix = _numbered(tensors, options.prefix.split(",")), _LISTED
+    listed = dict[str, list[int]]()
+    if options.prefix is not None and ("," in options.prefix or f"{options.prefix}.weight" in tensors):
+        names = options.prefix.split(",")
+        listed = {name: _affine(tensors, name) for name in names if name in _groups(tensors)}
+        tensors, prefix = _numbered(tensors, names), _LISTED
     else:
         prefix = options.prefix if options.prefix is not None else _only(tensors, n, m, options)
     norms = {} if options.norm is None else _norms(tensors, prefix, options)
@@ -141,6 +152,8 @@ def read_state_dict(
             "Name the states that it reads with --states."
         )
     squash: Output = "identity" if options.squash is None else options.squash
+    groups = listed if prefix == _LISTED else {prefix: _affine(tensors, prefix)}
+    require_said(modules or {}, groups, options)
     read, known = set(_own(tensors, prefix)), dict[str, str]()
     if (at := normaliser_root(tensors)) is not None:
         read |= {f"{at}_mean", f"{at}_std"}
@@ -149,8 +162,24 @@ def read_state_dict(
     if beside is not None:
         known |= dict.fromkeys(_own(tensors, beside), "the Lyapunov network that is imported beside it")
     activation, placed = options.activation or "tanh", dict(norms.values())
-    assumed = f"{in_words(activation)} between the layers is what --activation says"
-    assumed += f", {squash} behind them what --squash says"
+    return Reading(
+        words=f"state_dict {prefix} {widths(layers)}{' with layer normalisation' if norms else ''}",
+        steps=(*between(layers, activation, placed), *_ENDS[squash]),
+        evaluate=perceptron(layers, squash, activation, placed),
+        normaliser=rsl_normaliser(tensors, options.epsilon),
+        double=_is_double(tensors, prefix),
+        assumed=_assumed(options, m, modules or {}),
+        unread=unread(tensors, read, prefix, m, options.ignore, known, observed=n),
+    )
+
+
+def _assumed(options: ImportOptions, m: int, modules: Mapping[str, Call]) -> str:
+    """The source of the functions between the layers, and the numbers of modules that were pickled whole."""
+    assumed = f"{in_words(options.activation or 'tanh')} between the layers is what --activation says"
+    assumed += f", {options.squash or 'identity'} behind them what --squash says"
+    if modules:
+        numbers = ", ".join(numbers_in(modules)[:_MOST_LISTED])
+        assumed += f", of a module whose forward is not in the file{numbers and f', nor the part in it of {numbers}'}"
     if options.output == MEAN:
         assumed += f", of whose {2 * m} numbers the first {m} are the mean, as --output says"
     elif options.output is not None:
@@ -158,20 +187,12 @@ def read_state_dict(
     if options.norm is not None:
         epsilon = float(options.norm_epsilon or _EPSILON)
         assumed += f", layer normalisation {options.norm[6:]} the activation, with epsilon {epsilon}, what --norm says"
-    return Reading(
-        words=f"state_dict {prefix} {widths(layers)}{' with layer normalisation' if norms else ''}",
-        steps=(*between(layers, activation, placed), *_ENDS[squash]),
-        evaluate=perceptron(layers, squash, activation, placed),
-        normaliser=rsl_normaliser(tensors, options.epsilon),
-        double=_is_double(tensors, prefix),
-        assumed=assumed,
-        unread=unread(tensors, read, prefix, m, options.ignore, known, observed=n),
-    )
+    return assumed
 
 
 def parameters_of(activation: str) -> re.Pattern[str] | None:
-    """The names that a file may give to the number of an activation; None if it has none, or it is said."""
-    return _PARAMETERS.get(activation)
+    """The names that a file may give to the number of an activation; None if it has none."""
+    return _PARAMETERS.get(activation.partition(":")[0])
 
 
 def _stated(
@@ -196,7 +217,8 @@ def _stated(
             f"{name}. Say which is right: --activation {name}:{plainly(value)}, or --activation "
             f"{name}:{plainly(usual)} if {key} is another number."
         )
-    return {key: f"the {PARAMETERS[name][0]} that --activation says" for key, v in found.items() if v == said[0]}
+    same = f"the {PARAMETERS[name][0]} that --activation says" if found else ""
+    return {key: same if v == said[0] else f"it is {plainly(v)}, not {same}" for key, v in found.items()}
 
 
 def read_lyapunov(tensors: Mapping[str, Numbers], prefix: str | None, options: ImportOptions) -> Reading:
@@ -300,25 +322,32 @@ def _to_actions(layers: Layers, m: int, options: ImportOptions) -> Layers:
         raise InputError(
             f"the last layer must give {m} numbers, one for each input; it gives {given}. If these are the mean of the "
             "actions and then their spread, as Brax has them, say so with --output mean; if each action's spread is "
-            f"behind it, as RLlib has those of a tuple, with --output {','.join(str(2 * k) for k in range(m))}."
+            f"behind it, as RLlib has those of a tuple, with --output {','.join(str(2 * k) for k in range(m))}; or say "
+            "the places of the actions, counted from 0."
         )
     return layers
 
 
 def _numbered(tensors: Mapping[str, Numbers], names: Sequence[str]) -> dict[str, Numbers]:
-    """The tensors with the layers of these names, in their order, numbered under one prefix.
+    """The tensors with the layers of these names, or of these prefixes of numbered layers, in their order, numbered
+    under one prefix.
 
     Raises
     ------
-    InputError : a name is none of a layer, or stands there twice.
+    InputError : a name is none of layers, or a layer stands there twice.
     """
-    wrong = [name for name in names if f"{name}.weight" not in tensors]
-    if wrong or len(set(names)) != len(names):
+    groups, places, count = _groups(tensors), dict[str, int](), 0
+    for name in names:
+        inside = {f"{name}.{k}": k for k in _numbers(tensors, name)} if name in groups else {name: 0}
+        start, count = max(places.values(), default=-1) + 1, count + len(inside)
+        places |= {layer: start + k for layer, k in inside.items()}
+    if len(places) < count or any(f"{layer}.weight" not in tensors for layer in places):
         raise InputError(
-            f"--prefix with commas must name each layer once, in their order; found {','.join(names)}. "
-            f"Layers are {', '.join(_weights(tensors).values()) or 'none'}.{_without_norm(tensors)}"
+            "--prefix with commas must name each layer once, or the keys of some up to their numbers, in their order; "
+            f"found {','.join(names)}. Layers are {', '.join(_weights(tensors).values()) or 'none'}."
+            f"{_without_norm(tensors)}"
         )
-    parts = {f"{name}.{part}": f"{_LISTED}.{k}.{part}" for k, name in enumerate(names) for part in ("weight", "bias")}
+    parts = {f"{name}.{part}": f"{_LISTED}.{k}.{part}" for name, k in places.items() for part in ("weight", "bias")}
     return {parts.get(name, name): tensor for name, tensor in tensors.items()}
 
 
@@ -339,35 +368,68 @@ def _groups(tensors: Mapping[str, Numbers]) -> list[str]:
 
 
 def _only(tensors: Mapping[str, Numbers], n: int, m: int, options: ImportOptions) -> str:
-    """The one prefix whose layers lead from n to m and that no name calls a critic."""
-    described = []
-    fitting = []
-    for prefix in _groups(tensors):
-        numbers = _numbers(tensors, prefix)
-        first, last = tensors[f"{_dot(prefix)}{numbers[0]}.weight"], tensors[f"{_dot(prefix)}{numbers[-1]}.weight"]
-        described.append(f"{prefix or 'no prefix'}: {first.shape[-1]} to {last.shape[0] if last.ndim else 0}")
-        fits = first.shape[-1:] == (n,) and last.ndim > 0 and _gives(last.shape[0], m, options)
-        if fits and not _of_another(prefix):
-            fitting.append(prefix)
-    if len(fitting) == 1:
-        return fitting[0]
-    listed = "; ".join(described)
-    if not described:
+    """The one prefix whose layers lead from n to m and that no name calls a critic.
+
+    It is also one that gives other numbers than `--output` takes, or without it two for each action, about which there
+    is more to say.
+    """
+    ends = _ends(tensors)
+    own = [prefix for prefix, (reads, _) in ends.items() if reads == n and not _of_another(prefix)]
+    fitting = [prefix for prefix in own if _gives(ends[prefix][1], m, options)]
+    said = options.output is not None or (len(own) == 1 and ends[own[0]][1] == 2 * m)
+    if len(fitting) == 1 or (not fitting and len(own) == 1 and said):
+        return (fitting or own)[0]
+    listed = "; ".join(f"{prefix or 'no prefix'}: {reads} to {gives}" for prefix, (reads, gives) in ends.items())
+    if not ends:
         layers = _weights(tensors)
         named, order = ", ".join(layers.values()), ",".join(name for name in layers if not _of_another(name))
         listed = f"layers without a number, {named}: name them in their order, as in --prefix {order or 'fc1,fc2'}"
         needed = (
-            "PREFIX.NUMBER.weight (out, in) and PREFIX.NUMBER.bias, or of numpy kernel (in, out) instead of weight; a "
-            "gain K, u = -K x, is one layer, 0.weight = -K"
+            "PREFIX.NUMBER.weight (out, in) and PREFIX.NUMBER.bias, or of numpy kernel (in, out) instead of weight; "
+            'write others so, numpy.savez("policy.npz", **{"0.weight": W, "0.bias": b}) with every layer, or W.T if W '
+            "is (in, out); a gain K, u = -K x, is one layer, 0.weight = -K"
         )
         shapes = ", ".join(f"{name} {tensor.shape}" for name, tensor in islice(tensors.items(), _MOST_LISTED))
         listed = listed if named else f"none in {shapes or 'no tensors'} (layers must be called {needed})"
+    elif policy := _named(tensors, n, m, options):
+        listed += f"; if the policy is {policy.replace(',', ' and behind it ')}, say so: --prefix {policy}"
     raise InputError(
         f"a file must hold one policy from {n} states to {m} inputs; it holds {len(fitting)}. "
         f"Name its keys up to their numbers with --prefix, and its states with --states. Found {listed}. "
         "If the policy is more than layers one behind the other, export it as TorchScript or ONNX."
         f"{_without_norm(tensors)}"
     )
+
+
+def _ends(tensors: Mapping[str, Numbers]) -> dict[str, tuple[int, int]]:
+    """The numbers that the first of some numbered layers reads and the last one gives, by their prefixes."""
+    found = {}
+    for prefix in _groups(tensors):
+        numbers = _numbers(tensors, prefix)
+        first, last = (tensors[f"{_dot(prefix)}{numbers[k]}.weight"].shape for k in (0, -1))
+        found[prefix] = first[-1] if first else 0, last[0] if last else 0
+    return found
+
+
+def _named(tensors: Mapping[str, Numbers], n: int, m: int, options: ImportOptions) -> str | None:
+    """The layer without a number that leads from n numbers to m actions; or two, with a comma between them, of which
+    one leads to the numbers that the other takes to them, prefixes of numbered layers or layers without a number. None
+    if there are none, or several."""
+    ends = _ends(tensors)
+    numbered = {f"{_dot(prefix)}{k}" for prefix in ends for k in _numbers(tensors, prefix)}
+    weights = {name.removesuffix(".weight"): w for name, w in tensors.items() if name.endswith(".weight")}
+    plain = {name: (w.shape[1], w.shape[0]) for name, w in weights.items() if w.ndim == 2 and name not in numbered}
+    plain = {name: pair for name, pair in plain.items() if known_by_name(f"{name}.weight", tensors, "", m) is None}
+    known = {name: pair for name, pair in {**ends, **plain}.items() if name and not _of_another(name)}
+    found = [name for name in plain if name in known and plain[name][0] == n and _gives(plain[name][1], m, options)]
+    found += [
+        f"{first},{last}"
+        for first, (reads, between) in known.items()
+        for last, (then, gives) in known.items()
+        if first != last and reads == n and then == between and _gives(gives, m, options)
+        if known_by_name(f"{last}.weight", tensors, first, m) is None
+    ]
+    return found[0] if len(found) == 1 else None
 
 
 def _of_another(name: str) -> bool:
@@ -461,6 +523,11 @@ def _numbers(tensors: Mapping[str, Numbers], prefix: str) -> list[int]:
         found = ", ".join(f"--prefix {name}" if name else "layers without a prefix" for name in _groups(tensors))
         raise InputError(f"there must be layers {root}0.weight and so on; found {found or ', '.join(tensors)}.")
     return sorted(numbers)
+
+
+def _affine(tensors: Mapping[str, Numbers], prefix: str) -> list[int]:
+    """The numbers of the layers under a prefix, less those of normalisations."""
+    return [k for k in _numbers(tensors, prefix) if tensors[f"{_dot(prefix)}{k}.weight"].ndim != 1]
 
 
 def _own(tensors: Mapping[str, Numbers], prefix: str) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import re
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -12,32 +13,46 @@ import numpy as np
 from certify.errors import InputError
 from certify.loop.files.archives import Archive
 from certify.loop.files.arrays import Numbers, array_of, is_array, is_number
-from certify.loop.files.pickles import Call, Name
+from certify.loop.files.barepickle import BEGINNING as BARE
+from certify.loop.files.barepickle import BarePickle
+from certify.loop.files.legacy import BEGINNING
+from certify.loop.files.pickles import Call, Name, Persistent
 from certify.loop.files.torchfile import TorchFile, is_tensor
+from certify.loop.policies.importers.operations import WITHOUT_WEIGHT_NORM
 
 _SAFE = {
     "F64": "f8", "F32": "f4", "F16": "f2", "BOOL": "b1", "U8": "u1", "U16": "u2", "U32": "u4", "U64": "u8",
     "I8": "i1", "I16": "i2", "I32": "i4", "I64": "i8",
 }  # fmt: skip
+_MOST_MODULES = 1000
+_HELD = ("_parameters", "_buffers", "_modules")
+METADATA = "__metadata__"
+"""The entry of a file of safetensors for texts."""
 
 
 def load_tensors(
-    raw: bytes, what: str, file: TorchFile | None = None, also: re.Pattern[str] | None = None
+    raw: bytes,
+    what: str,
+    file: TorchFile | None = None,
+    also: re.Pattern[str] | None = None,
+    modules: dict[str, Call] | None = None,
 ) -> dict[str, Numbers]:
-    """The tensors and arrays of a file of torch.save: the keys on the way to one are joined by dots.
+    """The tensors and arrays of a file of torch.save, or of a pickle that stands alone: the keys on the way to one are
+    joined by dots. A `kernel` (in, out) of numpy becomes a `weight` (out, in).
 
     Parameters
     ----------
     also : keys of single numbers that are taken for tensors; None for none.
+    modules : gets the modules of torch that were pickled whole, by their names; None refuses such.
 
     Raises
     ------
     InputError : the file is no archive of torch.save, or a module that was pickled whole, whose `forward` is code that
-        the file does not hold; two tensors have one name, or one cannot be read.
+        the file does not hold, where these are refused; two tensors have one name, or one cannot be read.
     """
-    file = file if file is not None else TorchFile(raw, what)
+    held, root = _opened(raw, what, file)
     found: dict[str, Numbers] = {}
-    waiting, seen = [("", file.pickle("data.pkl"))], set[int]()
+    waiting, seen = [("", root)], set[int]()
     while waiting:
         prefix, node = waiting.pop()
         named = also is not None and is_number(node) and also.fullmatch(prefix)
@@ -48,14 +63,36 @@ def load_tensors(
                     "file. Save it traced, torch.jit.trace(model.eval(), torch.zeros(1, n)).save(FILE), or its "
                     "state_dict, of which you say what stands between the layers."
                 )
+            array = held.tensor(node, prefix) if is_tensor(node) else array_of(node, prefix)
+            prefix, array = (prefix, array) if is_tensor(node) else _out_in(prefix, array)
             if prefix in found:
                 raise InputError(f"{what} must name each tensor once; {prefix} stands there twice.")
-            found[prefix] = file.tensor(node, prefix) if is_tensor(node) else array_of(node, prefix)
-        elif isinstance(node, dict | list | tuple | Call) and id(node) not in seen:
+            found[prefix] = array
+        elif isinstance(node, dict | list | tuple | Call):
+            module = None if modules is None else _module(node, prefix or what)
+            if module is not None and modules is not None and isinstance(node, Call):
+                modules[prefix] = node  # under each of its names, as in a state_dict
+                if len(modules) > _MOST_MODULES:
+                    raise InputError(f"{what} must have at most {_MOST_MODULES:,} modules; it has more.")
+            elif id(node) in seen:
+                continue
             seen.add(id(node))
-            inside = [(k, v) for k, v in _inside(node) if isinstance(k, str | int | Name)]
+            within = _inside(node) if module is None else module
+            inside = [(k, v) for k, v in within if isinstance(k, str | int | Name)]
             waiting += [(f"{prefix}.{k}" if prefix else str(k), v) for k, v in reversed(inside)]
     return found
+
+
+def _opened(raw: bytes, what: str, file: TorchFile | None) -> tuple[TorchFile | BarePickle, Any]:
+    """The reader of a file's tensors, and the value of its pickle."""
+    if raw.startswith(BARE) and not raw.startswith(BEGINNING):
+        bare = BarePickle(raw, what)
+        made = bare.root.function if isinstance(bare.root, Call) else None
+        if isinstance(made, Name) and made.name == "VecNormalize":
+            raise InputError(f"{what} is a normaliser of observations: name it with --normaliser, beside the policy.")
+        return bare, bare.root
+    file = file if file is not None else TorchFile(raw, what)
+    return file, file.pickle("data.pkl")
 
 
 def _inside(node: dict[Any, Any] | list[Any] | tuple[Any, ...] | Call) -> Iterable[tuple[Any, Any]]:
@@ -67,6 +104,33 @@ def _inside(node: dict[Any, Any] | list[Any] | tuple[Any, ...] | Call) -> Iterab
         return enumerate(node)
     held = [node.arguments, node.items, *(part for state in node.states for part in _parts(state))]
     return [*node.pairs, *(pair for each in held if isinstance(each, dict | list | tuple) for pair in _inside(each))]
+
+
+def _module(node: Any, what: str) -> list[tuple[Any, Any]] | None:
+    """The content of a module of torch, by the names of a state_dict; None if a node is none.
+
+    Raises
+    ------
+    InputError : it calls other functions before or after its own.
+    """
+    state = node.states[0] if isinstance(node, Call) and len(node.states) == 1 else None
+    if not isinstance(state, dict) or not all(isinstance(state.get(part), dict) for part in _HELD):
+        return None
+    if any(state.get(hooks) for hooks in ("_forward_pre_hooks", "_forward_hooks")):
+        raise InputError(
+            f"the module {what} must have no hooks, which change what it reads or gives. {WITHOUT_WEIGHT_NORM}"
+        )
+    rest = {} if str(class_of(node)).startswith("torch.") else state  # torch's own use no tensor beside these
+    named = [(k, v) for k, v in rest.items() if not (isinstance(k, str) and k.startswith("_"))]
+    return [*(pair for part in _HELD for pair in state[part].items()), *named]
+
+
+def class_of(module: Call) -> Name | None:
+    """The class of a module that was pickled whole; in a file of torch before version 1.6 its source is with it."""
+    found = module.function
+    if isinstance(found, Persistent) and isinstance(found.reference, tuple) and len(found.reference) > 1:
+        found = found.reference[1]
+    return found if isinstance(found, Name) else None
 
 
 def _parts(state: Any) -> tuple[Any, ...]:
@@ -96,20 +160,30 @@ def load_npz(raw: bytes, what: str) -> dict[str, Numbers]:
             raise InputError(f"{member} in {what} is no plain array of numpy: {error}.") from error
         if array.dtype.kind == "c" or (array.dtype.kind in "fiu" and array.dtype.itemsize > 8):
             raise InputError(f"{member} in {what} must hold real numbers of at most 64 bits; found {array.dtype}.")
-        if name.rpartition(".")[2] == "kernel" and array.ndim == 2:
-            name, array = f"{name.removesuffix('kernel')}weight", array.T
+        name, array = _out_in(name, array)
         if name in found:
             raise InputError(f"{what} must name each array once; {name} stands there twice.")
         found[name] = array
     return found
 
 
-def load_safetensors(raw: bytes, what: str) -> dict[str, Numbers]:
+def _out_in(name: str, array: Numbers) -> tuple[str, Numbers]:
+    """A `kernel` (in, out), as flax and Keras call it, as the `weight` (out, in); other arrays as they are."""
+    if name.rpartition(".")[2] == "kernel" and array.ndim == 2:
+        return f"{name.removesuffix('kernel')}weight", array.T
+    return name, array
+
+
+def load_safetensors(raw: bytes, what: str, also: re.Pattern[str] | None = None) -> dict[str, Numbers]:
     """The tensors of a file of safetensors; float16 and bfloat16 as float32, which holds them exactly.
+
+    Parameters
+    ----------
+    also : keys of its metadata whose texts are taken for single numbers; None for none.
 
     Raises
     ------
-    InputError : the package is missing, or the file is damaged.
+    InputError : the package is missing, the file is damaged, or such a text is no number.
     """
     try:
         import safetensors
@@ -122,7 +196,21 @@ def load_safetensors(raw: bytes, what: str) -> dict[str, Numbers]:
         held = safetensors.deserialize(raw)  # type: ignore[no-untyped-call]
     except (safetensors.SafetensorError, ValueError, KeyError, RuntimeError) as error:
         raise InputError(f"{what} is no file of safetensors or is damaged: {error}.") from error
-    return {name: _array(tensor, f"{name} of {what}") for name, tensor in held}
+    found = {name: _array(tensor, f"{name} of {what}") for name, tensor in held}
+    said = {key: text for key, text in metadata(raw).items() if also is not None and also.fullmatch(key)}
+    for key, text in said.items():
+        try:
+            found[f"{METADATA}.{key}"] = np.array(float(text))
+        except ValueError as error:
+            raise InputError(f"{key} in the metadata of {what} must be a number; found {text!r}.") from error
+    return found
+
+
+def metadata(raw: bytes) -> dict[str, str]:
+    """The texts beside the tensors of a file of safetensors that was read."""
+    size = int.from_bytes(raw[:8], "little")
+    held: dict[str, str] = json.loads(raw[8 : 8 + size]).get(METADATA) or {}
+    return held
 
 
 def _array(tensor: Mapping[str, Any], what: str) -> Numbers:
