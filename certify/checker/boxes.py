@@ -117,9 +117,10 @@ class Boxes(ABC):
         return states, inputs
 
     def inputs_kept(self, x: Form, u: Form) -> Array:
-        """True for each input and box (m, B) on which it keeps its bounds: by form, or as `keep_bounds` finds."""
+        """True for each input and box (m, B) on which it keeps its bounds: by form if it has a value, or as
+        `keep_bounds` finds."""
         if self.case.bounded:
-            return np.ones(u.value.shape[1:], dtype=bool)
+            return np.all(np.isfinite(u.range.ends), axis=0)
         return keep_bounds(self.net, self.c.input_bounds, x, u)
 
     def quantities(self, batch: int) -> list[Taylor]:
@@ -204,12 +205,12 @@ def middle(lo: Array, hi: Array) -> tuple[Array, Array]:
 def keeps_inputs(leaves: Leaves) -> Failures:
     """`inputs`: by form, or on each leaf."""
     c = leaves.boxes.c
-    if leaves.boxes.case.bounded:
-        return 0
+    by_form = leaves.boxes.case.bounded
     for name, hold in zip(c.inputs, leaves.inputs, strict=True):
         if not np.all(hold):
-            yield f"{leaves.place}{leaves.numbers[np.argmin(hold)]}", f"{name} may leave its bounds"
-    return int(leaves.inputs.size)
+            wrong = "have no value" if by_form else "leave its bounds"
+            yield f"{leaves.place}{leaves.numbers[np.argmin(hold)]}", f"{name} may {wrong}"
+    return 0 if by_form else int(leaves.inputs.size)
 
 
 def is_whole(tree: bytes, axes: Sequence[int], where: str = "") -> Failures:

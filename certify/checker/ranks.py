@@ -228,8 +228,8 @@ class Steps(Moving):
         """The images of forms, of leaves with these numbers, some at a time, and which form each is of."""
         c = self.c
         u = enclose_on_boxes(self.net, x)
-        if not self.case.bounded:
-            course.note("inputs", np.all(self.inputs_kept(x, u), axis=0), numbers, "an input may leave its bounds")
+        hold = np.all(self.inputs_kept(x, u), axis=0)
+        course.note("inputs", hold, numbers, "an input may leave its bounds, or have no value")
         states, inputs = self.models(x, u)
         held = [*inputs, *self.quantities(len(numbers))]
         motion = Motion([], [states], held) if c.dynamics.jumps else self.motion(states, inputs)

@@ -36,6 +36,11 @@ class Input:
         mid, slopes, error = self.form
         return mid, total(map(abs, slopes)) + error
 
+    @property
+    def has_value(self) -> bool:
+        """True if its form is finite."""
+        return all(part.is_finite() for part in self.range)
+
     def keeps(self, lo: fmpq, hi: fmpq) -> bool:
         """True if it certainly lies in these bounds."""
         centre, radius = self.range
@@ -81,8 +86,8 @@ class Motion:
     def keep_bounds(self, at: Stage) -> None:
         """Rule `inputs`."""
         each = zip(at.u, self.c.plant.input_bounds, strict=True)
-        good = self.bounded or all(u.keeps(*bounds) for u, bounds in each)
-        require(good, "inputs", at.place, "an input is not certain to stay in its bounds")
+        good = all(u.has_value if self.bounded else u.keeps(*bounds) for u, bounds in each)
+        require(good, "inputs", at.place, "an input is not certain to stay in its bounds, or to have a value")
 
     def policy(self, x: arb_mat, count: int) -> list[list[Input]]:
         """For each input and each leaf, given x on the leaves; the network reads x from its origin."""

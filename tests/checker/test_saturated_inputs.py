@@ -6,8 +6,10 @@ Bounds are placed at what Arb says that the inputs reach, a hair beyond and a ha
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -316,3 +318,22 @@ def test_an_input_whose_form_is_no_number_has_no_ends() -> None:
     walk, nan = Walk(c, 1, c.evidence.ranking), arb("nan")
     assert len(walk.input(0, (arb(0), [arb(1)], arb(0)), (arb(0), arb(1))).ends) == 2
     assert not walk.input(0, (nan, [arb(1)], nan), (arb(0), arb(1))).ends
+
+
+def test_an_input_that_no_equation_reads_must_have_a_value() -> None:
+    """By its form it keeps any bounds that hold [-1, 1], where it is a number at all."""
+
+    def read_by_nobody(shift: float) -> Document:
+        data = loop([affine([[1.0]], [shift]), mapped("sqrt", 1), affine([[1.0]], [0.0], of=2)], (-1, 1), centre="none")
+        data["plant"]["dynamics"] = [["*", "3/2", "x"]]
+        return data
+
+    assert said(read_by_nobody(0.5)) is None
+    assert said(read_by_nobody(-0.5)) == "inputs"  # the root of a negative number, up to x = 1/2
+
+
+def test_nor_may_it_be_without_one_on_a_ring() -> None:
+    """x' = -x, and a policy sqrt(x + 3/5): {V <= 1/2} has states where that is no number."""
+    path = Path(__file__).parents[1] / "data" / "undefined_policy.json"
+    found = verdicts(json.loads(path.read_text()))
+    assert found == ("inputs", "inputs")
