@@ -50,7 +50,7 @@ class Multipliers:
 
     @staticmethod
     def of(part: LocalBall | Slab) -> Multipliers:
-        """Those of a part of the evidence."""
+        """The multipliers of a part of the evidence."""
         rest, apart, joint = (tuple(map(rational, row)) for row in part.multipliers.tolist())
         return Multipliers(rest, apart, joint, part.weight)
 
