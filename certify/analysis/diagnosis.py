@@ -392,7 +392,7 @@ def _correction(result: RoaResult, options: RoaOptions, plant: System) -> Step |
         return Step((), "leave --level out for the largest level that can be proved")
     if result.levels.roa is None:
         try:
-            require_equilibrium(plant, rounded=True)
+            require_equilibrium(plant)
         except InputError as error:
             return Step((), str(error))
     return None
