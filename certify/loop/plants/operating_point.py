@@ -63,7 +63,7 @@ def moves_off(system: System, but: Collection[str] = ()) -> dict[str, Fraction |
             explained = _by_rounding(slopes(_origin(system)), _values(system, _origin(system)))
     except InputError:
         explained = np.full(system.n, _ROUNDED)
-    least = dict(zip((s.name for s in system.states), explained.tolist(), strict=True))
+    least: dict[str, float] = {s.name: float(e) for s, e in zip(system.states, explained, strict=True)}
     return {name: r for name, r in moves.items() if not abs(r) <= least[name]}
 
 
@@ -138,13 +138,13 @@ def _origin(system: System) -> Array:
 
 def _values(system: System, z: Array) -> Array:
     """The values of the states, and the inputs, of a point in deviations, (n + m,)."""
-    return z + np.array([*map(float, system.exact_x_eq()), *[0.0] * system.m])
+    return np.asarray(z + np.array([*map(float, system.exact_x_eq()), *[0.0] * system.m]))
 
 
 def _by_rounding(slopes: Array, values: Array) -> Array:
     """The residual of each rate that rounding these values explains, (n,)."""
     found = np.maximum(_ROUNDED, _ULPS * np.abs(slopes) @ np.abs(values))
-    return np.where(np.isfinite(found), found, _ROUNDED)
+    return np.asarray(np.where(np.isfinite(found), found, _ROUNDED))
 
 
 def _residual(system: System, name: str, residual: Fraction | float) -> str:
