@@ -55,7 +55,7 @@ def moves_off(system: System, but: Collection[str] = ()) -> dict[str, Fraction |
     roundings of x_eq and u_eq change f by, which is more where rates are large. States named in `but` may move.
     """
     moves = {name: r for name, r in residuals(system).items() if name not in but}
-    if all(abs(r) <= _ROUNDED for r in moves.values()):
+    if all(abs(float(r)) <= _ROUNDED for r in moves.values()):
         return {}
     try:
         _, slopes = _in_floats(system)
@@ -64,7 +64,7 @@ def moves_off(system: System, but: Collection[str] = ()) -> dict[str, Fraction |
     except InputError:
         explained = np.full(system.n, _ROUNDED)
     least: dict[str, float] = {s.name: float(e) for s, e in zip(system.states, explained, strict=True)}
-    return {name: r for name, r in moves.items() if not abs(r) <= least[name]}
+    return {name: r for name, r in moves.items() if not abs(float(r)) <= least[name]}
 
 
 def require_equilibrium(
