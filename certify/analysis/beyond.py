@@ -35,6 +35,8 @@ def outer_facts(problem: Problem, claim: Claim, outer: Outer, found: OuterProof)
         found.leaves,
         None if found.witness is None else tuple(found.witness.x.tolist()),
         None if found.witness is None else found.witness.level,
+        None if found.witness is None else found.witness.kind,
+        (found.witness.constraint or None) if found.witness is not None else None,
     )
 
 

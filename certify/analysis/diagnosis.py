@@ -399,7 +399,7 @@ def _correction(result: RoaResult, options: RoaOptions, plant: System) -> Step |
         return Step((), f"leave --level out for the largest level that can be proved{_whose(options)}")
     if result.levels.roa is None:
         try:
-            require_equilibrium(plant, rounded=True)
+            require_equilibrium(plant)
         except InputError as error:
             return Step((), str(error))
     return None

@@ -100,7 +100,8 @@ class OuterFacts:
     `volume` is that of its union with {V <= c2}, estimated from samples of the domain, and `deviation` the standard
     deviation of that estimate; `leaves` are those of all trees; `limit` says what ends the level: `domain` (its faces),
     `witness`, `requested`, or what ran out;
-    `witness` is a state, (n,), at which N is no larger than `witness_level` and does not fall, None if none was met.
+    `witness` is a state, (n,), at which N is no larger than `witness_level` and does not fall (`violation` is `rise`),
+    an input leaves its bounds (`input`) or the `constraint` is violated (`keep`); None if none was met.
     """
 
     function: Neural | Symbolic
@@ -112,6 +113,8 @@ class OuterFacts:
     leaves: int
     witness: tuple[float, ...] | None = None
     witness_level: float | None = None
+    violation: str | None = None
+    constraint: str | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""

@@ -24,6 +24,7 @@ from certify.loop.policies import Centre, PolicyNetwork
 from certify.lyapunov import domain_limit, slowest_decay, solve_lyapunov
 from certify.lyapunov.function import Quadratic
 from certify.provers.ranks import turning
+from certify.report.limits import violated
 from certify.report.words import quantity, symbol
 
 WIDER = Fraction(3, 2)
@@ -211,7 +212,8 @@ def _ends_inside(result: RoaResult) -> str | None:
         return None
     each = zip(system.states, outer.witness, system.exact_x_eq(), strict=True)
     at = ", ".join(f"{symbol(s.name)} = {quantity(x + float(q), system.units.get(s.name, ''), 4)}" for s, x, q in each)
-    return f"N ends where it does not fall, at {at}, well inside of the domain, so that a wider one would not help"
+    where = violated(outer.violation, outer.constraint, "it does not fall")
+    return f"N ends where {where}, at {at}, well inside of the domain, so that a wider one would not help"
 
 
 def _in_a_wider_domain(result: RoaResult, effort: Effort) -> Step | None:

@@ -45,7 +45,7 @@ def plant(
     else:
         show(_page(found, A, B, eigenvalues, reach))
     try:
-        require_equilibrium(found, rounded=True, but=clocks(found))
+        require_equilibrium(found, but=clocks(found))
     except InputError as error:
         tell(f"certify: {error} {_WITHOUT_REST}")
         raise typer.Exit(2) from None
@@ -132,7 +132,7 @@ def _facts(s: System, eigenvalues: Sequence[complex], reach: Controllability) ->
 
 def _rest(s: System) -> str:
     """The value of f at the operating point, or its distance from an equilibrium, in words."""
-    from certify.loop.plants import clocks, residuals, rests_where
+    from certify.loop.plants import clocks, moves_off, residuals, rests_where
 
     verb = " moves by" if s.time == "discrete" else "' ="
     running, moves = clocks(s), residuals(s)
@@ -142,7 +142,7 @@ def _rest(s: System) -> str:
     where = f"f(x_eq, u_eq) = {rests_where(s)}"
     if all(isinstance(moves[name], Fraction) and r == 0 for name, r in off.items()):
         return f"{where}{told}"
-    if all(abs(r) <= 1e-12 for r in off.values()):
+    if not moves_off(s, running):
         largest = max(map(abs, off.values()))
         return f"{where} within rounding, not exactly: the largest residual is {largest:.2g} in floats{told}"
     found = (f"{name}{verb} {r:.6g}" for name, r in off.items() if r != 0)

@@ -58,8 +58,10 @@ Terms = dict[Factors, Fraction]
 Change = Callable[[Balls], tuple[Balls, flint.arb_mat]]  # F and its slopes on balls
 _STEPS, _HALVINGS = 100, 30  # of Newton's method, and of a step that does not reduce ||F||
 _REFINEMENTS = 8  # in Arb, each by some ten digits
-_RADIUS = 1e-20  # of the box of the test, in the states' units
-_LEAP = 1e-9  # of a derivative between states so near to each other
+_RADIUS = 1e-20  # of the box of the test, of the domain's widths
+_LEAP = 1e-9  # of a derivative between states so near to each other, of the largest: by the domain's widths
+_DIFFERENCE, _LEAST = 1e-7, 1e-2  # of a difference quotient: of a state, and of this share of its width at least
+_ALMOST = 1e-8  # of the domain's widths: a last step of Newton's method from which the test begins
 _DIGITS = 12
 _MOST_TERMS = 4096  # of a product that is multiplied out
 _BITS = 40  # of a point from which a loop is looked at
@@ -74,8 +76,8 @@ class Rest:
 
     Parameters
     ----------
-    x, u : decimals with 12 digits that are certain up to the last, or 0 for less than 1e-18, (n,) and (m,); x is in
-        deviations from the plant's operating point.
+    x, u : decimals with 12 digits that are certain up to the last, or 0 for some 1e-20 of the domain's width or of
+        the input's bounds, (n,) and (m,); x is in deviations from the plant's operating point.
     eigenvalues : eigenvalues of the Jacobian there, in discrete time of the map; enclosed, as text; empty if Arb cannot
         isolate them.
     stable : True if all of them certainly lie left of the imaginary axis, in discrete time in the unit circle.
@@ -129,18 +131,31 @@ def _short(q: Fraction, width: Fraction) -> Fraction:
 
 
 def _enclosed(loop: ClosedLoop, start: Array) -> Rest | None:
+    widths = _widths(loop)
     with precision():
-        box = _zero_of(
-            partial(_change_on, loop), [flint.arb(float(v)) for v in start], [flint.arb(_RADIUS)] * len(start)
-        )
+        radii = [flint.arb(_RADIUS * w) for w in widths.tolist()]
+        box = _zero_of(partial(_change_on, loop), [flint.arb(float(v)) for v in start], radii)
         if box is None:
             return None
         u, _ = policy_on(loop, box)
         _, J = field_on(loop, box)
-        if any(v.rad() > _LEAP for v in J.entries()):  # slopes of a corner at the equilibrium
+        if _leaps(J, widths):  # slopes of a corner at the equilibrium
             return None
         eigenvalues, stable = _spectrum(J, loop.system.time)
     return Rest(_decimals(box), _decimals(u), eigenvalues, stable)
+
+
+def _widths(loop: ClosedLoop) -> Array:
+    """The widths of the domain, (n,), by which states of any units compare."""
+    return np.array([float(hi - lo) for lo, hi in loop.system.domain])
+
+
+def _leaps(J: flint.arb_mat, widths: Array) -> bool:
+    """True if the slopes of balls are far wider than those of a smooth F."""
+    entries = [[J[i, j] for j in range(J.ncols())] for i in range(J.nrows())]
+    size = np.array([[float(abs(v).upper()) for v in row] for row in entries]) * widths / widths[:, None]
+    wide = np.array([[float(v.rad()) for v in row] for row in entries]) * widths / widths[:, None]
+    return not bool(np.max(wide) <= _LEAP * np.max(size))
 
 
 def _zero_of(change: Change, x: Balls, radii: Balls) -> Balls | None:
@@ -306,7 +321,8 @@ def _end(loop: ClosedLoop) -> Array | None:
 
     F, (lo, hi) = _rates(loop), np.array([[float(a), float(b)] for a, b in loop.system.domain]).T
     with warnings.catch_warnings(action="ignore"):  # of steps that fail
-        solver = scipy.integrate.LSODA(lambda _, x: F(x), 0.0, _origin(loop), _WHILE, rtol=1e-6)
+        each = {"rtol": 1e-6, "atol": 1e-6 * np.minimum(hi - lo, 1.0)}
+        solver = scipy.integrate.LSODA(lambda _, x: F(x), 0.0, _origin(loop), _WHILE, **each)
         for _ in range(_MOST_STEPS):
             solver.step()
             x = np.asarray(solver.y, dtype=np.float64)
@@ -332,24 +348,26 @@ def _last(loop: ClosedLoop) -> Array | None:
 
 def _newton(loop: ClosedLoop, x: Array) -> Array | None:
     """A root of F in floats inside the domain, by Newton's method with halved steps; None if it finds none."""
-    F = _rates(loop)
+    F, widths = _rates(loop), _widths(loop)
     lo, hi = np.array([[float(a), float(b)] for a, b in loop.system.domain]).T
-    value = F(x)
+    value, step = F(x), np.full(len(x), np.inf)
     for _ in range(_STEPS):
-        steps = 1e-7 * np.maximum(1e-3, np.abs(x)) + 1e-9
+        steps = _DIFFERENCE * np.maximum(_LEAST * widths, np.abs(x))
         J = np.stack([(F(x + d) - F(x - d)) / (2 * s) for s, d in zip(steps, np.diag(steps), strict=True)], axis=1)
         if not np.all(np.isfinite(J)):
             return None
-        step = np.linalg.lstsq(J, value, rcond=None)[0]
+        scaled = J * widths / widths[:, None]
+        step = widths * np.linalg.lstsq(scaled, value / widths)[0]
         for _ in range(_HALVINGS):
             new = F(x - step)
-            if np.all((x - step > lo) & (x - step < hi)) and np.linalg.norm(new) < np.linalg.norm(value):
+            less = np.linalg.norm(new / widths) < np.linalg.norm(value / widths)
+            if np.all((x - step > lo) & (x - step < hi)) and less:
                 break
             step = step / 2
         else:
             break
         x, value = x - step, new
-    return x if np.linalg.norm(value) < 1e-8 * (1 + np.linalg.norm(x)) else None
+    return x if np.linalg.norm(value / widths) <= _ALMOST * np.linalg.norm(scaled) else None
 
 
 def _inverse(J: flint.arb_mat) -> flint.arb_mat | None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,15 +46,36 @@ def solve_lyapunov(A: Array, Q: Array, step: float = 0.0, decay: float = 0.0) ->
         eigenvalues = np.linalg.eigvals(M)
         if not np.max(eigenvalues.real) < 0:
             raise InputError(f"`A` must be Hurwitz; its eigenvalues are {eigenvalues}.")
-        P = scipy.linalg.solve_continuous_lyapunov(M.T, -Q)
+        P = _balanced(scipy.linalg.solve_continuous_lyapunov, M, -Q, 0.0)
     else:
         M = np.eye(len(A)) + step * A
         eigenvalues = np.linalg.eigvals(M)
         if not np.max(np.abs(eigenvalues)) ** 2 < 1 - 2 * decay * step:
             raise InputError(f"the map of a step must be stable; its eigenvalues are {eigenvalues}.")
         share = 1 - 2 * decay * step
-        P = scipy.linalg.solve_discrete_lyapunov(M.T / share**0.5, step * Q / share)
+        P = _balanced(scipy.linalg.solve_discrete_lyapunov, M / share**0.5, step * Q / share, 1.0)
     return np.asarray((P + P.T) / 2)
+
+
+def _balanced(solve: Callable[[Array, Array], Array], M: Array, Q: Array, step: float) -> Array:
+    """The solution for M' and Q; where states have units of very different sizes, and it is none in floats, that of a
+    balanced M (Parlett and Reinsch, Numerische Mathematik 13, 1969)."""
+    import scipy.linalg
+
+    with warnings.catch_warnings(action="ignore"):  # of eigenvalues that are far apart
+        P = solve(M.T, Q)
+        if _is_definite(P) and _is_definite(P - M.T @ P @ M if step else -(M.T @ P + P @ M)):
+            return P
+        B, (scale, _) = scipy.linalg.matrix_balance(M, permute=False, separate=True)
+        return np.asarray(solve(B.T, scale[:, None] * Q * scale) / scale[:, None] / scale)
+
+
+def _is_definite(P: Array) -> bool:
+    """True if a symmetric matrix is positive definite in floats, in whatever units its states are."""
+    size = np.sqrt(np.maximum(np.diag(P), 0.0))
+    return bool(
+        np.all(size > 0) and np.all(np.isfinite(P)) and np.min(np.linalg.eigvalsh(P / size / size[:, None])) > 0
+    )
 
 
 def slowest_decay(A: Array, step: float = 0.0) -> float:

@@ -23,7 +23,6 @@ _LIMITS = {
 }
 _OF_OUTER = {
     "domain": "the domain: a larger set reaches its boundary",
-    "witness": "a state at which N does not fall",
     "effort": "the effort: more may be provable",
     "time": "the time limit: more may be provable",
     "boxes": "the limit on boxes: more may be provable",
@@ -85,11 +84,22 @@ def outer_limited_by(outer: Mapping[str, Any]) -> str:
 
     >>> outer_limited_by({"limit": "boxes"})
     'the limit on boxes: more may be provable'
+    >>> outer_limited_by({"limit": "witness", "witness_level": 1.5, "violation": "keep", "constraint": "wall"})
+    'a state at which the constraint wall is violated, where N = 1.5'
     """
     reason = str(outer["limit"])
     said = _OF_OUTER.get(reason, reason)
+    if reason == "witness":
+        said = f"a state at which {violated(outer.get('violation'), outer.get('constraint'))}"
     met = outer.get("witness_level")
     return said + (f", where N = {number(met)}" if reason == "witness" and met is not None else "")
+
+
+def violated(kind: str | None, constraint: str | None, falling: str = "N does not fall") -> str:
+    """The condition of an outer set that fails at a witness of this kind, in words."""
+    if kind == "keep":
+        return f"the constraint {constraint} is violated"
+    return "an input leaves its bounds" if kind == "input" else falling
 
 
 def limit_in_words(reason: str, timing: TimingInWords = PLAIN) -> str:

@@ -150,7 +150,7 @@ def _task(plant: str | None, given: dict[str, Any], preset: str, chosen: dict[st
 
     system, plant_options = chosen_plant(plant)
     options = overridden(plant_options.named(preset), chosen)
-    require_equilibrium(system, rounded=True)
+    require_equilibrium(system)
     return _Task(plant, system, plant_options, options)
 
 

@@ -440,6 +440,10 @@ def test_no_wider_domain_is_suggested_where_n_ends_well_inside_of_it(
         assert step is not None and (step == domain) is not told
         assert (f"N ends where it does not fall, at x = {number(outer.witness[0], 4)}" in step.why) is told
         assert not told or step.options == (("--candidate", "polynomial"),)
+    kept = replace(outer, violation="keep", constraint="wall")  # N falls there
+    changed = replace(by_default, outer=kept, simulated=SimulatedFacts(1000, 900, 780))
+    step = beyond_the_ellipsoid(changed, RoaOptions(), Effort(10 * UNIT))
+    assert step is not None and "N ends where the constraint wall is violated, at x = " in step.why
 
 
 @pytest.mark.parametrize(

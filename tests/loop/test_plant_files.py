@@ -350,7 +350,7 @@ def test_a_point_that_is_no_equilibrium_is_refused_with_the_residual(
 def test_an_irrational_operating_point_is_refused_with_a_sentence(tmp_path: Path) -> None:
     message = refused(tmp_path, {'level = "rest"': 'level = "sin(rest)"'})
     assert f"line {TANK.splitlines().index('[x_eq]') + 2}: x_eq.level" in message
-    assert "must be rational" in message and "sin(1/3)" in message
+    assert "must be rational" in message and "sin(1/3)" in message and "digits, 0.327194" in message
     message = refused(tmp_path, {'u = "rest**3"': 'u = "sqrt(tau)"'})
     assert f"line {TANK.splitlines().index('[u_eq]') + 2}: u_eq.u" in message and "found sqrt(2)" in message
     assert load_system(write(tmp_path, TANK.replace('u = "rest**3"', 'u = "sqrt(rest**6)"'))).exact_u_eq() == (
@@ -558,6 +558,46 @@ def test_the_equilibrium_that_is_named_is_one(tmp_path: Path) -> None:
     tank = write(tmp_path, TANK.replace("level**3", "exp(level)/8").replace('level = "rest"', level).replace(
         'flow = "rest**3"', flow).replace('u = "rest**3"', u))  # fmt: skip
     assert max(map(abs, residuals(load_system(tank)).values())) < 1e-15
+    roots = {"level**3": "(level**2 - 2)", 'level = "rest"': "level = 1.5", "[0, 1]": "[1, 2]"}
+    roots |= {'flow = "rest**3"': "flow = 0", 'u = "rest**3"': "u = 0"}
+    assert "it rests at level = 1.4" in refused(tmp_path, roots)
+
+
+@pytest.mark.parametrize("pace", ["1", "1000000000"])
+def test_the_digits_of_an_irrational_equilibrium_of_polynomials_are_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], pace: str
+) -> None:
+    """Lorenz's equilibria have the root of 72; its digits leave a residual, which grows with the pace of the rates."""
+    text = f"""
+name = "lorenz"
+states = ["x", "y", "z"]
+inputs = ["u"]
+[parameters]
+b = "8/3"
+pace = {pace}
+[dynamics]
+x = "pace*10*(y - x)"
+y = "pace*(x*(28 - z) - y + u)"
+z = "pace*(x*y - b*z)"
+[x_eq]
+x = 8.4852813742385702
+y = 8.4852813742385702
+z = 27
+[u_eq]
+u = 0
+[domain]
+x = [-20, 25]
+y = [-25, 30]
+z = [0, 50]
+[input_bounds]
+u = [-100, 100]
+"""
+    path = write(tmp_path, text)
+    assert 0 < abs(residuals(load_system(path))["z"]) < 1e-14 * float(pace)
+    status, out, _ = plant_command(capsys, str(path))
+    assert status == 0 and "= 0 within rounding, not exactly" in " ".join(out.split())
+    with pytest.raises(InputError, match=r"z' = -.*it rests at x = 8\.4852"):
+        load_system(write(tmp_path, text.replace("742385702", "6")))
 
 
 def test_plant_says_what_cannot_be_controlled_and_what_does_not_rest(

@@ -32,7 +32,7 @@ from certify.loop.policies import Policy, PolicyNetwork, load_policy, save_polic
 from certify.loop.rigorous import field_on, precision
 from certify.lyapunov.function import Quadratic
 from controllers.evaluation.proved_set import count_covered, require_same_loop, require_same_question
-from tests.support.loops import box
+from tests.support.loops import box, units_apart
 
 PLAIN = Path(__file__).parent.parent.parent / "examples" / "policies" / "without_gain" / "pendulum.pt"
 LITTLE = ["roa", "--policy", str(PLAIN), "--candidate", "lqr", "--effort", "0.02"]
@@ -77,6 +77,16 @@ def test_a_clip_that_acts_at_rest_leaves_the_plant_alone_there() -> None:
 def test_a_rest_that_is_not_stable_is_not_called_so() -> None:
     found = find_rest(scalar(x + u, 0.5, 0.25))
     assert found is not None and not found.stable and found.eigenvalues == ("1.5",)
+
+
+def test_units_change_the_digits_alone(tmp_path: Path) -> None:
+    """A microactuator in metres and coulombs was not seen to rest anywhere, and its set had 896,039 boxes."""
+    found = [find_rest(ClosedLoop(*units_apart(unit, 0.01))) for unit in (Fraction(1), Fraction(1, 10**13))]
+    one, small = (None if rest is None else Fraction(rest.x[0]) for rest in found)
+    assert one is not None and small is not None and abs(small * 10**13 / one - 1) < Fraction(1, 10**11)
+    unit = Fraction(1, 10**9)
+    proved = certify_roa(*units_apart(unit, 0.01), tmp_path, RoaOptions(candidate="lqr", effort=0.1))
+    assert proved.verdict is Verdict.PROVED and proved.claim == "nearby" and (proved.volume or 0) > 2 * unit
 
 
 @pytest.mark.parametrize("candidate", ["auto", "lqr"])

@@ -56,6 +56,19 @@ def test_not_hurwitz_is_refused(A: np.ndarray) -> None:
         solve_lyapunov(A, np.eye(2))
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1e-12])
+def test_units_of_very_different_sizes_are_solved(unit: float) -> None:
+    """An oscillator whose position is in small units; scipy's solution has another sign. The exact one: P22 = 1 +
+    unit^2, by k = 1/unit."""
+    A = np.array([[0.0, unit], [-1 / unit, -1.0]])
+    for M, step in ((A, 0.0), (A, 0.1)):
+        P = solve_lyapunov(M, np.eye(2), step)
+        size = np.array([unit, 1.0])
+        left = size[:, None] * (M.T @ P + P @ M + step * M.T @ P @ M) * size
+        assert np.linalg.eigvalsh(size[:, None] * P * size)[0] > 0.1
+        assert np.max(np.abs(left + np.diag(size**2))) < 1e-9
+
+
 def test_indefinite_Q_is_refused() -> None:
     with pytest.raises(InputError, match="positive definite"):
         solve_lyapunov(-np.eye(2), np.diag([1.0, 0.0]))

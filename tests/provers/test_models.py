@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ from certify.provers.tube.tube import Around, Tube, find_tube
 from tests.support.cases import case_of
 from tests.support.certificates import parse
 from tests.support.jets import remainders, seen, sides
-from tests.support.loops import chain, pendulum_network, scalar_tanh, tank, valve
+from tests.support.loops import chain, pendulum_network, scalar_tanh, tank, units_apart, valve
 
 
 def loop_of(name: str) -> tuple[System, PolicyNetwork]:
@@ -75,6 +76,23 @@ def test_models_and_sides_are_those_of_the_checker(name: str, tmp_path: Path) ->
     assert np.allclose(decay_of(mine, J, b), decay, rtol=1e-9, atol=1e-12 * np.max(decay))
     assert np.allclose(rest_of(mine, b, Multipliers(rows, by.weight)), rest, rtol=1e-6, atol=1e-6 * np.max(decay))
     assert best_multipliers(mine, J, c.P).margin > 0
+
+
+def test_gradients_are_in_doubt_as_a_checker_has_them_where_units_differ(tmp_path: Path) -> None:
+    """A state in nanometres and one in units of some metres a second: a checker bounds roundings of W x by norms, which
+    is a millionth of the gradient here. A charge-driven microactuator was REJECTED for it."""
+    system, network = units_apart(Fraction(1, 10**9))
+    result = certify_roa(system, network, tmp_path, RoaOptions(candidate="scaled", level=0.1))
+    assert result.verdict is Verdict.PROVED and result.raw is not None
+    c = parse(json.loads(result.raw))
+    assert c.evidence.local is not None
+    J = c.evidence.local.J
+    mine = paths(case_of(system, network, c.P).loop).models(J)
+    with np.errstate(all="ignore"):
+        theirs = float(Ball(Case(c), J, "ball").F()[1].slack.top)
+    assert 1e-8 * np.linalg.norm(mine.inputs.A) < theirs <= mine.slack[1] <= 4 * theirs
+    pendulum = paths(case_of(*loop_of("pendulum")).loop).models(0.1 * np.eye(2))
+    assert not np.any(pendulum.slack)  # far less than what is left to roundings
 
 
 def loops() -> dict[str, ClosedLoop]:

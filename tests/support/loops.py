@@ -66,6 +66,25 @@ def tank() -> tuple[System, PolicyNetwork]:
     return system, network
 
 
+def units_apart(unit: Fraction, bias: float = 0.0) -> tuple[System, PolicyNetwork]:
+    """A damped oscillator whose position has another unit than its speed; with a bias it rests beside the origin."""
+    p, v, u = symbols("p v u")
+    system = System(
+        name="oscillator",
+        states=(p, v),
+        inputs=(u,),
+        parameters={},
+        dynamics=(v * unit, -p / unit - v + u),
+        u_eq=(Number(0),),
+        domain=((-unit, unit), *box(1)),
+        input_bounds=box(3),
+    )
+    k = float(unit)
+    weights = np.array([[-0.3 / k, -0.2], [0.5 / k, 0.1]]), np.array([[0.7, -0.4]])
+    biases = np.array([bias, 0.0]), np.zeros(1)
+    return system, PolicyNetwork.of_layers(weights, biases, np.full(1, 2.0), np.zeros(1), "tanh", "none")
+
+
 def valve() -> tuple[System, PolicyNetwork]:
     """Two states and every function of equations beside sin, cos and tan, at points where they are known exactly."""
     x, y, u = symbols("x y u")

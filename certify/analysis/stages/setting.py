@@ -17,6 +17,7 @@ from certify.analysis.options import RoaOptions
 from certify.analysis.outcome import by_spectrum, not_stable
 from certify.analysis.results import RoaResult
 from certify.analysis.stages.state import State, Tools
+from certify.analysis.suggested import centring
 from certify.certificates import require_within_limits
 from certify.certificates.claims.claim import Kind
 from certify.certificates.verdict import Stop, Verdict
@@ -78,6 +79,14 @@ class Setting:
                 reach_from=None if begin is None else values_of(loop.system, begin),
             )
             return _by_spectrum(state, rest)
+
+
+def _at_origin(loop: ClosedLoop) -> str:
+    """The step to a loop that rests at the origin, or to an answer about a state without a tube."""
+    centre = centring(loop.system, loop.network)
+    if centre is not None:
+        return f"With --centre {centre} it is; the centred policy is then the one to run."
+    return "`certify roa` proves the set around the loop's equilibrium, and its --contains whether a state lies in it."
 
 
 def setting_of(loop: ClosedLoop, options: RoaOptions) -> State:
@@ -162,10 +171,11 @@ def _with_claim(state: State) -> State:
         state = state.noting(f"practical stability is claimed{or_nearby}, because {why}")
     if kind == "practical" and options.enlarges:
         if options.reach_from is not None:
-            raise InputError(
-                f"a tube from a state needs a loop whose equilibrium is the origin; {'; '.join(state.notes)}."
-            )
-        state = state.noting("a tube needs a set from which trajectories converge, and is not looked for")
+            said = f"a tube from a state needs a loop whose equilibrium is the origin; {'; '.join(state.notes)}."
+            raise InputError(f"{said} {_at_origin(state.loop)}")
+        centre = centring(state.loop.system, state.loop.network)
+        with_it = "" if centre is None else f"; with --centre {centre} it is"
+        state = state.noting(f"a tube needs a loop whose equilibrium is the origin, and is not looked for{with_it}")
         options = replace(options, enlarge=False, box=None)
     return replace(state, options=replace(options, claim=kind))
 

@@ -197,6 +197,8 @@ def _facts(found: StayProof, system: System) -> OuterFacts:
         found.leaves,
         None if hazard is None else tuple(hazard.x.tolist()),
         None if hazard is None else hazard.level,
+        None if hazard is None else hazard.kind,
+        (hazard.constraint or None) if hazard is not None else None,
     )
 
 

@@ -13,7 +13,7 @@ from certify.loop.plants.deviations import (
 from certify.loop.plants.floating_point import mean_rate
 from certify.loop.plants.linear import Controllability, Matrix, controllability, corners_at_rest, in_floats, linearise
 from certify.loop.plants.measurements import Axis, Measurements, Run
-from certify.loop.plants.operating_point import clocks, require_equilibrium, residuals, rests_where
+from certify.loop.plants.operating_point import clocks, moves_off, require_equilibrium, residuals, rests_where
 from certify.loop.plants.registry import available_systems, chosen_system, get_system, shipped_system
 from certify.loop.plants.samples import Sampled, Samples, Unknown
 from certify.loop.plants.system import System, exact
@@ -52,6 +52,7 @@ __all__ = [
     "linearise",
     "load_system",
     "mean_rate",
+    "moves_off",
     "require_equilibrium",
     "require_no_jumps",
     "require_origin_inside",

@@ -30,7 +30,7 @@ from certify.loop.expressions import (
     symbols_of,
     value_if_rational,
 )
-from certify.loop.expressions.numerical import Module
+from certify.loop.expressions.numerical import Module, numerical
 from certify.loop.plants.calls import Call
 from certify.loop.plants.floating_point import function_of
 from certify.loop.plants.measurements import Measurements
@@ -295,8 +295,15 @@ def _rational(
     result = _substituted(system, expression, {Symbol(name): Number(q) for name, q in parameters.items()})
     value = value_if_rational(result, {})
     if isinstance(value, str):
-        raise InputError(
-            f"{what} in {system.name} must be rational, because the equilibrium is decided in rationals; "
-            f"found {result}. Choose parameters for which it is, or make it a parameter itself."
-        )
+        raise InputError(f"{what} in {system.name} {irrational(result)}")
     return value
+
+
+def irrational(point: Expression) -> str:
+    """Say that an entry of the operating point has no rational value, and what to write."""
+    value = float(numerical([point], [])()[0])
+    digits = f"Write its digits, {value:.17g}, or choose" if math.isfinite(value) else "Choose"
+    return (
+        f"must be rational, because the equilibrium is decided in rationals; found {point}. {digits} parameters for "
+        "which it is rational."
+    )

@@ -29,7 +29,7 @@ from certify.loop.plants.deviations import in_deviations
 from certify.loop.plants.equations import nearest, parse_constraint, parse_expression
 from certify.loop.plants.operating_point import clocks, require_equilibrium
 from certify.loop.plants.source import PlantFile, interval_at, number_at, read_plant_file
-from certify.loop.plants.system import Interval, System, Time
+from certify.loop.plants.system import Interval, System, Time, irrational
 from certify.loop.plants.unknown import measurements_in, parameter, residual_ranges, samples_in, with_residuals
 
 _REQUIRED = ("name", "states", "inputs", "dynamics", "u_eq", "domain", "input_bounds")
@@ -295,12 +295,7 @@ def _at_rest(
     except InputError as error:
         raise file.refuse(f"the operating point has no value: {error}.", table, name) from error
     if isinstance(value, str):
-        raise file.refuse(
-            f"the operating point must be rational, because the equilibrium is decided in rationals; found {point}. "
-            "Choose parameters for which it is, or make it a parameter itself.",
-            table,
-            name,
-        )
+        raise file.refuse(f"the operating point {irrational(point)}", table, name)
     return value
 
 

@@ -88,9 +88,9 @@ def _corner(
     decay = -(whole + whole.T) - (h * A.T @ P @ A if h else 0.0) - (0.0 if R is None else J.T @ R @ J)
     charge = h * (gamma**2 + 2 * math.sqrt(max(float(f @ moved), 0.0)) * gamma)
     start = h * float(f @ moved)
-    error, slack = models.rounding, np.zeros_like(f)
+    error, slack = models.rounding, models.slack
     if models.spread is not None:
-        error, slack = error + models.spread.error, models.spread.slack
+        error, slack = error + models.spread.error, slack + models.spread.slack
     far, wide = _lengths(models.others, P) if h else (0.0, 0.0)
     wide += _length_of_kinks(models, P) if h else 0.0
     if np.any(error) or np.any(slack) or far or wide:

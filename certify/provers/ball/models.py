@@ -12,6 +12,7 @@ ball that meets its corner, which leaves the more the closer the corner is to th
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -40,6 +41,7 @@ _AT_CORNER = 1e-12  # what a unit reads, so near 0 that no ball of any use is fr
 AT_CORNERS = 6  # uncertain quantities of which the checker decides every corner
 _UNIT = 2.0**-51  # twice what a checker counts for each term of a sum, relative to the sum's size
 _ROUNDED = 2.0**-49  # and for anything else that it computes
+_MUCH = 1e-9  # share of a gradient, from which on its roundings count beside the decay
 _WIDER, _BEYOND = 1 + 1e-9, 1e-12  # of a constraint's radius, and of its middle, for the checker's rounding
 
 
@@ -77,7 +79,8 @@ class Models:
 
     Those are N numbers |e_q| <= d'R_q d, R (N, k, k), which enter F as `shares` (n, N) times e; `squares` are R_q'R_q.
     `spread` says what is uncertain of f and A, None that nothing is; `stays` whether the states are certain to stay in
-    the domain over a sampling period; `rounding` (n,) is about what a checker does not know of f for its roundings.
+    the domain over a sampling period; `rounding` (n,) is about what a checker does not know of f for its roundings, and
+    `slack` (n,) of A, where that is much.
     `others` are y beside those of `spread` that have no corners, `moves` and `turns` as there; see `with_others`.
     `kinks` are those among the units, on the `cone`; None if none is allowed.
     """
@@ -92,6 +95,7 @@ class Models:
     squares: Array
     inputs: Inputs
     rounding: Array
+    slack: Array
     spread: Spread | None = None
     stays: bool = True
     others: tuple[Array, Array] | None = None
@@ -138,12 +142,14 @@ class Models:
 class _Vector:
     """A vector of the network, `y + X [x - m, A]`: A stacks what every unit so far adds to its tangent at m. If it has
     units of its `own`, their columns are the identity and come last, not in X. `wrong` is about what a checker does not
-    know of y for its roundings."""
+    know of y for its roundings, `blur` the same of gradients on a ball of J over ||J||: it bounds the roundings of a
+    layer by norms, which is much where states have units of very different sizes."""
 
     y: Array
     X: Array
     wrong: Array
     own: bool = False
+    blur: float = 0.0
 
     def among(self, columns: int) -> Array:
         """X with the columns of its own units, and of zeros up to so many."""
@@ -171,7 +177,8 @@ class _Policy:
 @dataclass(frozen=True, slots=True)
 class Driven:
     """The inputs on a ball as rows in their basis: gradients G (m, k), Q and K, and `errors` (m, ...) of what is left,
-    which are `shares` (m, N) of those that R (N, k, k) bounds; `curve` and `room` as `Inputs` has them.
+    which are `shares` (m, N) of those that R (N, k, k) bounds; `curve` and `room` as `Inputs` has them. A checker does
+    not know the inputs by their `rounding`, nor their gradients by their `slack`, (m,) each.
     """
 
     G: Array
@@ -184,6 +191,7 @@ class Driven:
     curve: Array
     room: Array
     rounding: Array
+    slack: Array
     kinks: Kinks | None = None
     cone: Cone = ALL
 
@@ -196,8 +204,8 @@ class Driven:
         inputs = Inputs(self.G, form.matrices(self.Q), form.forms(self.K), self.curve, self.room, B)
         parts = form.matrices(Q), form.forms(K), form.matrices(E)
         f = np.array([v.c for v in F])
-        wrong = np.abs(B) @ self.rounding
-        found = Models(f, a, *parts, B @ self.shares, self.R, self.squares, inputs, wrong, spread, stays)
+        wrong, slack = np.abs(B) @ self.rounding, np.abs(B) @ self.slack
+        found = Models(f, a, *parts, B @ self.shares, self.R, self.squares, inputs, wrong, slack, spread, stays)
         return found if self.kinks is None else replace(found, kinks=self.kinks, cone=self.cone)
 
     @property
@@ -224,13 +232,14 @@ class Paths:
     """The closed loop at a state `middle`, (n,): all of its models that does not depend on the ball around it.
 
     `u` are the inputs there, before a clip, and `rounding` (m,) is about what a checker does not know of them for its
-    roundings.
+    roundings, `blur` (m,) of their gradients on a ball of J, over ||J||.
     """
 
     loop: ClosedLoop
     middle: Array
     u: Array
     rounding: Array
+    blur: Array
     network: Network
     vectors: tuple[_Vector, ...]
 
@@ -277,7 +286,9 @@ class Paths:
         G, Q, K, each = scale * policy.G, scale * policy.Q, scale * policy.K, scale * policy.shares
         errors, R = np.abs(each) @ policy.R, form.matrices(policy.R)
         curve = sizes(G, Q, K, errors).curve
-        found = Driven(G, Q, K, errors, each, R, R @ R, curve, _room(loop, self.u), self.rounding)
+        slack = self.blur * np.linalg.norm(J)
+        slack = np.where(slack > _MUCH * np.linalg.norm(G, axis=1), slack, 0.0)
+        found = Driven(G, Q, K, errors, each, R, R @ R, curve, _room(loop, self.u), self.rounding, slack)
         if kinks is None or cone is None:
             return found
         return replace(found, curve=curve + np.abs(each) @ kinks.rho, kinks=kinks, cone=cone)
@@ -384,8 +395,8 @@ class _Along(Algebra[_Vector]):
         self.n = n
         self.vectors = [_Vector(at, np.eye(n), np.zeros(n))]
 
-    def _made(self, y: Array, X: Array, wrong: Array, own: bool = False) -> _Vector:
-        self.vectors.append(_Vector(y, X, wrong, own))
+    def _made(self, y: Array, X: Array, wrong: Array, blur: float, own: bool = False) -> _Vector:
+        self.vectors.append(_Vector(y, X, wrong, own, blur))
         return self.vectors[-1]
 
     def affine(self, step: Affine, v: _Vector) -> _Vector:
@@ -393,40 +404,47 @@ class _Along(Algebra[_Vector]):
         y, X = W @ v.y + b, W @ v.X
         terms = _UNIT * (W.shape[1] + 2) * np.linalg.norm(W, axis=1) * np.linalg.norm(v.y)
         wrong = np.abs(W) @ v.wrong + terms + _ROUNDED * (np.abs(y) + np.abs(b))
-        return self._made(y, np.concatenate([X, W], axis=1) if v.own else X, wrong)
+        blur = float(np.linalg.norm(W, 2)) * v.blur
+        if v is self.vectors[0]:
+            blur += _UNIT * W.shape[1] * float(np.linalg.norm(W))
+        return self._made(y, np.concatenate([X, W], axis=1) if v.own else X, wrong, blur)
 
     def map(self, step: Map, v: _Vector) -> _Vector:
         y, slope = step.phi.pair(v.y)
         X = slope[:, None] * self._all(v)
-        return self._made(y, X, step.phi.steepest * v.wrong + _ROUNDED * np.abs(y), own=True)
+        steepest = step.phi.steepest
+        return self._made(y, X, steepest * v.wrong + _ROUNDED * np.abs(y), steepest * v.blur, own=True)
 
     def clip(self, step: Clip, v: _Vector) -> _Vector:
         inside = (v.y > step.lo) & (v.y < step.hi)
         y = np.minimum(np.maximum(v.y, step.lo), step.hi)
-        return self._made(y, np.where(inside[:, None], self._all(v), 0.0), v.wrong)
+        return self._made(y, np.where(inside[:, None], self._all(v), 0.0), v.wrong, v.blur)
 
     def sum(self, step: Sum, *vectors: _Vector) -> _Vector:
         most = max(v.columns for v in vectors)
         y, wrong = (np.sum([getattr(v, part) for v in vectors], axis=0) for part in ("y", "wrong"))
         size = np.sum([np.abs(v.y) for v in vectors], axis=0)
-        return self._made(y, np.sum([v.among(most) for v in vectors], axis=0), wrong + _ROUNDED * size)
+        X, blur = np.sum([v.among(most) for v in vectors], axis=0), sum(v.blur for v in vectors)
+        return self._made(y, X, wrong + _ROUNDED * size, blur)
 
     def concat(self, step: Concat, *vectors: _Vector) -> _Vector:
         most = max(v.columns for v in vectors)
         y, wrong = (np.concatenate([getattr(v, part) for v in vectors]) for part in ("y", "wrong"))
-        return self._made(y, np.concatenate([v.among(most) for v in vectors]), wrong)
+        X, blur = np.concatenate([v.among(most) for v in vectors]), math.hypot(*(v.blur for v in vectors))
+        return self._made(y, X, wrong, blur)
 
     def product(self, step: Product, v: _Vector, w: _Vector) -> _Vector:
         y, X = v.y * w.y, v.y[:, None] * self._all(w) + w.y[:, None] * self._all(v)
         wrong = np.abs(v.y) * w.wrong + np.abs(w.y) * v.wrong + _ROUNDED * np.abs(y)
-        return self._made(y, X, wrong, own=True)
+        blur = float(np.max(np.abs(v.y))) * w.blur + float(np.max(np.abs(w.y))) * v.blur
+        return self._made(y, X, wrong, blur, own=True)
 
     def observe(self, step: Observe, v: _Vector) -> _Vector:
         D, y = jacobian(step, v.y), evaluated(step.expressions, step.symbols, v.y)
         X = np.zeros((len(y), self._units))
         X[:, : self.n] = D @ v.X[:, : self.n]
         wrong = np.abs(D) @ v.wrong + _ROUNDED * (np.abs(y) + np.abs(D) @ np.abs(v.y))
-        return self._made(y, X, wrong, own=True)
+        return self._made(y, X, wrong, float(np.linalg.norm(D, 2)) * v.blur, own=True)
 
     def _all(self, v: _Vector) -> Array:
         """X among all units so far, so that those of the next step are the next ones."""
@@ -475,7 +493,7 @@ def paths(loop: ClosedLoop, at: Array | None = None, resting: bool = True) -> Pa
     else:
         wrong = np.zeros_like(u)
     rounding = np.zeros_like(u) if resting else wrong + _ROUNDED * (np.abs(u) + np.abs(folded.offset))
-    return Paths(loop, middle, u, rounding, network, tuple(along.vectors))
+    return Paths(loop, middle, u, rounding, np.abs(folded.scale) * value.blur, network, tuple(along.vectors))
 
 
 def _require_small(network: Network, k: int) -> None:

@@ -70,8 +70,8 @@ class BoundsEngine(Engine):
         """A ring that grows from the ball whose floor is about the least; None without such a ball."""
         start = time.perf_counter()
         many = len(self.T) > FEW
-        effort, shares = budget.effort.share(_FOR_BALL), {"above": _ABOVE[many], "beside": _BESIDE[many]}
-        found = prove_band(task.problem, self.T, task.target, effort=effort, **shares)
+        effort, above, beside = budget.effort.share(_FOR_BALL), _ABOVE[many], _BESIDE[many]
+        found = prove_band(task.problem, self.T, task.target, effort=effort, above=above, beside=beside)
         if found is None:
             return None
         (floor, inner), stop = found, None

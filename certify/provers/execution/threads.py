@@ -32,7 +32,12 @@ def cores() -> int:
 
 
 def one_thread() -> AbstractContextManager[Any]:
-    """Linear algebra on the thread that asks for it, so that rounding does not depend on how many there are."""
+    """Linear algebra on the thread that asks for it, so that rounding does not depend on how many there are.
+
+    scipy has a library of its own, which a limit reaches only once it is loaded. The command line sets the variable.
+    """
+    if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
+        import scipy.linalg  # noqa: F401
     limits: AbstractContextManager[Any] = _libraries(len(sys.modules)).limit(limits=1, user_api="blas")
     return limits
 
