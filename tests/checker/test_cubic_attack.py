@@ -443,8 +443,8 @@ def attempts(case: Case, piece: tube.Piece) -> Iterator[tube.Piece]:
     """The slab with multipliers that balance the sums, edge and motion on a grid around the rate of the flow."""
     F = seen(piece.F())
     b = abs(float(piece.J[0, 0] * piece.slab.middle[0, 0]))
-    rest, apart = ((quotient(max(float(np.linalg.norm(getattr(F[0], part))) / b, 1e-30)),) for part in ("E", "Q"))
-    slab, path = replace(piece.slab, multipliers=(rest, apart, (fmpq(1),))), piece.slab.path
+    rest, apart = (max(float(np.linalg.norm(getattr(F[0], part))) / b, 1e-30) for part in ("E", "Q"))
+    slab, path = replace(piece.slab, multipliers=np.array([[rest], [apart], [1.0]])), piece.slab.path
     if path is None:
         yield replace(piece, slab=slab)
         return
@@ -478,7 +478,7 @@ def test_slabs_that_are_accepted_next_to_the_flow_are_true(name: str, moving: bo
             share = 0.3 if moving else 0.0
             path = Path(np.array([to]), share, 1.0, 1.0, 1.0) if moving else None
             J = np.array([[min(start, middle, end) ** -0.5 * 1.001 / (1 - share**2) ** 0.5]])
-            by = ((fmpq(0),), (fmpq(1),), (fmpq(1),))
+            by = np.array([[0.0], [1.0], [1.0]])
             slab = Slab(np.array([[middle]]), np.array([[end]]), h, J, by, np.eye(1 + moving), path)
             piece = tube.Piece(case, J, "slab", np.array([[start]]), np.array([centre]) if moving else None, slab)
             passes = any(refused_by(each) is None for each in attempts(case, piece))
