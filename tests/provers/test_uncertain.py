@@ -84,7 +84,7 @@ def test_the_pendulum_under_a_torque_and_errors_of_its_input(tmp_path: Path) -> 
     system = with_input_errors(pendulum(disturbed), {"u": Fraction(1, 10_000)})
     result = proved(system, tmp_path)
     document = json.loads(result.raw or b"")
-    assert result.claim == "practical" and [q["name"] for q in document["plant"]["uncertain"]] == [
+    assert result.claim == "nearby" and [q["name"] for q in document["plant"]["uncertain"]] == [
         "m", "b", "torque", "error_u"]  # fmt: skip
     floor = float.fromhex(document["levels"]["floor"])
     assert result.levels.roa is not None and 0 < floor < 0.01 * result.levels.roa
