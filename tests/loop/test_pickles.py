@@ -336,6 +336,19 @@ def test_many_views_of_one_storage_are_refused(monkeypatch: pytest.MonkeyPatch) 
         load_tensors(buffer.getvalue(), "f")
 
 
+@pytest.mark.parametrize("base", [torch.zeros(30), np.zeros(30)], ids=["tensor", "array"])
+@pytest.mark.parametrize("alone", [True, False])
+def test_one_array_under_many_names_is_refused(monkeypatch: pytest.MonkeyPatch, base: Any, alone: bool) -> None:
+    monkeypatch.setattr("certify.loop.policies.importers.tensors._MAX_NUMBERS", 100)
+    for names in (3, 4):
+        value, buffer = {str(k): base for k in range(names)}, io.BytesIO()
+        buffer.write(pickle.dumps(value)) if alone else torch.save(value, buffer)
+        if names == 3:
+            assert len(load_tensors(buffer.getvalue(), "f")) == 3
+    with pytest.raises(InputError, match="at most 100 numbers"):
+        load_tensors(buffer.getvalue(), "f")
+
+
 def legacy(value: Any) -> bytes:
     """A file in the format of torch before version 1.6."""
     buffer = io.BytesIO()

@@ -24,6 +24,7 @@ _SAFE = {
     "F64": "f8", "F32": "f4", "F16": "f2", "BOOL": "b1", "U8": "u1", "U16": "u2", "U32": "u4", "U64": "u8",
     "I8": "i1", "I16": "i2", "I32": "i4", "I64": "i8",
 }  # fmt: skip
+_MAX_NUMBERS = 2**26  # a small pickle may name one array many times
 _MOST_MODULES = 1000
 _HELD = ("_parameters", "_buffers", "_modules")
 METADATA = "__metadata__"
@@ -51,7 +52,7 @@ def load_tensors(
         the file does not hold, where these are refused; two tensors have one name, or one cannot be read.
     """
     held, root = _opened(raw, what, file)
-    found: dict[str, Numbers] = {}
+    found, count = dict[str, Numbers](), 0
     waiting, seen = [("", root)], set[int]()
     while waiting:
         prefix, node = waiting.pop()
@@ -63,11 +64,13 @@ def load_tensors(
                     "file. Save it traced, torch.jit.trace(model.eval(), torch.zeros(1, n)).save(FILE), or its "
                     "state_dict, of which you say what stands between the layers."
                 )
-            array = held.tensor(node, prefix) if is_tensor(node) else array_of(node, prefix)
-            prefix, array = (prefix, array) if is_tensor(node) else _out_in(prefix, array)
-            if prefix in found:
-                raise InputError(f"{what} must name each tensor once; {prefix} stands there twice.")
-            found[prefix] = array
+            dense = is_tensor(node)
+            name, array = (prefix, held.tensor(node, prefix)) if dense else _out_in(prefix, array_of(node, prefix))
+            if name in found:
+                raise InputError(f"{what} must name each tensor once; {name} stands there twice.")
+            found[name], count = array, count + array.size
+            if count > _MAX_NUMBERS:
+                raise InputError(f"{what} must hold at most {_MAX_NUMBERS} numbers in its tensors; it holds more.")
         elif isinstance(node, dict | list | tuple | Call):
             module = None if modules is None else _module(node, prefix or what)
             if module is not None and modules is not None and isinstance(node, Call):
