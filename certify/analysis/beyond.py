@@ -17,7 +17,7 @@ from certify.lyapunov import sampled_volume
 from certify.lyapunov.rigorous import evaluate_rise
 
 if TYPE_CHECKING:
-    from certify.provers.outer import OuterProof
+    from certify.provers.outer import OuterProof, Rise
     from certify.provers.ranks import RankProof
 
 
@@ -26,18 +26,17 @@ def outer_facts(problem: Problem, claim: Claim, outer: Outer, found: OuterProof)
     held = sampled_volume(
         lambda x: (outer.function(x) <= outer.level) | (problem.V(x) <= claim.roa), problem.loop.system.domain
     )
-    return OuterFacts(
-        outer.function,
-        outer.level,
-        *held,
-        found.stop.name.lower(),
-        found.boxes,
-        found.leaves,
-        None if found.witness is None else tuple(found.witness.x.tolist()),
-        None if found.witness is None else found.witness.level,
-        None if found.witness is None else found.witness.kind,
-        (found.witness.constraint or None) if found.witness is not None else None,
-    )
+    facts = OuterFacts(outer.function, outer.level, *held, found.stop.name.lower(), found.boxes, found.leaves)
+    return with_hazard(facts, found.witness)
+
+
+def with_hazard(facts: OuterFacts, hazard: Rise | None) -> OuterFacts:
+    """The facts with the state at which a condition of the set fails, if one was met."""
+    if hazard is None:
+        return facts
+    at = tuple(hazard.x.tolist())
+    named = hazard.constraint or None
+    return replace(facts, witness=at, witness_level=hazard.level, violation=hazard.kind, constraint=named)
 
 
 def rank_facts(certificate: AnyCertificate, search: RankProof | None = None) -> RankFacts | None:

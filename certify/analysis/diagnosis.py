@@ -235,6 +235,11 @@ def _next(
     return Step((), result.reason)
 
 
+def _without_level(options: RoaOptions) -> Step:
+    """The step to the largest level, of a run for one that cannot be proved."""
+    return Step((), f"leave --level out for the largest level that can be proved{_whose(options)}")
+
+
 def _whose(options: RoaOptions) -> str:
     """A remark on the V of a level, where only the level chose it: that of a run without may be another one."""
     if options.P is not None or replace(options, level=None).only is not None:
@@ -304,7 +309,7 @@ def _around_a_constraint(result: RoaResult, options: RoaOptions) -> Step:
     """The step where a constraint ends the set: a V that is shaped around it, if that was not tried."""
     shaped = any(one.candidate.startswith("optimised") for one in result.tried)
     if options.level is not None:
-        return Step((), f"leave --level out for the largest level that can be proved{_whose(options)}")
+        return _without_level(options)
     several = options.claim == "asymptotic"  # one of them is shaped so
     given = options.P is not None or options.resume
     if not shaped and not given and (not several or (options.only is not None and _is_free(options))):
@@ -396,7 +401,7 @@ def _correction(result: RoaResult, options: RoaOptions, plant: System) -> Step |
         return slower
     failed = result.verdict is Verdict.REFUTED or (result.witness is not None and result.levels.roa is None)
     if options.level is not None and failed:
-        return Step((), f"leave --level out for the largest level that can be proved{_whose(options)}")
+        return _without_level(options)
     if result.levels.roa is None:
         try:
             require_equilibrium(plant)

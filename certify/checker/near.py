@@ -267,11 +267,13 @@ class Near:
         return type(self)(self.value[place], self.error[index])
 
     def through(self, W: Array) -> Self:
-        """W x for an exact matrix W, x along the first axis of `error`.
+        """W x for an exact matrix W, x along the first axis of `error`, the last or last but one of `value`.
 
         A row's roundings are at most gamma_n sum_l |W_il| times the norms of the x_l, and so is what underflows.
         """
-        return type(self)(np.matmul(W, self.value), (self.error + self.size.ulps(W.shape[1])).through(W))
+        flat = np.ndim(self.value) == len(self.axes) + 1
+        value = self.value @ W.T if flat else np.matmul(W, self.value)
+        return type(self)(value, (self.error + self.size.ulps(W.shape[1])).through(W))
 
 
 class Form(Near):

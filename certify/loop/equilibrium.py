@@ -152,9 +152,8 @@ def _widths(loop: ClosedLoop) -> Array:
 
 def _leaps(J: flint.arb_mat, widths: Array) -> bool:
     """True if the slopes of balls are far wider than those of a smooth F."""
-    entries = [[J[i, j] for j in range(J.ncols())] for i in range(J.nrows())]
-    size = np.array([[float(abs(v).upper()) for v in row] for row in entries]) * widths / widths[:, None]
-    wide = np.array([[float(v.rad()) for v in row] for row in entries]) * widths / widths[:, None]
+    ends = np.array([[(float(v.rad()), float(abs(v).upper())) for v in row] for row in J.tolist()])
+    wide, size = np.moveaxis(ends, -1, 0) * widths / widths[:, None]
     return not bool(np.max(wide) <= _LEAP * np.max(size))
 
 

@@ -81,9 +81,8 @@ class Setting:
             return _by_spectrum(state, rest)
 
 
-def _at_origin(loop: ClosedLoop) -> str:
-    """The step to a loop that rests at the origin, or to an answer about a state without a tube."""
-    centre = centring(loop.system, loop.network)
+def _at_origin(centre: str | None) -> str:
+    """The step to a loop that rests at the origin, by this centring, or to an answer about a state without a tube."""
     if centre is not None:
         return f"With --centre {centre} it is; the centred policy is then the one to run."
     return "`certify roa` proves the set around the loop's equilibrium, and its --contains whether a state lies in it."
@@ -170,10 +169,10 @@ def _with_claim(state: State) -> State:
         or_nearby = ", or a nearby equilibrium" if converging else ""
         state = state.noting(f"practical stability is claimed{or_nearby}, because {why}")
     if kind == "practical" and options.enlarges:
+        centre = centring(state.loop.system, state.loop.network)
         if options.reach_from is not None:
             said = f"a tube from a state needs a loop whose equilibrium is the origin; {'; '.join(state.notes)}."
-            raise InputError(f"{said} {_at_origin(state.loop)}")
-        centre = centring(state.loop.system, state.loop.network)
+            raise InputError(f"{said} {_at_origin(centre)}")
         with_it = "" if centre is None else f"; with --centre {centre} it is"
         state = state.noting(f"a tube needs a loop whose equilibrium is the origin, and is not looked for{with_it}")
         options = replace(options, enlarge=False, box=None)

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from certify.analysis.beyond import constraints_in_words
+from certify.analysis.beyond import constraints_in_words, with_hazard
 from certify.analysis.facts import OuterFacts
 from certify.analysis.options import RoaOptions
 from certify.analysis.stages.state import Report, effort_of
@@ -188,18 +188,8 @@ def _facts(found: StayProof, system: System) -> OuterFacts:
     """The facts on the set; its volume is estimated from samples."""
     outer, hazard = found.outer, found.hazard
     held = sampled_volume(lambda x: outer.function(x) <= outer.level, system.domain)
-    return OuterFacts(
-        outer.function,
-        outer.level,
-        *held,
-        "domain" if hazard is None else "witness",
-        found.boxes,
-        found.leaves,
-        None if hazard is None else tuple(hazard.x.tolist()),
-        None if hazard is None else hazard.level,
-        None if hazard is None else hazard.kind,
-        (hazard.constraint or None) if hazard is not None else None,
-    )
+    limit = "domain" if hazard is None else "witness"
+    return with_hazard(OuterFacts(outer.function, outer.level, *held, limit, found.boxes, found.leaves), hazard)
 
 
 def _split(loop: ClosedLoop, certificate: InvariantCertificate, at: str) -> InvariantCertificate | None:

@@ -10,7 +10,7 @@ from typing import Any
 from certify.errors import InputError
 from certify.loop.files.arrays import Numbers, bytes_of
 from certify.loop.files.pickles import Call, Name, Persistent, brief, read_pickle
-from certify.loop.files.torchfile import TorchFile, is_tensor
+from certify.loop.files.torchfile import TorchFile, is_tensor, unwrapped
 
 BEGINNING = b"\x80"
 """The first byte of such a pickle, unless it is of one of the two protocols before Python 2.3."""
@@ -41,11 +41,9 @@ class BarePickle:
         ------
         InputError : as there, or its storage is not in the pickle.
         """
-        if isinstance(node, Call) and node.function == Name("torch._utils", "_rebuild_parameter"):
-            node = node.arguments[0] if isinstance(node.arguments, tuple) and node.arguments else None
-        storage = (
-            node.arguments[0] if is_tensor(node) and isinstance(node.arguments, tuple) and node.arguments else None
-        )
+        node = unwrapped(node)
+        plain = is_tensor(node) and isinstance(node.arguments, tuple) and node.arguments
+        storage = node.arguments[0] if plain else None
         given = storage.arguments if isinstance(storage, Call) and storage.function == _STORAGE else None
         if not isinstance(given, tuple) or len(given) != 1:
             raise InputError(f"tensor {what} must have its storage in the pickle; found {brief(storage)}.")

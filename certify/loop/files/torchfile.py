@@ -90,8 +90,7 @@ class TorchFile:
         ------
         InputError : it is no dense tensor of plain numbers, or reaches out of its storage.
         """
-        if isinstance(node, Call) and node.function == Name("torch._utils", "_rebuild_parameter"):
-            node = node.arguments[0] if isinstance(node.arguments, tuple) and node.arguments else None
+        node = unwrapped(node)
         if not is_tensor(node):
             raise InputError(f"{what} must be a dense tensor; found {brief(node)}.")
         given = node.arguments
@@ -156,6 +155,13 @@ class TorchFile:
             return high.view(np.float32)
         array = np.frombuffer(raw, dtype=f"{self.order}{code}")
         return array.astype(np.float32 if code == "f2" else array.dtype.newbyteorder("="))
+
+
+def unwrapped(node: Any) -> Any:
+    """The tensor of a parameter; any other node as it is."""
+    if not isinstance(node, Call) or node.function != Name("torch._utils", "_rebuild_parameter"):
+        return node
+    return node.arguments[0] if isinstance(node.arguments, tuple) and node.arguments else None
 
 
 def is_tensor(node: Any) -> bool:
